@@ -1,0 +1,70 @@
+# The commands a person types, which are also the ones that CI runs.
+#
+#   make demo    set-up, then the demonstration: a phantom pair registered, a report in ./demo
+#   make test    set-up, then lint, types, import contract and all tests
+#   make setup   only the environment in .venv, redone when requirements.lock or pyproject.toml changes
+#   make lint    ruff, mypy and the import contract
+#   make format  rewrite the sources as ruff formats them
+#   make lock    renew requirements.lock after a change of the dependencies (needs uv; UPGRADE=--upgrade for newer versions)
+#   make clean   remove the environment and the caches
+#
+# Another interpreter: make PYTHON=/path/to/python3.12 setup
+
+# The first that runs, is 3.11 or newer, and can make an environment: a name on PATH may be too old, or a dead shim.
+PYTHON ?= $(shell for name in python3 python3.13 python3.12 python3.11; do \
+	if $$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; \
+	then echo $$name; break; fi; done)
+UV ?= uv
+UPGRADE ?=
+VENV := .venv
+ifeq ($(OS),Windows_NT)
+BIN := $(VENV)/Scripts
+else
+BIN := $(VENV)/bin
+endif
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint format lock clean
+.DELETE_ON_ERROR:
+
+help:
+	@sed -n '3,11p' Makefile | sed 's/^# \{0,1\}//'
+
+setup: $(VENV)/installed.stamp
+
+$(VENV)/dependencies.stamp: requirements.lock
+	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with the venv module was found on PATH." \
+		"Install one (on Debian and Ubuntu also python3-venv), or name it: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo "mrstrain needs Python 3.11 or newer; $(PYTHON) is older. Name another: make PYTHON=/path/to/python3.11 setup" >&2; exit 1; }
+	"$(PYTHON)" -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --require-hashes --only-binary :all: -r requirements.lock
+	@touch $@
+
+# Built with the hatchling that the lock has pinned, so nothing comes in without a hash.
+$(VENV)/installed.stamp: $(VENV)/dependencies.stamp pyproject.toml
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
+	@touch $@
+
+demo: setup
+	$(BIN)/mrstrain demo --out demo
+
+test: setup lint
+	$(BIN)/python -m pytest
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+lock:
+	$(UV) pip compile pyproject.toml --group dev --universal --python-version 3.11 --generate-hashes \
+		--no-header --no-emit-index-url --no-emit-find-links --quiet $(UPGRADE) -o requirements.lock
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist

@@ -1,0 +1,146 @@
+"""Error of displacement and maximal shear on the heel phantom: heel-mr beside elastix' default B-spline.
+
+    python benchmarks/registration_accuracy.py [--seeds 1 2] [--load 1.0] [--out benchmarks/results/registration_accuracy.json]
+
+Both register the same pair after the same rigid motion (the true one for elastix' default, which gets no mask;
+mrstrain finds its own). Scored: every labelled voxel whose true place lies inside the loaded image.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from dvc import elastix
+from dvc.deformation import Deformation, evaluate_on_grid
+from dvc.elastixtext import parse_parameters
+from dvc.image import Image, Mask
+from dvc.kinematics import StrainField
+from dvc.presets import Preset
+from dvc.registration import Settings, register
+from dvc.transformfile import bspline_from_elastix
+from dvc.worker import Worker, usable_cores
+from mrstrain.provenance import versions
+from phantoms.heel import HeelPair, heel_pair
+
+# elastix' own default for (Transform "BSplineTransform"), as GetDefaultParameterMap("bspline") gives it.
+DEFAULT = """
+(AutomaticParameterEstimation "true")
+(CheckNumberOfSamples "true")
+(FinalGridSpacingInPhysicalUnits 10.0)
+(FixedImagePyramid "FixedSmoothingImagePyramid")
+(GridSpacingSchedule 2.803221 1.988100 1.410000 1.0)
+(ImageSampler "RandomCoordinate")
+(Interpolator "LinearInterpolator")
+(MaximumNumberOfIterations 256)
+(MaximumNumberOfSamplingAttempts 8)
+(Metric "AdvancedMattesMutualInformation" "TransformBendingEnergyPenalty")
+(Metric0Weight 1.0)
+(Metric1Weight 1.0)
+(MovingImagePyramid "MovingSmoothingImagePyramid")
+(NewSamplesEveryIteration "true")
+(NumberOfResolutions 4)
+(NumberOfSamplesForExactGradient 4096)
+(NumberOfSpatialSamples 2048)
+(Optimizer "AdaptiveStochasticGradientDescent")
+(Registration "MultiMetricMultiResolutionRegistration")
+(Transform "BSplineTransform")
+"""
+
+
+def scored(pair: HeelPair, deformation: Deformation) -> dict[str, dict[str, float]]:
+    grid = pair.reference.grid
+    X = grid.points()
+    inside = pair.labels.labels > 0
+    U, true_H = evaluate_on_grid(pair.deformation, grid, inside)
+    seen = pair.loaded.grid.contains(pair.foot_motion.apply(X[inside] + U))
+    u, H = evaluate_on_grid(deformation, grid, inside)
+    truth, found = StrainField.from_gradient(true_H), StrainField.from_gradient(H)
+    label = pair.labels.labels[inside]
+    rows = {}
+    for number, name in pair.labels.names.items():
+        kept = (label == number) & seen & found.valid
+        error = found.max_shear[kept] - truth.max_shear[kept]
+        length = np.linalg.norm(u[kept] - U[kept], axis=1)
+        rows[name] = {
+            "voxels": int(kept.sum()),
+            "true_shear_p50": float(np.median(truth.max_shear[kept])),
+            "true_shear_p95": float(np.percentile(truth.max_shear[kept], 95)),
+            "shear_rmse": float(np.sqrt(np.mean(error**2))),
+            "shear_bias": float(error.mean()),
+            "shear_error_p95": float(np.percentile(np.abs(error), 95)),
+            "u_p50_mm": float(np.median(length)),
+            "u_p95_mm": float(np.percentile(length, 95)),
+            "folded": int(np.count_nonzero(found.jacobian[kept] <= 0)),
+        }
+    return rows
+
+
+def elastix_default(pair: HeelPair, worker: Worker, seed: int) -> Deformation:
+    back = pair.foot_motion.inverse()
+    moving = Image(pair.loaded.grid.moved_by(back.rotation, back.translation_mm), pair.loaded.values)
+    preset = Preset("elastix default", DEFAULT, parse_parameters(DEFAULT))
+    parameters = preset.complete(seed=seed) | {"UseMultiThreadingForMetrics": ("false",)}
+    with tempfile.TemporaryDirectory() as folder:
+        found = worker.run(
+            "elastix default", elastix.register, pair.reference, moving, parameters, None, None, None, folder
+        )
+    return bspline_from_elastix(found.transform)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--load", type=float, default=1.0)
+    parser.add_argument("--preset", default="heel-mr")
+    parser.add_argument("--skip-default", action="store_true")
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args()
+    threads = usable_cores()
+    results = []
+    with Worker(threads) as worker:
+        for seed in given.seeds:
+            pair = heel_pair(seed=seed, load=given.load)
+            body = Mask(pair.reference.grid, pair.labels.labels > 0)
+            runs = {}
+            worker.run("warming up", elastix.self_test)
+            began = time.perf_counter()
+            result = register(
+                pair.reference,
+                pair.loaded,
+                bone=pair.bone,
+                tissue=body,
+                settings=Settings.of(given.preset, threads=threads),
+                worker=worker,
+            )
+            runs[given.preset] = (scored(pair, result.bspline), time.perf_counter() - began)
+            if not given.skip_default:
+                began = time.perf_counter()
+                runs["elastix default"] = (
+                    scored(pair, elastix_default(pair, worker, 1)),
+                    time.perf_counter() - began,
+                )
+            for method, (rows, seconds) in runs.items():
+                print(f"seed {seed}, load {given.load}, {method}: {seconds:.0f} s")
+                for tissue, row in rows.items():
+                    print(
+                        f"  {tissue:8s} true {row['true_shear_p50']:.3f}/{row['true_shear_p95']:.3f}  shear RMSE "
+                        f"{row['shear_rmse']:.4f} bias {row['shear_bias']:+.4f} p95 {row['shear_error_p95']:.4f}  "
+                        f"u {row['u_p50_mm']:.3f}/{row['u_p95_mm']:.3f} mm  folded {row['folded']}",
+                        flush=True,
+                    )
+                results.append(
+                    {"seed": seed, "load": given.load, "method": method, "seconds": seconds, "tissues": rows}
+                )
+    if given.out is not None:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        given.out.write_text(json.dumps({"versions": versions(), "threads": threads, "runs": results}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

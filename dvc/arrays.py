@@ -1,0 +1,25 @@
+"""Array types and the one way by which a value object takes an array in."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+_T = TypeVar("_T", bound=np.generic)
+
+FloatArray = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+
+def frozen(values: npt.ArrayLike, dtype: type[_T]) -> npt.NDArray[_T]:
+    """Return ``values`` as a read-only, C-ordered array of ``dtype``; copied only where it must be.
+
+    The caller's own array stays writable: what is returned is a view of it, or a copy.
+    """
+    array = np.ascontiguousarray(values, dtype=dtype).view()
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,38 @@
+"""The errors of mrstrain: one root, and each also a ValueError or a RuntimeError.
+
+A message says what was wrong, which rule it broke, which value was found, and what to do next.
+"""
+
+from __future__ import annotations
+
+
+class MrstrainError(Exception):
+    """Root of every error that mrstrain raises on purpose."""
+
+
+class InputError(MrstrainError, ValueError):
+    """Something given by the user cannot be used: a file, a value, a combination of them."""
+
+
+class ImageFileError(InputError):
+    """An image, mask, label or mesh file that is damaged, unsupported, or ambiguous in its geometry."""
+
+
+class GeometryError(InputError):
+    """Images, masks or meshes that do not share a frame, or do not overlap."""
+
+
+class ParameterError(InputError):
+    """A registration parameter that elastix does not know, or a value out of range."""
+
+
+class RegistrationError(MrstrainError, RuntimeError):
+    """A registration that failed, or whose result must not be handed on."""
+
+
+class WorkerError(MrstrainError, RuntimeError):
+    """A worker process that died: killed, out of memory, or crashed in native code."""
+
+
+class OutputError(MrstrainError, RuntimeError):
+    """A result that cannot be written: folder not writable, disk full, output equal to an input."""

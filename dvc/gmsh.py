@@ -1,0 +1,96 @@
+"""The numbers that a Gmsh file gives its nodes, which meshio reads past."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import IntArray
+from dvc.errors import ImageFileError
+
+
+def gmsh_node_numbers(path: Path, count: int) -> IntArray:
+    """Node tags of a .msh file (version 2.2 or 4.1, text or binary), (count,), in the file's order.
+
+    Gmsh numbers nodes freely: from any number, with gaps, in any order. Boundary conditions are given by
+    these numbers, so they are read and never assumed.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    count : int
+        The number of nodes that it is known to hold.
+
+    Raises
+    ------
+    ImageFileError
+        If the file has another version, or its nodes are not ``count`` different ones.
+
+    References
+    ----------
+    Gmsh reference manual, section "MSH file format" (versions 2 and 4.1).
+    """
+    data = path.read_bytes()
+    try:
+        version, binary, size = _section(data, b"MeshFormat").split()[:3]
+        body = _section(data, b"Nodes", whole=binary == b"1")
+        if version == b"2.2":
+            tags = _binary_2(body) if binary == b"1" else _text_2(body)
+        elif version == b"4.1":
+            tags = _binary_4(body, int(size)) if binary == b"1" else _text_4(body)
+        else:
+            raise ImageFileError(
+                f"{path} is a Gmsh file of version {version.decode(errors='replace')}; 2.2 and 4.1 are read. "
+                "Save it again with Gmsh (Mesh.MshFileVersion = 4.1)."
+            )
+    except (ValueError, IndexError) as error:
+        if isinstance(error, ImageFileError):
+            raise
+        raise ImageFileError(f"{path}: its $Nodes section is damaged ({error}).") from error
+    if len(tags) != count or len(np.unique(tags)) != count:
+        raise ImageFileError(
+            f"{path}: {len(np.unique(tags))} different node numbers were found for {count} nodes; the file is damaged."
+        )
+    return tags
+
+
+def _section(data: bytes, name: bytes, *, whole: bool = False) -> bytes:
+    start = data.index(b"$" + name) + len(name) + 1
+    start = data.index(b"\n", start) + 1
+    # Binary data may hold the closing word by chance, and is measured by its own counts instead.
+    return data[start:] if whole else data[start : data.index(b"$End" + name, start)]
+
+
+def _text_2(body: bytes) -> IntArray:
+    lines = body.split(b"\n")
+    return np.array([int(line.split()[0]) for line in lines[1 : int(lines[0]) + 1]], dtype=np.int64)
+
+
+def _binary_2(body: bytes) -> IntArray:
+    end = body.index(b"\n")
+    record = np.dtype([("tag", "<i4"), ("x", "<f8", 3)])
+    return np.frombuffer(body, record, int(body[:end]), end + 1)["tag"].astype(np.int64)
+
+
+def _text_4(body: bytes) -> IntArray:
+    lines = [line for line in body.split(b"\n") if line.strip()]
+    at, tags = 1, []
+    for _ in range(int(lines[0].split()[0])):
+        nodes = int(lines[at].split()[3])
+        tags += [int(line) for line in lines[at + 1 : at + 1 + nodes]]
+        at += 1 + 2 * nodes
+    return np.array(tags, dtype=np.int64)
+
+
+def _binary_4(body: bytes, size: int) -> IntArray:
+    number = np.dtype(f"<u{size}")
+    blocks = int(np.frombuffer(body, number, 4)[0])
+    at, tags = 4 * size, []
+    for _ in range(blocks):
+        nodes = int(np.frombuffer(body, number, 1, at + 12)[0])
+        at += 12 + size
+        tags.append(np.frombuffer(body, number, nodes, at).astype(np.int64))
+        at += nodes * (size + 24)
+    return np.concatenate(tags) if tags else np.empty(0, dtype=np.int64)

@@ -1,0 +1,306 @@
+"""Images on a grid in space: Grid, Image, Mask, LabelMap.
+
+Everything is in one frame, LPS in mm (x to the patient's left, y to posterior, z to superior), whatever
+frame the file used. Arrays are indexed ``values[i, j, k]`` along the grid's own axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
+from dvc.errors import GeometryError, InputError
+
+_ORTHONORMAL_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """A regular grid of voxel centres in LPS space.
+
+    The centre of voxel ``(i, j, k)`` lies at ``X = origin_mm + direction @ (spacing_mm * (i, j, k))``.
+
+    Parameters
+    ----------
+    shape : (3,) int
+        Number of voxels along each grid axis.
+    spacing_mm : (3,)
+        Distance between voxel centres along each grid axis, mm, positive.
+    origin_mm : (3,)
+        Centre of voxel (0, 0, 0), LPS mm.
+    direction : (3, 3)
+        Columns are the unit vectors of the grid axes in LPS; orthonormal, either handedness.
+
+    Raises
+    ------
+    GeometryError
+        If an axis has no voxel, a spacing is not positive and finite, or the axes are not orthonormal.
+
+    Examples
+    --------
+    >>> grid = Grid((4, 4, 4), (1.0, 1.0, 2.0), (0.0, 0.0, 0.0))
+    >>> grid.points()[1, 0, 3].tolist()
+    [1.0, 0.0, 6.0]
+    >>> grid.indices_of([[1.0, 0.0, 6.0]]).tolist()
+    [[1.0, 0.0, 3.0]]
+    """
+
+    shape: tuple[int, int, int]
+    spacing_mm: FloatArray
+    origin_mm: FloatArray
+    direction: FloatArray = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        shape = tuple(int(n) for n in self.shape)
+        if len(shape) != 3 or min(shape) < 1:
+            raise GeometryError(f"A grid needs three axes of at least one voxel; got shape {shape}.")
+        spacing = frozen(self.spacing_mm, np.float64)
+        origin = frozen(self.origin_mm, np.float64)
+        direction = frozen(self.direction, np.float64)
+        if spacing.shape != (3,) or not np.all(np.isfinite(spacing)) or np.any(spacing <= 0):
+            raise GeometryError(f"Voxel spacing must be three positive lengths in mm; got {spacing.tolist()}.")
+        if origin.shape != (3,) or not np.all(np.isfinite(origin)):
+            raise GeometryError(f"The grid's origin must be three finite coordinates in mm; got {origin.tolist()}.")
+        if direction.shape != (3, 3) or not np.all(np.isfinite(direction)):
+            raise GeometryError("The grid's direction must be a finite 3 x 3 matrix.")
+        skew = float(np.abs(direction.T @ direction - np.eye(3)).max())
+        if skew > _ORTHONORMAL_TOLERANCE:
+            raise GeometryError(
+                f"The grid's axes are not perpendicular unit vectors (largest deviation {skew:.2g}): the "
+                "affine is sheared or its spacing is wrong. Resample the image to a regular grid first."
+            )
+        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "spacing_mm", spacing)
+        object.__setattr__(self, "origin_mm", origin)
+        object.__setattr__(self, "direction", direction)
+
+    @property
+    def affine(self) -> FloatArray:
+        """The (4, 4) matrix from voxel indices to LPS mm."""
+        affine = np.eye(4)
+        affine[:3, :3] = self.direction * self.spacing_mm
+        affine[:3, 3] = self.origin_mm
+        return affine
+
+    @property
+    def voxel_volume_mm3(self) -> float:
+        """Volume of one voxel, mm3."""
+        return float(np.prod(self.spacing_mm))
+
+    @property
+    def size(self) -> int:
+        """Number of voxels."""
+        return int(np.prod(self.shape))
+
+    @property
+    def centre_mm(self) -> FloatArray:
+        """Centre of the grid, LPS mm."""
+        middle = (np.array(self.shape) - 1) / 2.0
+        return np.asarray(self.origin_mm + self.direction @ (self.spacing_mm * middle))
+
+    def points(self, where: BoolArray | None = None) -> FloatArray:
+        """Voxel centres in LPS mm: (ni, nj, nk, 3), or (n, 3) for the voxels of the mask ``where``."""
+        if where is None:
+            indices = np.moveaxis(np.indices(self.shape, dtype=np.float64), 0, -1)
+        else:
+            indices = np.argwhere(where).astype(np.float64)
+        return self.points_at(indices)
+
+    def points_at(self, indices: FloatArray) -> FloatArray:
+        """LPS mm of continuous voxel indices (..., 3)."""
+        return np.asarray((np.asarray(indices, dtype=np.float64) * self.spacing_mm) @ self.direction.T + self.origin_mm)
+
+    def indices_of(self, points_mm: FloatArray) -> FloatArray:
+        """Continuous voxel indices (..., 3) of points in LPS mm."""
+        inverse = np.linalg.inv(self.direction)
+        return np.asarray(((np.asarray(points_mm) - self.origin_mm) @ inverse.T) / self.spacing_mm)
+
+    def contains(self, points_mm: FloatArray) -> BoolArray:
+        """Whether points in LPS mm lie inside the grid's box, which ends half a voxel beyond its centres."""
+        indices = self.indices_of(points_mm)
+        return np.asarray(np.all((indices >= -0.5) & (indices <= np.array(self.shape) - 0.5), axis=-1))
+
+    def corners(self) -> FloatArray:
+        """The eight outer corners of the grid's box, (8, 3) LPS mm."""
+        bits = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.float64)
+        return self.points_at(bits * np.array(self.shape) - 0.5)
+
+    def bounds_mm(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper corner of the axis-aligned LPS box around the grid, mm."""
+        corners = self.corners()
+        return corners.min(axis=0), corners.max(axis=0)
+
+    def same_as(self, other: Grid, tolerance_voxels: float = 0.02) -> bool:
+        """Whether two grids have the same shape and place their corner voxels within a fraction of a voxel.
+
+        Headers written by different programs differ in the last digits; that is the same grid.
+        """
+        if self.shape != other.shape:
+            return False
+        shift = np.abs(self.indices_of(other.corners()) - self.indices_of(self.corners()))
+        return bool(shift.max() <= tolerance_voxels)
+
+    def axes_to_lps(self) -> tuple[tuple[int, int, int], tuple[bool, bool, bool]]:
+        """Order and flips of the grid axes that bring them closest to L, P, S.
+
+        Returns
+        -------
+        order : axis of this grid to be used as first, second, third
+        flips : whether that axis has to be reversed
+        """
+        closeness = np.abs(self.direction)
+        order = [-1, -1, -1]
+        for _ in range(3):
+            world, axis = np.unravel_index(int(np.argmax(closeness)), (3, 3))
+            order[int(world)] = int(axis)
+            closeness[world, :] = -1.0
+            closeness[:, axis] = -1.0
+        flips = tuple(bool(self.direction[w, a] < 0) for w, a in enumerate(order))
+        return (order[0], order[1], order[2]), (flips[0], flips[1], flips[2])
+
+    def toward_lps(self) -> Grid:
+        """The same voxels with axes ordered and flipped to run closest to L, P, S."""
+        order, flips = self.axes_to_lps()
+        first = np.array([self.shape[a] - 1 if f else 0 for a, f in zip(order, flips, strict=True)])
+        start = np.zeros(3)
+        start[list(order)] = first
+        signs = np.where(flips, -1.0, 1.0)
+        shape = (self.shape[order[0]], self.shape[order[1]], self.shape[order[2]])
+        return Grid(shape, self.spacing_mm[list(order)], self.points_at(start), self.direction[:, list(order)] * signs)
+
+    def moved_by(self, rotation: FloatArray, translation_mm: FloatArray) -> Grid:
+        """The grid carried by the rigid motion x -> rotation @ x + translation_mm."""
+        return replace(self, origin_mm=rotation @ self.origin_mm + translation_mm, direction=rotation @ self.direction)
+
+    def __str__(self) -> str:
+        """Shape, spacing and bounding box, for messages."""
+        low, high = self.bounds_mm()
+        box = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in zip(low, high, strict=True))
+        spacing = " x ".join(f"{s:.4g}" for s in self.spacing_mm)
+        return f"{' x '.join(map(str, self.shape))} voxels of {spacing} mm, box (LPS mm) {box}"
+
+
+def _check_shape(what: str, shape: tuple[int, ...], grid: Grid) -> None:
+    if shape != grid.shape:
+        raise GeometryError(f"{what} has shape {shape}, its grid has {grid.shape}; they must be equal.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Image:
+    """A scalar image on a grid; single precision, as scanners give it. Missing voxels are NaN.
+
+    Raises
+    ------
+    InputError
+        If values and grid differ in shape or a value is infinite.
+    """
+
+    grid: Grid
+    values: Float32Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", frozen(self.values, np.float32))
+        _check_shape("The image", self.values.shape, self.grid)
+        if np.isinf(self.values).any():
+            raise InputError("The image holds infinite values; set them to NaN (missing) or repair them.")
+
+    @property
+    def missing(self) -> BoolArray:
+        """Voxels without a value."""
+        return np.isnan(self.values)
+
+    def toward_lps(self) -> Image:
+        """The same image with its axes closest to L, P, S; values are reordered, never resampled."""
+        return Image(self.grid.toward_lps(), reordered_to_lps(self.grid, self.values))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mask:
+    """A set of voxels on a grid."""
+
+    grid: Grid
+    inside: BoolArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "inside", frozen(self.inside, np.bool_))
+        _check_shape("The mask", self.inside.shape, self.grid)
+
+    @property
+    def volume_mm3(self) -> float:
+        """Volume of the mask, mm3."""
+        return float(np.count_nonzero(self.inside)) * self.grid.voxel_volume_mm3
+
+    def points(self) -> FloatArray:
+        """Centres of the mask's voxels, (n, 3) LPS mm."""
+        return self.grid.points(self.inside)
+
+    def toward_lps(self) -> Mask:
+        """The same mask with its axes closest to L, P, S."""
+        return Mask(self.grid.toward_lps(), reordered_to_lps(self.grid, self.inside))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelMap:
+    """Regions on a grid, each an integer with a name. Zero is background and has no name.
+
+    Raises
+    ------
+    InputError
+        If a label is negative, has no name, or two labels share a name.
+    """
+
+    grid: Grid
+    labels: IntArray
+    names: Mapping[int, str]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "labels", frozen(self.labels, np.int64))
+        _check_shape("The label map", self.labels.shape, self.grid)
+        present = [int(v) for v in np.unique(self.labels)]
+        if present and present[0] < 0:
+            raise InputError(f"Labels must not be negative; found {present[0]}.")
+        nameless = [v for v in present if v != 0 and v not in self.names]
+        if nameless:
+            raise InputError(f"Labels without a name: {nameless}. Names given: {dict(self.names)}.")
+        listed = list(self.names.values())
+        twice = sorted({n for n in listed if listed.count(n) > 1})
+        if twice:
+            raise InputError(f"Region names used for more than one label: {twice}.")
+        object.__setattr__(self, "names", dict(self.names))
+
+    def region(self, name: str) -> Mask:
+        """The mask of one region.
+
+        Raises
+        ------
+        InputError
+            If no label has this name; the message lists the names there are.
+        """
+        for label, known in self.names.items():
+            if known == name:
+                return Mask(self.grid, self.labels == label)
+        raise InputError(f"The label map has no region '{name}'; it has {sorted(self.names.values())}.")
+
+    def toward_lps(self) -> LabelMap:
+        """The same label map with its axes closest to L, P, S."""
+        return LabelMap(self.grid.toward_lps(), reordered_to_lps(self.grid, self.labels), self.names)
+
+
+def reordered_to_lps(grid: Grid, values: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    """Values on ``grid`` (leading three axes) reordered to ``grid.toward_lps()``."""
+    order, flips = grid.axes_to_lps()
+    rest = tuple(range(3, values.ndim))
+    reordered = values.transpose((*order, *rest))
+    return np.ascontiguousarray(reordered[tuple(slice(None, None, -1 if f else 1) for f in flips)])
+
+
+def reordered_from_lps(grid: Grid, values: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    """Values on ``grid.toward_lps()`` put back into the voxel order of ``grid``."""
+    order, flips = grid.axes_to_lps()
+    rest = tuple(range(3, values.ndim))
+    unflipped = values[tuple(slice(None, None, -1 if f else 1) for f in flips)]
+    inverse = tuple(int(a) for a in np.argsort(order))
+    return np.ascontiguousarray(unflipped.transpose((*inverse, *rest)))

@@ -1,0 +1,161 @@
+"""Reading images: NIfTI, NRRD, MetaImage and DICOM series, to an Image in LPS mm.
+
+A file that is damaged, or whose place in space can be read in two ways, is refused with the reason. What
+was read differently from how it was written (units, a lone volume of a 4D file) is told by the logger
+``dvc.images``.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import Float32Array
+from dvc.dicom import is_dicom, read_dicom_series
+from dvc.errors import ImageFileError, InputError
+from dvc.image import Grid, Image
+from dvc.nifti import nifti_shape, read_nifti_header
+from dvc.nrrd import meta_shape, nrrd_shape, read_meta_header, read_nrrd_header
+from dvc.storedvolume import MAX_BYTES, StoredVolume, Voxels
+
+_log = logging.getLogger("dvc.images")
+
+_MIN_SLICES = 4
+
+_Header = Callable[[Path, int | None, int], StoredVolume]
+_Shape = Callable[[Path], tuple[int, ...]]
+_FORMATS: dict[str, tuple[_Header, _Shape]] = {
+    ".nii": (read_nifti_header, nifti_shape),
+    ".nii.gz": (read_nifti_header, nifti_shape),
+    ".nrrd": (read_nrrd_header, nrrd_shape),
+    ".nhdr": (read_nrrd_header, nrrd_shape),
+    ".mha": (read_meta_header, meta_shape),
+    ".mhd": (read_meta_header, meta_shape),
+}
+
+
+def read_image(
+    path: str | PathLike[str],
+    *,
+    allow_missing: bool = False,
+    series: str | None = None,
+    volume: int | None = None,
+    max_bytes: int = MAX_BYTES,
+) -> Image:
+    """Read a 3D image, whatever its format, into LPS mm.
+
+    Parameters
+    ----------
+    path : file (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd) or folder of a DICOM series
+    allow_missing : bool
+        Take voxels that are NaN or infinite as missing (NaN) instead of refusing the image.
+    series : str, optional
+        Which DICOM series of a folder that holds several; the end of its UID, as the refusal lists them.
+    volume : int, optional
+        Which volume of a 4D file, from 0.
+    max_bytes : int
+        Largest image that is read, counted in single precision.
+
+    Returns
+    -------
+    Image
+        Voxels in the order of the file; scaling (slope and intercept) applied.
+
+    Raises
+    ------
+    ImageFileError
+        If the file is damaged, of an unknown kind, not a scalar 3D image of four slices or more, constant, or
+        does not say without contradiction where it lies.
+    InputError
+        If voxels are NaN or infinite and ``allow_missing`` is not set, or ``series`` is missing or unknown.
+    """
+    grid, voxels = read_voxels(path, series=series, volume=volume, max_bytes=max_bytes)
+    if min(grid.shape) < _MIN_SLICES:
+        raise ImageFileError(
+            f"{path}: an image of {' x '.join(map(str, grid.shape))} voxels; a volume needs at least "
+            f"{_MIN_SLICES} slices along each axis, since strain is a matter of three dimensions."
+        )
+    with np.errstate(over="ignore"):  # beyond single precision: infinite, and found below
+        values = np.ascontiguousarray(voxels, dtype=np.float32)
+    return Image(grid, _checked_values(Path(path), values, allow_missing))
+
+
+def read_voxels(
+    path: str | PathLike[str],
+    *,
+    series: str | None = None,
+    volume: int | None = None,
+    max_bytes: int = MAX_BYTES,
+) -> tuple[Grid, Voxels]:
+    """Grid (LPS mm) and voxels (ni, nj, nk) of a file or DICOM folder, in the file's own number type.
+
+    Raises
+    ------
+    ImageFileError, InputError
+        As `read_image`, but for the checks of the values.
+    """
+    place = Path(path)
+    if not place.exists():
+        raise InputError(f"{place}: no such file or folder. Check the path.")
+    if place.is_dir():
+        if volume is not None:
+            raise InputError(f"{place}: volume={volume} is for 4D files; a DICOM folder is chosen from by series.")
+        return read_dicom_series(place, series=series, max_bytes=max_bytes)
+    if series is not None:
+        raise InputError(f"{place}: series='{series}' is for DICOM folders; this is a file.")
+    header, _ = _FORMATS[_suffix(place)]
+    stored = header(place, volume, max_bytes)
+    return stored.grid, stored.load()
+
+
+def estimate_size(path: str | PathLike[str]) -> int:
+    """Bytes that the image of a file would take in single precision, from its header alone.
+
+    Raises
+    ------
+    ImageFileError
+        If the file is of an unknown kind or its header is damaged.
+    """
+    place = Path(path)
+    if not place.is_file():
+        raise InputError(f"{place}: no such file. Check the path.")
+    _, shape = _FORMATS[_suffix(place)]
+    return 4 * int(np.prod([max(n, 0) for n in shape(place)], dtype=object))
+
+
+def _suffix(path: Path) -> str:
+    name = path.name.lower()
+    for suffix in sorted(_FORMATS, key=len, reverse=True):
+        if name.endswith(suffix):
+            return suffix
+    if is_dicom(path):
+        raise ImageFileError(f"{path}: one file of a DICOM series. Give its folder instead: {path.parent}")
+    raise ImageFileError(
+        f"{path}: images of this kind are not read. What is read: {', '.join(_FORMATS)}, and folders of DICOM files."
+    )
+
+
+def _checked_values(path: Path, values: Float32Array, allow_missing: bool) -> Float32Array:
+    finite = np.isfinite(values)
+    missing = values.size - int(np.count_nonzero(finite))
+    if missing == values.size:
+        raise ImageFileError(f"{path}: no voxel has a finite value.")
+    if missing:
+        first = tuple(int(n) for n in np.unravel_index(int(np.argmin(finite)), values.shape))
+        found = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
+        if not allow_missing:
+            raise InputError(
+                f"{path}: {found}. Repair the image, or pass allow_missing=True to leave those voxels out."
+            )
+        _log.warning("%s: %s; taken as missing", path, found)
+        values = np.where(finite, values, np.float32(np.nan))
+        low, high = np.nanmin(values), np.nanmax(values)
+    else:
+        low, high = values.min(), values.max()
+    if low == high:
+        raise ImageFileError(f"{path}: a constant image (every voxel is {float(low):g}); there is nothing to follow.")
+    return values

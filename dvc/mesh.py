@@ -1,0 +1,266 @@
+"""A mesh of linear tetrahedra with named regions and facets, checked once at construction."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+import numpy.typing as npt
+
+from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
+from dvc.errors import GeometryError, InputError
+
+_log = logging.getLogger("dvc.mesh")
+
+_SMALLEST_EXTENT_MM = 1.0  # a body part in metres is 0.05 to 0.5 "mm" across
+_LARGEST_EXTENT_MM = 5000.0  # a body part in mm that was declared as metres is 50,000 mm across or more
+_DEGENERATE = 1e-9  # volume over the longest edge cubed; 0.118 for a regular tetrahedron
+_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+_FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))  # face i lies opposite to node i
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TetMesh:
+    """Linear tetrahedra in the reference configuration, LPS mm.
+
+    Parameters
+    ----------
+    points_mm : (n, 3)
+        Nodes, LPS mm, finite.
+    cells : (m, 4) int
+        Node indices of each tetrahedron. Its volume det(X1 - X0, X2 - X0, X3 - X0) / 6 is positive, in mm3.
+    regions : mapping of str to (k,) int, optional
+        Indices of the cells in each named region; regions may overlap and need not cover the mesh.
+    facets : mapping of str to (k, 3) int, optional
+        Node indices of the triangles on each named surface.
+    node_ids : (n,) int, optional
+        The number of each node in the numbering it came from; 0 to n - 1 by default.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, an index is out of range, a region is empty, or a node id is repeated.
+    GeometryError
+        If a coordinate is not finite, a cell has no volume, the mesh folds over itself, or its size is not
+        that of a body part in mm.
+
+    Notes
+    -----
+    What is provably safe is mended, and logged (logger ``dvc.mesh``):
+
+    - Nodes that no cell uses are dropped; ``node_ids`` keeps the numbers of the others.
+    - The order of two nodes is swapped in cells of negative volume, which leaves each the same set of points.
+      Where all cells are negative the file merely counts the other way round. Where only some are, it is done
+      only if the two cells on either side of every face lie on opposite sides of it; otherwise a negative
+      volume is a sign of tissue folded over itself, and the mesh is refused.
+
+    Examples
+    --------
+    >>> corner = TetMesh([[0, 0, 0], [6, 0, 0], [0, 6, 0], [0, 0, 6]], [[0, 1, 2, 3]], {"fat": [0]})
+    >>> corner.volumes_mm3.tolist(), corner.centroids_mm.tolist()
+    ([36.0], [[1.5, 1.5, 1.5]])
+    """
+
+    points_mm: FloatArray
+    cells: IntArray
+    regions: Mapping[str, IntArray]
+    facets: Mapping[str, IntArray]
+    node_ids: IntArray
+
+    def __init__(
+        self,
+        points_mm: npt.ArrayLike,
+        cells: npt.ArrayLike,
+        regions: Mapping[str, npt.ArrayLike] | None = None,
+        facets: Mapping[str, npt.ArrayLike] | None = None,
+        node_ids: npt.ArrayLike | None = None,
+    ) -> None:
+        points = checked_points(points_mm)
+        tets = checked_indices("cells", cells, len(points), 4)
+        if len(tets) == 0:
+            raise InputError("The mesh has no tetrahedron.")
+        ids = np.arange(len(points)) if node_ids is None else np.asarray(node_ids)
+        if ids.shape != (len(points),) or len(np.unique(ids)) != len(ids):
+            raise InputError(
+                f"node_ids must give each of the {len(points)} nodes a number of its own; got {ids.shape[0]} "
+                f"numbers, {len(np.unique(ids))} of them different."
+            )
+        named_cells = {
+            name: checked_indices(f"region {name!r}", index, len(tets)) for name, index in (regions or {}).items()
+        }
+        named_facets = {
+            name: checked_indices(f"facets {name!r}", index, len(points), 3) for name, index in (facets or {}).items()
+        }
+        for name, index in {**named_cells, **named_facets}.items():
+            if len(index) == 0:
+                raise InputError(f"{name!r} is empty. Leave it out, or check how the mesh was made.")
+
+        tets = _positively_ordered(points, tets)
+        used = np.zeros(len(points), dtype=bool)
+        used[tets] = True
+        if not used.all():
+            for name, index in named_facets.items():
+                if not used[index].all():
+                    raise InputError(f"facets {name!r} lie on nodes that no tetrahedron uses.")
+            _log.info(
+                "%d of %d nodes belong to no tetrahedron and are left out; the first is node %d.",
+                np.count_nonzero(~used), len(used), ids[np.argmin(used)],
+            )  # fmt: skip
+            new_index = np.cumsum(used) - 1
+            points, ids, tets = points[used], ids[used], new_index[tets]
+            named_facets = {name: new_index[index] for name, index in named_facets.items()}
+        check_extent(points)
+
+        def sealed(named: Mapping[str, IntArray]) -> Mapping[str, IntArray]:
+            return MappingProxyType({name: frozen(index, np.int64) for name, index in named.items()})
+
+        object.__setattr__(self, "points_mm", frozen(points, np.float64))
+        object.__setattr__(self, "cells", frozen(tets, np.int64))
+        object.__setattr__(self, "regions", sealed(named_cells))
+        object.__setattr__(self, "facets", sealed(named_facets))
+        object.__setattr__(self, "node_ids", frozen(ids, np.int64))
+
+    @property
+    def volumes_mm3(self) -> FloatArray:
+        """Volume of each cell, (m,) mm3, positive."""
+        return _signed_volumes(self.points_mm, self.cells)
+
+    @property
+    def centroids_mm(self) -> FloatArray:
+        """Mean of each cell's four nodes, (m, 3) LPS mm."""
+        return np.asarray(self.points_mm[self.cells].mean(axis=1))
+
+    @property
+    def bounds_mm(self) -> FloatArray:
+        """Least and greatest coordinates of the nodes, (2, 3) LPS mm."""
+        return np.stack([self.points_mm.min(axis=0), self.points_mm.max(axis=0)])
+
+
+def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
+    """Nodes as an (n, 3) array of finite numbers.
+
+    Raises
+    ------
+    InputError
+        If the shape is another.
+    GeometryError
+        If a coordinate is not finite; with the count and the first index.
+    """
+    points = np.array(points_mm, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise InputError(f"Nodes of a mesh must be an (n, 3) array of coordinates; got shape {points.shape}.")
+    bad = ~np.isfinite(points).all(axis=1)
+    if bad.any():
+        raise GeometryError(
+            f"{np.count_nonzero(bad)} of {len(points)} nodes have a coordinate that is not a finite number; "
+            f"the first is at index {np.argmax(bad)}."
+        )
+    return points
+
+
+def checked_indices(what: str, index: npt.ArrayLike, count: int, width: int | None = None) -> IntArray:
+    """Integer indices below ``count``, (k,) or (k, width).
+
+    Raises
+    ------
+    InputError
+        If they are not integers, have another shape, or one is out of range.
+    """
+    array = np.asarray(index)
+    if array.size == 0:
+        array = array.reshape((0,) if width is None else (0, width)).astype(np.int64)
+    if not np.issubdtype(array.dtype, np.integer):
+        raise InputError(f"{what}: indices must be integers; got {array.dtype}.")
+    if array.ndim != (1 if width is None else 2) or (width is not None and array.shape[1] != width):
+        wanted = "(k,)" if width is None else f"(k, {width})"
+        raise InputError(f"{what}: indices must have shape {wanted}; got {array.shape}.")
+    array = array.astype(np.int64)
+    outside = (array < 0) | (array >= count)
+    if outside.any():
+        first = np.argwhere(outside)[0]
+        raise InputError(
+            f"{what}: {np.count_nonzero(outside)} indices are outside 0 to {count - 1}; the first is "
+            f"{array[tuple(first)]}, in row {first[0]}."
+        )
+    return array
+
+
+def check_extent(points_mm: FloatArray) -> None:
+    """Refuse a mesh that is not the size of a body part in mm.
+
+    Raises
+    ------
+    GeometryError
+        If its longest side is under 1 mm or over 5 m.
+    """
+    extent = float(np.ptp(points_mm, axis=0).max())
+    if extent < _SMALLEST_EXTENT_MM:
+        raise GeometryError(
+            f"The mesh is {extent:.3g} mm across, and a mesh in mm is not that small: its coordinates are "
+            "probably in metres. If so, say unit='m' (--mesh-unit m)."
+        )
+    if extent > _LARGEST_EXTENT_MM:
+        raise GeometryError(
+            f"The mesh is {extent / 1000:.4g} m across, and no body part is that large: its coordinates are "
+            "probably in mm and not in metres, or finer. Say unit='mm' (--mesh-unit mm), or scale them to mm."
+        )
+
+
+def _signed_volumes(points: FloatArray, cells: IntArray) -> FloatArray:
+    corner = points[cells]
+    a, b, c = (corner[:, i] - corner[:, 0] for i in (1, 2, 3))
+    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+
+
+def _positively_ordered(points: FloatArray, cells: IntArray) -> IntArray:
+    """Give every cell a positive volume, or refuse; see the notes of TetMesh."""
+    volumes = _signed_volumes(points, cells)
+    longest = np.max([np.linalg.norm(points[cells[:, i]] - points[cells[:, j]], axis=1) for i, j in _EDGES], axis=0)
+    flat = np.abs(volumes) <= _DEGENERATE * longest**3
+    if flat.any():
+        first = int(np.argmax(flat))
+        raise GeometryError(
+            f"{np.count_nonzero(flat)} of {len(cells)} tetrahedra are degenerate (no volume); the first is "
+            f"cell {first}, nodes {cells[first].tolist()}, {volumes[first]:.3g} mm3. Mend the mesh where it "
+            "was made: remove or remesh them."
+        )
+    negative = volumes < 0
+    if not negative.any():
+        return cells
+    if not negative.all():
+        overlapping = _overlapping(points, cells)
+        if overlapping.any():
+            first = int(np.argmax(overlapping))
+            raise GeometryError(
+                f"{np.count_nonzero(negative)} of {len(cells)} tetrahedra are inverted (negative volume), "
+                f"and {np.count_nonzero(overlapping)} overlap a neighbour across a common face, the first of "
+                f"them cell {first}, nodes {cells[first].tolist()}: the mesh folds over itself. Mend it "
+                "where it was made."
+            )
+    _log.warning(
+        "%d of %d tetrahedra count their nodes the other way round (negative volume); two nodes of each were "
+        "swapped. Their shape and place are unchanged, and no cell overlaps its neighbour.",
+        np.count_nonzero(negative), len(cells),
+    )  # fmt: skip
+    ordered = cells.copy()
+    ordered[negative, 2], ordered[negative, 3] = cells[negative, 3], cells[negative, 2]
+    return ordered
+
+
+def _overlapping(points: FloatArray, cells: IntArray) -> BoolArray:
+    """Which cells have a face whose cells do not lie one on either side of it (or that three cells share)."""
+    faces = np.sort(np.concatenate([cells[:, face] for face in _FACES]), axis=1)
+    opposite = cells.T.ravel()
+    owner = np.tile(np.arange(len(cells)), 4)
+    _, which = np.unique(faces, axis=0, return_inverse=True)
+    which = which.ravel()
+    side = np.sign(_signed_volumes(points, np.column_stack([faces, opposite])))
+    shared_by = np.bincount(which)
+    balance = np.bincount(which, weights=side)  # 0 where two cells lie on opposite sides
+    wrong = (shared_by > 2) | ((shared_by == 2) & (balance != 0))
+    overlapping = np.zeros(len(cells), dtype=bool)
+    overlapping[owner[wrong[which]]] = True
+    return overlapping

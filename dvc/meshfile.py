@@ -1,0 +1,278 @@
+"""A user's mesh file: every node and cell of it, with the numbers it uses, in LPS mm."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import meshio
+import numpy as np
+
+from dvc.abaqus import read_abaqus
+from dvc.arrays import FloatArray, IntArray, frozen
+from dvc.errors import GeometryError, ImageFileError, InputError
+from dvc.gmsh import gmsh_node_numbers
+from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points
+
+_log = logging.getLogger("dvc.meshfile")
+
+MM_PER_UNIT = {"mm": 1.0, "m": 1000.0}
+TO_LPS = {"LPS": np.array([1.0, 1.0, 1.0]), "RAS": np.array([-1.0, -1.0, 1.0])}  # signs; their own inverse
+
+_VOLUMES = {"tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
+_CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4} | _VOLUMES
+_DIMENSION = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2} | dict.fromkeys(_VOLUMES, 3)
+# Cell arrays of VTK files that hold a region's number, in the order in which they are looked for.
+_REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part")
+_MOST_REGIONS = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CellBlock:
+    """Cells of one ``kind``, in meshio's names (tetra10 ...), by the indices of their ``nodes`` (m, k)."""
+
+    kind: str
+    nodes: IntArray
+
+    @property
+    def shape(self) -> str:
+        """The kind without its order: tetra for tetra10."""
+        return self.kind.rstrip("0123456789")
+
+    @property
+    def corners(self) -> IntArray:
+        """The corner nodes, (m, 4) for tetrahedra of any order."""
+        return self.nodes[:, : _CORNERS[self.shape]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshFile:
+    """A mesh as its file has it, whatever its elements: every node, every cell.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    unit, frame : str
+        The file's own: "mm" or "m", "LPS" or "RAS".
+    points_mm : (n, 3)
+        All nodes, mid-side nodes too, LPS mm.
+    node_ids : (n,) int
+        The file's numbers of its nodes (Gmsh, Abaqus); the index from 0 in VTK files, which give none.
+    blocks : tuple of CellBlock
+        All cells, surfaces and lines too; cells are counted through all blocks.
+    regions : mapping of str to (k,) int
+        Indices of the cells in each named set.
+    tets : TetMesh or None
+        The tetrahedra by their corner nodes, checked, with the regions that hold tetrahedra and, as facets,
+        those that hold triangles. None where the file has volume cells of other shapes.
+    """
+
+    path: Path
+    unit: str
+    frame: str
+    points_mm: FloatArray
+    node_ids: IntArray
+    blocks: tuple[CellBlock, ...]
+    regions: Mapping[str, IntArray]
+    tets: TetMesh | None
+
+    @property
+    def cell_count(self) -> int:
+        """Number of cells in all blocks."""
+        return sum(len(block.nodes) for block in self.blocks)
+
+    @property
+    def centroids_mm(self) -> FloatArray:
+        """Mean of each cell's corner nodes, (cells, 3) LPS mm, through all blocks."""
+        return np.concatenate([self.points_mm[block.corners].mean(axis=1) for block in self.blocks])
+
+    @property
+    def bounds_mm(self) -> FloatArray:
+        """Least and greatest coordinates of the nodes, (2, 3) LPS mm."""
+        return np.stack([self.points_mm.min(axis=0), self.points_mm.max(axis=0)])
+
+
+def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
+    """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2 or 4.1) or Abaqus (.inp).
+
+    Parameters
+    ----------
+    path : path
+        The file; its ending tells the format.
+    unit : {"mm", "m"}
+        Unit of length of the file's coordinates.
+    frame : {"LPS", "RAS"}
+        Frame of the file's coordinates: DICOM, ITK and Slicer's own files are LPS, NIfTI-based tools RAS.
+
+    Returns
+    -------
+    MeshFile
+        With regions from Abaqus element sets, Gmsh physical groups, or, in VTK files, a cell array of whole
+        numbers called region, label, tissue, material or part.
+
+    Raises
+    ------
+    InputError
+        If the unit, the frame or the format is not one of those above.
+    ImageFileError
+        If the file is missing, damaged, or has no volume cells.
+    GeometryError
+        If the mesh is not usable; see `dvc.mesh.TetMesh`.
+    """
+    path = Path(path)
+    if unit not in MM_PER_UNIT:
+        raise InputError(f"The unit of a mesh is mm or m; got {unit!r}.")
+    if frame not in TO_LPS:
+        raise InputError(f"The frame of a mesh is LPS or RAS; got {frame!r}.")
+    readers: dict[str, Callable[[Path], _Raw]] = {
+        ".inp": _from_abaqus, ".msh": _from_gmsh, ".vtu": _from_vtk, ".vtk": _from_vtk,
+    }  # fmt: skip
+    if path.suffix.lower() not in readers:
+        raise InputError(f"{path}: a mesh is a file ending in {', '.join(readers)}; got {path.suffix!r}.")
+    if not path.is_file():
+        raise ImageFileError(f"{path}: there is no such file.")
+    try:
+        return _checked(path, unit, frame, readers[path.suffix.lower()](path))
+    except (GeometryError, InputError) as error:
+        if isinstance(error, ImageFileError):
+            raise
+        raise type(error)(f"{path}: {error}") from error
+
+
+@dataclass(slots=True)
+class _Raw:
+    points: Any
+    node_ids: IntArray
+    blocks: list[tuple[str, Any]]
+    regions: dict[str, IntArray]
+
+
+def _from_abaqus(path: Path) -> _Raw:
+    mesh = read_abaqus(path)
+    return _Raw(mesh.points, mesh.node_ids, list(mesh.blocks), mesh.sets)
+
+
+def _from_gmsh(path: Path) -> _Raw:
+    mesh = _by_meshio(path, meshio.gmsh.read)
+    blocks = [(block.type, block.data) for block in mesh.cells]
+    sizes = [len(data) for _, data in blocks]
+    regions: dict[str, IntArray] = {}
+    if "gmsh:physical" in mesh.cell_data:
+        tag = np.concatenate(mesh.cell_data["gmsh:physical"])
+        dimension = np.repeat([_DIMENSION.get(kind.rstrip("0123456789"), -1) for kind, _ in blocks], sizes)
+        names = {(int(d), int(t)): name for name, (t, d) in mesh.field_data.items()}
+        for d, t in np.unique(np.column_stack([dimension, tag])[tag != 0], axis=0).tolist():
+            regions[names.get((d, t), f"physical {t}")] = np.flatnonzero((dimension == d) & (tag == t))
+    starts = np.cumsum([0, *sizes])[:-1]
+    for name, parts in mesh.cell_sets.items():  # version 4.1, where a cell may be in several groups
+        if not name.startswith("gmsh:"):
+            if len(parts) != len(starts):
+                raise ImageFileError(f"{path}: its $Elements section is cut short.")
+            found = [np.asarray(part, dtype=np.int64) for part in parts]
+            regions[name] = np.concatenate([part + start for part, start in zip(found, starts, strict=True)])
+    return _Raw(mesh.points, gmsh_node_numbers(path, len(mesh.points)), blocks, regions)
+
+
+def _from_vtk(path: Path) -> _Raw:
+    mesh = _by_meshio(path, meshio.vtu.read if path.suffix.lower() == ".vtu" else meshio.vtk.read)
+    regions: dict[str, IntArray] = {}
+    arrays = {name.casefold(): name for name in mesh.cell_data}
+    for wanted in _REGION_ARRAYS:
+        if wanted in arrays:
+            values = np.concatenate(mesh.cell_data[arrays[wanted]])
+            numbers = np.unique(values)
+            if values.ndim == 1 and len(numbers) <= _MOST_REGIONS and np.all(numbers == np.round(numbers)):
+                regions = {f"{arrays[wanted]} {int(n)}": np.flatnonzero(values == n) for n in numbers}
+                break
+    blocks = [(block.type, block.data) for block in mesh.cells]
+    return _Raw(mesh.points, np.arange(len(mesh.points)), blocks, regions)
+
+
+def _by_meshio(path: Path, read: Callable[[str], Any]) -> Any:
+    with silenced() as said, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return read(str(path))
+        except Exception as error:
+            # meshio meets damaged files with whatever Python raises: KeyError, ValueError, IndexError ...
+            reason = " ".join(f"{type(error).__name__}: {error} {said.getvalue()}".split())
+            raise ImageFileError(
+                f"{path} cannot be read as a mesh ({reason}). It is damaged, or of a variant that is not "
+                "read; write it again as VTU."
+            ) from error
+
+
+@contextlib.contextmanager
+def silenced() -> Iterator[io.StringIO]:
+    """Keep what meshio prints off the terminal, and log it."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        yield said
+    if said.getvalue().strip():
+        _log.info("meshio: %s", " ".join(said.getvalue().split()))
+
+
+def _checked(path: Path, unit: str, frame: str, raw: _Raw) -> MeshFile:
+    points = checked_points(raw.points) * MM_PER_UNIT[unit] * TO_LPS[frame]
+    blocks = []
+    for kind, nodes in raw.blocks:
+        corners = _CORNERS.get(kind.rstrip("0123456789"))
+        if corners is None:
+            raise ImageFileError(f"{path}: cells of kind {kind!r} are not read, only {', '.join(_CORNERS)}.")
+        if np.ndim(nodes) != 2 or np.shape(nodes)[1] < corners:
+            raise ImageFileError(f"{path}: {kind} cells have {np.shape(nodes)} nodes; the file is cut short.")
+        index = checked_indices(f"{kind} cells", nodes, len(points), np.shape(nodes)[1])
+        blocks.append(CellBlock(kind, frozen(index, np.int64)))
+    volumes = [block for block in blocks if block.shape in _VOLUMES]
+    if not volumes:
+        found = ", ".join(sorted({block.kind for block in blocks})) or "no cells at all"
+        raise ImageFileError(
+            f"{path} holds no volume cells (found: {found}). Results are given in the tissue: hand over the "
+            "volume mesh, not its surface."
+        )
+    check_extent(points[np.unique(np.concatenate([block.nodes.ravel() for block in volumes]))])
+    regions = {name: frozen(index, np.int64) for name, index in raw.regions.items() if len(index)}
+    tets = None
+    if all(block.shape == "tetra" for block in volumes):
+        tets = _tetrahedra(points, raw.node_ids, blocks, regions)
+    return MeshFile(
+        path=path,
+        unit=unit,
+        frame=frame,
+        points_mm=frozen(points, np.float64),
+        node_ids=frozen(raw.node_ids, np.int64),
+        blocks=tuple(blocks),
+        regions=MappingProxyType(regions),
+        tets=tets,
+    )
+
+
+def _tetrahedra(
+    points: FloatArray, node_ids: IntArray, blocks: list[CellBlock], regions: Mapping[str, IntArray]
+) -> TetMesh:
+    shape = np.repeat([block.shape for block in blocks], [len(block.nodes) for block in blocks])
+
+    def gathered(wanted: str) -> tuple[IntArray, IntArray]:
+        of_shape = [block.corners for block in blocks if block.shape == wanted]
+        corners = np.concatenate(of_shape) if of_shape else np.empty((0, 3), dtype=np.int64)
+        return corners, np.cumsum(shape == wanted) - 1  # row of ``corners`` of each cell of the shape
+
+    cells, tet_row = gathered("tetra")
+    triangles, triangle_row = gathered("triangle")
+    tissues, surfaces = {}, {}
+    for name, index in regions.items():
+        solid, flat = index[shape[index] == "tetra"], index[shape[index] == "triangle"]
+        if len(solid):
+            tissues[name] = tet_row[solid]
+        if len(flat):
+            surfaces[name] = triangles[triangle_row[flat]]
+    return TetMesh(points, cells, tissues, surfaces, node_ids)

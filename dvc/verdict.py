@@ -1,0 +1,71 @@
+"""A verdict on a result, in three levels and in words, with its reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from dvc.errors import InputError
+
+Level = Literal["trust", "caution", "distrust"]
+
+_WORDS: dict[Level, str] = {"trust": "Trust", "caution": "Use with care", "distrust": "Do not trust"}
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether a result may be used, and why (not).
+
+    Parameters
+    ----------
+    level : {"trust", "caution", "distrust"}
+    reasons : tuple of str
+        Full sentences; a "trust" may have none.
+
+    Raises
+    ------
+    InputError
+        If the level is not one of the three, or a level below "trust" gives no reason.
+
+    Examples
+    --------
+    >>> Verdict("caution", ("The images agree poorly.",)).words
+    'Use with care'
+    """
+
+    level: Level
+    reasons: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.level not in get_args(Level):
+            raise InputError(f"A verdict is one of {list(get_args(Level))}; got '{self.level}'.")
+        if self.level != "trust" and not self.reasons:
+            raise InputError(f"The verdict '{self.level}' needs a reason; give at least one sentence.")
+
+    @property
+    def words(self) -> str:
+        """The level as people read it: "Trust", "Use with care", "Do not trust"."""
+        return _WORDS[self.level]
+
+
+def worst(verdicts: Iterable[Verdict]) -> Verdict:
+    """Return the lowest level among verdicts, with the reasons of all at that level, each told once.
+
+    Raises
+    ------
+    InputError
+        If there is no verdict: nothing judged is not the same as nothing wrong.
+
+    Examples
+    --------
+    >>> worst([Verdict("trust"), Verdict("distrust", ("It folds.",))])
+    Verdict(level='distrust', reasons=('It folds.',))
+    """
+    given = list(verdicts)
+    if not given:
+        raise InputError("There is no verdict to choose the worst of; judge at least one result first.")
+    order = get_args(Level)
+    level = max((v.level for v in given), key=order.index)
+    reasons = dict.fromkeys(r for v in given if v.level == level for r in v.reasons)
+    return Verdict(level, tuple(reasons))

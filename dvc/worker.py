@@ -1,0 +1,107 @@
+"""Work in child processes that may crash without taking the caller with them.
+
+elastix is native code: a crash there ends its process. Each worker here is a process of its own, kept alive
+between tasks because the first use of elastix costs many seconds; when one dies, its task raises
+`WorkerError`, the other workers go on, and the next task gets a fresh process.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import TimeoutError as FutureTimeout
+from typing import Any, TypeVar
+
+from loky import ProcessPoolExecutor
+from loky.process_executor import TerminatedWorkerError
+
+from dvc.errors import WorkerError
+
+_T = TypeVar("_T")
+_POLL_S = 0.5
+
+
+class Worker:
+    """One child process that runs one task at a time.
+
+    Parameters
+    ----------
+    threads : int
+        Threads that native code (ITK, numba, BLAS) may use in the child. Results of elastix are equal bit
+        for bit only for equal numbers of threads.
+
+    Raises
+    ------
+    WorkerError
+        From `run`, when the child died: the message holds its exit code or signal.
+    """
+
+    def __init__(self, threads: int) -> None:
+        if threads < 1:
+            raise ValueError(f"A worker needs at least one thread; got {threads}.")
+        self.threads = threads
+        self._executor: ProcessPoolExecutor | None = None
+        self._lock = threading.Lock()
+
+    def run(self, what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None = None) -> _T:
+        """Run ``task(*args)`` in the child and return its result; its exceptions are raised here.
+
+        Parameters
+        ----------
+        what : str
+            The task in words, for the error message ("registering Load1").
+        watch : callable, optional
+            Called about twice a second while the task runs.
+        """
+        with self._lock:
+            if self._executor is None:
+                self._executor = self._start()
+            future = self._executor.submit(task, *args)
+            while True:
+                try:
+                    return future.result(timeout=_POLL_S)  # type: ignore[no-any-return]
+                except FutureTimeout:
+                    if future.done():
+                        raise  # the task itself timed out on something; not ours to hide
+                    if watch is not None:
+                        watch()
+                except TerminatedWorkerError as died:
+                    self._executor.shutdown(wait=False, kill_workers=True)
+                    self._executor = None
+                    raise WorkerError(
+                        f"The process {what} died ({_cause(died)}). Native code crashed or the system ended it, most "
+                        "often for lack of memory. Free memory, use fewer --workers, or, with parameter files of "
+                        'your own that hold several metrics, set (UseMultiThreadingForMetrics "false").'
+                    ) from died
+
+    def _start(self) -> ProcessPoolExecutor:
+        count = str(self.threads)
+        names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
+        return ProcessPoolExecutor(max_workers=1, env=dict.fromkeys(names, count))
+
+    def close(self) -> None:
+        """End the child process."""
+        with self._lock:
+            if self._executor is not None:
+                self._executor.shutdown(wait=True, kill_workers=True)
+                self._executor = None
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _cause(died: TerminatedWorkerError) -> str:
+    text = str(died)
+    start, end = text.find("{"), text.rfind("}")
+    return f"exit code {text[start + 1 : end]}" if 0 <= start < end else "exit code unknown"
+
+
+def usable_cores() -> int:
+    """Number of processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

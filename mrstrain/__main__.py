@@ -1,0 +1,5 @@
+"""`python -m mrstrain`: the command line."""
+
+from mrstrain.cli import main
+
+main()

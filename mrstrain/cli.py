@@ -1,0 +1,249 @@
+"""The command line. It parses, calls one function, and prints; heavy imports wait until a command runs."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    name="mrstrain",
+    help="Strain inside soft tissue from pairs of MR images, and how far it may be trusted.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+class Align(StrEnum):
+    """What is aligned rigidly before the non-rigid registration."""
+
+    BONE = "bone"
+    IMAGE = "image"
+    NONE = "none"
+
+
+class Frame(StrEnum):
+    """Frame of coordinates in a mesh or landmark file."""
+
+    LPS = "LPS"
+    RAS = "RAS"
+
+
+class Unit(StrEnum):
+    """Unit of lengths in a mesh file."""
+
+    MM = "mm"
+    M = "m"
+
+
+Out = Annotated[Path, typer.Option(help="Folder for the results; made where it is missing.")]
+Bone = Annotated[Path | None, typer.Option(help="Mask of the bone to align on, on the unloaded image.")]
+BoneLabel = Annotated[str | None, typer.Option(help="Or: the name of the bone in --labels.")]
+Tissue = Annotated[Path | None, typer.Option(help="Mask of the body; found by a threshold where it is not given.")]
+Labels = Annotated[Path | None, typer.Option(help="Label map of the tissues on the unloaded image.")]
+Names = Annotated[Path | None, typer.Option(help="Names of the labels: ITK-SNAP or Slicer table, or CSV.")]
+Plate = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(help="The plate's outward normal, away from the foot, LPS. Default: patient inferior (0 0 -1)."),
+]
+Shear = Annotated[tuple[float, float, float] | None, typer.Option(help="Direction of the shear force, LPS.")]
+MeshFile = Annotated[Path | None, typer.Option(help="Mesh to put displacement and strain on.")]
+MeshUnit = Annotated[Unit, typer.Option(help="Unit of the mesh's coordinates.")]
+MeshFrame = Annotated[Frame, typer.Option(help="Frame of the mesh's coordinates.")]
+
+
+@app.command()
+def register(
+    load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, or a DICOM folder.")],
+    loads: Annotated[list[Path], typer.Argument(help="Loaded images.")],
+    out: Out,
+    bone: Bone = None,
+    bone_label: BoneLabel = None,
+    tissue: Tissue = None,
+    labels: Labels = None,
+    names: Names = None,
+    align: Annotated[Align, typer.Option(help="What to align rigidly first.")] = Align.BONE,
+    preset: Annotated[str, typer.Option(help="Named registration parameters.")] = "heel-mr",
+    parameters: Annotated[
+        list[Path] | None, typer.Option(help="elastix parameter file(s) of your own, instead of a preset.")
+    ] = None,
+    allow_unknown_parameters: Annotated[
+        bool, typer.Option("--allow-unknown-parameters", help="Accept parameter names we do not know.")
+    ] = False,
+    chain: Annotated[
+        bool,
+        typer.Option("--chain", help="Start each load from the result of the one before it, in the order given."),
+    ] = False,
+    repeat: Annotated[Path | None, typer.Option(help="A second unloaded image: gives the noise floor.")] = None,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(help="CSV of landmark pairs (x0,y0,z0,x1,y1,z1 in mm LPS); for a single loaded image."),
+    ] = None,
+    mesh: MeshFile = None,
+    mesh_unit: MeshUnit = Unit.MM,
+    mesh_frame: MeshFrame = Frame.LPS,
+    plate_normal: Plate = None,
+    shear_direction: Shear = None,
+    allow_missing: Annotated[
+        bool,
+        typer.Option("--allow-missing", help="Leave NaN or infinite voxels out instead of refusing the image."),
+    ] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Loads registered at once. Default: as many as cores and loads allow."),
+    ] = None,
+    threads: Annotated[
+        int | None,
+        typer.Option(min=1, help="Threads of each worker. Results are equal bit for bit on equal threads."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=1, help="Seed of all random numbers.")] = 1,
+) -> None:
+    """Displacement and strain of loaded images against the unloaded one, with quality and a report."""
+    from mrstrain.progress import live
+    from mrstrain.registering import register as run
+
+    with live() as progress:
+        results = run(
+            load0,
+            loads,
+            out=out,
+            bone=bone,
+            bone_label=bone_label,
+            tissue=tissue,
+            labels=labels,
+            names=names,
+            align=align.value,
+            preset=preset,
+            parameters=parameters or (),
+            allow_unknown_parameters=allow_unknown_parameters,
+            chain=chain,
+            repeat=repeat,
+            landmarks=landmarks,
+            mesh=mesh,
+            mesh_unit=mesh_unit.value,
+            mesh_frame=mesh_frame.value,
+            plate_normal=plate_normal,
+            shear_direction=shear_direction,
+            allow_missing=allow_missing,
+            workers=workers,
+            threads=threads,
+            seed=seed,
+            progress=progress,
+        )
+    for line in results.summary():
+        typer.echo(line)
+    if results.failures:
+        raise typer.Exit(1)
+
+
+@app.command()
+def strain(
+    reference: Annotated[Path, typer.Argument(help="Unloaded image: gives the grid.")],
+    deformation: Annotated[
+        Path,
+        typer.Argument(help="elastix transform .txt, ITK transform (.h5, .tfm), or a displacement image."),
+    ],
+    out: Out,
+    bone: Bone = None,
+    bone_label: BoneLabel = None,
+    tissue: Tissue = None,
+    labels: Labels = None,
+    names: Names = None,
+    frame: Annotated[
+        Frame | None,
+        typer.Option(help="Frame of a displacement image's components, where no JSON beside it tells."),
+    ] = None,
+    mesh: MeshFile = None,
+    mesh_unit: MeshUnit = Unit.MM,
+    mesh_frame: MeshFrame = Frame.LPS,
+    plate_normal: Plate = None,
+    shear_direction: Shear = None,
+) -> None:
+    """Strain maps from a transform or displacement field that any tool has made."""
+    from mrstrain.straining import strain as run
+
+    results = run(
+        reference,
+        deformation,
+        out=out,
+        bone=bone,
+        bone_label=bone_label,
+        tissue=tissue,
+        labels=labels,
+        names=names,
+        frame=None if frame is None else frame.value,
+        mesh=mesh,
+        mesh_unit=mesh_unit.value,
+        mesh_frame=mesh_frame.value,
+        plate_normal=plate_normal,
+        shear_direction=shear_direction,
+    )
+    for line in results.summary():
+        typer.echo(line)
+
+
+@app.command()
+def demo(
+    out: Out = Path("demo"),
+    seed: Annotated[int, typer.Option(min=1, help="Seed of the phantom.")] = 1,
+) -> None:
+    """A heel phantom with known strain: register it, tell the error by tissue, and leave a report."""
+    from mrstrain.demo import demo as run
+    from mrstrain.progress import live
+
+    with live() as progress:
+        lines = run(out, seed=seed, progress=progress)
+    for line in lines:
+        typer.echo(line)
+
+
+@app.command()
+def doctor() -> None:
+    """Is this machine fit to run mrstrain?"""
+    from mrstrain.doctor import examine
+
+    def registration() -> str:
+        from dvc.elastix import self_test
+        from dvc.worker import Worker
+
+        with Worker(threads=1) as worker:
+            return worker.run("trying elastix", self_test)
+
+    findings = examine(elastix_check=registration)
+    for finding in findings:
+        typer.echo(f"{'ok  ' if finding.ok else 'NOT '} {finding.what}: {finding.detail}")
+        if not finding.ok and finding.advice:
+            typer.echo(f"     {finding.advice}")
+    if not all(f.ok for f in findings):
+        raise typer.Exit(1)
+
+
+def main() -> None:
+    """Entry point: errors made on purpose are printed as sentences, with exit status 2."""
+    if len(sys.argv) > 1 and not {"--help", "-h"} & set(sys.argv[1:]):
+        from mrstrain.doctor import refuse_foreign_packages
+
+        try:
+            refuse_foreign_packages()  # before anything of dvc is imported: it might not be ours
+        except ImportError as error:
+            _stop(str(error))
+    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    try:
+        app()
+    except Exception as error:
+        from dvc.errors import MrstrainError
+
+        if not isinstance(error, MrstrainError):
+            raise
+        _stop(str(error))
+
+
+def _stop(message: str) -> None:
+    typer.echo(f"mrstrain: {message}", err=True)
+    sys.exit(2)

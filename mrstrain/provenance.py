@@ -1,0 +1,91 @@
+"""What a result was made from: versions, parameters, seeds, hashes. Nothing that names a person or a machine."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+_PACKAGES = (
+    "mrstrain",
+    "itk-elastix",
+    "SimpleITK",
+    "numpy",
+    "scipy",
+    "scikit-image",
+    "numba",
+    "nibabel",
+    "pydicom",
+    "meshio",
+)
+_BLOCK = 1 << 20
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file; of a folder, of its files' names and contents in order."""
+    digest = hashlib.sha256()
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            digest.update(str(file.relative_to(path)).encode())
+        with file.open("rb") as stream:
+            while block := stream.read(_BLOCK):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that figures depend on."""
+    found = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def provenance(
+    command: str, inputs: Mapping[str, Path | Iterable[Path]], parameters: Mapping[str, object]
+) -> dict[str, object]:
+    """A record to be kept beside a result.
+
+    Parameters
+    ----------
+    command : str
+        Name of the command or function.
+    inputs : mapping
+        Role to file or files; only file names and hashes are kept.
+    parameters : mapping
+        Everything else that the result depends on, as plain values.
+    """
+    files: dict[str, list[dict[str, str]]] = {}
+    for role, given in inputs.items():
+        paths = [given] if isinstance(given, Path) else list(given)
+        files[role] = [{"name": p.name, "sha256": file_hash(p)} for p in paths]
+    return {
+        "command": command,
+        "made_utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "versions": versions(),
+        "inputs": files,
+        "parameters": dict(parameters),
+    }
+
+
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write JSON whole or not at all."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
+    try:
+        with os.fdopen(handle, "w") as stream:
+            json.dump(content, stream, indent=2, allow_nan=False)
+            stream.write("\n")
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise

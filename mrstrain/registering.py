@@ -1,0 +1,277 @@
+"""`register`: images in, a folder of strain maps and a report out."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvc.align import AlignOn
+from dvc.arrays import FloatArray
+from dvc.bspline import BSpline
+from dvc.errors import InputError, MrstrainError, RegistrationError
+from dvc.image import Image, Mask
+from dvc.imagefile import read_image
+from dvc.landmarks import read_landmarks
+from dvc.presets import Preset, load_preset, read_parameter_file
+from dvc.registration import Registration, Settings
+from dvc.registration import register as register_pair
+from dvc.tissue import tissue_mask
+from dvc.worker import Worker, usable_cores
+from mrstrain.inputs import Subject, case_names, prepare_output, read_subject
+from mrstrain.provenance import provenance, write_json
+from mrstrain.results import Case, write_case, write_series_report
+
+Told = Callable[[str, str, float], None]
+_REPEAT = "repeat"
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """What a series gave.
+
+    Attributes
+    ----------
+    out : Path
+        Folder of all results; ``report.html`` is in it.
+    cases : tuple of Case
+        The loads that were registered, in the order given; the repeat scan first, if there is one.
+    failures : dict
+        Load to the reason why it was not.
+    """
+
+    out: Path
+    cases: tuple[Case, ...]
+    failures: dict[str, str]
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        lines = [case.summary() for case in self.cases]
+        lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
+        return [*lines, f"Report: {self.out / 'report.html'}"]
+
+
+def register(
+    load0: Path | str,
+    loads: Sequence[Path | str],
+    *,
+    out: Path | str,
+    bone: Path | str | None = None,
+    bone_label: str | None = None,
+    tissue: Path | str | None = None,
+    labels: Path | str | None = None,
+    names: Path | str | None = None,
+    align: AlignOn = "bone",
+    preset: str = "heel-mr",
+    parameters: Sequence[Path | str] = (),
+    allow_unknown_parameters: bool = False,
+    chain: bool = False,
+    repeat: Path | str | None = None,
+    landmarks: Path | str | None = None,
+    mesh: Path | str | None = None,
+    mesh_unit: str = "mm",
+    mesh_frame: str = "LPS",
+    plate_normal: Sequence[float] | None = None,
+    shear_direction: Sequence[float] | None = None,
+    allow_missing: bool = False,
+    workers: int | None = None,
+    threads: int | None = None,
+    seed: int = 1,
+    progress: Told | None = None,
+) -> Series:
+    """Register loaded images to the unloaded one and write displacement, strain, quality and a report.
+
+    Parameters
+    ----------
+    load0 : path
+        Unloaded image (reference configuration).
+    loads : paths
+        Loaded images. Each gets a folder in ``out`` named after its file.
+    out : path
+    bone : path, optional
+        Mask of the bone to align on, on the unloaded image; or ``bone_label``, its name in ``labels``.
+    tissue : path, optional
+        Mask of the body, bone included; found by a threshold where it is not given.
+    labels, names : path, optional
+        Label map of the tissues on the unloaded image and the table of its names, for statistics by region.
+    align : {"bone", "image", "none"}
+    preset : str
+        Named parameters; or ``parameters``, elastix files of your own, applied one after the other.
+    chain : bool
+        Start each load from the result of the one before, in the order given.
+    repeat : path, optional
+        A second unloaded image; its apparent strain is the noise floor.
+    landmarks : path, optional
+        CSV of point pairs (x0, y0, z0, x1, y1, z1; LPS mm), for a single loaded image.
+    mesh : path, optional
+        Displacement and strain are written at its nodes and cells.
+    plate_normal, shear_direction : (3,), optional
+        LPS. The plate's outward normal (default: inferior) finds the bone's lowest point; with a shear direction,
+        strain is written in the plate's axes as well.
+    allow_missing : bool
+        Leave NaN or infinite voxels out instead of refusing the image.
+    workers, threads : int, optional
+        Loads at once, and threads of each; by default all cores are used.
+    seed : int
+    progress : callable, optional
+        ``progress(case, stage, fraction)``.
+
+    Returns
+    -------
+    Series
+        A load that fails is named in ``failures``; the others are finished.
+
+    Raises
+    ------
+    MrstrainError
+        For any input that cannot be used, before anything is computed; or if every load failed.
+    """
+    target = Path(out)
+    paths = [Path(p) for p in loads]
+    cases = case_names(paths)
+    if repeat is not None:
+        if _REPEAT in cases:
+            raise InputError(
+                f"A loaded image is called '{_REPEAT}', the folder name kept for the repeat scan: rename it."
+            )
+        cases, paths = [_REPEAT, *cases], [Path(repeat), *paths]
+    if not paths:
+        raise InputError("Give at least one loaded image.")
+    if landmarks is not None and len(loads) != 1:
+        raise InputError(f"--landmarks belong to one loaded image; {len(loads)} are given. Register that one alone.")
+    stages = _stages(preset, parameters, allow_unknown_parameters)
+    given = [Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh) if p is not None]
+    prepare_output(target, cases, given)
+    subject = read_subject(
+        load0,
+        bone=bone,
+        bone_label=bone_label,
+        tissue=tissue,
+        labels=labels,
+        names=names,
+        mesh=mesh,
+        mesh_unit=mesh_unit,
+        mesh_frame=mesh_frame,
+        plate_normal=plate_normal,
+        shear_direction=shear_direction,
+        allow_missing=allow_missing,
+    )
+    if align == "bone" and subject.bone is None:
+        raise InputError(
+            "Aligning on the bone needs it: give --bone, or --bone-label with --labels, or another --align."
+        )
+    images = {name: read_image(path, allow_missing=allow_missing) for name, path in zip(cases, paths, strict=True)}
+    points = None if landmarks is None else read_landmarks(landmarks)[:2]
+    cores = usable_cores()
+    at_once = 1 if chain else min(workers or cores, cores, len(cases))
+    each = threads or max(1, cores // at_once)
+    settings = Settings(stages, align, seed, each)
+    record = provenance(
+        "register",
+        {**subject.files, "loads": paths} | ({} if landmarks is None else {"landmarks": Path(landmarks)}),
+        {
+            "align": align,
+            "chain": chain,
+            "seed": seed,
+            "threads": each,
+            "bone_label": bone_label,
+            "plate_normal_lps": subject.plate_normal.tolist(),
+            "allow_missing": allow_missing,
+            "stages": [{"name": s.name, "text": s.text} for s in stages],
+        },
+    )
+    body = subject.tissue or tissue_mask(subject.reference)
+    run = _Run(target, subject, images, settings, body, record, points, progress or (lambda *_: None))
+    run.all(at_once, chain)
+    finished = [run.cases[name] for name in cases if name in run.cases]
+    if not finished:
+        raise RegistrationError(
+            "No load could be registered. " + " ".join(f"{n}: {r}" for n, r in run.failures.items())
+        )
+    write_json(target / "provenance.json", record)
+    write_series_report(target / "report.html", finished, run.failures, record)
+    return Series(target, tuple(finished), run.failures)
+
+
+def _stages(preset: str, parameters: Sequence[Path | str], allow_unknown: bool) -> tuple[Preset, ...]:
+    if parameters:
+        return tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters)
+    return (load_preset(preset),)
+
+
+class _Run:
+    """The loads of one series: registered in worker processes, each written as soon as it is finished."""
+
+    def __init__(
+        self,
+        out: Path,
+        subject: Subject,
+        images: dict[str, Image],
+        settings: Settings,
+        body: Mask,
+        record: dict[str, object],
+        landmarks: tuple[FloatArray, FloatArray] | None,
+        tell: Told,
+    ) -> None:
+        self.out, self.subject, self.images, self.settings, self.body = out, subject, images, settings, body
+        self.record, self.landmarks, self._tell = record, landmarks, tell
+        self.cases: dict[str, Case] = {}
+        self.failures: dict[str, str] = {}
+        self._telling, self._writing = threading.Lock(), threading.Lock()
+        self._floor_known = threading.Event()
+        if _REPEAT not in images:
+            self._floor_known.set()
+
+    def all(self, at_once: int, chain: bool) -> None:
+        local = threading.local()
+        workers: list[Worker] = []
+        last: list[BSpline] = []
+
+        def one(name: str) -> None:
+            if not hasattr(local, "worker"):
+                local.worker = Worker(self.settings.threads)
+                workers.append(local.worker)
+            start = last[-1] if chain and last and name != _REPEAT else None
+            try:
+                found = register_pair(
+                    self.subject.reference,
+                    self.images[name],
+                    bone=self.subject.bone,
+                    tissue=self.body,
+                    settings=self.settings,
+                    start=start,
+                    worker=local.worker,
+                    progress=lambda stage, fraction: self._told(name, stage, fraction),
+                )
+                if name != _REPEAT:
+                    last.append(found.bspline)
+                    self._floor_known.wait()
+                self._write(name, found)
+            except MrstrainError as error:
+                self.failures[name] = str(error)
+            finally:
+                if name == _REPEAT:
+                    self._floor_known.set()
+
+        try:
+            with ThreadPoolExecutor(at_once) as pool:
+                list(pool.map(one, self.images))
+        finally:
+            for worker in workers:
+                worker.close()
+
+    def _write(self, name: str, found: Registration) -> None:
+        stage = "strain and figures"
+        with self._writing:
+            self._told(name, stage, 0.0)
+            floor = self.cases[_REPEAT].own_floor if _REPEAT in self.cases else None
+            self.cases[name] = write_case(
+                self.out / name, name, self.subject, found, self.record, self.landmarks, floor
+            )
+            self._told(name, stage, 1.0)
+
+    def _told(self, case: str, stage: str, fraction: float) -> None:
+        with self._telling:
+            self._tell(case, stage, fraction)

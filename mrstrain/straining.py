@@ -1,0 +1,105 @@
+"""`strain`: strain maps from a transform or displacement field that any tool has made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvc.align import motion_of
+from dvc.deformation import Composed, Deformation, RigidMotion
+from dvc.displacementfile import read_displacement
+from dvc.tissue import tissue_mask
+from dvc.transformfile import read_transform
+from mrstrain.inputs import case_names, prepare_output, read_subject
+from mrstrain.provenance import provenance, write_json
+from mrstrain.results import Case, Measured, write_measured, write_series_report
+
+_TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm")
+
+
+@dataclass(frozen=True, slots=True)
+class Strained:
+    """What `strain` gave: the folder and the case in it."""
+
+    out: Path
+    case: Case
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        return [self.case.summary(), f"Report: {self.out / 'report.html'}"]
+
+
+def strain(
+    reference: Path | str,
+    deformation: Path | str,
+    *,
+    out: Path | str,
+    bone: Path | str | None = None,
+    bone_label: str | None = None,
+    tissue: Path | str | None = None,
+    labels: Path | str | None = None,
+    names: Path | str | None = None,
+    frame: str | None = None,
+    mesh: Path | str | None = None,
+    mesh_unit: str = "mm",
+    mesh_frame: str = "LPS",
+    plate_normal: Sequence[float] | None = None,
+    shear_direction: Sequence[float] | None = None,
+) -> Strained:
+    """Strain maps of a deformation that was found elsewhere.
+
+    Parameters
+    ----------
+    reference : path
+        Unloaded image (reference configuration): gives the voxels.
+    deformation : path
+        An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), or a displacement
+        image. All map points of the reference to points of the loaded image.
+    out : path
+    bone, bone_label, labels, names
+        With a bone, its rigid motion (least squares over its voxels) is taken out of the displacement.
+    tissue : path, optional
+        Where strain is wanted; found by a threshold where it is not given.
+    frame : {"LPS", "RAS"}, optional
+        Frame of a displacement image's components, where no JSON file beside it tells.
+    mesh, mesh_unit, mesh_frame, plate_normal, shear_direction
+        As in `register`.
+
+    Returns
+    -------
+    Strained
+    """
+    target, source = Path(out), Path(deformation)
+    subject = read_subject(
+        reference,
+        bone=bone,
+        bone_label=bone_label,
+        tissue=tissue,
+        labels=labels,
+        names=names,
+        mesh=mesh,
+        mesh_unit=mesh_unit,
+        mesh_frame=mesh_frame,
+        plate_normal=plate_normal,
+        shear_direction=shear_direction,
+    )
+    name = case_names([source])[0].removesuffix(source.suffix) or "strain"
+    prepare_output(target, [name], [source, *subject.files.values()])
+    whole: Deformation
+    if source.suffix.lower() in _TRANSFORMS:
+        whole = read_transform(source)
+    else:
+        whole = read_displacement(source, frame=frame)
+    motion = RigidMotion.identity() if subject.bone is None else motion_of(whole, subject.bone)
+    relative = whole if subject.bone is None else Composed([whole, motion.inverse()])
+    record = provenance(
+        "strain",
+        {**subject.files, "deformation": source},
+        {"bone_label": bone_label, "frame": frame, "plate_normal_lps": subject.plate_normal.tolist()},
+    )
+    body = subject.tissue or tissue_mask(subject.reference)
+    case = write_measured(target / name, Measured(name, subject, body, relative, motion), record)
+    write_json(target / "provenance.json", record)
+    write_series_report(target / "report.html", [case], {}, record)
+    return Strained(target, case)

@@ -1,0 +1,306 @@
+"""A heel defined in space: which tissue lies at a point, and its proton-density signal there.
+
+Right foot, LPS mm: x to medial, toes toward -y, sole toward -z. Every shape is a closed form and every
+texture a hash of the seed and of lattice coordinates, so that a point has the same signal at any voxel size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit, prange
+
+from dvc.arrays import FloatArray, IntArray
+from dvc.errors import InputError
+from phantoms.motions import EllipsoidUnion, distance
+
+TISSUES: Mapping[int, str] = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "ankle"}
+"""Label numbers and names. "bone" is the calcaneus; "ankle" is the other bones, at rest with it."""
+
+FAT_SIGNAL = 735.0
+"""Mean signal of fat with its septa, arbitrary units: the level that SNR refers to."""
+
+_BONE, _FAT, _MUSCLE, _SKIN, _TENDON, _ANKLE = 1, 2, 3, 4, 5, 6
+_LOBULE_SIGNAL, _MARROW_SIGNAL, _MUSCLE_SIGNAL, _SKIN_SIGNAL = 900.0, 760.0, 400.0, 300.0
+_TENDON_SIGNAL, _CORTEX_SIGNAL = 110.0, 60.0
+
+# Centre (mm), semi-axes (mm), turns about x, y, z (degrees).
+_CALCANEUS = (
+    ((0.0, 20.0, -4.0), (14.5, 14.5, 17.5), (18.0, 0.0, 0.0)),  # tuberosity
+    ((3.5, 19.0, -15.0), (9.5, 10.5, 8.8), (0.0, 0.0, 0.0)),  # medial process, the lowest point
+    ((-7.0, 17.0, -13.0), (6.5, 8.0, 8.0), (0.0, 0.0, 0.0)),  # lateral process
+    ((-1.0, -1.0, 0.5), (12.5, 25.0, 11.5), (-16.0, 0.0, 0.0)),  # body
+    ((-3.0, -22.0, 4.5), (11.0, 10.5, 9.8), (-10.0, 0.0, 8.0)),  # anterior process
+    ((13.0, -9.0, 9.5), (9.0, 9.5, 5.0), (0.0, -12.0, 0.0)),  # sustentaculum tali
+    ((-2.0, -2.0, 9.5), (12.0, 10.5, 8.5), (-28.0, 0.0, 0.0)),  # posterior facet
+)
+_ANKLE_BONES = (
+    ((0.0, -9.0, 32.5), (15.5, 18.0, 9.5), (-8.0, 0.0, 0.0)),  # talus, dome
+    ((6.0, -33.0, 22.5), (11.5, 13.5, 10.0), (22.0, 0.0, 0.0)),  # talus, head
+    ((1.0, -9.0, 72.0), (20.0, 19.0, 28.0), (0.0, 0.0, 0.0)),  # tibia
+    ((18.0, -9.0, 43.0), (5.5, 9.0, 13.0), (0.0, 6.0, 0.0)),  # medial malleolus
+    ((-19.5, 1.0, 56.0), (6.0, 8.0, 36.0), (0.0, 4.0, 0.0)),  # fibula
+    ((-6.0, -46.0, 1.0), (12.0, 12.5, 10.5), (-8.0, 0.0, 0.0)),  # cuboid
+    ((10.0, -55.0, 17.0), (14.0, 7.5, 12.0), (15.0, 0.0, 0.0)),  # navicular
+)
+_MUSCLES = (
+    ((4.0, -36.0, -22.0), (15.0, 42.0, 8.5), (-7.0, 0.0, 0.0)),  # flexor digitorum brevis
+    ((20.0, -26.0, -9.0), (7.0, 34.0, 11.0), (-14.0, 10.0, 0.0)),  # abductor hallucis
+    ((-19.0, -26.0, -19.0), (7.5, 38.0, 7.5), (-4.0, 0.0, 0.0)),  # abductor digiti minimi
+    ((4.0, -32.0, -9.0), (14.0, 28.0, 8.5), (-14.0, 0.0, 0.0)),  # quadratus plantae
+    ((0.0, -9.0, 40.0), (21.5, 30.0, 38.0), (0.0, 0.0, 0.0)),  # deep compartments around the ankle
+    ((0.5, 13.0, 43.0), (20.5, 13.0, 31.0), (-4.0, 0.0, 0.0)),  # flexor hallucis longus, soleus
+    ((-17.0, -30.0, 17.0), (8.5, 19.0, 8.0), (26.0, -14.0, 0.0)),  # extensor digitorum brevis
+    ((0.0, -44.0, 16.0), (24.0, 26.0, 19.0), (20.0, 0.0, 0.0)),  # extensors, dorsum
+)
+_OUTLINE = (
+    ((0.0, 10.5, -13.0), (28.0, 34.0, 29.0), (0.0, 0.0, 0.0)),  # heel
+    ((0.0, 1.0, 62.0), (25.0, 34.5, 78.0), (0.0, 0.0, 0.0)),  # ankle and leg
+    ((1.0, -46.0, -2.5), (29.0, 74.0, 30.5), (5.0, 0.0, 0.0)),  # midfoot
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Heel:
+    """A right heel, seeded: shapes vary by about 1 mm from one seed to another, textures altogether.
+
+    Parameters
+    ----------
+    seed : int
+        0 or more.
+    skin_mm, cortex_mm : float
+        Thickness of the skin and of the bones' cortical rim, mm.
+    lobule_mm : float
+        Mean width of the fat's lobules, mm; fibrous septa divide them.
+
+    Raises
+    ------
+    InputError
+        If the seed is negative or a length is not positive.
+
+    Examples
+    --------
+    >>> heel = Heel(seed=1)
+    >>> tissue = heel.tissue_at(np.array([[0.0, 10.0, 0.0], [0.0, 20.0, -33.0], [0.0, 20.0, -60.0]]))
+    >>> [TISSUES.get(int(t), "air") for t in tissue]
+    ['bone', 'fat', 'air']
+    """
+
+    seed: int = 1
+    skin_mm: float = 2.0
+    cortex_mm: float = 1.2
+    lobule_mm: float = 6.0
+    bone: EllipsoidUnion = field(init=False)
+    ankle: EllipsoidUnion = field(init=False)
+    muscle: EllipsoidUnion = field(init=False)
+    outline: EllipsoidUnion = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise InputError(f"The heel's seed must be 0 or more; got {self.seed}.")
+        for name in ("skin_mm", "cortex_mm", "lobule_mm"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} must be positive; got {getattr(self, name)}.")
+        random = np.random.default_rng([self.seed, 1])
+        for name, parts, jitter, sharpness in (
+            ("bone", _CALCANEUS, 0.6, 5.0),
+            ("ankle", _ANKLE_BONES, 0.6, 8.0),
+            ("muscle", _MUSCLES, 0.6, 8.0),
+            ("outline", _OUTLINE, 0.4, 3.5),
+        ):
+            varied = [
+                (
+                    np.add(centre, jitter * random.uniform(-1.0, 1.0, 3)).tolist(),
+                    np.multiply(axes, 1.0 + 0.02 * random.uniform(-1.0, 1.0, 3)).tolist(),
+                    turns,
+                )
+                for centre, axes, turns in parts
+            ]
+            object.__setattr__(self, name, EllipsoidUnion.of(varied, sharpness))
+
+    @property
+    def skeleton(self) -> EllipsoidUnion:
+        """All bones as one body, which holds each of them."""
+        bodies = (self.bone, self.ankle)
+        return EllipsoidUnion(
+            np.concatenate([body.centres_mm for body in bodies]),
+            np.concatenate([body.forms for body in bodies]),
+            min(body.sharpness for body in bodies),
+        )
+
+    def _parameters(self) -> tuple[FloatArray, ...]:
+        bodies = (self.bone, self.ankle, self.muscle, self.outline)
+        numbers = np.array([self.skin_mm, self.cortex_mm, self.lobule_mm, float(self.seed)])
+        sharpness = np.array([body.sharpness for body in bodies])
+        return (numbers, sharpness, *(a for body in bodies for a in (body.centres_mm, body.forms)))
+
+    def tissue_at(self, points_mm: FloatArray) -> IntArray:
+        """Labels (n,) of TISSUES at points (n, 3) LPS mm; 0 is air."""
+        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        return np.asarray(_tissues(points, self._parameters()))
+
+    def intensity_at(self, points_mm: FloatArray) -> FloatArray:
+        """Noise-free signal (n,) at points (n, 3) LPS mm; air is 0."""
+        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        return np.asarray(_signals(points, np.zeros((1, 3, 3)), 1, self._parameters()))
+
+    def voxel_intensity(self, points_mm: FloatArray, axes_mm: FloatArray) -> FloatArray:
+        """Mean noise-free signal (n,) of voxels: eight samples at a quarter of each axis around the centre.
+
+        Parameters
+        ----------
+        points_mm : (n, 3)
+            Centres, LPS mm.
+        axes_mm : (3, 3) or (n, 3, 3)
+            Columns are the voxel's edges, LPS mm: one for all, or one set for each voxel, as where the
+            voxels of a loaded image are carried back into the unloaded heel.
+        """
+        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        axes = np.ascontiguousarray(axes_mm, dtype=np.float64).reshape(-1, 3, 3)
+        return np.asarray(_signals(points, axes, 8, self._parameters()))
+
+
+@njit(cache=True)
+def _hash(i, j, k, salt):  # type: ignore[no-untyped-def]
+    """Draw a number in [0, 1) from lattice coordinates, by integer mixing (splitmix64's finaliser)."""
+    h = np.uint64(i * 73856093) ^ np.uint64(j * 19349663) ^ np.uint64(k * 83492791)
+    h ^= np.uint64(salt) * np.uint64(0x9E3779B97F4A7C15)
+    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    h ^= h >> np.uint64(31)
+    return np.float64(h >> np.uint64(11)) / 9007199254740992.0
+
+
+@njit(cache=True)
+def _noise(x, y, z, salt):  # type: ignore[no-untyped-def]
+    """Smooth lattice noise in [-1, 1]: hashed values at integer points, blended by a cubic step."""
+    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    a, b, c = x - i, y - j, z - k
+    a, b, c = a * a * (3 - 2 * a), b * b * (3 - 2 * b), c * c * (3 - 2 * c)
+    total = 0.0
+    for m in range(8):
+        di, dj, dk = m & 1, (m >> 1) & 1, m >> 2
+        weight = (a if di else 1 - a) * (b if dj else 1 - b) * (c if dk else 1 - c)
+        total += weight * _hash(i + di, j + dj, k + dk, salt)
+    return 2.0 * total - 1.0
+
+
+@njit(cache=True)
+def _lobule(x, y, z, salt):  # type: ignore[no-untyped-def]
+    """Distance to the border of a Voronoi cell of a jittered unit lattice, and a number of the cell's own."""
+    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    first, second = 1e9, 1e9
+    ax, ay, az, bx, by, bz, own = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for di in range(-1, 2):
+        for dj in range(-1, 2):
+            for dk in range(-1, 2):
+                r = _hash(i + di, j + dj, k + dk, salt)
+                # three offsets from one hash: its leading, middle and trailing digits
+                sx = i + di + 0.15 + 0.7 * r
+                r = r * 4096.0
+                sy = j + dj + 0.15 + 0.7 * (r - np.floor(r))
+                r = (r - np.floor(r)) * 4096.0
+                sz = k + dk + 0.15 + 0.7 * (r - np.floor(r))
+                d = (x - sx) ** 2 + (y - sy) ** 2 + (z - sz) ** 2
+                if d < first:
+                    second, bx, by, bz = first, ax, ay, az
+                    first, ax, ay, az, own = d, sx, sy, sz, r - np.floor(r)
+                elif d < second:
+                    second, bx, by, bz = d, sx, sy, sz
+    apart = np.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
+    return (second - first) / (2.0 * apart), own
+
+
+@njit(cache=True)
+def _tissue(x, y, z, heel):  # type: ignore[no-untyped-def]
+    """Label at a point, and the distance to the nearest bone's surface (mm) where the label needs it."""
+    numbers, k, bone_c, bone_f, ankle_c, ankle_f, muscle_c, muscle_f, out_c, out_f = heel
+    depth = -distance(x, y, z, out_c, out_f, k[3])
+    if depth <= 0.0:
+        return 0, 0.0
+    if depth <= numbers[0]:
+        return _SKIN, 0.0
+    d = distance(x, y, z, bone_c, bone_f, k[0])
+    if d <= 0.0:
+        return _BONE, d
+    d = min(d, distance(x, y, z, ankle_c, ankle_f, k[1]))
+    if d <= 0.0:
+        return _ANKLE, d
+    # Achilles tendon: a flat band down to the back of the tuberosity
+    behind = 31.5 + 0.05 * max(z, 0.0)
+    if z > -4.0 and (x / (6.0 + 4.0 * np.exp(-(((z - 2.0) / 9.0) ** 2)))) ** 2 + ((y - behind) / 2.6) ** 2 <= 1.0:
+        return _TENDON, d
+    # plantar aponeurosis: a sheet under the short flexor, from the medial process forward
+    sheet = -30.2 + 0.13 * (y + 36.0) + 0.006 * (x - 4.0) ** 2
+    if y < 18.0 and abs(x - 4.0) < 11.0 and sheet - 1.8 < z < sheet:
+        return _TENDON, d
+    m = distance(x, y, z, muscle_c, muscle_f, k[2])
+    if m <= 0.0:
+        return _MUSCLE, d
+    return _FAT, d
+
+
+@njit(cache=True)
+def _signal(x, y, z, heel):  # type: ignore[no-untyped-def]
+    tissue, d = _tissue(x, y, z, heel)
+    numbers = heel[0]
+    salt = 16 * int(numbers[3])
+    if tissue == 0:
+        return 0.0
+    fine = _noise(x / 1.7, y / 1.7, z / 1.7, salt)
+    if tissue == _SKIN:
+        patch = _noise(x / 4.5, y / 4.5, z / 4.5, salt + 11)  # pores, creases and vessels
+        return _SKIN_SIGNAL * (1.0 + 0.18 * fine + 0.3 * patch)
+    if tissue in (_BONE, _ANKLE):
+        if d > -numbers[1]:
+            return _CORTEX_SIGNAL * (1.0 + 0.2 * fine)
+        coarse = _noise(x / 4.5, y / 4.5, z / 4.5, salt + 1)
+        # trabeculae: thin dark sheets where a lattice noise passes through zero
+        beam = np.exp(-((_noise(x / 2.3, y / 2.3, z / 2.3, salt + 2) / 0.25) ** 2))
+        rise = 1.0 - 0.35 * np.exp((d + numbers[1]) / 1.5)
+        return _MARROW_SIGNAL * rise * (1.0 + 0.08 * coarse + 0.06 * fine - 0.16 * beam)
+    if tissue == _TENDON:
+        return _TENDON_SIGNAL * (1.0 + 0.35 * _noise(x / 1.5, y / 5.0, z / 5.0, salt + 3))
+    if tissue == _MUSCLE:
+        fibre = _noise(x / 1.9, y / 9.0, z / 1.9, salt + 4)
+        streak = max(0.0, _noise(x / 3.3, y / 14.0, z / 3.3, salt + 5) - 0.45)
+        return _MUSCLE_SIGNAL * (1.0 + 0.16 * fibre + 0.08 * fine + 1.3 * streak)
+    # fat: lobules, taller than wide, between fibrous septa of varying strength; fainter ones inside each
+    wide = numbers[2]
+    bent = 0.15 * wide * _noise(x / 8.0, y / 8.0, z / 8.0, salt + 6)
+    wavy = 0.08 * wide * _noise(x / 2.7, y / 2.7, z / 2.7, salt + 8)
+    u, v, w = (x + bent + wavy) / wide, (y - bent + wavy) / wide, (z + wavy) / (1.5 * wide)
+    border, own = _lobule(u, v, w, salt + 7)
+    strength = 0.42 + 0.26 * _noise(x / 5.0, y / 5.0, z / 5.0, salt + 9)
+    septum = strength * np.exp(-((border * wide / 0.5) ** 2))
+    border, part = _lobule(2.1 * u, 2.1 * v, 2.1 * w, salt + 10)
+    septum = max(septum, 0.16 * np.exp(-((border * wide / 0.9) ** 2)))
+    return _LOBULE_SIGNAL * (1.0 + 0.07 * (own - 0.5) + 0.05 * (part - 0.5) + 0.05 * fine) * (1.0 - septum)
+
+
+@njit(parallel=True, cache=True)
+def _tissues(points, heel):  # type: ignore[no-untyped-def]
+    out = np.empty(points.shape[0], dtype=np.int64)
+    for n in prange(points.shape[0]):
+        out[n] = _tissue(points[n, 0], points[n, 1], points[n, 2], heel)[0]
+    return out
+
+
+@njit(parallel=True, cache=True)
+def _signals(points, axes, samples, heel):  # type: ignore[no-untyped-def]
+    out = np.empty(points.shape[0])
+    for n in prange(points.shape[0]):
+        a = axes[n] if axes.shape[0] > 1 else axes[0]
+        total = 0.0
+        for m in range(samples):
+            s = 0.25 if m & 1 else -0.25
+            t = 0.25 if m & 2 else -0.25
+            w = 0.25 if m & 4 else -0.25
+            x = points[n, 0] + s * a[0, 0] + t * a[0, 1] + w * a[0, 2]
+            y = points[n, 1] + s * a[1, 0] + t * a[1, 1] + w * a[1, 2]
+            z = points[n, 2] + s * a[2, 0] + t * a[2, 1] + w * a[2, 2]
+            total += _signal(x, y, z, heel)
+        out[n] = total / samples
+    return out

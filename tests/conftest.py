@@ -1,0 +1,35 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real images by others; not part of the project, so tests that need it are skipped without."""
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("MRSTRAIN_TEST_DATA", beside))
+    if not (folder / "README.md").is_file():
+        pytest.skip(f"real test data not found at {folder}; set MRSTRAIN_TEST_DATA to its folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small_pair():
+    """A heel at 1.6 mm voxels, pressed, moved and scanned again; truth known."""
+    from phantoms.heel import heel_pair
+
+    return heel_pair(seed=3, shape=(64, 72, 68), spacing_mm=1.6, load=0.6)
+
+
+@pytest.fixture(scope="session")
+def worker():
+    """One process that runs elastix for all tests: its first use costs many seconds."""
+    from dvc.worker import Worker
+
+    with Worker(threads=1) as one:
+        yield one

@@ -1,0 +1,49 @@
+"""Workers that crash, are killed, or raise: the caller gets a sentence, and the next task a fresh process."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from dvc.errors import RegistrationError, WorkerError
+from dvc.worker import Worker
+
+
+def _crash() -> None:
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def _killed() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _fails() -> None:
+    raise RegistrationError("no overlap")
+
+
+def _process() -> tuple[int, str | None]:
+    return os.getpid(), os.environ.get("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS")
+
+
+@pytest.mark.parametrize(("task", "signal_name"), [(_crash, "SIGSEGV"), (_killed, "SIGKILL")])
+def test_death_is_an_error_that_says_so_and_the_next_task_runs(task, signal_name):
+    with Worker(threads=1) as worker:
+        with pytest.raises(WorkerError, match=rf"registering Load1 died .*{signal_name}"):
+            worker.run("registering Load1", task)
+        process, _ = worker.run("asking", _process)
+    assert process != os.getpid()
+
+
+def test_its_own_errors_come_back_as_they_are():
+    with Worker(threads=1) as worker, pytest.raises(RegistrationError, match="no overlap"):
+        worker.run("registering", _fails)
+
+
+def test_one_process_serves_many_tasks_with_the_threads_asked_for():
+    with Worker(threads=2) as worker:
+        first, threads = worker.run("asking", _process)
+        second, _ = worker.run("asking", _process)
+    assert first == second
+    assert threads == "2"
