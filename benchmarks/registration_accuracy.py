@@ -1,6 +1,6 @@
 """Error of displacement and maximal shear on the heel phantom: heel-mr beside elastix' default B-spline.
 
-    python benchmarks/registration_accuracy.py [--seeds 1 2] [--load 1.0] [--out benchmarks/results/registration_accuracy.json]
+    python benchmarks/registration_accuracy.py --seeds 1 2 --out benchmarks/results/registration_accuracy.json
 
 Both register the same pair after the same rigid motion (the true one for elastix' default, which gets no mask;
 mrstrain finds its own). Scored: every labelled voxel whose true place lies inside the loaded image.

@@ -102,7 +102,7 @@ class Affine:
 
     def inverse(self) -> Affine:
         """The map back."""
-        back = np.linalg.inv(self.matrix)
+        back = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
         return Affine(back, -back @ self.translation_mm)
 
 
@@ -245,10 +245,7 @@ class Within:
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
         """U and H at the voxels of ``grid`` in ``where``; NaN outside."""
         u, H = evaluate_on_grid(self.whole, grid, where)
-        if grid is self.mask.grid:
-            outside = ~self._near[where]
-        else:
-            outside = self._outside(grid.points(where))
+        outside = ~self._near[where] if grid is self.mask.grid else self._outside(grid.points(where))
         u[outside], H[outside] = np.nan, np.nan
         return u, H
 

@@ -321,7 +321,7 @@ def _pixels(one: _Slice) -> Float32Array:
 
 def _decoded_by_itk(path: Path, shape: tuple[int, int]) -> Float32Array:
     """Decode JPEG, JPEG-LS or JPEG 2000, for which the other reader needs plugins; it rescales as well."""
-    import SimpleITK as sitk  # noqa: N813  # only compressed files need it
+    import SimpleITK as sitk  # only compressed files need it
 
     values = sitk.GetArrayFromImage(sitk.ReadImage(str(path), sitk.sitkFloat32))
     if values.shape != (1, *shape):

@@ -9,7 +9,7 @@ from typing import Any
 
 import nibabel
 import numpy as np
-import SimpleITK as sitk  # noqa: N813
+import SimpleITK as sitk
 from nibabel.filebasedimages import ImageFileError as NiftiError
 
 from dvc.arrays import FloatArray

@@ -112,11 +112,11 @@ def self_test() -> str:
 
     rng = np.random.default_rng(0)
     coarse = rng.normal(size=(10, 10, 10)).astype(np.float32)
-    grid = Grid((40, 40, 40), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    grid = Grid((40, 40, 40), np.ones(3), np.zeros(3))
     from scipy.ndimage import zoom
 
     values = zoom(coarse, 4.0, order=3)
-    shifted = Grid((40, 40, 40), (1.0, 1.0, 1.0), (1.5, 0.0, 0.0))
+    shifted = Grid((40, 40, 40), np.ones(3), np.array([1.5, 0.0, 0.0]))
     parameters = load_preset("bone-rigid").complete(seed=1)
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
         found = register(Image(grid, values), Image(shifted, values), parameters, None, None, None, folder)

@@ -112,12 +112,12 @@ def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Arr
             )
 
         fine = 0.5
-        for a in np.arange(left + _LINE_MM / 2, right, _LINE_MM):
+        for at in np.arange(left + _LINE_MM / 2, right, _LINE_MM):
             b = np.arange(low, high, fine)
-            ax.plot(*moved(np.full_like(b, a), b), color="#F0E442", linewidth=0.9)
-        for b in np.arange(low + _LINE_MM / 2, high, _LINE_MM):
+            ax.plot(*moved(np.full_like(b, at), b), color="#F0E442", linewidth=0.9)
+        for at in np.arange(low + _LINE_MM / 2, high, _LINE_MM):
             a = np.arange(left, right, fine)
-            ax.plot(*moved(a, np.full_like(a, b)), color="#F0E442", linewidth=0.9)
+            ax.plot(*moved(a, np.full_like(a, at)), color="#F0E442", linewidth=0.9)
         if bone is not None:
             _contour(ax, view, plane, bone, "#56B4E9")
         _dress(ax, view, plane)
@@ -207,7 +207,7 @@ def _checks(a: FloatArray, b: FloatArray, view: View, plane: Plane) -> FloatArra
 
 def _levelled(page: npt.NDArray[Any], whole: npt.NDArray[Any]) -> FloatArray:
     low, high = np.nanpercentile(whole[::3, ::3, ::3], [1.0, 99.5])
-    return np.clip(np.nan_to_num((page - low) / max(high - low, 1e-12)), 0.0, 1.0).astype(np.float64)
+    return np.asarray(np.clip(np.nan_to_num((page - low) / max(high - low, 1e-12)), 0.0, 1.0), dtype=np.float64)
 
 
 def _panels(

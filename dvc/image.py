@@ -8,11 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, InputError
+
+_T = TypeVar("_T", bound=np.generic)
 
 _ORTHONORMAL_TOLERANCE = 1e-4
 
@@ -289,7 +293,7 @@ class LabelMap:
         return LabelMap(self.grid.toward_lps(), reordered_to_lps(self.grid, self.labels), self.names)
 
 
-def reordered_to_lps(grid: Grid, values: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def reordered_to_lps(grid: Grid, values: npt.NDArray[_T]) -> npt.NDArray[_T]:
     """Values on ``grid`` (leading three axes) reordered to ``grid.toward_lps()``."""
     order, flips = grid.axes_to_lps()
     rest = tuple(range(3, values.ndim))
@@ -297,7 +301,7 @@ def reordered_to_lps(grid: Grid, values: np.ndarray) -> np.ndarray:  # type: ign
     return np.ascontiguousarray(reordered[tuple(slice(None, None, -1 if f else 1) for f in flips)])
 
 
-def reordered_from_lps(grid: Grid, values: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def reordered_from_lps(grid: Grid, values: npt.NDArray[_T]) -> npt.NDArray[_T]:
     """Values on ``grid.toward_lps()`` put back into the voxel order of ``grid``."""
     order, flips = grid.axes_to_lps()
     rest = tuple(range(3, values.ndim))

@@ -11,7 +11,7 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.image import Grid, Image, Mask
 from dvc.resample import fill_missing
 from dvc.strainmaps import StrainMaps
-from dvc.verdict import Verdict
+from dvc.verdict import Level, Verdict
 
 _WINDOW_MM = 2.5
 
@@ -214,7 +214,7 @@ def assess(
     jacobian = maps.jacobian
     folded = int(np.count_nonzero(jacobian[maps.valid] <= 0.0))
     lowest, at = _lowest(jacobian, maps.grid)
-    undefined = 1.0 - np.count_nonzero(maps.valid & tissue.inside) / max(np.count_nonzero(tissue.inside), 1)
+    undefined = 1.0 - int(np.count_nonzero(maps.valid & tissue.inside)) / max(int(np.count_nonzero(tissue.inside)), 1)
     bone_shift = bone_shear = float("nan")
     if bone is not None:
         kept = bone.inside & maps.valid
@@ -312,5 +312,5 @@ def _judge_below(findings: list[Verdict], value: float, limits: tuple[float, flo
 def _together(findings: list[Verdict]) -> Verdict:
     if not findings:
         return Verdict("trust", ())
-    level = "distrust" if any(f.level == "distrust" for f in findings) else "caution"
+    level: Level = "distrust" if any(f.level == "distrust" for f in findings) else "caution"
     return Verdict(level, tuple(r for f in findings for r in f.reasons))

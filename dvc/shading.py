@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 import SimpleITK as sitk
 
 from dvc.image import Image
@@ -47,7 +50,7 @@ def without_shading(image: Image) -> Image:
     return Image(image.grid, image.values / field.astype(np.float32))
 
 
-def _to_sitk(image: Image, values: np.ndarray) -> sitk.Image:  # type: ignore[type-arg]
+def _to_sitk(image: Image, values: npt.NDArray[Any]) -> sitk.Image:
     made = sitk.GetImageFromArray(np.ascontiguousarray(values.T))
     made.SetSpacing([float(s) for s in image.grid.spacing_mm])
     return made

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, distance_transform_edt, label
 from skimage.filters import threshold_otsu
 
-from dvc.arrays import BoolArray
+from dvc.arrays import BoolArray, IntArray
 from dvc.errors import InputError
 from dvc.image import Image, Mask
 from dvc.resample import fill_missing, smoothed
@@ -42,7 +42,8 @@ def tissue_mask(image: Image) -> Mask:
     share = float(filled.mean())
     if not 0.01 <= share <= 0.99:
         raise InputError(
-            f"No tissue mask could be made: the threshold takes {100 * share:.1f} % of the image. Give one with --tissue."
+            f"No tissue mask could be made: the threshold takes {100 * share:.1f} % of the image. "
+            "Give one with --tissue."
         )
     return Mask(image.grid, filled)
 
@@ -60,7 +61,7 @@ def widened(mask: Mask, margin_mm: float) -> Mask:
     return Mask(mask.grid, distance <= margin_mm)
 
 
-def _ellipsoid(radius: np.ndarray) -> BoolArray:  # type: ignore[type-arg]
+def _ellipsoid(radius: IntArray) -> BoolArray:
     axes = [np.arange(-int(r), int(r) + 1) / max(float(r), 0.5) for r in radius]
     i, j, k = np.meshgrid(*axes, indexing="ij")
     return np.asarray(i**2 + j**2 + k**2 <= 1.0 + 1e-9)

@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -52,7 +52,7 @@ def versions() -> dict[str, str]:
 
 
 def provenance(
-    command: str, inputs: Mapping[str, Path | Iterable[Path]], parameters: Mapping[str, object]
+    command: str, inputs: Mapping[str, Path | list[Path]], parameters: Mapping[str, object]
 ) -> dict[str, object]:
     """A record to be kept beside a result.
 
@@ -67,7 +67,7 @@ def provenance(
     """
     files: dict[str, list[dict[str, str]]] = {}
     for role, given in inputs.items():
-        paths = [given] if isinstance(given, Path) else list(given)
+        paths = [given] if isinstance(given, Path) else given
         files[role] = [{"name": p.name, "sha256": file_hash(p)} for p in paths]
     return {
         "command": command,

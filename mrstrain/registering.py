@@ -136,7 +136,7 @@ def register(
             raise InputError(
                 f"A loaded image is called '{_REPEAT}', the folder name kept for the repeat scan: rename it."
             )
-        cases, paths = [_REPEAT, *cases], [Path(repeat), *paths]
+        cases, paths = [*cases, _REPEAT], [*paths, Path(repeat)]
     if not paths:
         raise InputError("Give at least one loaded image.")
     if landmarks is not None and len(loads) != 1:
@@ -170,7 +170,7 @@ def register(
     settings = Settings(stages, align, seed, each)
     record = provenance(
         "register",
-        {**subject.files, "loads": paths} | ({} if landmarks is None else {"landmarks": Path(landmarks)}),
+        {**subject.files, "loads": paths, "landmarks": [] if landmarks is None else [Path(landmarks)]},
         {
             "align": align,
             "chain": chain,
@@ -257,7 +257,7 @@ class _Run:
 
         try:
             with ThreadPoolExecutor(at_once) as pool:
-                list(pool.map(one, self.images))
+                list(pool.map(one, sorted(self.images, key=lambda name: name != _REPEAT)))  # its floor is waited for
         finally:
             for worker in workers:
                 worker.close()

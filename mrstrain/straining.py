@@ -87,10 +87,7 @@ def strain(
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"
     prepare_output(target, [name], [source, *subject.files.values()])
     whole: Deformation
-    if source.suffix.lower() in _TRANSFORMS:
-        whole = read_transform(source)
-    else:
-        whole = read_displacement(source, frame=frame)
+    whole = read_transform(source) if source.suffix.lower() in _TRANSFORMS else read_displacement(source, frame=frame)
     motion = RigidMotion.identity() if subject.bone is None else motion_of(whole, subject.bone)
     relative = whole if subject.bone is None else Composed([whole, motion.inverse()])
     record = provenance(

@@ -235,7 +235,7 @@ def test_progress_tells_stages_and_rises(small_pair, worker):
         worker=worker,
         progress=lambda stage, fraction: told.append((stage, fraction)),
     )
-    assert [s for s, _ in told][0] == "aligning"
+    assert next(s for s, _ in told) == "aligning"
     fractions = [f for s, f in told if s == "registering"]
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0

@@ -1,0 +1,121 @@
+"""Verdicts: what must be distrusted is, and says why; strain maps leave out what was not measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dvc.deformation import Affine, RigidMotion, SampledDisplacement, Within
+from dvc.image import Grid, Image, Mask
+from dvc.quality import assess, local_correlation, noise_floor
+from dvc.strainmaps import strain_maps
+
+GRID = Grid((24, 20, 16), np.array([1.0, 1.2, 1.5]), np.array([-10.0, 5.0, 0.0]))
+WHOLE = Mask(GRID, np.ones(GRID.shape, dtype=bool))
+STRETCH = Affine(np.diag([1.2, 1.0, 1.0]), np.zeros(3))
+
+
+def core() -> Mask:
+    inside = np.zeros(GRID.shape, dtype=bool)
+    inside[6:18, 5:15, 4:12] = True
+    return Mask(GRID, inside)
+
+
+def test_maps_hold_the_closed_form_of_a_stretch_and_nan_elsewhere():
+    maps = strain_maps(STRETCH, core())
+    kept = core().inside
+    np.testing.assert_allclose(maps.green_lagrange[kept][:, 0], (1.2**2 - 1) / 2, rtol=1e-6)
+    np.testing.assert_allclose(maps.green_lagrange[kept][:, 1:], 0.0, atol=1e-7)
+    np.testing.assert_allclose(maps.max_shear[kept], (1.2**2 - 1) / 4, rtol=1e-6)
+    np.testing.assert_allclose(maps.jacobian[kept], 1.2, rtol=1e-6)
+    np.testing.assert_array_equal(maps.valid, kept)
+    assert np.isnan(maps.max_shear[~kept]).all()
+    assert np.isnan(maps.displacement_mm[~kept]).all()
+
+
+def test_what_leaves_the_loaded_image_is_no_result_and_is_counted():
+    maps = strain_maps(STRETCH, WHOLE, seen=lambda x: x[:, 0] < 0.0)
+    share = 1.0 - maps.valid.mean()
+    quality = assess(maps, WHOLE, None)
+    assert quality.undefined_fraction == pytest.approx(share)
+    assert 0.3 < share < 0.9
+    assert quality.verdict.level == "distrust"
+    assert "leaves the loaded image" in quality.verdict.reasons[0]
+
+
+def test_row_11_folding_is_found_with_its_place_and_not_trusted():
+    u = np.zeros((*GRID.shape, 3))
+    X = GRID.points()
+    middle = GRID.points_at(np.array([12.0, 10.0, 8.0]))
+    u[..., 0] = -3.0 * (X[..., 0] - middle[0]) * np.exp(-np.sum((X - middle) ** 2, axis=-1) / 8.0)
+    maps = strain_maps(SampledDisplacement(GRID, u), WHOLE)
+    quality = assess(maps, WHOLE, None, similarity=(0.5, 0.7, 0.95))
+    assert quality.folded_voxels > 0
+    assert quality.verdict.level == "distrust"
+    assert "folds" in quality.verdict.reasons[0]
+    np.testing.assert_allclose(quality.lowest_jacobian_at_mm, middle, atol=1.6)
+    assert assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.5, 0.7, 0.95)).verdict.level == "trust"
+
+
+@pytest.mark.parametrize(
+    ("similarity", "level"),
+    [
+        ((0.3, 0.5, 0.9), "trust"),
+        ((0.3, 0.5, 0.6), "caution"),
+        ((0.3, 0.35, 0.4), "distrust"),
+        ((0.3, 0.9, 0.8), "distrust"),
+    ],
+)
+def test_a_poor_or_falling_similarity_costs_trust(similarity, level):
+    assert assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=similarity).verdict.level == level
+
+
+def test_a_bone_that_moves_costs_trust():
+    shifted = strain_maps(RigidMotion(np.eye(3), np.array([0.5, 0.0, 0.0])), WHOLE)
+    quality = assess(shifted, WHOLE, core(), similarity=(0.3, 0.5, 0.9))
+    assert quality.bone_shift_mm == pytest.approx(0.5, rel=1e-6)
+    assert quality.verdict.level == "caution"
+
+
+def test_landmarks_count_and_their_absence_is_told():
+    errors = np.array([2.5, 3.0, np.nan])
+    quality = assess(strain_maps(STRETCH, WHOLE), WHOLE, None, landmark_errors_mm=errors)
+    assert quality.verdict.level == "distrust"
+    told = quality.as_dict()["landmarks"]
+    assert told["undefined"] == 1
+    assert told["median_mm"] == pytest.approx(2.75)
+
+
+def test_noise_floor_is_the_mean_and_spread_of_the_mean_absolute_component():
+    maps = strain_maps(STRETCH, WHOLE)
+    floor = noise_floor(maps, core().inside)
+    assert floor.maer == pytest.approx((1.2**2 - 1) / 2 / 6, rel=1e-6)
+    assert floor.sder == pytest.approx(0.0, abs=1e-7)
+    assert floor.shear_p95 == pytest.approx((1.2**2 - 1) / 4, rel=1e-6)
+
+
+def test_local_correlation_of_an_image_with_itself_is_one_and_is_blind_to_gain():
+    random = np.random.default_rng(1)
+    image = Image(GRID, random.normal(size=GRID.shape).astype(np.float32))
+    _, pooled = local_correlation(image, 3.0 * image.values + 7.0, core())
+    assert pooled == pytest.approx(1.0, abs=1e-4)
+    _, turned = local_correlation(image, -image.values, core())
+    assert turned == pytest.approx(-1.0, abs=1e-4)
+    _, other = local_correlation(image, random.normal(size=GRID.shape).astype(np.float32), core())
+    assert abs(other) < 0.2
+
+
+def test_a_registration_is_undefined_away_from_its_tissue():
+    limited = Within(STRETCH, core(), margin_voxels=1)
+    inside, beside, far = (
+        core().points()[:1],
+        GRID.points_at(np.array([[5.0, 6.0, 6.0]])),
+        GRID.points_at(np.zeros((1, 3))),
+    )
+    assert np.isfinite(limited.displacement(inside)).all()
+    assert np.isfinite(limited.displacement(beside)).all()
+    assert np.isnan(limited.displacement(far)).all()
+    u, H = limited.evaluate(np.concatenate([inside, far]))
+    assert np.isnan(u[1]).all()
+    assert np.isnan(H[1]).all()
+    assert np.isfinite(H[0]).all()
