@@ -1,279 +1,227 @@
-"""Figures of a registration, each as PNG bytes: three planes through a point, and curves.
+"""Figures of a registration, each as PNG bytes: slices in three planes through a point, and curves.
 
-All panels of a figure share one scale, so a length is the same everywhere. How slices lie on the page: `dvc.planes`.
+All panels of a figure share one scale, so a length is the same everywhere. How slices lie on the page:
+`dvc.planes`. Yellow marks at a panel's edge show where the other planes cut. Voxels without a value are never
+drawn as zero: the loaded image is dark blue there, a map leaves the image below it plain.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from matplotlib import colormaps, patheffects
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import ListedColormap, Normalize, TwoSlopeNorm
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter
 from scipy.ndimage import map_coordinates
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.errors import GeometryError, InputError
 from dvc.image import Image, LabelMap
-from dvc.planes import AXES, LETTERS, PLANES, Plane, View
+from dvc.planes import AXES, Plane, View
 from dvc.regions import volume_above
+from dvc.sheet import DPI, FONT, INK, SHADOW, UNSEEN, WIDTH_IN, Sheet, levelled, png_bytes, window_of
 
-# Okabe and Ito's palette, told apart by all common kinds of colour vision.
+# The palette of Okabe and Ito, told apart by all common kinds of colour vision.
 REGION_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-_WIDTH_IN, _DPI = 11.0, 110
-_SHADOW = [patheffects.withStroke(linewidth=2.0, foreground="black")]
+_STAGES = ("After the rigid alignment", "After the whole registration")
 _CHECK_MM = 12.0
 _LINE_MM = 5.0
+_HIGHEST_SHEAR = 0.6
 
 
 def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
-    """Unloaded image in green, loaded in magenta: after the rigid alignment (above) and after all (below).
+    """Unloaded image in green and loaded image in magenta: after the rigid alignment, and after all.
 
-    Where both agree the picture is grey; colour is disagreement.
+    Where both agree the picture is grey; a coloured rim is a border that lies elsewhere in the other image.
+    Dark blue: the loaded scan does not show this place.
     """
-    return _two_rows(view, reference, rigid, registered, _fused)
+    sheet = Sheet(view, _STAGES)
+    window = window_of(view, reference.values)
+    for row, carried in zip(sheet.rows, (rigid, registered), strict=True):
+        own = window_of(view, carried)
+        for plane, axes in row.items():
+            green = levelled(view.cut(reference.values, plane), window)
+            magenta = levelled(view.cut(carried, plane), own)
+            page = np.stack([magenta, green, magenta], axis=-1)
+            page[np.isnan(page).any(axis=-1)] = UNSEEN
+            sheet.paint(plane, axes, page)
+    return sheet.png()
 
 
 def checkerboard(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
-    """Fields of 12 mm in turn from the unloaded and the loaded image: borders must run through."""
-    return _two_rows(view, reference, rigid, registered, _checks)
+    """Fields of 12 mm in turn from the unloaded and the loaded image: after the rigid alignment, and after all.
+
+    Where the registration is right, borders run on across the fields without a step.
+    """
+    sheet = Sheet(view, _STAGES)
+    window = window_of(view, reference.values)
+    for row, carried in zip(sheet.rows, (rigid, registered), strict=True):
+        own = window_of(view, carried)
+        for plane, axes in row.items():
+            a = levelled(view.cut(reference.values, plane), window)
+            b = levelled(view.cut(carried, plane), own)
+            _, across, along = AXES[plane]
+            spacing = view.grid.toward_lps().spacing_mm
+            down, right = np.indices(a.shape)
+            odd = (down * spacing[along] // _CHECK_MM + right * spacing[across] // _CHECK_MM) % 2 == 1
+            page = np.repeat(np.where(odd, b, a)[..., None], 3, axis=-1)
+            page[np.isnan(page[..., 0])] = UNSEEN
+            sheet.paint(plane, axes, page)
+    return sheet.png()
 
 
 def strain_slices(
     view: View, reference: Image, max_shear: Float32Array, largest: float, outline: LabelMap | None = None
 ) -> bytes:
-    """Maximal shear (E1 - E3)/2 over the unloaded image, reference configuration; plain MR where undefined."""
-    norm = Normalize(0.0, largest)
-    figure, axes = _panels(view, 1, colour_bar=True)
-    for ax, plane in zip(axes[0], PLANES, strict=True):
-        _grey(ax, view, plane, reference.values)
-        drawn = ax.imshow(
-            view.cut(max_shear, plane),
-            cmap=colormaps["viridis"],
-            norm=norm,
-            extent=view.extent_mm(plane),
-            alpha=0.85,
-        )
-        _outlines(ax, view, plane, outline)
-        _dress(ax, view, plane)
-    bar = figure.colorbar(drawn, ax=axes[0].tolist(), fraction=0.025, pad=0.01, extend="max")
-    bar.set_label("maximal shear (E₁ − E₃)/2")
-    return _png(figure)
+    """Maximal shear strain (E1 - E3)/2 in colour over the unloaded image, in the reference configuration.
+
+    Thin white lines are the borders of the regions. The image stays plain grey where there is no result.
+    """
+    if not largest > 0:
+        raise InputError(f"The end of the colour bar for maximal shear must be positive; got {largest}.")
+    sheet = Sheet(view, [""], bar=True)
+    window = window_of(view, reference.values)
+    shades, norm = colormaps["viridis"], Normalize(0.0, largest)
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, reference.values, window)
+        sheet.colours(plane, axes, max_shear, shades, norm)
+        if outline is not None:
+            labels = view.cut(outline.labels, plane)
+            sheet.outlines(plane, axes, (labels == label for label in outline.names))
+    beyond = bool((view.shown(max_shear) > largest).any())
+    sheet.bar(shades, norm, "maximal shear strain (E₁ − E₃)/2, no unit", "max" if beyond else "neither")
+    return sheet.png()
 
 
 def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> bytes:
-    """Volume ratio det F over the unloaded image: blue shrinks, brown grows, red folds (det F <= 0)."""
-    norm = TwoSlopeNorm(1.0, 0.7, 1.3)
-    figure, axes = _panels(view, 1, colour_bar=True)
-    for ax, plane in zip(axes[0], PLANES, strict=True):
-        _grey(ax, view, plane, reference.values)
-        page = view.cut(jacobian, plane)
-        drawn = ax.imshow(page, cmap=colormaps["BrBG_r"], norm=norm, extent=view.extent_mm(plane), alpha=0.8)
-        folded = np.where(page <= 0.0, 1.0, np.nan)
-        ax.imshow(folded, cmap=ListedColormap(["red"]), extent=view.extent_mm(plane), vmin=0, vmax=1)
-        _dress(ax, view, plane)
-    bar = figure.colorbar(drawn, ax=axes[0].tolist(), fraction=0.025, pad=0.01, extend="both")
-    bar.set_label("volume ratio det F")
-    return _png(figure)
+    """Volume ratio det F in colour over the unloaded image: purple shrinks, orange grows, white keeps its volume.
 
-
-def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Array, bone: BoolArray | None) -> bytes:
-    """Material lines, 5 mm apart when unloaded, over the loaded image; in-plane displacement, relative to bone."""
-    planes: tuple[Plane, ...] = ("sagittal", "coronal")
-    figure, axes = _panels(view, 1, planes=planes)
-    lps = view.grid.toward_lps()
-    for ax, plane in zip(axes[0], planes, strict=True):
-        _grey(ax, view, plane, aligned)
-        _, across, along = AXES[plane]
-        left, right, low, high = view.extent_mm(plane)
-        page = view.cut(displacement_mm, plane)[::-1] @ lps.direction
-        u, v = page[..., across], page[..., along]
-        h, w = lps.spacing_mm[across], lps.spacing_mm[along]
-
-        def moved(
-            a: FloatArray,
-            b: FloatArray,
-            u: Any = u,
-            v: Any = v,
-            left: float = left,
-            low: float = low,
-            h: float = h,
-            w: float = w,
-        ) -> tuple[FloatArray, FloatArray]:
-            at = np.stack([(b - low) / w - 0.5, (a - left) / h - 0.5])
-            return (
-                a + map_coordinates(u, at, order=1, cval=np.nan),
-                b + map_coordinates(v, at, order=1, cval=np.nan),
-            )
-
-        fine = 0.5
-        for at in np.arange(left + _LINE_MM / 2, right, _LINE_MM):
-            b = np.arange(low, high, fine)
-            ax.plot(*moved(np.full_like(b, at), b), color="#F0E442", linewidth=0.9)
-        for at in np.arange(low + _LINE_MM / 2, high, _LINE_MM):
-            a = np.arange(left, right, fine)
-            ax.plot(*moved(a, np.full_like(a, at)), color="#F0E442", linewidth=0.9)
-        if bone is not None:
-            _contour(ax, view, plane, bone, "#56B4E9")
-        _dress(ax, view, plane)
-    return _png(figure)
-
-
-def shear_curves(max_shear: Float32Array, labels: LabelMap) -> bytes:
-    """Volume of each region whose maximal shear exceeds a value, mL: exact step curves, no bins."""
-    figure = Figure(figsize=(7.5, 4.2), dpi=_DPI)
-    FigureCanvasAgg(figure)
-    ax = figure.subplots()
-    at = np.linspace(0.0, 0.6, 601)
-    voxel_ml = labels.grid.voxel_volume_mm3 / 1000.0
-    for colour, (label, name) in zip(_cycled(len(labels.names)), labels.names.items(), strict=True):
-        values = max_shear[labels.labels == label]
-        if np.isfinite(values).any():
-            ax.plot(
-                at,
-                np.maximum(volume_above(values, voxel_ml, at), 1e-4),
-                label=name,
-                color=colour,
-                linewidth=1.8,
-            )
-    ax.set(
-        yscale="log",
-        ylim=(1e-2, None),
-        xlim=(0.0, 0.6),
-        xlabel="maximal shear (E₁ − E₃)/2",
-        ylabel="volume above, mL",
-    )
-    ax.grid(alpha=0.25)
-    ax.legend(frameon=False)
-    return _png(figure)
+    Red, with the number of voxels, is where the deformation folds (det F <= 0): no result can be trusted there.
+    """
+    sheet = Sheet(view, [""], bar=True)
+    window = window_of(view, reference.values)
+    shown = view.shown(jacobian)
+    change = np.abs(shown[shown > 0.0] - 1.0)
+    reach = float(np.clip(np.ceil(np.percentile(change, 99.0) * 10) / 10, 0.1, 0.8)) if change.size else 0.1
+    shades, norm = colormaps["PuOr_r"], Normalize(1.0 - reach, 1.0 + reach)
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, reference.values, window)
+        sheet.colours(plane, axes, jacobian, shades, norm)
+        folded = view.cut(jacobian, plane) <= 0.0
+        if folded.any():
+            red = np.zeros((*folded.shape, 4))
+            red[folded] = (1.0, 0.0, 0.0, 1.0)
+            sheet.paint(plane, axes, red, interpolation="nearest")
+            told = f"folded: {np.count_nonzero(folded)} voxels"
+            style: dict[str, Any] = {"color": "#FF8A80", "weight": "bold", "path_effects": SHADOW}
+            axes.text(0.5, 0.08, told, transform=axes.transAxes, ha="center", **style, **FONT)
+    ends = (bool((shown < 1.0 - reach).any()), bool((shown > 1.0 + reach).any()))
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}[ends]
+    sheet.bar(shades, norm, "volume ratio det F, no unit", extend)
+    return sheet.png()
 
 
 def similarity_slices(view: View, rigid: Float32Array, registered: Float32Array) -> bytes:
-    """Local correlation of the loaded with the unloaded image: after the rigid alignment (above), after all (below)."""
-    figure, axes = _panels(view, 2, colour_bar=True)
-    for row, values in zip(axes, (rigid, registered), strict=True):
-        for ax, plane in zip(row, PLANES, strict=True):
-            ax.set_facecolor("black")
-            drawn = ax.imshow(
-                view.cut(values, plane),
-                cmap=colormaps["cividis"],
-                vmin=0,
-                vmax=1,
-                extent=view.extent_mm(plane),
-            )
-            _dress(ax, view, plane)
-    bar = figure.colorbar(drawn, ax=axes.ravel().tolist(), fraction=0.025, pad=0.01, extend="min")
-    bar.set_label("local correlation")
-    return _png(figure)
+    """Local correlation of the loaded with the unloaded image: after the rigid alignment, and after all.
+
+    Yellow: alike. Dark: not alike, or a place without any structure that could be compared.
+    """
+    sheet = Sheet(view, _STAGES, bar=True)
+    shades, norm = colormaps["cividis"], Normalize(0.0, 1.0)
+    for row, values in zip(sheet.rows, (rigid, registered), strict=True):
+        for plane, axes in row.items():
+            page = np.ma.masked_invalid(view.cut(values, plane))
+            sheet.paint(plane, axes, page, cmap=shades, norm=norm, interpolation="nearest")
+    below = any(bool((view.shown(values) < 0.0).any()) for values in (rigid, registered))
+    sheet.bar(shades, norm, "local correlation (1: alike), no unit", "min" if below else "neither")
+    return sheet.png()
 
 
-def _two_rows(view: View, reference: Image, rigid: Float32Array, registered: Float32Array, join: Any) -> bytes:
-    figure, axes = _panels(view, 2)
-    for row, loaded, said in zip(axes, (rigid, registered), ("after rigid alignment", "after all"), strict=True):
-        for ax, plane in zip(row, PLANES, strict=True):
-            a = _levelled(view.cut(reference.values, plane), reference.values)
-            b = _levelled(view.cut(loaded, plane), loaded)
-            ax.imshow(join(a, b, view, plane), extent=view.extent_mm(plane), vmin=0, vmax=1, cmap="gray")
-            _dress(ax, view, plane)
-        row[0].text(
-            0.02,
-            0.02,
-            said,
-            transform=row[0].transAxes,
-            color="white",
-            fontsize=10,
-            va="bottom",
-            path_effects=_SHADOW,
-        )
-    return _png(figure)
+def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Array, bone: BoolArray | None) -> bytes:
+    """Material lines over the loaded image, whose bone (orange) lies on that of the unloaded one.
+
+    Unloaded, the lines are straight and 5 mm apart; the measured displacement carries them, and they should follow
+    the tissue that is seen below. Only the two components in the plane are drawn; lines end where there is no result.
+    """
+    if displacement_mm.shape[3:] != (3,):
+        raise GeometryError(f"A displacement needs three components per voxel; got shape {displacement_mm.shape}.")
+    planes: tuple[Plane, ...] = ("sagittal", "coronal")
+    sheet = Sheet(view, [""], planes)
+    direction = view.grid.toward_lps().direction
+    window = window_of(view, aligned)
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, aligned, window)
+        _, across, along = AXES[plane]
+        u = np.asarray(view.cut(displacement_mm, plane), dtype=np.float64) @ direction[:, [across, along]]
+        lines = _material_lines(u, view.extent_mm(plane))
+        axes.add_collection(LineCollection(lines, colors="#56D4FF", linewidths=1.1), autolim=False)
+        if bone is not None:
+            sheet.outlines(plane, axes, [view.cut(bone, plane)], "#FFB000")
+    return sheet.png()
 
 
-def _fused(a: FloatArray, b: FloatArray, _view: View, _plane: Plane) -> FloatArray:
-    return np.stack([b, a, b], axis=-1)
+def _material_lines(u: FloatArray, extent: tuple[float, float, float, float]) -> list[FloatArray]:
+    """Lines (n, 2) mm of a square grid, carried by u (rows, columns, 2) mm in the plane; cut where u is NaN."""
+    left, right, bottom, top = extent
+    low, high = min(bottom, top), max(bottom, top)
+    xs, ys = np.arange(left + _LINE_MM / 2, right, _LINE_MM), np.arange(low + _LINE_MM / 2, high, _LINE_MM)
+    fine_x, fine_y = np.arange(left, right, 0.5), np.arange(low, high, 0.5)
+    straight = [np.column_stack([np.full_like(fine_y, x), fine_y]) for x in xs]
+    straight += [np.column_stack([fine_x, np.full_like(fine_x, y)]) for y in ys]
+    carried: list[FloatArray] = []
+    for line in straight:
+        row = (line[:, 1] - top) / (bottom - top) * u.shape[0] - 0.5
+        column = (line[:, 0] - left) / (right - left) * u.shape[1] - 0.5
+        at = np.stack([row, column])
+        moved = line + np.stack([map_coordinates(u[..., c], at, order=1, cval=np.nan) for c in (0, 1)], axis=-1)
+        known = np.isfinite(moved).all(axis=1)
+        breaks = np.flatnonzero(np.diff(known.astype(np.int8))) + 1
+        carried += [p for p in np.split(moved, breaks) if len(p) > 1 and np.isfinite(p[0]).all()]
+    return carried
 
 
-def _checks(a: FloatArray, b: FloatArray, view: View, plane: Plane) -> FloatArray:
-    _, across, along = AXES[plane]
-    spacing = view.grid.toward_lps().spacing_mm
-    row, column = np.indices(a.shape)
-    odd = (row * spacing[along] // _CHECK_MM + column * spacing[across] // _CHECK_MM) % 2 == 1
-    return np.where(odd, b, a)
+def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float | None = None) -> bytes:
+    """Volume of each region whose maximal shear exceeds a value, mL: the exact step curve, without bins.
 
-
-def _levelled(page: npt.NDArray[Any], whole: npt.NDArray[Any]) -> FloatArray:
-    low, high = np.nanpercentile(whole[::3, ::3, ::3], [1.0, 99.5])
-    return np.asarray(np.clip(np.nan_to_num((page - low) / max(high - low, 1e-12)), 0.0, 1.0), dtype=np.float64)
-
-
-def _panels(
-    view: View, rows: int, planes: tuple[Plane, ...] = PLANES, colour_bar: bool = False
-) -> tuple[Figure, npt.NDArray[Any]]:
-    extents = [view.extent_mm(p) for p in planes]
-    widths = [abs(e[1] - e[0]) for e in extents]
-    heights = [abs(e[3] - e[2]) for e in extents]
-    scale = (_WIDTH_IN - (1.0 if colour_bar else 0.0)) / sum(widths)
-    figure = Figure(figsize=(_WIDTH_IN, rows * (max(heights) * scale + 0.35)), dpi=_DPI, layout="constrained")
+    Both panels show the same curves; the logarithmic axis opens up the small volumes at high strain.
+    The legend tells the share of a region that has no result; its curve is a lower bound.
+    """
+    figure = Figure(figsize=(WIDTH_IN, 3.8), dpi=DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, len(planes), squeeze=False, gridspec_kw={"width_ratios": widths})
-    return figure, axes
-
-
-def _grey(ax: Axes, view: View, plane: Plane, values: Float32Array) -> None:
-    ax.imshow(_levelled(view.cut(values, plane), values), cmap="gray", vmin=0, vmax=1, extent=view.extent_mm(plane))
-
-
-def _outlines(ax: Axes, view: View, plane: Plane, labels: LabelMap | None) -> None:
-    if labels is None:
-        return
-    for colour, label in zip(_cycled(len(labels.names)), labels.names, strict=True):
-        _contour(ax, view, plane, labels.labels == label, colour)
-
-
-def _contour(ax: Axes, view: View, plane: Plane, inside: BoolArray, colour: str) -> None:
-    page = view.cut(inside, plane).astype(np.float64)
-    if page.any() and not page.all():
-        ax.contour(page, levels=[0.5], colors=[colour], linewidths=0.8, extent=view.extent_mm(plane), origin="upper")
-
-
-def _dress(ax: Axes, view: View, plane: Plane) -> None:
-    """Title, anatomical letters and a scale bar; no ticks."""
-    left, right, bottom, top = view.extent_mm(plane)
-    ax.set(xticks=[], yticks=[], xlim=(left, right), ylim=(bottom, top), aspect="equal")
-    ax.set_title(view.title(plane), fontsize=10)
-    style: dict[str, Any] = {
-        "transform": ax.transAxes,
-        "color": "white",
-        "fontsize": 10,
-        "path_effects": _SHADOW,
-        "zorder": 10,
-    }
-    a, b, c, d = LETTERS[plane]
-    ax.text(0.02, 0.5, a, ha="left", va="center", **style)
-    ax.text(0.98, 0.5, b, ha="right", va="center", **style)
-    ax.text(0.5, 0.98, c, ha="center", va="top", **style)
-    ax.text(0.5, 0.02, d, ha="center", va="bottom", **style)
-    width = abs(right - left)
-    ax.plot(
-        [0.95 - 20.0 / width, 0.95],
-        [0.06, 0.06],
-        transform=ax.transAxes,
-        color="white",
-        linewidth=2.5,
-        zorder=10,
-    )
-    ax.text(0.95 - 10.0 / width, 0.075, "20 mm", ha="center", va="bottom", **(style | {"fontsize": 8}))
-
-
-def _cycled(count: int) -> list[str]:
-    return [REGION_COLOURS[n % len(REGION_COLOURS)] for n in range(count)]
-
-
-def _png(figure: Figure, metadata: Mapping[str, str] | None = None) -> bytes:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata=dict(metadata or {"Software": "mrstrain"}))
-    return stream.getvalue()
+    panels: tuple[Axes, Axes] = figure.subplots(1, 2)
+    at = np.linspace(0.0, _HIGHEST_SHEAR, 1501)  # finer than a dot of the figure; each ordinate is exact
+    voxel_ml = labels.grid.voxel_volume_mm3 / 1000.0
+    for number, (label, name) in enumerate(labels.names.items()):
+        values = max_shear[labels.labels == label]
+        if not np.isfinite(values).any():
+            continue
+        above = volume_above(values, voxel_ml, at)
+        undefined = float(np.isnan(values).mean())
+        told = name if undefined < 0.0005 else f"{name} ({undefined:.1%} without a result)"
+        told = told.replace("$", r"\$")  # a dollar would start a formula
+        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+        dashes = ("-", "--", ":")[number // len(REGION_COLOURS) % 3]
+        for axes, shown in zip(panels, (above, np.where(above > 0, above, np.nan)), strict=True):
+            axes.step(at, shown, where="post", color=colour, linestyle=dashes, linewidth=1.8, label=told)
+    panels[1].set_yscale("log")
+    panels[1].yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    for axes, scale in zip(panels, ("linear", "logarithmic"), strict=True):
+        axes.set_xlim(0.0, _HIGHEST_SHEAR)
+        axes.set_title(f"Volume above a strain, {scale} axis", loc="left", color=INK, fontsize=10)
+        axes.set_xlabel("maximal shear strain (E₁ − E₃)/2, no unit", color=INK, **FONT)
+        axes.set_ylabel("volume above, mL", color=INK, **FONT)
+        axes.grid(True, color="#d9dee4", linewidth=0.6)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=9)
+        if noise_floor is not None:
+            axes.axvspan(0.0, noise_floor, color="#9aa5b1", alpha=0.35, linewidth=0, label="below the noise floor")
+    panels[0].set_ylim(bottom=0.0)
+    if panels[0].get_legend_handles_labels()[0]:
+        panels[0].legend(fontsize=9, frameon=False)
+    return png_bytes(figure)

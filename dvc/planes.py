@@ -123,7 +123,7 @@ class View:
         if tilt > OBLIQUE_DEG:
             return f"{plane.capitalize()}, along image axes (tilted {tilt:.0f}°)"
         at = lps.points_at(np.array(self.index, dtype=np.float64))[cut]
-        return f"{plane.capitalize()}, {'LPS'[cut]} {at:.0f} mm"
+        return f"{plane.capitalize()}, {'xyz'[cut]} = {at:.0f} mm".replace("-", "\u2212")
 
 
 def _toward_lps(grid: Grid, values: Values) -> Values:

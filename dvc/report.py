@@ -11,34 +11,73 @@ from pathlib import Path
 import jinja2
 import numpy as np
 
+from dvc.errors import InputError
 from dvc.regions import write_whole
 from dvc.verdict import Verdict
 
 Cell = str | float | int | None
 
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_CSS_PIXELS_PER_DOT = 96 / 120  # figures are drawn at 120 dots per inch: text of 10 pt is then 10 pt on the page
+
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure with what it shows and how to read it."""
+    """A figure with what it shows and how to read it.
+
+    Raises
+    ------
+    InputError
+        If ``png`` is not a PNG file.
+    """
 
     title: str
     caption: str
     png: bytes
+
+    def __post_init__(self) -> None:
+        if not self.png.startswith(_PNG_SIGNATURE):
+            raise InputError(f"The figure '{self.title}' is no PNG file; it begins with {self.png[:8]!r}.")
 
     @property
     def data(self) -> str:
         """The picture for an ``img`` element."""
         return "data:image/png;base64," + base64.b64encode(self.png).decode()
 
+    @property
+    def width(self) -> int:
+        """Width on the page, CSS pixels."""
+        return round(int.from_bytes(self.png[16:20], "big") * _CSS_PIXELS_PER_DOT)
+
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows under named columns; numbers are shown to three or four digits, missing ones as a dash."""
+    """Rows under named columns; numbers are shown to three or four digits, missing ones as a dash.
+
+    Raises
+    ------
+    InputError
+        If a row has not one cell for each column.
+    """
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     note: str = ""
+
+    def __post_init__(self) -> None:
+        for number, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise InputError(
+                    f"Row {number} of the table '{self.title}' has {len(row)} cells, its header "
+                    f"{len(self.columns)}; give one for each column."
+                )
+
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """Whether each column holds numbers and missing values alone, and is set flush right."""
+        columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(self.columns)
+        return tuple(bool(column) and not any(isinstance(c, str) for c in column) for column in columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,16 +92,16 @@ class Section:
 
 
 def shown(value: Cell) -> str:
-    """A table cell as people read it.
+    """Return a table cell as people read it.
 
     Examples
     --------
     >>> [shown(v) for v in (0.123456, 1234.5, 12, float("nan"), None, "fat")]
     ['0.1235', '1234', '12', '–', '–', 'fat']
     """
-    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+    if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
         return "–"
-    if isinstance(value, float):
+    if isinstance(value, float | np.floating):
         return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
     return str(value)
 
@@ -77,7 +116,8 @@ def write_report(
 ) -> None:
     """Write a report: verdict first, then the sections, the closing ones, and where it all came from.
 
-    One HTML file without scripts and without anything to fetch; all text is escaped.
+    One HTML file without scripts and without anything to fetch; all text is escaped. A list of the sections
+    with their verdicts stands at the top where there are two or more.
 
     Raises
     ------
