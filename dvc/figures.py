@@ -22,7 +22,7 @@ from scipy.ndimage import map_coordinates
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import GeometryError, InputError
 from dvc.image import Image, LabelMap
-from dvc.planes import AXES, Plane, View
+from dvc.planes import AXES, Plane, Values, View
 from dvc.regions import volume_above
 from dvc.sheet import DPI, FONT, INK, SHADOW, UNSEEN, WIDTH_IN, Sheet, levelled, png_bytes, window_of
 
@@ -152,23 +152,34 @@ def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Arr
         raise GeometryError(f"A displacement needs three components per voxel; got shape {displacement_mm.shape}.")
     planes: tuple[Plane, ...] = ("sagittal", "coronal")
     sheet = Sheet(view, [""], planes)
-    direction = view.grid.toward_lps().direction
     window = window_of(view, aligned)
     for plane, axes in sheet.rows[0].items():
         sheet.grey(plane, axes, aligned, window)
-        _, across, along = AXES[plane]
-        u = np.asarray(view.cut(displacement_mm, plane), dtype=np.float64) @ direction[:, [across, along]]
-        lines = _material_lines(u, view.extent_mm(plane))
+        lines = carried_lines(view, plane, displacement_mm)
         axes.add_collection(LineCollection(lines, colors="#56D4FF", linewidths=1.1), autolim=False)
         if bone is not None:
             sheet.outlines(plane, axes, [view.cut(bone, plane)], "#FFB000")
     return sheet.png()
 
 
-def _material_lines(u: FloatArray, extent: tuple[float, float, float, float]) -> list[FloatArray]:
-    """Lines (n, 2) mm of a square grid, carried by u (rows, columns, 2) mm in the plane; cut where u is NaN."""
-    left, right, bottom, top = extent
+def carried_lines(view: View, plane: Plane, displacement_mm: Values) -> list[FloatArray]:
+    """Lines of a square grid of 5 mm in a slice, where the displacement carries them.
+
+    Parameters
+    ----------
+    displacement_mm : (ni, nj, nk, 3)
+        u(X), LPS components; NaN where not defined, which cuts the lines. The component across the slice is left out.
+
+    Returns
+    -------
+    list of (n, 2)
+        Points across and along the page, mm in the frame of `View.extent_mm`.
+    """
+    left, right, bottom, top = view.extent_mm(plane)
     low, high = min(bottom, top), max(bottom, top)
+    _, across, along = AXES[plane]
+    in_plane = view.grid.toward_lps().direction[:, [across, along]]
+    u = np.asarray(view.cut(displacement_mm, plane), dtype=np.float64) @ in_plane
     xs, ys = np.arange(left + _LINE_MM / 2, right, _LINE_MM), np.arange(low + _LINE_MM / 2, high, _LINE_MM)
     fine_x, fine_y = np.arange(left, right, 0.5), np.arange(low, high, 0.5)
     straight = [np.column_stack([np.full_like(fine_y, x), fine_y]) for x in xs]
@@ -181,7 +192,7 @@ def _material_lines(u: FloatArray, extent: tuple[float, float, float, float]) ->
         moved = line + np.stack([map_coordinates(u[..., c], at, order=1, cval=np.nan) for c in (0, 1)], axis=-1)
         known = np.isfinite(moved).all(axis=1)
         breaks = np.flatnonzero(np.diff(known.astype(np.int8))) + 1
-        carried += [p for p in np.split(moved, breaks) if len(p) > 1 and np.isfinite(p[0]).all()]
+        carried += [part for part in np.split(moved, breaks) if len(part) > 1 and np.isfinite(part[0]).all()]
     return carried
 
 

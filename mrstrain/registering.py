@@ -21,8 +21,9 @@ from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
 from dvc.worker import Worker, usable_cores
 from mrstrain.inputs import Subject, case_names, prepare_output, read_subject
+from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
-from mrstrain.results import Case, write_case, write_series_report
+from mrstrain.results import Case, write_case
 
 Told = Callable[[str, str, float], None]
 _REPEAT = "repeat"
@@ -191,7 +192,7 @@ def register(
             "No load could be registered. " + " ".join(f"{n}: {r}" for n, r in run.failures.items())
         )
     write_json(target / "provenance.json", record)
-    write_series_report(target / "report.html", finished, run.failures, record)
+    write_series_report(target / "report.html", [case.section for case in finished], run.failures, record)
     return Series(target, tuple(finished), run.failures)
 
 

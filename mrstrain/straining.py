@@ -12,8 +12,9 @@ from dvc.displacementfile import read_displacement
 from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform
 from mrstrain.inputs import case_names, prepare_output, read_subject
+from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
-from mrstrain.results import Case, Measured, write_measured, write_series_report
+from mrstrain.results import Case, Measured, write_measured
 
 _TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm")
 
@@ -98,5 +99,5 @@ def strain(
     body = subject.tissue or tissue_mask(subject.reference)
     case = write_measured(target / name, Measured(name, subject, body, relative, motion), record)
     write_json(target / "provenance.json", record)
-    write_series_report(target / "report.html", [case], {}, record)
+    write_series_report(target / "report.html", [case.section], {}, record)
     return Strained(target, case)

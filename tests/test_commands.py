@@ -85,7 +85,8 @@ def results(study):
 
 
 PROMISED = [
-    "displacement.nii.gz", "displacement.json", "displacement.nrrd", "green_lagrange.nii.gz", "green_lagrange_plate.nii.gz",
+    "displacement.nii.gz", "displacement.json", "displacement.nrrd", "green_lagrange.nii.gz",
+    "green_lagrange_plate.nii.gz",
     "max_shear.nii.gz", "jacobian.nii.gz", "valid.nii.gz", "aligned.nii.gz", "registered.nii.gz",
     "TransformParameters.0.txt", "TransformParameters.1.txt", "transform.h5", "regions.csv", "quality.json",
     "provenance.json", "figures/strain.png", "figures/overlay.png", "figures/checkerboard.png",

@@ -40,7 +40,8 @@ def test_row_10_a_misspelt_parameter_is_refused_with_the_nearest_known(tmp_path,
 @pytest.mark.parametrize(
     "line",
     [
-        "(Metric0Weight 1.0)", "(Metric1Use \"true\")", "(Metric1NumberOfHistogramBins 32)", "(ErodeFixedMask0 \"false\")",
+        "(Metric0Weight 1.0)", "(Metric1Use \"true\")", "(Metric1NumberOfHistogramBins 32)",
+        "(ErodeFixedMask0 \"false\")",
         "(FixedImagePyramidSchedule 4 4 4 1 1 1)", "(SP_alpha 0.6)", "(BSplineInterpolationOrder 1)",
         "(Metric0RelativeWeight 0.1)", "(RandomSeed 3)", "(MaximumStepLength 0.5)", "(FinalGridSpacing 8)",
     ],
@@ -59,7 +60,7 @@ def test_real_files_of_others_are_accepted(real_data):
 def test_an_unknown_component_is_refused(tmp_path):
     path = tmp_path / "mine.txt"
     path.write_text(GOOD.replace("AdvancedNormalizedCorrelation", "AdvancedNormalisedCorrelation"))
-    with pytest.raises(ParameterError, match="no Metric .*'AdvancedNormalizedCorrelation'"):
+    with pytest.raises(ParameterError, match=r"no Metric .*'AdvancedNormalizedCorrelation'"):
         read_parameter_file(path)
 
 
