@@ -7,6 +7,7 @@ displacement is that of the tissue relative to its bone; T(X) = R (X + u(X)) + t
 
 from __future__ import annotations
 
+import logging
 import tempfile
 import time
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from dvc.align import Alignment, AlignOn, align, not_aligned
 from dvc.bspline import BSpline
 from dvc.deformation import Composed, Deformation, Within
 from dvc.errors import InputError, ParameterError, RegistrationError
-from dvc.image import Image, Mask
+from dvc.image import Grid, Image, Mask
 from dvc.presets import Preset, load_preset
 from dvc.resample import fill_missing
 from dvc.shading import without_shading
@@ -31,7 +32,10 @@ from dvc.worker import Worker
 
 Progress = Callable[[str, float], None]
 
+_log = logging.getLogger("dvc.registration")
+
 _MASK_MARGIN_MM = 3.0
+_LEAST_VOXELS = 2.0
 _RIGID_SEED_OFFSET = 101
 
 
@@ -234,6 +238,24 @@ def _align(
     return align(reference, loaded, mask, fit, on=settings.align_on, seed=seed)
 
 
+def _resolvable(parameters: dict[str, tuple[str, ...]], grid: Grid) -> dict[str, tuple[str, ...]]:
+    """The parameters, with control points no closer than two voxels along any axis of the fixed image.
+
+    Closer ones follow noise: on slices of 6 mm, control points every 4 mm gave a shear of 0.3 where there was none.
+    """
+    name = "FinalGridSpacingInPhysicalUnits"
+    if name not in parameters:
+        return parameters
+    given = np.array([float(v) for v in parameters[name]])
+    asked = np.broadcast_to(given, (3,)) if given.size in (1, 3) else np.full(3, given[0])
+    spacing = np.maximum(asked, _LEAST_VOXELS * grid.spacing_mm)
+    if np.all(spacing <= asked + 1e-9):
+        return parameters
+    told = " x ".join(f"{s:.3g}" for s in spacing)
+    _log.warning("Voxels of %s are too coarse for control points every %g mm; %s mm are used.", grid, given[0], told)
+    return parameters | {name: tuple(f"{s:.6g}" for s in spacing)}
+
+
 def _nonrigid(
     reference: Image,
     loaded: Image,
@@ -262,7 +284,8 @@ def _nonrigid(
         if start is not None:
             initial = str(write_elastix_transform(Path(folder), start, None, fixed.grid)[0])
         total = preset.iterations
-        parameters = preset.complete(seed=seed, combine="Add" if start is not None else "Compose")
+        run = preset.complete(seed=seed, combine="Add" if start is not None else "Compose")
+        parameters = _resolvable(run, fixed.grid)
         found = worker.run(
             f"registering with {preset.name}",
             elastix.register,

@@ -84,7 +84,7 @@ class Worker:
         """End the child process."""
         with self._lock:
             if self._executor is not None:
-                self._executor.shutdown(wait=True, kill_workers=True)
+                self._executor.shutdown(wait=True)
                 self._executor = None
 
     def __enter__(self) -> Worker:

@@ -205,5 +205,6 @@ def _alignment(found: Registration) -> dict[str, object]:
         "similarity_before": plain(alignment.similarity_before),
         "similarity": plain(alignment.similarity),
         "repeatability_rms_mm": plain(alignment.repeatability_mm),
+        "control_spacing_mm": found.bspline.control.spacing_mm.tolist(),
         "seconds": round(found.seconds, 1),
     }

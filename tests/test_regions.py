@@ -100,6 +100,15 @@ def test_a_failed_write_leaves_the_older_file_and_nothing_else(tmp_path: Path) -
     assert [p.name for p in tmp_path.iterdir()] == ["regions.csv"]
 
 
+def test_a_file_is_replaced_never_written_over(tmp_path: Path) -> None:
+    path, other_name = tmp_path / "regions.csv", tmp_path / "kept.csv"
+    path.write_text("old")
+    other_name.hardlink_to(path)
+    write_regions_csv(path, region_statistics(LABELS, {"max_shear": SHEAR}))
+    assert other_name.read_text() == "old"  # whoever reads while we write sees the whole old file
+    assert path.read_text().startswith("region,quantity,")
+
+
 def test_verdicts() -> None:
     poor, folds = Verdict("caution", ("Poor.",)), Verdict("distrust", ("Folds.",))
     assert worst([Verdict("trust"), poor]) == poor

@@ -245,3 +245,21 @@ def test_the_motion_of_a_bone_is_taken_from_any_deformation(small_pair):
     motion = small_pair.foot_motion
     found = motion_of(Composed([small_pair.deformation, motion]), small_pair.bone)
     assert rms_over(small_pair.bone, found, motion) < 1e-9
+
+
+def test_control_points_are_never_closer_than_two_voxels(small_pair, worker, caplog):
+    """Thick slices: a spacing that the image cannot carry is widened, and that is told."""
+    thick = Grid((64, 72, 14), np.array([1.6, 1.6, 8.0]), small_pair.reference.grid.origin_mm)
+    from dvc.resample import carry
+
+    def slices(image: Image) -> Image:
+        return Image(thick, np.nan_to_num(carry(image, thick, order=1)))
+
+    found = register(
+        slices(small_pair.reference),
+        slices(small_pair.loaded),
+        settings=replace(quick(), align_on="none"),
+        worker=worker,
+    )
+    np.testing.assert_allclose(found.bspline.control.spacing_mm, [6.0, 6.0, 16.0])
+    assert "too coarse" in caplog.text
