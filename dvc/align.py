@@ -37,6 +37,9 @@ _SCORE_MARGIN_MM = 2.0
 _SCORE_BLUR_MM = 1.0
 _LOWEST_SIMILARITY = 0.5
 _LARGEST_SPREAD_MM = 0.5
+_LEAST_COVERED = 0.75
+_INVERTED_TRIES = 7
+_CLEARLY = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,25 +96,25 @@ def align(reference: Image, loaded: Image, mask: Mask, fit: RigidFit, *, on: Ali
     """
     if not mask.inside.any():
         raise InputError("The mask to align on is empty.")
-    whole = fill_missing(loaded)
-    reference = fill_missing(reference)
-    starts = _search(reference, whole, mask)
-    best: tuple[float, RigidMotion] | None = None
+    starts, highest = _search(reference, loaded, mask)
+    candidates: list[tuple[float, RigidMotion]] = []
     for start in starts:
-        motion = _refine(reference, whole, mask, start, fit, seed)
+        try:
+            motion = _refine(reference, loaded, mask, start, fit, seed)
+        except RegistrationError:
+            continue  # a start from which elastix finds no overlap is not the place
         score = _similarity(reference, loaded, mask, motion)
-        if best is None or score > best[0]:
-            best = (score, motion)
-    assert best is not None
+        if np.isfinite(score):
+            candidates.append((score, motion))
     before = _similarity(reference, loaded, mask, RigidMotion.identity())
-    score, motion = best
+    score, motion = max(candidates, key=lambda c: c[0], default=(float("nan"), RigidMotion.identity()))
     if not score >= _LOWEST_SIMILARITY:
-        raise RegistrationError(_why_failed(reference, whole, mask, score, on))
-    again = _refine(reference, whole, mask, motion, fit, seed + 1)
-    third = _refine(reference, whole, mask, motion, fit, seed + 2)
+        raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
+    again = _refine(reference, loaded, mask, motion, fit, seed + 1)
+    third = _refine(reference, loaded, mask, motion, fit, seed + 2)
     points = mask.points()
     spread = float(np.sqrt(np.mean(np.sum((again.apply(points) - third.apply(points)) ** 2, axis=1))))
-    if spread > _LARGEST_SPREAD_MM:
+    if not spread <= _LARGEST_SPREAD_MM:
         raise RegistrationError(
             f"Two rigid fits on the {on} differ by {spread:.2f} mm (at most {_LARGEST_SPREAD_MM} is accepted): the "
             f"{on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly "
@@ -170,9 +173,9 @@ def _near(mask: Mask, margin_mm: float) -> BoolArray:
 def _similarity(reference: Image, loaded: Image, mask: Mask, motion: RigidMotion) -> float:
     """Normalised correlation of the slightly blurred images in and 2 mm around the mask; NaN without overlap."""
     where = _near(mask, _SCORE_MARGIN_MM)
-    fixed = smoothed(fill_missing(reference), _SCORE_BLUR_MM).values[where]
-    moved = carry(smoothed(fill_missing(loaded), _SCORE_BLUR_MM), reference.grid, motion.apply, where, order=1)[where]
-    known = np.isfinite(moved)
+    fixed = smoothed(reference, _SCORE_BLUR_MM).values[where]
+    moved = carry(smoothed(loaded, _SCORE_BLUR_MM), reference.grid, motion.apply, where, order=1)[where]
+    known = np.isfinite(moved) & np.isfinite(fixed)
     if np.count_nonzero(known) < 0.5 * known.size:
         return float("nan")
     a, b = fixed[known].astype(np.float64), moved[known].astype(np.float64)
@@ -181,14 +184,15 @@ def _similarity(reference: Image, loaded: Image, mask: Mask, motion: RigidMotion
     return float(a @ b / norm) if norm > 0 else float("nan")
 
 
-def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, on: AlignOn) -> str:
-    rotations = _rotations()[:1]
-    inverted = max(s for s, _ in _scored(reference, loaded, mask, rotations, sign=-1.0))
-    told = (
-        f"The rigid alignment on the {on} failed: the best normalised correlation found around it is {score:.2f} "
-        f"({_LOWEST_SIMILARITY} is needed)."
+def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highest: float, on: AlignOn) -> str:
+    inverted = max(
+        (s for s, _ in _scored(reference, loaded, mask, _rotations()[:_INVERTED_TRIES], sign=-1.0)), default=0.0
     )
-    if inverted > max(_LOWEST_SIMILARITY, score):
+    found = (
+        f"the best normalised correlation found around it is {score:.2f}" if np.isfinite(score) else "it was not found"
+    )
+    told = f"The rigid alignment on the {on} failed: {found} ({_LOWEST_SIMILARITY} is needed)."
+    if inverted > max(_LOWEST_SIMILARITY, highest + _CLEARLY):
         return (
             f"{told} With the contrast turned round it is {inverted:.2f}: the two images have different contrast "
             "(water against fat, say). Correlation cannot follow that; mutual information could: a parameter file "
@@ -213,8 +217,8 @@ def _rotations() -> list[FloatArray]:
     return list(Rotation.from_rotvec(np.radians(kept)).as_matrix())
 
 
-def _search(reference: Image, loaded: Image, mask: Mask) -> list[RigidMotion]:
-    """The best few starts, far enough apart to be different."""
+def _search(reference: Image, loaded: Image, mask: Mask) -> tuple[list[RigidMotion], float]:
+    """The place of the header and the best few others, far enough apart to be different; and the highest score."""
     scored = sorted(_scored(reference, loaded, mask, _rotations()), key=lambda s: -s[0])
     centre = mask.points().mean(axis=0)[None]
     chosen: list[RigidMotion] = []
@@ -228,7 +232,7 @@ def _search(reference: Image, loaded: Image, mask: Mask) -> list[RigidMotion]:
             chosen.append(motion)
         if len(chosen) == _CANDIDATES:
             break
-    return chosen
+    return [*chosen, RigidMotion.identity()], scored[0][0] if scored else -1.0
 
 
 def _scored(
@@ -247,8 +251,9 @@ def _scored(
     for rotation in rotations:
         t, w = _rotated(template, weight, template_grid, centre, rotation)
         count = w.sum()
-        t = (t - (t * w).sum() / count) * w
-        energy = (t * t).sum()
+        deviation = t - (t * w).sum() / count
+        energy = (w * deviation * deviation).sum()
+        t = w * deviation
         w_f = np.conj(fft.rfftn(w, size, workers=-1))
         cross = fft.irfftn(scene_f * np.conj(fft.rfftn(t, size, workers=-1)), size, workers=-1)
         mean = fft.irfftn(scene_f * w_f, size, workers=-1) / count
@@ -256,10 +261,12 @@ def _scored(
         covered = fft.irfftn(known_f * w_f, size, workers=-1) / count
         floor = 1e-3 * values.var()
         score = sign * cross / np.sqrt(energy * count * np.maximum(variance, floor))
-        score[covered < 0.9] = -1.0
+        score[covered < _LEAST_COVERED] = -np.inf
         # A shift s of the template wraps round: its centre lies at index s + half of the scene.
         score = np.roll(score, tuple(half), axis=(0, 1, 2))[places]
         best = np.unravel_index(int(np.argmax(score)), score.shape)
+        if not np.isfinite(score[best]):
+            continue  # nowhere does the loaded image show enough of the mask
         to = scene.grid.points_at(np.array(best, dtype=np.float64))
         found.append((float(score[best]), RigidMotion(rotation, to - rotation @ centre)))
     return found
@@ -267,13 +274,13 @@ def _scored(
 
 def _template(reference: Image, mask: Mask, centre: FloatArray) -> tuple[Image, Image, Grid]:
     """The reference and its weight around the mask, on a cubic low-resolution grid centred on the mask."""
-    near = Mask(mask.grid, _near(mask, _SEARCH_MARGIN_MM))
+    near = Mask(mask.grid, _near(mask, _SEARCH_MARGIN_MM) & ~reference.missing)
     reach = float(np.linalg.norm(near.points() - centre, axis=1).max())
     half = int(np.ceil(reach / _SEARCH_MM)) + 1
     n = 2 * half + 1
     grid = Grid((n, n, n), np.full(3, _SEARCH_MM), centre - half * _SEARCH_MM)
     weight = smoothed(Image(mask.grid, near.inside.astype(np.float32)), _SEARCH_MM / 2.0)
-    return smoothed(reference, _SEARCH_MM / 2.0), weight, grid
+    return smoothed(fill_missing(reference), _SEARCH_MM / 2.0), weight, grid
 
 
 def _rotated(

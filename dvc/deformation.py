@@ -123,6 +123,8 @@ class RigidMotion:
         rotation, translation = frozen(self.rotation, np.float64), frozen(self.translation_mm, np.float64)
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise InputError("A rigid motion needs a 3 x 3 rotation and three translations in mm.")
+        if not np.isfinite(translation).all():
+            raise InputError(f"A rigid motion needs finite translations; got {translation.tolist()}.")
         error = np.abs(rotation.T @ rotation - np.eye(3)).max()
         if not error < 1e-6 or np.linalg.det(rotation) < 0:
             raise InputError(f"Not a proper rotation (R^T R differs from I by {error:.2g}).")
@@ -285,7 +287,9 @@ class SampledDisplacement:
         if undefined.any():
             from scipy.ndimage import distance_transform_edt
 
-            nearest = distance_transform_edt(undefined, return_distances=False, return_indices=True)
+            nearest = distance_transform_edt(
+                undefined, sampling=grid.spacing_mm, return_distances=False, return_indices=True
+            )
             values = values[tuple(nearest)]
         coefficients = np.stack([spline_filter(values[..., c], order=3, mode="mirror") for c in range(3)])
         object.__setattr__(self, "grid", grid)

@@ -37,7 +37,8 @@ _HIGHEST_SHEAR = 0.6
 def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
     """Unloaded image in green and loaded image in magenta: after the rigid alignment, and after all.
 
-    Where both agree the picture is grey; a coloured rim is a border that lies elsewhere in the other image.
+    Where both agree the picture is grey, but for a faint tint over whole regions where the scans' shading differs; a
+    coloured rim is a border that lies elsewhere in the other image. Yellow marks: where the other planes cut.
     Dark blue: the loaded scan does not show this place.
     """
     sheet = Sheet(view, _STAGES)

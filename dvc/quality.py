@@ -26,7 +26,9 @@ class Limits:
 
     similarity: tuple[float, float] = (0.7, 0.45)
     bone_shift_mm: tuple[float, float] = (0.3, 0.8)
-    undefined_fraction: tuple[float, float] = (0.05, 0.25)
+    bone_shear_p95: tuple[float, float] = (0.1, 0.25)
+    lowest_jacobian: tuple[float, float] = (0.3, 0.0)
+    undefined_fraction: tuple[float, float] = (0.15, 0.4)
     landmark_error_mm: tuple[float, float] = (1.0, 2.0)
     floor_shear_p95: tuple[float, float] = (0.06, 0.15)
 
@@ -176,9 +178,11 @@ def _bounding_box(inside: BoolArray) -> tuple[slice, slice, slice]:
     return spans[0], spans[1], spans[2]
 
 
-def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor:
-    """The apparent strain of a repeat scan, in the voxels of ``where`` that are valid."""
+def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
+    """The apparent strain of a repeat scan, in the voxels of ``where`` that are valid; None where none is."""
     kept = maps.valid & where
+    if not kept.any():
+        return None
     each = np.abs(maps.green_lagrange[kept]).astype(np.float64).mean(axis=1)
     shear = maps.max_shear[kept]
     length = np.linalg.norm(maps.displacement_mm[kept], axis=1)
@@ -223,6 +227,10 @@ def assess(
             bone_shift = float(np.sqrt(squared.mean()))
             bone_shear = float(np.percentile(maps.max_shear[kept], 95))
     findings: list[Verdict] = []
+    if bone is not None and not np.isfinite(bone_shift):
+        findings.append(Verdict("caution", ("The bone has no result, so whether it stayed rigid is not known.",)))
+    if similarity is None:
+        findings.append(Verdict("caution", ("No images were compared: the deformation is taken as it was given.",)))
     if folded:
         place = ", ".join(f"{c:.1f}" for c in at)
         findings.append(
@@ -256,9 +264,24 @@ def assess(
     )
     _judge_above(
         findings,
+        bone_shear,
+        lines.bone_shear_p95,
+        "The bone, which is rigid, shows an apparent maximal shear of {value:.3f} (95th percentile; care "
+        "above {limit:.2f}).",
+    )
+    if np.isfinite(lowest):
+        _judge_below(
+            findings,
+            lowest,
+            lines.lowest_jacobian,
+            "Somewhere tissue is squeezed to {value:.2f} of its volume (care below {limit:.2f}).",
+        )
+    _judge_above(
+        findings,
         undefined,
         lines.undefined_fraction,
-        "{value:.0%} of the tissue has no result: it leaves the loaded image (care above {limit:.0%}).",
+        "{value:.0%} of the tissue has no result: it is not shown by the loaded image or not covered by the "
+        "deformation (care above {limit:.0%}).",
     )
     if landmark_errors_mm is not None and np.isfinite(landmark_errors_mm).any():
         _judge_above(

@@ -36,7 +36,6 @@ _log = logging.getLogger("dvc.registration")
 
 _MASK_MARGIN_MM = 3.0
 _LEAST_VOXELS = 2.0
-_RIGID_SEED_OFFSET = 101
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +153,7 @@ def register(
     chosen = settings or Settings.of()
     if not chosen.presets:
         raise ParameterError("No registration stage given; name a preset or parameter files.")
+    _refuse_other_spacing(chosen.presets)
     tell = progress or (lambda _stage, _fraction: None)
     _refuse_same(reference, loaded)
     body = tissue if tissue is not None else tissue_mask(reference)
@@ -178,7 +178,7 @@ def register(
                 inside,
                 alignment,
                 preset,
-                chosen.seed + number,
+                _seeds(chosen)[number + 1],
                 bspline,
                 runner,
                 lambda fraction, stage=stage: tell(stage, fraction),  # type: ignore[misc]
@@ -221,21 +221,46 @@ def _align(
     preset = load_preset("bone-rigid")
 
     def fit(fixed: Image, moving: Image, where: Mask, seed: int) -> dict[str, tuple[str, ...]]:
+        known = Mask(where.grid, where.inside & ~fixed.missing)
+        whole, seen = _without_gaps(moving)
         with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
             return worker.run(
                 "aligning the bone",
                 elastix.register,
-                fixed,
-                moving,
+                fill_missing(fixed),
+                whole,
                 preset.complete(seed=seed),
-                where,
-                None,
+                known,
+                seen,
                 None,
                 folder,
             ).transform
 
-    seed = settings.seed + _RIGID_SEED_OFFSET
+    seed = _seeds(settings)[0]
     return align(reference, loaded, mask, fit, on=settings.align_on, seed=seed)
+
+
+def _seeds(settings: Settings) -> list[int]:
+    """Independent seeds: of the rigid fits (three in a row are used), then of each non-rigid stage."""
+    drawn = np.random.SeedSequence(settings.seed).generate_state(1 + len(settings.presets))
+    return [int(s) % 2**30 + 1 for s in drawn]
+
+
+def _without_gaps(image: Image) -> tuple[Image, Mask | None]:
+    """The image with missing voxels filled in, and the mask of those that are known, where any is missing."""
+    missing = image.missing
+    return fill_missing(image), Mask(image.grid, ~missing) if missing.any() else None
+
+
+def _refuse_other_spacing(presets: tuple[Preset, ...]) -> None:
+    """Stages add their coefficients up, so their control points must be the same."""
+    name = "FinalGridSpacingInPhysicalUnits"
+    found = {p.parameters.get(name, p.parameters.get("FinalGridSpacingInVoxels", ("default",))) for p in presets}
+    if len(found) > 1:
+        raise ParameterError(
+            f"The stages end with different spacings of control points: {sorted(map(' '.join, found))}. Each stage "
+            f"starts from the coefficients of the one before, so {name} must be the same in all."
+        )
 
 
 def _resolvable(parameters: dict[str, tuple[str, ...]], grid: Grid) -> dict[str, tuple[str, ...]]:
@@ -275,9 +300,7 @@ def _nonrigid(
     fixed = fill_missing(reference)
     back = alignment.motion.inverse()
     moved_grid = loaded.grid.moved_by(back.rotation, back.translation_mm)
-    missing = loaded.missing
-    moving_mask = Mask(moved_grid, ~missing) if missing.any() else None
-    moving = Image(moved_grid, fill_missing(loaded).values)
+    moving, moving_mask = _without_gaps(Image(moved_grid, loaded.values))
     mask = Mask(reference.grid, widened(body, _MASK_MARGIN_MM).inside & ~reference.missing)
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
         initial = None

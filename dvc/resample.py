@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.image import Grid, Image
@@ -14,17 +14,39 @@ _SLAB_VOXELS = 500_000
 
 
 def fill_missing(image: Image) -> Image:
-    """The image with missing voxels set to its lowest value, for engines that cannot leave voxels out."""
+    """The image with missing voxels set to their nearest known neighbour, for what cannot leave voxels out.
+
+    A constant would be an edge that is not there, and blurring and splines would carry it into what is known.
+    """
     missing = image.missing
     if not missing.any():
         return image
-    return Image(image.grid, np.where(missing, np.nanmin(image.values), image.values))
+    nearest = distance_transform_edt(
+        missing, sampling=image.grid.spacing_mm, return_distances=False, return_indices=True
+    )
+    return Image(image.grid, image.values[tuple(nearest)])
 
 
 def smoothed(image: Image, sigma_mm: float) -> Image:
-    """The image blurred by a Gaussian of ``sigma_mm`` in space."""
+    """The image blurred by a Gaussian of ``sigma_mm`` in space; missing voxels stay missing."""
     sigma = sigma_mm / image.grid.spacing_mm
-    return Image(image.grid, gaussian_filter(image.values, sigma, mode="nearest"))
+    values = gaussian_filter(fill_missing(image).values, sigma, mode="nearest")
+    return Image(image.grid, np.where(image.missing, np.float32(np.nan), values))
+
+
+def shows(image: Image, points_mm: FloatArray, margin_mm: float = 0.0) -> BoolArray:
+    """Whether an image has values at points (n, 3) LPS mm, and for ``margin_mm`` around along its axes.
+
+    That is inside its voxel centres' box, with no missing voxel beside. NaN points are not shown.
+    """
+    at = image.grid.indices_of(points_mm)
+    margin = margin_mm / image.grid.spacing_mm - 1e-6
+    known = np.all((at >= margin) & (at <= np.array(image.grid.shape) - 1 - margin), axis=1)
+    if image.missing.any():
+        distance = distance_transform_edt(~image.missing, sampling=image.grid.spacing_mm)
+        gaps = (distance <= margin_mm).astype(np.float32)
+        known[known] = map_coordinates(gaps, at[known].T, order=1, mode="nearest") <= 1e-6
+    return np.asarray(known)
 
 
 def carry(
@@ -34,7 +56,7 @@ def carry(
     where: BoolArray | None = None,
     order: int = 3,
 ) -> Float32Array:
-    """Values of ``image`` brought onto ``grid``, NaN where the image has none.
+    """Values of ``image`` brought onto ``grid``, NaN where any of the eight voxels around is missing or outside.
 
     Parameters
     ----------
@@ -46,7 +68,7 @@ def carry(
     order : int
         1 for linear, 3 for cubic spline interpolation.
     """
-    missing = image.missing
+    gaps = image.missing.astype(np.float32) if image.missing.any() else None
     filled = fill_missing(image)
     coefficients = (
         spline_filter(filled.values, order=order, output=np.float32, mode="mirror") if order > 1 else filled.values
@@ -70,8 +92,8 @@ def carry(
         values[known] = map_coordinates(
             coefficients, at[known].T, order=order, mode="mirror", prefilter=False, output=np.float32
         )
-        if missing.any():
-            nearest = np.rint(at[known]).astype(np.int64)
-            values[np.flatnonzero(known)[missing[tuple(nearest.T)]]] = np.nan
+        if gaps is not None:
+            touched = map_coordinates(gaps, at[known].T, order=1, mode="nearest") > 1e-6
+            values[np.flatnonzero(known)[touched]] = np.nan
         carried[start : start + step][wanted] = values
     return carried

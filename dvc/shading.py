@@ -18,7 +18,7 @@ _ITERATIONS = [50, 50, 50]
 
 
 def without_shading(image: Image) -> Image:
-    """The image divided by its smooth multiplicative field, found by N4 on a coarse copy.
+    """The image, above its lowest value, divided by its smooth multiplicative field, found by N4 on a coarse copy.
 
     Normalised correlation over the whole body takes shading for contrast, and a B-spline then bends tissue to
     follow it: on a phantom with fields of +-20 % that tripled the strain error. N4: N. Tustison et al., 2010,
@@ -47,7 +47,7 @@ def without_shading(image: Image) -> Image:
     log_field = sitk.GetArrayFromImage(n4.GetLogBiasFieldAsImage(scan)).T
     found = log_field[inside]  # away from tissue the spline is extrapolated and may be anything
     field = np.exp(np.clip(log_field, found.min(), found.max()) - float(np.median(found)))
-    return Image(image.grid, image.values / field.astype(np.float32))
+    return Image(image.grid, low + (image.values - low) / field.astype(np.float32))
 
 
 def _to_sitk(image: Image, values: npt.NDArray[Any]) -> sitk.Image:

@@ -8,7 +8,9 @@ between tasks because the first use of elastix costs many seconds; when one dies
 from __future__ import annotations
 
 import os
+import signal
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import TimeoutError as FutureTimeout
 from typing import Any, TypeVar
@@ -78,7 +80,15 @@ class Worker:
     def _start(self) -> ProcessPoolExecutor:
         count = str(self.threads)
         names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
-        return ProcessPoolExecutor(max_workers=1, env=dict.fromkeys(names, count))
+        return ProcessPoolExecutor(
+            max_workers=1, env=dict.fromkeys(names, count), initializer=_end_with, initargs=(os.getpid(),)
+        )
+
+    def kill(self) -> None:
+        """End the child process at once, whatever it is doing; a task in it raises `WorkerError`."""
+        executor = self._executor
+        if executor is not None:
+            executor.shutdown(wait=False, kill_workers=True)
 
     def close(self) -> None:
         """End the child process."""
@@ -92,6 +102,19 @@ class Worker:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _end_with(parent: int) -> None:
+    """Let the child end when its parent is gone, and leave interrupts from the keyboard to the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    if hasattr(os, "fork"):  # elsewhere a child keeps the number of a parent that is gone
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def _cause(died: TerminatedWorkerError) -> str:

@@ -50,12 +50,34 @@ Labels = Annotated[Path | None, typer.Option(help="Label map of the tissues on t
 Names = Annotated[Path | None, typer.Option(help="Names of the labels: ITK-SNAP or Slicer table, or CSV.")]
 Plate = Annotated[
     tuple[float, float, float] | None,
-    typer.Option(help="The plate's outward normal, away from the foot, LPS. Default: patient inferior (0 0 -1)."),
+    typer.Option(
+        help="The plate's outward normal, away from the foot, LPS; default, patient inferior: --plate-normal 0 0 -1."
+    ),
 ]
-Shear = Annotated[tuple[float, float, float] | None, typer.Option(help="Direction of the shear force, LPS.")]
+Shear = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(help="Direction of the shear force, LPS, such as --shear-direction 0 -1 0."),
+]
 MeshFile = Annotated[Path | None, typer.Option(help="Mesh to put displacement and strain on.")]
 MeshUnit = Annotated[Unit, typer.Option(help="Unit of the mesh's coordinates.")]
 MeshFrame = Annotated[Frame, typer.Option(help="Frame of the mesh's coordinates.")]
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from mrstrain import __version__
+
+        typer.echo(f"mrstrain {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
 
 
 @app.command()

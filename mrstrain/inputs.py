@@ -146,8 +146,8 @@ def case_names(loads: Sequence[Path]) -> list[str]:
     return names
 
 
-def prepare_output(out: Path, case_folders: Sequence[str], inputs: Sequence[Path]) -> None:
-    """Make the output folder, and refuse one that cannot be written or that would touch an input."""
+def refuse_touching_inputs(out: Path, case_folders: Sequence[str], inputs: Sequence[Path]) -> None:
+    """Refuse an output folder in which a result would replace an input, or the folder that an input lies in."""
     refuse_overwriting_inputs([out / c for c in case_folders] + [out / "report.html"], inputs)
     for path in inputs:
         for case in case_folders:
@@ -155,6 +155,10 @@ def prepare_output(out: Path, case_folders: Sequence[str], inputs: Sequence[Path
                 raise OutputError(
                     f"{out / case} would be replaced, and the input {path} lies in it. Choose another --out."
                 )
+
+
+def make_output(out: Path) -> None:
+    """Make the output folder, and refuse one that cannot be written to."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".mrstrain-probe"

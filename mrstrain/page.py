@@ -11,7 +11,7 @@ from dvc import figures
 from dvc.arrays import Float32Array
 from dvc.image import Image, LabelMap
 from dvc.planes import View
-from dvc.quality import Quality
+from dvc.quality import NoiseFloor, Quality
 from dvc.regions import SHEAR_THRESHOLDS, RegionRow
 from dvc.report import Cell, Picture, Section, Table, write_report
 from dvc.strainmaps import StrainMaps
@@ -34,6 +34,8 @@ _CLOSING = (
             "scan without load (--repeat) tells by how much. Strain that jumps at a border of tissues is smeared over "
             "about one spacing of the control points (4 mm for heel-mr). Scanner distortion and creep between scans "
             "are not seen at all.",
+            "A noise floor is what a repeat scan shows where there is no strain. MAER is the mean over voxels of the "
+            "mean absolute value of the six strain components, SDER the standard deviation of the same.",
             "Missing is NaN in every map, never zero; valid.nii.gz tells where values are. Programs built on ITK show "
             "NaN in NIfTI as zero: use the NRRD twin or the validity mask there.",
         ),
@@ -86,12 +88,17 @@ def agreement_pictures(
 
 
 def _said(draw: Callable[..., bytes]) -> str:
-    """The first paragraph of a figure's docstring: it says how the figure is read."""
-    return " ".join((draw.__doc__ or "").split("\n\n")[0].split())
+    """A figure's docstring: it says how the figure is read."""
+    return " ".join((draw.__doc__ or "").split())
 
 
 def strain_pictures(
-    view: View, subject: Subject, labels: LabelMap, maps: StrainMaps, aligned: Float32Array | None
+    view: View,
+    subject: Subject,
+    labels: LabelMap,
+    maps: StrainMaps,
+    aligned: Float32Array | None,
+    floor: NoiseFloor | None,
 ) -> dict[str, Picture]:
     """Draw strain, curves, grid and volume ratio; over the loaded image where there is one."""
     reference, bone = subject.reference, subject.bone
@@ -104,7 +111,7 @@ def strain_pictures(
         "curves": Picture(
             "Volume above a strain",
             _said(figures.shear_curves),
-            figures.shear_curves(maps.max_shear, labels),
+            figures.shear_curves(maps.max_shear, labels, None if floor is None else floor.shear_p95),
         ),
         "deformed_grid": Picture(
             "Deformed grid",
@@ -141,7 +148,7 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
             ),
             ("Correlation in and around the bone, after alignment", _number(alignment["similarity"]), "1"),
             (
-                "Two rigid fits with other samples differ by (rms over the bone)",
+                "Spread of two rigid fits with other random samples (rms over the bone; not its accuracy)",
                 _number(alignment["repeatability_rms_mm"]),
                 "mm",
             ),

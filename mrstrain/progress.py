@@ -18,11 +18,21 @@ _LINE_EVERY_S = 15.0
 
 @contextmanager
 def live() -> Iterator[Told]:
-    """Show progress on standard error; standard output stays for results."""
+    """Show progress on standard error; standard output stays for results. An interrupt is told in a line."""
     console = Console(stderr=True)
-    if not console.is_terminal:
-        yield _lines()
-        return
+    try:
+        if console.is_terminal:
+            with _bars(console) as told:
+                yield told
+        else:
+            yield _lines()
+    except KeyboardInterrupt:
+        console.print("Interrupted. Loads that were finished are kept; nothing half-written is.")
+        raise
+
+
+@contextmanager
+def _bars(console: Console) -> Iterator[Told]:
     bars: dict[str, TaskID] = {}
     with Progress(
         TextColumn("{task.description}"),
@@ -59,7 +69,7 @@ def _lines() -> Told:
             return
         told_at[key] = float("inf") if done else now
         spent = now - began[key]
-        left = f", {spent * (1 - fraction) / fraction:.0f} s left" if 0.02 < fraction < 1.0 else ""
+        left = f", {spent * (1 - fraction) / fraction:.0f} s left" if 0.05 < fraction < 1.0 else ""
         print(f"{case}: {stage} {100 * fraction:.0f} % after {spent:.0f} s{left}", file=sys.stderr, flush=True)
 
     return told

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
-import tempfile
+import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from dvc.regions import write_whole
 
 _PACKAGES = (
     "mrstrain",
@@ -27,10 +28,20 @@ _PACKAGES = (
 _BLOCK = 1 << 20
 
 
+_NAMED = re.compile(
+    rb'^\s*(?:ElementDataFile\s*=|data file:|\(InitialTransformParameter\w*\s+"|\(TransformFileName\s+")'
+    rb'\s*([^"\r\n]+)',
+    re.MULTILINE | re.IGNORECASE,
+)
+
+
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file; of a folder, of its files' names and contents in order."""
+    """SHA-256 of a file and of the files that it names; of a folder, of its files' names and contents in order.
+
+    Headers name the file of their voxels (.mhd, .nhdr), elastix transforms their initial transform.
+    """
     digest = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else _with_named(path)
     for file in files:
         if path.is_dir():
             digest.update(str(file.relative_to(path)).encode())
@@ -38,6 +49,20 @@ def file_hash(path: Path) -> str:
             while block := stream.read(_BLOCK):
                 digest.update(block)
     return digest.hexdigest()
+
+
+def _with_named(path: Path) -> list[Path]:
+    found, waiting = [path], [path]
+    while waiting:
+        file = waiting.pop()
+        if file.suffix.lower() not in (".mhd", ".nhdr", ".txt"):
+            continue
+        for name in _NAMED.findall(file.read_bytes()[:_BLOCK]):
+            named = file.parent / Path(name.decode(errors="replace").strip()).name
+            if named.is_file() and named not in found:
+                found.append(named)
+                waiting.append(named)
+    return found
 
 
 def versions() -> dict[str, str]:
@@ -79,13 +104,5 @@ def provenance(
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write JSON whole or not at all."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
-    try:
-        with os.fdopen(handle, "w") as stream:
-            json.dump(content, stream, indent=2, allow_nan=False)
-            stream.write("\n")
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    """Write JSON whole or not at all; NaN is refused, as JSON has none."""
+    write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

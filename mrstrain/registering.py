@@ -20,7 +20,7 @@ from dvc.registration import Registration, Settings
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
 from dvc.worker import Worker, usable_cores
-from mrstrain.inputs import Subject, case_names, prepare_output, read_subject
+from mrstrain.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
 from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
 from mrstrain.results import Case, write_case
@@ -49,7 +49,7 @@ class Series:
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
-        lines = [case.summary() for case in self.cases]
+        lines = [line for case in self.cases for line in case.summary()]
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
         return [*lines, f"Report: {self.out / 'report.html'}"]
 
@@ -144,7 +144,7 @@ def register(
         raise InputError(f"--landmarks belong to one loaded image; {len(loads)} are given. Register that one alone.")
     stages = _stages(preset, parameters, allow_unknown_parameters)
     given = [Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh) if p is not None]
-    prepare_output(target, cases, given)
+    refuse_touching_inputs(target, cases, given)
     subject = read_subject(
         load0,
         bone=bone,
@@ -165,6 +165,7 @@ def register(
         )
     images = {name: read_image(path, allow_missing=allow_missing) for name, path in zip(cases, paths, strict=True)}
     points = None if landmarks is None else read_landmarks(landmarks)[:2]
+    make_output(target)
     cores = usable_cores()
     at_once = 1 if chain else min(workers or cores, cores, len(cases))
     each = threads or max(1, cores // at_once)
@@ -179,7 +180,11 @@ def register(
             "threads": each,
             "bone_label": bone_label,
             "plate_normal_lps": subject.plate_normal.tolist(),
+            "shear_direction_lps": None if shear_direction is None else list(shear_direction),
+            "mesh_unit": mesh_unit,
+            "mesh_frame": mesh_frame,
             "allow_missing": allow_missing,
+            "rigid": load_preset("bone-rigid").text,
             "stages": [{"name": s.name, "text": s.text} for s in stages],
         },
     )
@@ -256,10 +261,15 @@ class _Run:
                 if name == _REPEAT:
                     self._floor_known.set()
 
+        pool = ThreadPoolExecutor(at_once)
         try:
-            with ThreadPoolExecutor(at_once) as pool:
-                list(pool.map(one, sorted(self.images, key=lambda name: name != _REPEAT)))  # its floor is waited for
+            list(pool.map(one, sorted(self.images, key=lambda name: name != _REPEAT)))  # its floor is waited for
+        except BaseException:  # an interrupt: end the workers now, not after their registrations
+            for worker in workers:
+                worker.kill()
+            raise
         finally:
+            pool.shutdown(wait=True, cancel_futures=True)
             for worker in workers:
                 worker.close()
 
@@ -269,7 +279,14 @@ class _Run:
             self._told(name, stage, 0.0)
             floor = self.cases[_REPEAT].own_floor if _REPEAT in self.cases else None
             self.cases[name] = write_case(
-                self.out / name, name, self.subject, found, self.record, self.landmarks, floor
+                self.out / name,
+                name,
+                self.subject,
+                found,
+                self.record,
+                None if name == _REPEAT else self.landmarks,
+                floor,
+                is_repeat=name == _REPEAT,
             )
             self._told(name, stage, 1.0)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import FloatArray
+from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation import Deformation, RigidMotion
 from dvc.image import Image, LabelMap, Mask
 from dvc.imagewrite import write_image
@@ -18,7 +18,7 @@ from dvc.quality import NoiseFloor, Quality, assess, local_correlation, noise_fl
 from dvc.regions import region_statistics, write_regions_csv
 from dvc.registration import Registration
 from dvc.report import Picture, Section
-from dvc.resample import carry
+from dvc.resample import carry, shows
 from dvc.strainmaps import StrainMaps, strain_maps
 from dvc.transformwrite import write_elastix_transform, write_itk_transform
 from dvc.verdict import Verdict
@@ -39,7 +39,7 @@ class Case:
     verdict : Verdict
     shear : dict
         Region to (median, 95th percentile) of the maximal shear.
-    own_floor : NoiseFloor
+    own_floor : NoiseFloor or None
         What this case's strain amounts to as a noise floor; meaningful for a repeat scan only.
     """
 
@@ -47,12 +47,16 @@ class Case:
     section: Section
     verdict: Verdict
     shear: dict[str, tuple[float, float]]
-    own_floor: NoiseFloor
+    own_floor: NoiseFloor | None
 
-    def summary(self) -> str:
-        """One line for a person."""
+    def summary(self) -> list[str]:
+        """The verdict with its reasons and the strain, for a person."""
         shear = ", ".join(f"{region} {p50:.3f} / {p95:.3f}" for region, (p50, p95) in self.shear.items())
-        return f"{self.name}: {self.verdict.words}. Maximal shear, median / 95th percentile: {shear}"
+        return [
+            f"{self.name}: {self.verdict.words}.",
+            *(f"    {reason}" for reason in self.verdict.reasons),
+            f"    maximal shear, median / 95th percentile: {shear}",
+        ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,29 +89,39 @@ def write_case(
     record: Mapping[str, object],
     landmarks: tuple[FloatArray, FloatArray] | None,
     floor: NoiseFloor | None,
+    *,
+    is_repeat: bool,
 ) -> Case:
-    """Maps, quality and figures of a registered load; its folder is written whole or not at all."""
+    """Maps, quality and figures of a registered load; its folder is written whole or not at all.
+
+    A repeat scan is judged by its own noise floor.
+    """
     reference, loaded, motion = found.reference, found.loaded, found.alignment.motion
     grid = reference.grid
     measured = Measured(name, subject, found.tissue, found.deformation, motion)
-    maps = strain_maps(found.deformation, found.tissue, lambda x: loaded.grid.contains(motion.apply(x)))
+    edge = float(
+        found.bspline.control.spacing_mm.min()
+    )  # nearer to the scan's end, control points see half their tissue
+    maps = strain_maps(found.deformation, found.tissue, lambda x: shows(loaded, motion.apply(x), edge))
+    before = carry(loaded, grid)
     aligned = carry(loaded, grid, motion.apply)
     registered = carry(loaded, grid, lambda X: motion.apply(X + found.bspline.displacement(X)))
-    local, pooled = zip(
-        *(
-            local_correlation(reference, image, found.tissue)
-            for image in (carry(loaded, grid, order=1), aligned, registered)
-        ),
-        strict=True,
-    )
+    both = Mask(grid, found.tissue.inside & np.isfinite(aligned) & np.isfinite(registered))  # the same voxels for both
+    _, as_scanned = local_correlation(reference, before, found.tissue)
+    local_rigid, rigid = local_correlation(reference, aligned, both)
+    local_after, after = local_correlation(reference, registered, both)
+    if is_repeat:
+        floor = noise_floor(maps, _soft(measured))
     bone = found.bone if found.alignment.on == "bone" else None
     errors = None if landmarks is None else target_registration_error(found.total, *landmarks)
-    quality = assess(maps, found.tissue, bone, similarity=pooled, landmark_errors_mm=errors, floor=floor)
+    quality = assess(
+        maps, found.tissue, bone, similarity=(as_scanned, rigid, after), landmark_errors_mm=errors, floor=floor
+    )
     view = page.view_of(subject, maps)
     labels = _regions(measured)
     pictures = {
-        **page.agreement_pictures(view, reference, aligned, registered, local[1], local[2]),
-        **page.strain_pictures(view, subject, labels, maps, aligned),
+        **page.agreement_pictures(view, reference, aligned, registered, local_rigid, local_after),
+        **page.strain_pictures(view, subject, labels, maps, aligned, floor),
     }
 
     def more(partial: Path) -> None:
@@ -124,7 +138,7 @@ def write_measured(folder: Path, measured: Measured, record: Mapping[str, object
     maps = strain_maps(measured.deformation, measured.tissue)
     quality = assess(maps, measured.tissue, measured.subject.bone)
     view = page.view_of(measured.subject, maps)
-    pictures = page.strain_pictures(view, measured.subject, _regions(measured), maps, None)
+    pictures = page.strain_pictures(view, measured.subject, _regions(measured), maps, None, None)
     alignment = {
         "on": "bone" if measured.subject.bone is not None else "none",
         **_motion(measured.bone_motion),
@@ -168,8 +182,12 @@ def _written(
         (page.key_figures(quality, alignment), page.region_table(regions)),
         tuple(pictures.values()),
     )
-    soft = measured.tissue.inside if subject.bone is None else measured.tissue.inside & ~subject.bone.inside
-    return Case(measured.name, section, quality.verdict, shear, noise_floor(maps, soft))
+    return Case(measured.name, section, quality.verdict, shear, noise_floor(maps, _soft(measured)))
+
+
+def _soft(measured: Measured) -> BoolArray:
+    bone = measured.subject.bone
+    return measured.tissue.inside if bone is None else measured.tissue.inside & ~bone.inside
 
 
 def _regions(measured: Measured) -> LabelMap:

@@ -11,7 +11,7 @@ from dvc.deformation import Composed, Deformation, RigidMotion
 from dvc.displacementfile import read_displacement
 from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform
-from mrstrain.inputs import case_names, prepare_output, read_subject
+from mrstrain.inputs import case_names, make_output, read_subject, refuse_touching_inputs
 from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
 from mrstrain.results import Case, Measured, write_measured
@@ -28,7 +28,7 @@ class Strained:
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
-        return [self.case.summary(), f"Report: {self.out / 'report.html'}"]
+        return [*self.case.summary(), f"Report: {self.out / 'report.html'}"]
 
 
 def strain(
@@ -86,15 +86,23 @@ def strain(
         shear_direction=shear_direction,
     )
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"
-    prepare_output(target, [name], [source, *subject.files.values()])
+    refuse_touching_inputs(target, [name], [source, *subject.files.values()])
     whole: Deformation
     whole = read_transform(source) if source.suffix.lower() in _TRANSFORMS else read_displacement(source, frame=frame)
     motion = RigidMotion.identity() if subject.bone is None else motion_of(whole, subject.bone)
     relative = whole if subject.bone is None else Composed([whole, motion.inverse()])
+    make_output(target)
     record = provenance(
         "strain",
         {**subject.files, "deformation": source},
-        {"bone_label": bone_label, "frame": frame, "plate_normal_lps": subject.plate_normal.tolist()},
+        {
+            "bone_label": bone_label,
+            "frame": frame,
+            "plate_normal_lps": subject.plate_normal.tolist(),
+            "shear_direction_lps": None if shear_direction is None else list(shear_direction),
+            "mesh_unit": mesh_unit,
+            "mesh_frame": mesh_frame,
+        },
     )
     body = subject.tissue or tissue_mask(subject.reference)
     case = write_measured(target / name, Measured(name, subject, body, relative, motion), record)

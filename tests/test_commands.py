@@ -139,7 +139,7 @@ def test_quality_landmarks_noise_floor_and_verdict_are_told_everywhere(results, 
     assert told["noise_floor"]["maer"] > 0
     words = results.cases[0].verdict.words
     assert words in (study / "out" / "report.html").read_text()
-    assert words in results.summary()[0]
+    assert any(words in line for line in results.summary())
     assert told["verdict"]["level"] == results.cases[0].verdict.level
 
 
@@ -184,6 +184,7 @@ def test_strain_from_the_written_transform_gives_the_same_maps(results, study):
     both = np.isfinite(a) & np.isfinite(b)
     assert both.sum() > 50_000
     np.testing.assert_allclose(b[both], a[both], atol=2e-5)
+    assert again.case.verdict.level != "trust"  # no images were compared
     assert again.case.verdict.words in again.summary()[0]
 
 

@@ -40,7 +40,7 @@ def test_what_leaves_the_loaded_image_is_no_result_and_is_counted():
     assert quality.undefined_fraction == pytest.approx(share)
     assert 0.3 < share < 0.9
     assert quality.verdict.level == "distrust"
-    assert "leaves the loaded image" in quality.verdict.reasons[0]
+    assert any("not shown by the loaded image" in reason for reason in quality.verdict.reasons)
 
 
 def test_row_11_folding_is_found_with_its_place_and_not_trusted():
@@ -75,6 +75,17 @@ def test_a_bone_that_moves_costs_trust():
     quality = assess(shifted, WHOLE, core(), similarity=(0.3, 0.5, 0.9))
     assert quality.bone_shift_mm == pytest.approx(0.5, rel=1e-6)
     assert quality.verdict.level == "caution"
+
+
+def test_no_evidence_is_no_trust():
+    maps = strain_maps(STRETCH, core())
+    assert "No images" in assess(maps, core(), None).verdict.reasons[0]
+    elsewhere = np.zeros(GRID.shape, dtype=bool)
+    elsewhere[0, 0, 0] = True
+    quality = assess(maps, core(), Mask(GRID, elsewhere), similarity=(0.3, 0.5, 0.9))
+    assert quality.verdict.level == "caution"
+    assert "bone has no result" in quality.verdict.reasons[0]
+    assert noise_floor(maps, elsewhere) is None
 
 
 def test_landmarks_count_and_their_absence_is_told():

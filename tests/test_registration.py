@@ -17,6 +17,7 @@ from dvc.image import Grid, Image, Mask
 from dvc.kinematics import StrainField
 from dvc.presets import Preset, load_preset
 from dvc.registration import Settings, register
+from dvc.resample import carry, shows
 from dvc.shading import without_shading
 from phantoms.heel import heel_pair
 
@@ -211,17 +212,24 @@ def test_elastix_own_reason_is_told(small_pair, worker):
 
 
 def test_missing_voxels_are_left_out(small_pair, worker):
+    """A tenth of the bone is not shown: neither an edge for the rigid fit, nor a result there."""
+    grid, inside = small_pair.loaded.grid, small_pair.bone.points()
+    front = np.percentile(small_pair.foot_motion.apply(inside)[:, 1], 10.0)
     values = np.array(small_pair.loaded.values)
-    values[:, :, :6] = np.nan
-    found = register(
-        small_pair.reference,
-        Image(small_pair.loaded.grid, values),
-        bone=small_pair.bone,
-        settings=quick(),
-        worker=worker,
-    )
+    values[grid.points()[..., 1] < front] = np.nan
+    cut = Image(grid, values)
+    found = register(small_pair.reference, cut, bone=small_pair.bone, settings=quick(), worker=worker)
     assert rms_over(small_pair.bone, found.alignment.motion, small_pair.foot_motion) < 2 * COARSE_MM
     assert np.isfinite(found.bspline.coefficients_mm).all()
+    X = small_pair.bone.points()
+    assert 0.02 < 1.0 - shows(cut, found.alignment.motion.apply(X)).mean() < 0.2
+
+
+def test_stages_that_end_on_other_control_points_are_refused_first(small_pair):
+    preset = quick().presets[0]
+    other = replace(preset, parameters=preset.parameters | {"FinalGridSpacingInPhysicalUnits": ("5.0",)})
+    with pytest.raises(ParameterError, match="must be the same"):
+        register(small_pair.reference, small_pair.loaded, bone=small_pair.bone, settings=Settings((preset, other)))
 
 
 def test_progress_tells_stages_and_rises(small_pair, worker):
@@ -250,7 +258,6 @@ def test_the_motion_of_a_bone_is_taken_from_any_deformation(small_pair):
 def test_control_points_are_never_closer_than_two_voxels(small_pair, worker, caplog):
     """Thick slices: a spacing that the image cannot carry is widened, and that is told."""
     thick = Grid((64, 72, 14), np.array([1.6, 1.6, 8.0]), small_pair.reference.grid.origin_mm)
-    from dvc.resample import carry
 
     def slices(image: Image) -> Image:
         return Image(thick, np.nan_to_num(carry(image, thick, order=1)))

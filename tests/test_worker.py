@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+import time
 
 import pytest
 
@@ -47,3 +49,14 @@ def test_one_process_serves_many_tasks_with_the_threads_asked_for():
         second, _ = worker.run("asking", _process)
     assert first == second
     assert threads == "2"
+
+
+def test_a_worker_that_is_killed_from_outside_ends_its_task_at_once():
+    worker = Worker(threads=1)
+    worker.run("asking", _process)
+    began = time.monotonic()
+    threading.Timer(0.5, worker.kill).start()
+    with pytest.raises(WorkerError, match="sleeping"):
+        worker.run("sleeping", time.sleep, 60.0)
+    assert time.monotonic() - began < 20.0
+    worker.close()
