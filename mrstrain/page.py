@@ -204,13 +204,13 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
         for r in regions
         if r.quantity == "max_shear"
     ]
-    columns = ("region", "volume, mL", "with a result, %", "median", "p90", "p95", "p99")
-    above = tuple(f"mL above {t:g}" for t in SHEAR_THRESHOLDS)
+    columns = ("region", "volume, mL", "defined, %", "median", "p90", "p95", "p99")
+    above = tuple(f"> {t:g}, mL" for t in SHEAR_THRESHOLDS)
     return Table(
         "Maximal shear by region",
         columns + above,
         tuple(rows),
-        "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, at the voxels of the unloaded image.",
+        "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, at the unloaded image's voxels; volumes above a value.",
     )
 
 
