@@ -210,7 +210,7 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
         "Maximal shear by region",
         columns + above,
         tuple(rows),
-        "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, at the unloaded image's voxels; volumes above a value.",
+        "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, and volumes above a value.",
     )
 
 
