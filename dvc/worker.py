@@ -16,7 +16,7 @@ from concurrent.futures import TimeoutError as FutureTimeout
 from typing import Any, TypeVar
 
 from loky import ProcessPoolExecutor
-from loky.process_executor import TerminatedWorkerError
+from loky.process_executor import ShutdownExecutorError, TerminatedWorkerError
 
 from dvc.errors import WorkerError
 
@@ -68,7 +68,7 @@ class Worker:
                         raise  # the task itself timed out on something; not ours to hide
                     if watch is not None:
                         watch()
-                except TerminatedWorkerError as died:
+                except (TerminatedWorkerError, ShutdownExecutorError) as died:
                     self._executor.shutdown(wait=False, kill_workers=True)
                     self._executor = None
                     raise WorkerError(
@@ -117,7 +117,7 @@ def _end_with(parent: int) -> None:
         threading.Thread(target=watch, daemon=True).start()
 
 
-def _cause(died: TerminatedWorkerError) -> str:
+def _cause(died: BaseException) -> str:
     text = str(died)
     start, end = text.find("{"), text.rfind("}")
     return f"exit code {text[start + 1 : end]}" if 0 <= start < end else "exit code unknown"
