@@ -127,24 +127,23 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     settings = Settings.of("heel-mr", align_on="image", threads=usable_cores())
-    results: dict[str, object] = {"versions": versions()}
+    results: dict[str, object] = {"versions": versions(), "lung transforms": lung_transforms(given.data)}
+    print("lung transforms", json.dumps(results["lung transforms"], indent=1))
     with Worker(settings.threads) as worker:
         for name, run in (
-            ("leg repeat", repeat_of_leg),
-            ("water against fat", inverted_contrast),
             ("brain pair", brain_pair),
+            ("water against fat", inverted_contrast),
             ("knee DICOM, moved twin", knee_series),
+            ("leg repeat", repeat_of_leg),
         ):
             try:
                 results[name] = run(given.data, worker, settings)
             except MrstrainError as failure:
                 results[name] = {"failed": str(failure)}
             print(name, json.dumps(results[name], indent=1), flush=True)
-    results["lung transforms"] = lung_transforms(given.data)
-    print("lung transforms", json.dumps(results["lung transforms"], indent=1))
-    if given.out is not None:
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        given.out.write_text(json.dumps(results, indent=1) + "\n")
+            if given.out is not None:
+                given.out.parent.mkdir(parents=True, exist_ok=True)
+                given.out.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":
