@@ -3,8 +3,8 @@
 First a search that cannot be trapped: the bone is laid at every place of the loaded image in many
 orientations, at low resolution, and normalised correlation is taken by FFT (masked template matching; see
 D. Padfield, Masked object registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Then
-elastix refines the best places; the best of these is kept, refined twice more with other random samples, and the
-spread of the two is the alignment's own measure of how well it repeats.
+elastix refines the best places; the best of these is kept and refined once more with other random samples. The motion
+midway between the two is the result, and their spread the alignment's own measure of how well it repeats.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ _CANDIDATES = 3
 _SCORE_MARGIN_MM = 2.0
 _SCORE_BLUR_MM = 1.0
 _LOWEST_SIMILARITY = 0.5
+_CERTAIN_SIMILARITY = 0.9
 _LARGEST_SPREAD_MM = 0.5
 _LEAST_COVERED = 0.75
 _INVERTED_TRIES = 7
@@ -106,21 +107,22 @@ def align(reference: Image, loaded: Image, mask: Mask, fit: RigidFit, *, on: Ali
         score = _similarity(reference, loaded, mask, motion)
         if np.isfinite(score):
             candidates.append((score, motion))
+        if score >= _CERTAIN_SIMILARITY:
+            break  # only the right place looks like this
     before = _similarity(reference, loaded, mask, RigidMotion.identity())
     score, motion = max(candidates, key=lambda c: c[0], default=(float("nan"), RigidMotion.identity()))
     if not score >= _LOWEST_SIMILARITY:
         raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
     again = _refine(reference, loaded, mask, motion, fit, seed + 1)
-    third = _refine(reference, loaded, mask, motion, fit, seed + 2)
     points = mask.points()
-    spread = float(np.sqrt(np.mean(np.sum((again.apply(points) - third.apply(points)) ** 2, axis=1))))
+    spread = float(np.sqrt(np.mean(np.sum((again.apply(points) - motion.apply(points)) ** 2, axis=1))))
     if not spread <= _LARGEST_SPREAD_MM:
         raise RegistrationError(
             f"Two rigid fits on the {on} differ by {spread:.2f} mm (at most {_LARGEST_SPREAD_MM} is accepted): the "
             f"{on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly "
             "inside the loaded one."
         )
-    motion = _midway(again, third, points.mean(axis=0))
+    motion = _midway(again, motion, points.mean(axis=0))
     centroid = points.mean(axis=0)[None]
     return Alignment(
         motion,

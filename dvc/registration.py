@@ -241,7 +241,7 @@ def _align(
 
 
 def _seeds(settings: Settings) -> list[int]:
-    """Independent seeds: of the rigid fits (three in a row are used), then of each non-rigid stage."""
+    """Independent seeds: of the rigid fits (two in a row are used), then of each non-rigid stage."""
     drawn = np.random.SeedSequence(settings.seed).generate_state(1 + len(settings.presets))
     return [int(s) % 2**30 + 1 for s in drawn]
 
