@@ -179,6 +179,13 @@ class Grid:
         """The grid carried by the rigid motion x -> rotation @ x + translation_mm."""
         return replace(self, origin_mm=rotation @ self.origin_mm + translation_mm, direction=rotation @ self.direction)
 
+    def part(self, box: tuple[slice, slice, slice]) -> Grid:
+        """The grid of a box of voxels, given by slices without a step."""
+        bounds = [cut.indices(n)[:2] for cut, n in zip(box, self.shape, strict=True)]
+        start = np.array([low for low, _ in bounds], dtype=np.float64)
+        ni, nj, nk = (high - low for low, high in bounds)
+        return Grid((ni, nj, nk), self.spacing_mm, self.points_at(start), self.direction)
+
     def __str__(self) -> str:
         """Shape, spacing and bounding box, for messages."""
         low, high = self.bounds_mm()

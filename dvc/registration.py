@@ -35,6 +35,7 @@ Progress = Callable[[str, float], None]
 _log = logging.getLogger("dvc.registration")
 
 _MASK_MARGIN_MM = 3.0
+_CROP_VOXELS = 4
 _LEAST_VOXELS = 2.0
 
 
@@ -252,6 +253,16 @@ def _without_gaps(image: Image) -> tuple[Image, Mask | None]:
     return fill_missing(image), Mask(image.grid, ~missing) if missing.any() else None
 
 
+def _cropped(image: Image, mask: Mask) -> tuple[Image, Mask]:
+    """Both cut to the mask's box and a few voxels around: control points in empty air cost time and find nothing."""
+    found = np.argwhere(mask.inside)
+    low = np.maximum(found.min(axis=0) - _CROP_VOXELS, 0)
+    high = np.minimum(found.max(axis=0) + 1 + _CROP_VOXELS, mask.inside.shape)
+    i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    grid = image.grid.part((i, j, k))
+    return Image(grid, image.values[i, j, k]), Mask(grid, mask.inside[i, j, k])
+
+
 def _refuse_other_spacing(presets: tuple[Preset, ...]) -> None:
     """Stages add their coefficients up, so their control points must be the same."""
     name = "FinalGridSpacingInPhysicalUnits"
@@ -302,6 +313,7 @@ def _nonrigid(
     moved_grid = loaded.grid.moved_by(back.rotation, back.translation_mm)
     moving, moving_mask = _without_gaps(Image(moved_grid, loaded.values))
     mask = Mask(reference.grid, widened(body, _MASK_MARGIN_MM).inside & ~reference.missing)
+    fixed, mask = _cropped(fixed, mask)
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
         initial = None
         if start is not None:

@@ -69,7 +69,7 @@ def strain_maps(
         where = mask.inside[slab]
         if not where.any():
             continue
-        part = Grid(where.shape, grid.spacing_mm, grid.points_at(np.array([float(start), 0.0, 0.0])), grid.direction)
+        part = grid.part((slab, slice(None), slice(None)))
         u, H = evaluate_on_grid(deformation, part, where)
         strain = StrainField.from_gradient(H)
         known = strain.valid & np.isfinite(u).all(axis=1)

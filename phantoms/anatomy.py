@@ -19,12 +19,13 @@ from phantoms.motions import EllipsoidUnion, distance
 TISSUES: Mapping[int, str] = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "ankle"}
 """Label numbers and names. "bone" is the calcaneus; "ankle" is the other bones, at rest with it."""
 
-FAT_SIGNAL = 735.0
+FAT_SIGNAL = 675.0
 """Mean signal of fat with its septa, arbitrary units: the level that SNR refers to."""
 
 _BONE, _FAT, _MUSCLE, _SKIN, _TENDON, _ANKLE = 1, 2, 3, 4, 5, 6
 _LOBULE_SIGNAL, _MARROW_SIGNAL, _MUSCLE_SIGNAL, _SKIN_SIGNAL = 900.0, 760.0, 400.0, 300.0
 _TENDON_SIGNAL, _CORTEX_SIGNAL = 110.0, 60.0
+_EDGE_MM = 0.6  # tissues blend over this far to either side of a border, so that samples every 0.4 mm see all of it
 
 # Centre (mm), semi-axes (mm), turns about x, y, z (degrees).
 _CALCANEUS = (
@@ -144,10 +145,10 @@ class Heel:
     def intensity_at(self, points_mm: FloatArray) -> FloatArray:
         """Noise-free signal (n,) at points (n, 3) LPS mm; air is 0."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        return np.asarray(_signals(points, np.zeros((1, 3, 3)), 1, self._parameters()))
+        return np.asarray(_signals(points, np.zeros((1, 3, 3)), 1, self._parameters()))[:, 0]
 
-    def voxel_intensity(self, points_mm: FloatArray, axes_mm: FloatArray) -> FloatArray:
-        """Mean noise-free signal (n,) of voxels: eight samples at a quarter of each axis around the centre.
+    def octant_intensity(self, points_mm: FloatArray, axes_mm: FloatArray) -> FloatArray:
+        """Noise-free signal (n, 2, 2, 2) at a quarter of each edge before and behind the centres of voxels.
 
         Parameters
         ----------
@@ -159,7 +160,7 @@ class Heel:
         """
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         axes = np.ascontiguousarray(axes_mm, dtype=np.float64).reshape(-1, 3, 3)
-        return np.asarray(_signals(points, axes, 8, self._parameters()))
+        return np.asarray(_signals(points, axes, 8, self._parameters())).reshape(-1, 2, 2, 2)
 
 
 @njit(cache=True)
@@ -214,93 +215,132 @@ def _lobule(x, y, z, salt):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _tissue(x, y, z, heel):  # type: ignore[no-untyped-def]
-    """Label at a point, and the distance to the nearest bone's surface (mm) where the label needs it."""
-    numbers, k, bone_c, bone_f, ankle_c, ankle_f, muscle_c, muscle_f, out_c, out_f = heel
-    depth = -distance(x, y, z, out_c, out_f, k[3])
-    if depth <= 0.0:
-        return 0, 0.0
-    if depth <= numbers[0]:
-        return _SKIN, 0.0
-    d = distance(x, y, z, bone_c, bone_f, k[0])
-    if d <= 0.0:
-        return _BONE, d
-    d = min(d, distance(x, y, z, ankle_c, ankle_f, k[1]))
-    if d <= 0.0:
-        return _ANKLE, d
+def _depths(x, y, z, heel):  # type: ignore[no-untyped-def]
+    """Depth of a point below the surface (mm) of the foot, of bone, ankle, tendon and muscle; negative outside."""
+    _, k, bone_c, bone_f, ankle_c, ankle_f, muscle_c, muscle_f, out_c, out_f = heel
+    foot = -distance(x, y, z, out_c, out_f, k[3])
+    if foot <= -_EDGE_MM:
+        return foot, -1e3, -1e3, -1e3, -1e3
+    bone = -distance(x, y, z, bone_c, bone_f, k[0])
+    ankle = -distance(x, y, z, ankle_c, ankle_f, k[1])
     # Achilles tendon: a flat band down to the back of the tuberosity
     behind = 31.5 + 0.05 * max(z, 0.0)
-    if z > -4.0 and (x / (6.0 + 4.0 * np.exp(-(((z - 2.0) / 9.0) ** 2)))) ** 2 + ((y - behind) / 2.6) ** 2 <= 1.0:
-        return _TENDON, d
+    wide = 6.0 + 4.0 * np.exp(-(((z - 2.0) / 9.0) ** 2))
+    achilles = min(2.6 * (1.0 - np.sqrt((x / wide) ** 2 + ((y - behind) / 2.6) ** 2)), z + 4.0)
     # plantar aponeurosis: a sheet under the short flexor, from the medial process forward
-    sheet = -30.2 + 0.13 * (y + 36.0) + 0.006 * (x - 4.0) ** 2
-    if y < 18.0 and abs(x - 4.0) < 11.0 and sheet - 1.8 < z < sheet:
-        return _TENDON, d
-    m = distance(x, y, z, muscle_c, muscle_f, k[2])
-    if m <= 0.0:
-        return _MUSCLE, d
-    return _FAT, d
+    below = -30.2 + 0.13 * (y + 36.0) + 0.006 * (x - 4.0) ** 2 - z
+    sheet = min(below, 1.8 - below, 18.0 - y, 11.0 - abs(x - 4.0))
+    muscle = -distance(x, y, z, muscle_c, muscle_f, k[2])
+    return foot, bone, ankle, max(achilles, sheet), muscle
+
+
+@njit(cache=True)
+def _tissue(x, y, z, heel):  # type: ignore[no-untyped-def]
+    foot, bone, ankle, tendon, muscle = _depths(x, y, z, heel)
+    if foot <= 0.0:
+        return 0
+    if foot <= heel[0][0]:
+        return _SKIN
+    if bone >= 0.0:
+        return _BONE
+    if ankle >= 0.0:
+        return _ANKLE
+    if tendon > 0.0:
+        return _TENDON
+    if muscle >= 0.0:
+        return _MUSCLE
+    return _FAT
+
+
+@njit(cache=True)
+def _share(depth):  # type: ignore[no-untyped-def]
+    """Share of a body at a depth below its surface: 0 outside, 1 inside, and a smooth edge between."""
+    t = min(1.0, max(0.0, 0.5 + 0.5 * depth / _EDGE_MM))
+    return t * t * (3.0 - 2.0 * t)
 
 
 @njit(cache=True)
 def _signal(x, y, z, heel):  # type: ignore[no-untyped-def]
-    tissue, d = _tissue(x, y, z, heel)
+    """Signals of the tissues at a point by their shares, from the outermost body to the innermost."""
+    foot, bone, ankle, tendon, muscle = _depths(x, y, z, heel)
     numbers = heel[0]
     salt = 16 * int(numbers[3])
-    if tissue == 0:
+    left = _share(foot)
+    if left == 0.0:
         return 0.0
     fine = _noise(x / 1.7, y / 1.7, z / 1.7, salt)
-    if tissue == _SKIN:
+    total = 0.0
+    share = left * _share(numbers[0] - foot)
+    if share > 0.0:
         patch = _noise(x / 4.5, y / 4.5, z / 4.5, salt + 11)  # pores, creases and vessels
-        return _SKIN_SIGNAL * (1.0 + 0.18 * fine + 0.3 * patch)
-    if tissue in (_BONE, _ANKLE):
-        if d > -numbers[1]:
-            return _CORTEX_SIGNAL * (1.0 + 0.2 * fine)
-        coarse = _noise(x / 4.5, y / 4.5, z / 4.5, salt + 1)
-        # trabeculae: thin dark sheets where a lattice noise passes through zero
-        beam = np.exp(-((_noise(x / 2.3, y / 2.3, z / 2.3, salt + 2) / 0.25) ** 2))
-        rise = 1.0 - 0.35 * np.exp((d + numbers[1]) / 1.5)
-        return _MARROW_SIGNAL * rise * (1.0 + 0.08 * coarse + 0.06 * fine - 0.16 * beam)
-    if tissue == _TENDON:
-        return _TENDON_SIGNAL * (1.0 + 0.35 * _noise(x / 1.5, y / 5.0, z / 5.0, salt + 3))
-    if tissue == _MUSCLE:
+        total += share * _SKIN_SIGNAL * (1.0 + 0.25 * fine + 0.4 * patch)
+        left -= share
+    for depth in (bone, ankle):
+        share = left * _share(depth)
+        if share > 0.0:
+            marrow = _share(depth - numbers[1])
+            total += share * (1.0 - marrow) * _CORTEX_SIGNAL * (1.0 + 0.2 * fine)
+            total += share * marrow * _marrow(x, y, z, depth - numbers[1], fine, salt)
+            left -= share
+    share = left * _share(tendon)
+    if share > 0.0:
+        total += share * _TENDON_SIGNAL * (1.0 + 0.35 * _noise(x / 1.5, y / 5.0, z / 5.0, salt + 3))
+        left -= share
+    share = left * _share(muscle)
+    if share > 0.0:
         fibre = _noise(x / 1.9, y / 9.0, z / 1.9, salt + 4)
         streak = max(0.0, _noise(x / 3.3, y / 14.0, z / 3.3, salt + 5) - 0.45)
-        return _MUSCLE_SIGNAL * (1.0 + 0.16 * fibre + 0.08 * fine + 1.3 * streak)
-    # fat: lobules, taller than wide, between fibrous septa of varying strength; fainter ones inside each
-    wide = numbers[2]
+        total += share * _MUSCLE_SIGNAL * (1.0 + 0.22 * fibre + 0.14 * fine + 1.6 * streak)
+        left -= share
+    if left > 0.0:
+        total += left * _fat(x, y, z, numbers[2], fine, salt)
+    return total
+
+
+@njit(cache=True)
+def _marrow(x, y, z, depth, fine, salt):  # type: ignore[no-untyped-def]
+    coarse = _noise(x / 4.5, y / 4.5, z / 4.5, salt + 1)
+    # trabeculae: dark sheets where a lattice noise passes through zero
+    beam = np.exp(-((_noise(x / 2.8, y / 2.8, z / 2.8, salt + 2) / 0.35) ** 2))
+    rise = 1.0 - 0.35 * np.exp(-max(depth, 0.0) / 1.5)
+    return _MARROW_SIGNAL * rise * (1.0 + 0.12 * coarse + 0.1 * fine - 0.22 * beam)
+
+
+@njit(cache=True)
+def _fat(x, y, z, wide, fine, salt):  # type: ignore[no-untyped-def]
+    """Lobules, taller than wide, between fibrous septa of varying strength; fainter ones inside each."""
     bent = 0.15 * wide * _noise(x / 8.0, y / 8.0, z / 8.0, salt + 6)
     wavy = 0.08 * wide * _noise(x / 2.7, y / 2.7, z / 2.7, salt + 8)
     u, v, w = (x + bent + wavy) / wide, (y - bent + wavy) / wide, (z + wavy) / (1.5 * wide)
     border, own = _lobule(u, v, w, salt + 7)
-    strength = 0.42 + 0.26 * _noise(x / 5.0, y / 5.0, z / 5.0, salt + 9)
-    septum = strength * np.exp(-((border * wide / 0.5) ** 2))
+    strength = 0.5 + 0.26 * _noise(x / 5.0, y / 5.0, z / 5.0, salt + 9)
+    wall = np.exp(-((border * wide / 0.5) ** 2))
     border, part = _lobule(2.1 * u, 2.1 * v, 2.1 * w, salt + 10)
-    septum = max(septum, 0.16 * np.exp(-((border * wide / 0.9) ** 2)))
-    return _LOBULE_SIGNAL * (1.0 + 0.07 * (own - 0.5) + 0.05 * (part - 0.5) + 0.05 * fine) * (1.0 - septum)
+    thin = np.exp(-((border * wide / 0.9) ** 2))
+    # each lobule has a level of its own, which ends at its wall
+    level = 1.0 + 0.12 * (own - 0.5) * (1.0 - wall) + 0.1 * (part - 0.5) * (1.0 - thin) + 0.08 * fine
+    return _LOBULE_SIGNAL * level * (1.0 - max(strength * wall, 0.24 * thin))
 
 
 @njit(parallel=True, cache=True)
 def _tissues(points, heel):  # type: ignore[no-untyped-def]
     out = np.empty(points.shape[0], dtype=np.int64)
     for n in prange(points.shape[0]):
-        out[n] = _tissue(points[n, 0], points[n, 1], points[n, 2], heel)[0]
+        out[n] = _tissue(points[n, 0], points[n, 1], points[n, 2], heel)
     return out
 
 
 @njit(parallel=True, cache=True)
 def _signals(points, axes, samples, heel):  # type: ignore[no-untyped-def]
-    out = np.empty(points.shape[0])
+    out = np.empty((points.shape[0], samples))
     for n in prange(points.shape[0]):
         a = axes[n] if axes.shape[0] > 1 else axes[0]
-        total = 0.0
         for m in range(samples):
-            s = 0.25 if m & 1 else -0.25
+            s = 0.25 if m & 4 else -0.25
             t = 0.25 if m & 2 else -0.25
-            w = 0.25 if m & 4 else -0.25
+            w = 0.25 if m & 1 else -0.25
             x = points[n, 0] + s * a[0, 0] + t * a[0, 1] + w * a[0, 2]
             y = points[n, 1] + s * a[1, 0] + t * a[1, 1] + w * a[1, 2]
             z = points[n, 2] + s * a[2, 0] + t * a[2, 1] + w * a[2, 2]
-            total += _signal(x, y, z, heel)
-        out[n] = total / samples
+            out[n, m] = _signal(x, y, z, heel)
     return out

@@ -13,11 +13,11 @@ from dvc.deformation import RigidMotion
 from dvc.errors import InputError
 from dvc.image import Grid, Image, LabelMap, Mask
 from phantoms.anatomy import FAT_SIGNAL, TISSUES, Heel
-from phantoms.motions import Flow
+from phantoms.motions import EllipsoidUnion, Flow
 from phantoms.mri import acquire
 
-_PRESS_MM = 6.2
-_SHEAR_MM = 3.0
+_PRESS_MM = 7.5
+_SHEAR_MM = 5.0
 _CENTRE_MM = np.array([0.0, 0.0, -6.0])
 _MARGIN_MM = 4.0
 _CHUNK = 300_000
@@ -77,7 +77,7 @@ def heel_pair(
     snr : float or None
         Fat's signal over the noise's standard deviation; None for no noise.
     load : float
-        Factor on the plate's motion; 1 is a press of 6.2 mm with a shear of 3 mm forward.
+        Factor on the plate's motion; 1 is a press of 7.5 mm with a shear of 5 mm forward.
     foot_motion : RigidMotion
         Of the whole foot between scans; a few degrees and mm by default.
     loaded_grid : Grid
@@ -102,7 +102,7 @@ def heel_pair(
 
     def scanned(number: int, where: Grid, truth: Flow, moved: RigidMotion) -> Image:
         noise, bias = (int(s) for s in np.random.SeedSequence([seed, 2, number]).generate_state(2))
-        signal = loaded_voxels(heel, truth, moved, where)
+        signal = loaded_octants(heel, truth, moved, where)
         return acquire(signal, where, snr=snr, reference_signal=FAT_SIGNAL, seed=noise, bias_seed=bias)
 
     still = pressed(heel, 0.0)
@@ -125,14 +125,15 @@ def default_motion() -> RigidMotion:
 
 def pressed(heel: Heel, load: float = 1.0) -> Flow:
     """Return the flow of a heel under a plate moving up and forward, its bones at rest; load scales it."""
-    plate = load * np.array([0.0, -_SHEAR_MM, _PRESS_MM])
+    bones = heel.skeleton
     return Flow(
-        plate,
-        pivot_mm=np.array([0.0, 3.0, -57.5]),
-        rest=heel.skeleton,
-        ramp=1.16,
-        fade_up_mm=(-34.5, 28.0),
-        fade_front_mm=(-98.0, -9.0),
+        load * np.array([0.0, -_SHEAR_MM, _PRESS_MM]),
+        pivot_mm=np.array([0.0, 15.0, -47.0]),
+        # merged softly, which makes the body larger: the bones stay inside, and motion rises around them smoothly
+        rest=EllipsoidUnion(bones.centres_mm, bones.forms, sharpness=1.25),
+        ramp=1.0,
+        centre_mm=np.array([0.0, 14.0, -50.0]),
+        width_mm=np.array([51.0, 58.0, 31.0]),
     )
 
 
@@ -167,22 +168,22 @@ def _covering(grid: Grid, points_mm: FloatArray) -> Grid:
     return Grid((i, j, k), grid.spacing_mm, grid.points_at(-before.astype(np.float64)), grid.direction)
 
 
-def loaded_voxels(heel: Heel, flow: Flow, motion: RigidMotion, grid: Grid) -> FloatArray:
-    """Voxel means of the heel's signal on the grid, after the flow and then the rigid motion.
+def loaded_octants(heel: Heel, flow: Flow, motion: RigidMotion, grid: Grid) -> FloatArray:
+    """The heel's signal in the octants of a grid's voxels, (ni, nj, nk, 2, 2, 2), after flow and rigid motion.
 
-    Each voxel's centre is carried back exactly; its samples are spread along the edges that the voxel has
+    Each voxel's centre is carried back exactly; its octants are spread along the edges that the voxel has
     there, which to first order are columns of F^-1 R^T times the spacing.
     """
     back, home = flow.inverse(), motion.inverse()
     edges = home.rotation @ (np.asarray(grid.direction) * grid.spacing_mm)
     centres = home.apply(grid.points().reshape(-1, 3))
-    out = np.zeros(len(centres))
-    # further out all is air, before and after: no tissue moves by 1.6 times the plate's displacement
-    reach = 1.6 * float(np.linalg.norm(flow.plate_mm)) + 2.0
+    out = np.zeros((len(centres), 2, 2, 2))
+    # further out all is air, before and after: no tissue moves by 1.2 times the plate's displacement
+    reach = 1.2 * float(np.linalg.norm(flow.plate_mm)) + 2.0
     near = np.flatnonzero(heel.outline.distance(centres) < reach)
     for start in range(0, len(near), _CHUNK):
         some = near[start : start + _CHUNK]
         X = centres[some]
         u, H = back.evaluate(X)
-        out[some] = heel.voxel_intensity(X + u, (H + np.eye(3)) @ edges)
-    return out.reshape(grid.shape)
+        out[some] = heel.octant_intensity(X + u, (H + np.eye(3)) @ edges)
+    return out.reshape(*grid.shape, 2, 2, 2)

@@ -124,31 +124,17 @@ def _distances(points, centres, forms, sharpness):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _step(t):  # type: ignore[no-untyped-def]
-    """Rise from 0 at t = 0 to 1 at t = 1 with three continuous derivatives; value and two derivatives."""
-    if t <= 0.0:
-        return 0.0, 0.0, 0.0
-    if t >= 1.0:
-        return 1.0, 0.0, 0.0
-    value = t**4 * (35.0 - 84.0 * t + 70.0 * t * t - 20.0 * t**3)
-    slope = 140.0 * (t * (1.0 - t)) ** 3
-    bend = 420.0 * (t * (1.0 - t)) ** 2 * (1.0 - 2.0 * t)
-    return value, slope, bend
-
-
-@njit(cache=True)
-def _velocity(p, centres, forms, sharpness, ramp, fades, plate, pivot, v, L, g, H, q):  # type: ignore[no-untyped-def]
+def _velocity(p, centres, forms, sharpness, ramp, window, plate, pivot, v, L, g, H, q):  # type: ignore[no-untyped-def]
     """Write the velocity at p into v and its gradient into L; g, H and q are room to work in."""
     v[:] = 0.0
     L[:, :] = 0.0
-    up = fades[0, 1] - fades[0, 0]
-    front = fades[1, 1] - fades[1, 0]
-    wz, wz1, wz2 = _step((fades[0, 1] - p[2]) / up)
-    wy, wy1, wy2 = _step((p[1] - fades[1, 0]) / front)
-    if wz == 0.0 or wy == 0.0:
+    # The window w = exp(-s / 2), its gradient w * e, its Hessian w * (e e^T - diag(f)).
+    f0, f1, f2 = window[1, 0] ** -2, window[1, 1] ** -2, window[1, 2] ** -2
+    e0, e1, e2 = (window[0, 0] - p[0]) * f0, (window[0, 1] - p[1]) * f1, (window[0, 2] - p[2]) * f2
+    s = e0 * e0 / f0 + e1 * e1 / f1 + e2 * e2 / f2
+    if s > 80.0:
         return
-    wz1, wz2 = -wz1 / up, wz2 / (up * up)
-    wy1, wy2 = wy1 / front, wy2 / (front * front)
+    w = np.exp(-0.5 * s)
 
     count = centres.shape[0]
     least = 1e300
@@ -214,19 +200,17 @@ def _velocity(p, centres, forms, sharpness, ramp, fades, plate, pivot, v, L, g, 
         g[:] = 0.0
         H[:, :] = 0.0
 
-    # psi = chi wy wz
-    w = wy * wz
-    e1, e2 = wy1 * wz, wy * wz1
-    H[0, 0] = w * H[0, 0]
-    H[0, 1] = w * H[0, 1] + g[0] * e1
-    H[0, 2] = w * H[0, 2] + g[0] * e2
-    H[1, 1] = w * H[1, 1] + 2.0 * g[1] * e1 + chi * wy2 * wz
-    H[1, 2] = w * H[1, 2] + g[1] * e2 + g[2] * e1 + chi * wy1 * wz1
-    H[2, 2] = w * H[2, 2] + 2.0 * g[2] * e2 + chi * wy * wz2
+    # psi = chi w
+    H[0, 0] = w * (H[0, 0] + 2.0 * g[0] * e0 + chi * (e0 * e0 - f0))
+    H[1, 1] = w * (H[1, 1] + 2.0 * g[1] * e1 + chi * (e1 * e1 - f1))
+    H[2, 2] = w * (H[2, 2] + 2.0 * g[2] * e2 + chi * (e2 * e2 - f2))
+    H[0, 1] = w * (H[0, 1] + g[0] * e1 + g[1] * e0 + chi * e0 * e1)
+    H[0, 2] = w * (H[0, 2] + g[0] * e2 + g[2] * e0 + chi * e0 * e2)
+    H[1, 2] = w * (H[1, 2] + g[1] * e2 + g[2] * e1 + chi * e1 * e2)
     H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
-    g[0] = w * g[0]
-    g[1] = w * g[1] + chi * e1
-    g[2] = w * g[2] + chi * e2
+    g[0] = w * (g[0] + chi * e0)
+    g[1] = w * (g[1] + chi * e1)
+    g[2] = w * (g[2] + chi * e2)
     psi = chi * w
 
     r0, r1, r2 = p[0] - pivot[0], p[1] - pivot[1], p[2] - pivot[2]
@@ -243,7 +227,7 @@ def _velocity(p, centres, forms, sharpness, ramp, fades, plate, pivot, v, L, g, 
 
 
 @njit(parallel=True, cache=True)
-def _carry(points, centres, forms, sharpness, ramp, fades, plate, pivot, steps, gradient):  # type: ignore[no-untyped-def]
+def _carry(points, centres, forms, sharpness, ramp, window, plate, pivot, steps, gradient):  # type: ignore[no-untyped-def]
     """Runge-Kutta 4 on x' = v(x) and, with it, on (F - I)' = grad v F."""
     count = points.shape[0]
     u = np.zeros((count, 3))
@@ -269,7 +253,7 @@ def _carry(points, centres, forms, sharpness, ramp, fades, plate, pivot, steps, 
                         for i in range(3):
                             for j in range(3):
                                 M[i, j] = F1[n, i, j] + nodes[stage] * K[i, j]
-                    _velocity(p, centres, forms, sharpness, ramp, fades, plate, pivot, v, L, g, H, q)
+                    _velocity(p, centres, forms, sharpness, ramp, window, plate, pivot, v, L, g, H, q)
                     for i in range(3):
                         du[i] += shares[stage] * v[i]
                         moving = moving or v[i] != 0.0
@@ -298,8 +282,8 @@ class Flow:
         v = psi c + [c (grad psi . r) - r (grad psi . c)] / 2,   r = x - o,
 
     so that div v = 0 exactly, v = c where psi = 1 and v = 0 where psi = 0. psi is the product of a cutoff
-    that is 0 in the body at rest and rises as 1 - exp(-t^3), t = (sqrt(Q) - 1) / ramp, outside it, and of two
-    smooth steps that end the motion upward and forward. Points follow v for one unit of time by
+    that is 0 in the body at rest and rises as 1 - exp(-t^3), t = (sqrt(Q) - 1) / ramp, outside it, and of a
+    Gaussian window around the sole, which ends the motion upward and forward. Points follow v for one unit of time by
     Runge-Kutta 4 with fixed steps; F follows dF/dt = (grad v) F by the same scheme, which makes it the
     derivative of the discrete map itself.
 
@@ -313,45 +297,42 @@ class Flow:
         The body that does not move.
     ramp : float
         Thickness of the layer over which motion rises from the body, in units of the body's radius.
-    fade_up_mm : (2,)
-        z below which motion is full and z above which there is none.
-    fade_front_mm : (2,)
-        y before (anterior of) which there is no motion and y behind which it is full.
+    centre_mm, width_mm : (3,)
+        Of the window, LPS mm: its middle, and its standard deviation along each axis.
     steps : int
         Runge-Kutta steps.
 
     Raises
     ------
     InputError
-        If a number is not finite, a fade is not increasing, or ramp or steps are not positive.
+        If a number is not finite, or the widths, the ramp or the steps are not positive.
     """
 
     plate_mm: FloatArray
     pivot_mm: FloatArray
     rest: EllipsoidUnion
     ramp: float
-    fade_up_mm: tuple[float, float]
-    fade_front_mm: tuple[float, float]
-    steps: int = 20
+    centre_mm: FloatArray
+    width_mm: FloatArray
+    steps: int = 10
 
     def __post_init__(self) -> None:
-        plate, pivot = frozen(self.plate_mm, np.float64), frozen(self.pivot_mm, np.float64)
-        if plate.shape != (3,) or pivot.shape != (3,) or not np.isfinite([plate, pivot]).all():
-            raise InputError("A flow's plate motion and pivot need three finite components each, mm.")
-        for name, (low, high) in (("fade_up_mm", self.fade_up_mm), ("fade_front_mm", self.fade_front_mm)):
-            if not low < high:
-                raise InputError(f"{name} must increase; got {low} to {high}.")
+        for name in ("plate_mm", "pivot_mm", "centre_mm", "width_mm"):
+            vector = frozen(getattr(self, name), np.float64)
+            if vector.shape != (3,) or not np.isfinite(vector).all():
+                raise InputError(f"A flow's {name} needs three finite components; got {vector.tolist()}.")
+            object.__setattr__(self, name, vector)
+        if not (self.width_mm > 0).all():
+            raise InputError(f"A flow's width_mm must be positive; got {self.width_mm.tolist()}.")
         if not self.ramp > 0 or self.steps < 1:
             raise InputError(f"A flow needs ramp > 0 and steps >= 1; got {self.ramp} and {self.steps}.")
-        object.__setattr__(self, "plate_mm", plate)
-        object.__setattr__(self, "pivot_mm", pivot)
 
     def _follow(self, points_mm: FloatArray, gradient: bool) -> tuple[FloatArray, FloatArray]:
         points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 3)
-        fades = np.array([self.fade_up_mm, self.fade_front_mm], dtype=np.float64)
+        window = np.array([self.centre_mm, self.width_mm])
         body = self.rest
         u, H = _carry(
-            points, body.centres_mm, body.forms, body.sharpness, self.ramp, fades,
+            points, body.centres_mm, body.forms, body.sharpness, self.ramp, window,
             self.plate_mm, self.pivot_mm, self.steps, gradient,
         )  # fmt: skip
         lost = ~np.isfinite(points).all(axis=-1)

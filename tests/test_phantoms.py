@@ -15,7 +15,7 @@ from dvc.deformation import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.image import Grid, Image
 from phantoms.anatomy import FAT_SIGNAL, TISSUES, Heel
-from phantoms.heel import HeelPair, default_motion, heel_pair, loaded_signal, loaded_voxels, pressed
+from phantoms.heel import HeelPair, default_motion, heel_pair, loaded_octants, loaded_signal, pressed
 from phantoms.motions import EllipsoidUnion, Flow
 from phantoms.mri import acquire, sensitivity
 
@@ -109,17 +109,17 @@ def test_motion_rises_smoothly_from_the_bone(heel: Heel) -> None:
     assert away[0] < 0
     assert away[-1] > 6
     moved = np.linalg.norm(pressed(heel).displacement(ray), axis=1)
-    assert np.all(np.diff(moved[away > 0]) > 0)
+    assert np.all(np.diff(moved) >= 0)
     assert moved[away < 0.1].max() < 1e-2
     assert moved[-1] > 1.0
 
 
 @pytest.mark.parametrize("load", [0.5, 1.5])
 def test_nothing_moves_further_than_images_allow_for(heel: Heel, tissue_points: np.ndarray, load: float) -> None:
-    """Images leave out air beyond 1.6 times the plate's displacement; tissue must not get there."""
+    """Images leave out air beyond 1.2 times the plate's displacement; tissue must not get there."""
     flow = pressed(heel, load)
     moved = np.linalg.norm(flow.displacement(tissue_points), axis=1)
-    assert moved.max() < 1.6 * np.linalg.norm(flow.plate_mm)
+    assert moved.max() < 1.2 * np.linalg.norm(flow.plate_mm)
 
 
 def test_missing_points_stay_missing(heel: Heel) -> None:
@@ -180,7 +180,7 @@ def test_tissue_has_texture_to_follow(heel: Heel, tissue_points: np.ndarray, nam
     """Seen at 0.8 mm, the texture stands clear of noise at SNR 25."""
     label = {v: k for k, v in TISSUES.items()}[name]
     inside = tissue_points[heel.tissue_at(tissue_points) == label]
-    voxels = heel.voxel_intensity(inside, 0.8 * np.eye(3))
+    voxels = heel.octant_intensity(inside, 0.8 * np.eye(3)).mean(axis=(1, 2, 3))
     assert voxels.std() > FAT_SIGNAL / 25.0
 
 
@@ -198,8 +198,10 @@ def test_seeds_differ(heel: Heel, tissue_points: np.ndarray) -> None:
 
 def test_rician_noise_has_its_sigma() -> None:
     grid = Grid((40, 40, 40), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
-    bright = acquire(np.full(grid.shape, 500.0), grid, snr=20.0, reference_signal=500.0, seed=1, bias_seed=None)
-    dark = acquire(np.zeros(grid.shape), grid, snr=20.0, reference_signal=500.0, seed=2, bias_seed=None)
+    bright = acquire(
+        np.full((*grid.shape, 2, 2, 2), 500.0), grid, snr=20.0, reference_signal=500.0, seed=1, bias_seed=None
+    )
+    dark = acquire(np.zeros((*grid.shape, 2, 2, 2)), grid, snr=20.0, reference_signal=500.0, seed=2, bias_seed=None)
     sigma = 25.0
     assert bright.values.std() == pytest.approx(sigma, rel=0.02)
     assert bright.values.mean() == pytest.approx(500.0 + sigma**2 / 1000.0, abs=0.4)
@@ -208,22 +210,41 @@ def test_rician_noise_has_its_sigma() -> None:
     assert dark.values.std() == pytest.approx(sigma * np.sqrt(2 - np.pi / 2), rel=0.02)
 
 
-def test_point_spread_is_half_a_voxel() -> None:
+def scanned(octants: np.ndarray, grid: Grid) -> np.ndarray:
+    return acquire(octants, grid, snr=None, reference_signal=1.0, seed=0, bias_seed=None).values.astype(float)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_frequencies_that_voxels_carry_are_kept_and_finer_ones_are_not(axis: int) -> None:
+    """Waves of 0.25 and of 0.75 cycles a voxel: one as it is, the other gone, where plain averaging keeps a ghost."""
+    grid = Grid((20, 20, 20), (0.8, 0.8, 2.0), (0.0, 0.0, 0.0))
+    centres, samples = np.arange(20) + 0.5, (np.arange(40) + 0.5) / 2.0
+    for frequency, kept in ((0.25, 1.0), (0.75, 0.0)):
+        fine = np.moveaxis(np.broadcast_to(np.cos(2 * np.pi * frequency * samples), (40, 40, 40)), 2, axis)
+        octants = fine.reshape(20, 2, 20, 2, 20, 2).transpose(0, 2, 4, 1, 3, 5)
+        expected = kept * np.moveaxis(np.broadcast_to(np.cos(2 * np.pi * frequency * centres), grid.shape), 2, axis)
+        np.testing.assert_allclose(scanned(octants, grid), expected, atol=1e-5)
+        if kept == 0.0:
+            assert octants.mean(axis=(3, 4, 5)).std() > 0.2
+
+
+def test_a_point_keeps_its_sum_and_its_place() -> None:
     grid = Grid((21, 21, 21), (0.8, 0.8, 2.0), (0.0, 0.0, 0.0))
-    point = np.zeros(grid.shape)
-    point[10, 10, 10] = 1.0
-    image = acquire(point, grid, snr=None, reference_signal=1.0, seed=0, bias_seed=None).values.astype(float)
-    steps = np.arange(21) - 10.0
+    point = np.zeros((21, 21, 21, 2, 2, 2))
+    point[10, 11, 9] = 1.0
+    image = scanned(point, grid)
     assert image.sum() == pytest.approx(1.0, abs=1e-5)
-    for axis in range(3):
+    for axis, place in enumerate((10, 11, 9)):
         profile = image.sum(axis=tuple(a for a in range(3) if a != axis))
-        assert profile @ steps**2 == pytest.approx(0.25, abs=0.04)
+        assert profile @ np.arange(21.0) == pytest.approx(place, abs=2e-3)
+        np.testing.assert_allclose(profile[place - 8 : place], profile[place + 8 : place : -1], atol=1e-3)
 
 
 def test_function_and_array_give_the_same_image(heel: Heel) -> None:
     turn = Rotation.from_rotvec([0.2, -0.1, 0.3]).as_matrix()
     grid = Grid((9, 8, 7), (0.8, 1.0, 1.5), (-3.0, 12.0, -40.0), turn)
-    array = heel.voxel_intensity(grid.points().reshape(-1, 3), turn * grid.spacing_mm).reshape(grid.shape)
+    octants = heel.octant_intensity(grid.points().reshape(-1, 3), turn * grid.spacing_mm)
+    array = octants.reshape(*grid.shape, 2, 2, 2)
     images = [
         acquire(signal, grid, snr=None, reference_signal=1.0, seed=0, bias_seed=3).values
         for signal in (heel.intensity_at, array)
@@ -260,7 +281,7 @@ def test_voxels_are_carried_back_with_their_shape(heel: Heel) -> None:
     turn = Rotation.from_rotvec([0.1, 0.3, -0.2]).as_matrix()
     grid = Grid((24, 22, 14), (0.8, 0.8, 1.6), (-8.0, 6.0, -38.0), turn)
     flow, motion = pressed(heel), default_motion()
-    signals = loaded_signal(heel, flow, motion), loaded_voxels(heel, flow, motion, grid)
+    signals = loaded_signal(heel, flow, motion), loaded_octants(heel, flow, motion, grid)
     one, two = (
         acquire(signal, grid, snr=None, reference_signal=1.0, seed=0, bias_seed=None).values for signal in signals
     )
@@ -346,8 +367,8 @@ def test_strain_of_the_full_pair_is_that_of_a_loaded_heel() -> None:
         u, H = pressed(heel).evaluate(points[tissue > 0])
         shear = max_shear(H)[tissue[tissue > 0] == 2]
         median, high = np.percentile(shear, [50, 95])
-        assert 0.16 < median < 0.24
-        assert 0.38 < high < 0.49
+        assert 0.12 < median < 0.18
+        assert 0.40 < high < 0.49
         assert 7.0 < np.linalg.norm(u, axis=1).max() < 10.0
 
 
@@ -386,10 +407,12 @@ def test_refuses_bad_shapes() -> None:
     with pytest.raises(InputError, match="forms"):
         EllipsoidUnion(np.zeros((2, 3)), np.eye(3)[None])
     body = EllipsoidUnion(np.zeros((1, 3)), np.eye(3)[None])
-    with pytest.raises(InputError, match="increase"):
-        Flow(np.zeros(3), np.zeros(3), body, 1.0, (5.0, 5.0), (0.0, 1.0))
+    with pytest.raises(InputError, match="width_mm must be positive"):
+        Flow(np.zeros(3), np.zeros(3), body, 1.0, np.zeros(3), np.array([1.0, 0.0, 1.0]))
+    with pytest.raises(InputError, match="pivot_mm needs three"):
+        Flow(np.zeros(3), np.zeros(2), body, 1.0, np.zeros(3), np.ones(3))
     with pytest.raises(InputError, match="steps"):
-        Flow(np.zeros(3), np.zeros(3), body, 1.0, (0.0, 5.0), (0.0, 1.0), steps=0)
+        Flow(np.zeros(3), np.zeros(3), body, 1.0, np.zeros(3), np.ones(3), steps=0)
     with pytest.raises(InputError, match="shape"):
         acquire(
             np.zeros((2, 2, 2)), Grid((3, 3, 3), (1, 1, 1), (0, 0, 0)),
