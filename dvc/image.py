@@ -239,6 +239,16 @@ class Mask:
         object.__setattr__(self, "inside", frozen(self.inside, np.bool_))
         _check_shape("The mask", self.inside.shape, self.grid)
 
+    def box(self, around: int = 0) -> tuple[slice, slice, slice]:
+        """Slices of the smallest box that holds the mask, and ``around`` voxels beside it; empty for an empty mask."""
+        cuts = []
+        for axis, n in enumerate(self.inside.shape):
+            hit = np.flatnonzero(self.inside.any(axis=tuple(a for a in range(3) if a != axis)))
+            if not hit.size:
+                return (slice(0, 0),) * 3
+            cuts.append(slice(max(int(hit[0]) - around, 0), min(int(hit[-1]) + 1 + around, n)))
+        return cuts[0], cuts[1], cuts[2]
+
     @property
     def volume_mm3(self) -> float:
         """Volume of the mask, mm3."""

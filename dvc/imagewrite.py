@@ -16,10 +16,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import IO, Any
@@ -31,6 +29,7 @@ import numpy.typing as npt
 from dvc.errors import InputError, OutputError
 from dvc.image import Grid, Image, LabelMap, Mask
 from dvc.nifti import LPS_FROM_RAS
+from dvc.whole import whole_file, write_whole
 
 StrPath = str | PathLike[str]
 
@@ -89,8 +88,7 @@ def write_labels(path: StrPath, labels: LabelMap) -> None:
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(["label", "name"])
     writer.writerows(sorted(labels.names.items()))
-    with _whole(_beside(place, ".csv")) as file:
-        file.write(table.getvalue().encode())
+    write_whole(_beside(place, ".csv"), table.getvalue())
 
 
 def write_vectors(
@@ -151,8 +149,7 @@ def write_vectors(
         "configuration": configuration,
         "missing": "NaN",
     }
-    with _whole(_beside(place, ".json")) as file:
-        file.write((json.dumps(told, indent=2) + "\n").encode())
+    write_whole(_beside(place, ".json"), json.dumps(told, indent=2) + "\n")
 
 
 def refuse_overwriting_inputs(outputs: Iterable[StrPath], inputs: Iterable[StrPath]) -> None:
@@ -194,7 +191,7 @@ def _write(path: Path, grid: Grid, values: npt.NDArray[Any], vector: bool = Fals
     makers: dict[str, Callable[[Grid, npt.NDArray[Any], bool], bytes]] = {".nrrd": _nrrd, ".mha": _meta}
     # NRRD and MetaImage keep the components of a voxel together, NIfTI one volume after the other.
     together = suffix in makers
-    with _whole(path) as file:
+    with whole_file(path) as part, part.open("wb") as file:
         header = makers.get(suffix, _nifti)(grid, values, vector)
         parts = _blocks(values, together)
         if suffix == ".nrrd":
@@ -294,23 +291,3 @@ def _meta(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:
         "ElementDataFile = LOCAL",
     ]
     return ("\n".join(lines) + "\n").encode()
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file that takes its name when it is complete, or leaves nothing behind."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}). Check that the folder exists and may "
-            "be written to, and that the disk has room."
-        ) from error
-    finally:
-        if partial.parent.is_dir():
-            partial.unlink(missing_ok=True)

@@ -6,19 +6,19 @@ taken over as a boundary condition as it stands.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import meshio
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.errors import InputError, OutputError
+from dvc.errors import InputError
 from dvc.meshfile import MM_PER_UNIT, TO_LPS, MeshFile, silenced
+from dvc.whole import whole_file, write_whole
 
 
 def write_on_mesh(
@@ -75,7 +75,7 @@ def write_on_mesh(
         point_data={"node": mesh.node_ids, **at_nodes},
         cell_data={name: np.split(array, ends) for name, array in in_cells.items()},
     )
-    with _whole(path) as part, silenced():
+    with whole_file(path) as part, silenced():
         meshio.vtu.write(part, whole, binary=True)
     return undefined
 
@@ -126,14 +126,13 @@ def write_nodal_displacements(path: str | os.PathLike[str], mesh: MeshFile, u_mm
         "nodes": len(u),
         "nodes_without_displacement": int(np.count_nonzero(undefined)),
     }
-    with _whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(columns)
         for node, X, u_X, missing in zip(mesh.node_ids, _own_points(mesh), own_u, undefined, strict=True):
             numbers = [f"{x:.10g}" for x in (X if missing else (*X, *u_X))]
             rows.writerow([int(node), *numbers, *([""] * 3 if missing else [])])
-    with _whole(path.with_suffix(".json")) as part:
-        part.write_text(json.dumps(declared, indent=2) + "\n", encoding="utf-8")
+    write_whole(path.with_suffix(".json"), json.dumps(declared, indent=2) + "\n")
     return int(np.count_nonzero(undefined))
 
 
@@ -165,20 +164,3 @@ def _check_name(path: Path, ending: str, mesh: MeshFile) -> None:
         raise InputError(f"{path}: the name of this file must end in {ending}; got {path.suffix!r}.")
     if path.resolve() == mesh.path.resolve():
         raise InputError(f"{path} is the mesh itself; results go into another file.")
-
-
-@contextlib.contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Give a name to write under; what was written takes its final name in one step, or is removed."""
-    part = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
-    try:
-        yield part
-        os.replace(part, path)
-    except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written ({error.strerror or error}). Check that the folder exists and may be "
-            "written to, and that the disk has room."
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()

@@ -1,18 +1,13 @@
-"""The folder of results of one loaded image: it appears under its name only when it is whole."""
+"""The folder of results of one loaded image."""
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from dvc.arrays import Float32Array, FloatArray
 from dvc.deformation import Deformation
-from dvc.errors import OutputError
 from dvc.image import Grid, Image, Mask
 from dvc.imagewrite import write_image, write_mask, write_vectors
 from dvc.kinematics import StrainField
@@ -23,38 +18,6 @@ from dvc.strainmaps import TENSOR_COMPONENTS, StrainMaps
 _DISPLACEMENT = "displacement of tissue relative to its bone: u(X) = x - X at the voxels of the unloaded image"
 _GREEN_LAGRANGE = "Green-Lagrange strain E = (F^T F - I) / 2"
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-
-
-@contextlib.contextmanager
-def whole_folder(final: Path) -> Iterator[Path]:
-    """Give a folder to fill; it takes its final name when the block ends well, and is removed if not.
-
-    An older folder of that name is replaced only then.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be made or renamed, or the disk is full.
-    """
-    try:
-        partial = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))
-        try:
-            partial.chmod(0o755)
-            yield partial
-            if final.exists():
-                old = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".old", dir=final.parent))
-                final.replace(old / final.name)
-                partial.replace(final)
-                shutil.rmtree(old, ignore_errors=True)
-            else:
-                partial.replace(final)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-    except OSError as error:
-        raise OutputError(
-            f"{final}: results cannot be written ({error.strerror or error}). Check the folder's rights and the "
-            "room on the disk; nothing half-written is left."
-        ) from error
 
 
 def write_maps(folder: Path, maps: StrainMaps, plate_axes: FloatArray | None = None) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dvc.arrays import FloatArray
-from dvc.errors import GeometryError, InputError, OutputError
+from dvc.errors import GeometryError, InputError
 from dvc.image import LabelMap
+from dvc.whole import write_whole
 
 SHEAR_THRESHOLDS = (0.2, 0.3, 0.4, 0.5)
 _THRESHOLDS: Mapping[str, Sequence[float]] = MappingProxyType({"max_shear": SHEAR_THRESHOLDS})
@@ -199,31 +199,6 @@ def write_regions_csv(path: Path, rows: Sequence[RegionRow]) -> None:
         cells += [row.volume_above_ml.get(t, "") for t in thresholds]
         writer.writerow([_plain(cell) for cell in cells])
     write_whole(path, text.getvalue())
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file (UTF-8) that takes its name only when it is complete, or leaves nothing behind.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("w", encoding="utf-8", newline="") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}). Check that the folder exists and may be "
-            "written to, and that the disk has room."
-        ) from error
-    finally:
-        if partial.parent.is_dir():
-            partial.unlink(missing_ok=True)
 
 
 def _plain(cell: object) -> str:

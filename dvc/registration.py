@@ -165,7 +165,9 @@ def register(
         tell("aligning", 0.0)
         # Axes toward L, P, S: a scan stored in another orientation then gives the same result.
         fixed = runner.run("correcting the shading", without_shading, reference.toward_lps())
+        tell("aligning", 0.2)
         moving = runner.run("correcting the shading", without_shading, loaded.toward_lps())
+        tell("aligning", 0.4)
         inside = body.toward_lps()
         on = None if bone is None else bone.toward_lps()
         alignment = _align(fixed, moving, inside, on, chosen, runner)
@@ -255,12 +257,9 @@ def _without_gaps(image: Image) -> tuple[Image, Mask | None]:
 
 def _cropped(image: Image, mask: Mask) -> tuple[Image, Mask]:
     """Both cut to the mask's box and a few voxels around: control points in empty air cost time and find nothing."""
-    found = np.argwhere(mask.inside)
-    low = np.maximum(found.min(axis=0) - _CROP_VOXELS, 0)
-    high = np.minimum(found.max(axis=0) + 1 + _CROP_VOXELS, mask.inside.shape)
-    i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    grid = image.grid.part((i, j, k))
-    return Image(grid, image.values[i, j, k]), Mask(grid, mask.inside[i, j, k])
+    box = mask.box(_CROP_VOXELS)
+    grid = image.grid.part(box)
+    return Image(grid, image.values[box]), Mask(grid, mask.inside[box])
 
 
 def _refuse_other_spacing(presets: tuple[Preset, ...]) -> None:

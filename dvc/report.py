@@ -12,8 +12,8 @@ import jinja2
 import numpy as np
 
 from dvc.errors import InputError
-from dvc.regions import write_whole
 from dvc.verdict import Verdict
+from dvc.whole import write_whole
 
 Cell = str | float | int | None
 
@@ -52,7 +52,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows under named columns; numbers are shown to three or four digits, missing ones as a dash.
+    """Rows under named columns; numbers are shown to three digits, missing ones as a dash.
 
     Raises
     ------
@@ -97,12 +97,12 @@ def shown(value: Cell) -> str:
     Examples
     --------
     >>> [shown(v) for v in (0.123456, 1234.5, 12, float("nan"), None, "fat")]
-    ['0.1235', '1234', '12', '–', '–', 'fat']
+    ['0.123', '1234', '12', '–', '–', 'fat']
     """
     if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
         return "–"
     if isinstance(value, float | np.floating):
-        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+        return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
     return str(value)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,9 @@ from dvc.arrays import FloatArray
 from dvc.bspline import BSpline
 from dvc.deformation import RigidMotion
 from dvc.elastixtext import Value, format_parameters
-from dvc.errors import InputError, OutputError
+from dvc.errors import InputError
 from dvc.image import Grid
+from dvc.whole import whole_file, write_whole
 
 StrPath = str | os.PathLike[str]
 
@@ -99,8 +100,7 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
     written = []
     for name, stage in zip(names, stages, strict=False):
         path = Path(folder) / name
-        text = format_parameters({**stage, **image})
-        _put(path, lambda part, text=text: part.write_text(text))  # type: ignore[misc]
+        write_whole(path, format_parameters({**stage, **image}))
         written.append(path)
     return written
 
@@ -145,19 +145,9 @@ def write_itk_transform(path: StrPath, bspline: BSpline, then: RigidMotion | Non
         motion.SetTranslation(then.translation_mm.tolist())
         composite.AddTransform(motion)
     composite.AddTransform(sitk.BSplineTransform(images, 3))
-    _put(place, lambda part: sitk.WriteTransform(composite, os.fspath(part)))
+    with whole_file(place) as part:
+        try:
+            sitk.WriteTransform(composite, os.fspath(part))
+        except RuntimeError as failure:
+            raise OSError(str(failure)) from failure
     return place
-
-
-def _put(path: Path, write: Callable[[Path], object]) -> None:
-    """Write beside, under another name of the same ending, and move into place when whole."""
-    part = path.with_name(f".{os.getpid()}.partial.{path.name}")
-    try:
-        write(part)
-        os.replace(part, path)
-    except (OSError, RuntimeError) as failure:
-        raise OutputError(
-            f"{path}: cannot be written ({failure}). Is the folder there, writable, not full?"
-        ) from failure
-    finally:
-        part.unlink(missing_ok=True)

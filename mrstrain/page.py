@@ -144,9 +144,9 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
             (
                 "Correlation in and around the bone, before alignment",
                 _number(alignment["similarity_before"]),
-                "1",
+                "",
             ),
-            ("Correlation in and around the bone, after alignment", _number(alignment["similarity"]), "1"),
+            ("Correlation in and around the bone, after alignment", _number(alignment["similarity"]), ""),
             (
                 "Spread of two rigid fits with other random samples (rms over the bone; not its accuracy)",
                 _number(alignment["repeatability_rms_mm"]),
@@ -157,12 +157,12 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
         rows.append(("Spacing of the B-spline's control points", " x ".join(f"{s:.3g}" for s in spacing), "mm"))
     if quality.similarity is not None:
         for said, value in zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True):
-            rows.append((f"Local similarity in the tissue, {said}", float(value), "1"))
+            rows.append((f"Local similarity in the tissue, {said}", float(value), ""))
     rows += [
         ("Displacement left in the bone (truth: 0), rms", quality.bone_shift_mm, "mm"),
-        ("Apparent maximal shear in the bone (truth: 0), 95th percentile", quality.bone_shear_p95, "1"),
+        ("Apparent maximal shear in the bone (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
         ("Folded voxels (det F <= 0)", quality.folded_voxels, "voxels"),
-        ("Lowest det F", quality.lowest_jacobian, "1"),
+        ("Lowest det F", quality.lowest_jacobian, ""),
         ("Tissue without a result", 100.0 * quality.undefined_fraction, "%"),
     ]
     if quality.landmark_errors_mm is not None:
@@ -176,10 +176,10 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
     if quality.noise_floor is not None:
         floor = quality.noise_floor
         rows += [
-            ("Noise floor (repeat scan): maximal shear, median", floor.shear_p50, "1"),
-            ("Noise floor (repeat scan): maximal shear, 95th percentile", floor.shear_p95, "1"),
-            ("Noise floor: MAER", floor.maer, "1"),
-            ("Noise floor: SDER", floor.sder, "1"),
+            ("Noise floor (repeat scan): maximal shear, median", floor.shear_p50, ""),
+            ("Noise floor (repeat scan): maximal shear, 95th percentile", floor.shear_p95, ""),
+            ("Noise floor: MAER", floor.maer, ""),
+            ("Noise floor: SDER", floor.sder, ""),
         ]
     return Table("Key figures", ("figure", "value", "unit"), tuple(rows))
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from dvc.regions import write_whole
+from dvc.whole import write_whole
 
 _PACKAGES = (
     "mrstrain",

@@ -172,7 +172,12 @@ def register(
     settings = Settings(stages, align, seed, each)
     record = provenance(
         "register",
-        {**subject.files, "loads": paths, "landmarks": [] if landmarks is None else [Path(landmarks)]},
+        {
+            **subject.files,
+            "loads": paths[: len(loads)],
+            "repeat": paths[len(loads) :],
+            "landmarks": [] if landmarks is None else [Path(landmarks)],
+        },
         {
             "align": align,
             "chain": chain,

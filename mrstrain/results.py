@@ -13,7 +13,7 @@ from dvc.deformation import Deformation, RigidMotion
 from dvc.image import Image, LabelMap, Mask
 from dvc.imagewrite import write_image
 from dvc.landmarks import target_registration_error
-from dvc.outputs import whole_folder, write_maps, write_mesh_results
+from dvc.outputs import write_maps, write_mesh_results
 from dvc.quality import NoiseFloor, Quality, assess, local_correlation, noise_floor
 from dvc.regions import region_statistics, write_regions_csv
 from dvc.registration import Registration
@@ -22,6 +22,7 @@ from dvc.resample import carry, shows
 from dvc.strainmaps import StrainMaps, strain_maps
 from dvc.transformwrite import write_elastix_transform, write_itk_transform
 from dvc.verdict import Verdict
+from dvc.whole import whole_folder
 from mrstrain import page
 from mrstrain.inputs import Subject
 from mrstrain.provenance import write_json
@@ -105,7 +106,8 @@ def write_case(
     maps = strain_maps(found.deformation, found.tissue, lambda x: shows(loaded, motion.apply(x), edge))
     before = carry(loaded, grid)
     aligned = carry(loaded, grid, motion.apply)
-    registered = carry(loaded, grid, lambda X: motion.apply(X + found.bspline.displacement(X)))
+    # Beyond the spline, in the air, the image is shown where the bone's motion alone puts it.
+    registered = carry(loaded, grid, lambda X: motion.apply(X + np.nan_to_num(found.bspline.displacement(X))))
     both = Mask(grid, found.tissue.inside & np.isfinite(aligned) & np.isfinite(registered))  # the same voxels for both
     _, as_scanned = local_correlation(reference, before, found.tissue)
     local_rigid, rigid = local_correlation(reference, aligned, both)

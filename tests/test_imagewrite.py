@@ -14,7 +14,7 @@ import pytest
 import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
 
-from dvc import imagewrite
+from dvc import whole
 from dvc.errors import InputError, OutputError
 from dvc.image import Grid, Image, LabelMap, Mask
 from dvc.imagefile import read_image
@@ -192,7 +192,7 @@ def test_an_interruption_leaves_nothing(tmp_path: Path, suffix: str, monkeypatch
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(imagewrite.os, "replace", interrupted)
+    monkeypatch.setattr(whole.os, "replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_image(tmp_path / f"a.{suffix}", _image())
     assert list(tmp_path.iterdir()) == []

@@ -77,5 +77,5 @@ def test_a_missing_file_is_an_input_error(tmp_path):
 
 
 def test_iterations_add_up_over_resolutions():
-    assert load_preset("heel-mr").iterations == 4 * 500
+    assert load_preset("heel-mr").iterations == 3 * 1000 + 500
     assert load_preset("heel-mr").complete(seed=7)["RandomSeed"] == ("7",)

@@ -70,6 +70,15 @@ def test_a_poor_or_falling_similarity_costs_trust(similarity, level):
     assert assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=similarity).verdict.level == level
 
 
+@pytest.mark.parametrize(("slice_mm", "level"), [(2.0, "trust"), (4.0, "caution"), (6.0, "distrust")])
+def test_thick_slices_cost_trust(slice_mm: float, level: str) -> None:
+    grid = Grid((6, 6, 6), (0.8, 0.8, slice_mm), (0.0, 0.0, 0.0))
+    whole = Mask(grid, np.ones(grid.shape, dtype=bool))
+    verdict = assess(strain_maps(STRETCH, whole), whole, None, similarity=(0.3, 0.5, 0.9)).verdict
+    assert verdict.level == level
+    assert all("Slices are" in reason for reason in verdict.reasons)
+
+
 def test_a_bone_that_moves_costs_trust():
     shifted = strain_maps(RigidMotion(np.eye(3), np.array([0.5, 0.0, 0.0])), WHOLE)
     quality = assess(shifted, WHOLE, core(), similarity=(0.3, 0.5, 0.9))

@@ -1,0 +1,75 @@
+"""Files and folders that take their name only when they are complete, or leave nothing behind."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from dvc.errors import OutputError
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a name of the same ending, in the same folder, to write under; it becomes ``path`` in one step.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written; what was begun is removed, and an older file of that name is still there.
+    """
+    part = path.with_name(f".{os.getpid()}.partial.{path.name}")
+    try:
+        yield part
+        with part.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror or error}). Check that the folder exists and may be "
+            "written to, and that the disk has room."
+        ) from error
+    finally:
+        with suppress(OSError):
+            part.unlink()
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file (UTF-8, lines ending as they are given), whole or not at all; errors as `whole_file`."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8", newline="")
+
+
+@contextmanager
+def whole_folder(final: Path) -> Iterator[Path]:
+    """Give a folder to fill; it takes its final name when the block ends well, and is removed if not.
+
+    An older folder of that name is replaced only then.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be made or renamed, or the disk is full.
+    """
+    try:
+        partial = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))
+        try:
+            partial.chmod(0o755)
+            yield partial
+            if final.exists():
+                old = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".old", dir=final.parent))
+                final.replace(old / final.name)
+                partial.replace(final)
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                partial.replace(final)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
+        raise OutputError(
+            f"{final}: results cannot be written ({error.strerror or error}). Check the folder's rights and the "
+            "room on the disk; nothing half-written is left."
+        ) from error
