@@ -55,7 +55,7 @@ def write_maps(folder: Path, maps: StrainMaps, plate_axes: FloatArray | None = N
 
 def write_displacement(folder: Path, grid: Grid, displacement_mm: Float32Array) -> None:
     """Write the displacement as NIfTI and as NRRD, LPS mm."""
-    for name in ("displacement.nii.gz", "displacement.nrrd"):
+    for name in ("displacement.nrrd", "displacement.nii.gz"):  # the JSON beside them names the last
         write_vectors(folder / name, grid, displacement_mm, ("x", "y", "z"), _DISPLACEMENT, "LPS", unit="mm")
 
 

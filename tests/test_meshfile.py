@@ -341,7 +341,7 @@ def test_what_cannot_be_written_is_refused_and_leaves_nothing_behind(tmp_path: P
     with pytest.raises(OutputError, match="folder exists"):
         write_on_mesh(tmp_path / "nowhere" / "out.vtu", mesh, {}, {})
     (tmp_path / "taken.csv").mkdir()
-    with pytest.raises(OutputError, match=r"taken\.csv cannot be written"):
+    with pytest.raises(OutputError, match=r"taken\.csv: cannot be written"):
         write_nodal_displacements(tmp_path / "taken.csv", mesh, u)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["heel.vtu", "taken.csv"]
     assert mesh.path.read_bytes() == before
