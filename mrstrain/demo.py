@@ -13,6 +13,7 @@ import numpy as np
 from dvc.deformation import RigidMotion, evaluate_on_grid
 from dvc.imagewrite import write_image, write_labels, write_mask
 from dvc.kinematics import StrainField
+from dvc.labels import read_mask
 from dvc.report import Section, Table
 from dvc.transformfile import read_transform
 from dvc.whole import write_whole
@@ -92,8 +93,8 @@ def _report(folder: Path, rows: list[dict[str, str | float]], results: Series) -
         ),
         paragraphs=(
             "These images are a phantom: the strain is known at every point, so the measurement below can be compared "
-            "with the truth, in the voxels whose true place lies inside the loaded image. Real images have no such "
-            "table; the verdict and the repeat scan stand in for it.",
+            "with the truth, wherever it has a result. Real images have no such table; the verdict and the repeat scan "
+            "stand in for it.",
         ),
     )
     record = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
@@ -102,12 +103,12 @@ def _report(folder: Path, rows: list[dict[str, str | float]], results: Series) -
 
 
 def _errors(pair: HeelPair, folder: Path) -> list[dict[str, str | float]]:
-    """Error by tissue, of the transform as it was written, where the true place lies in the loaded image."""
+    """Error by tissue, of the transform as it was written, where the result is valid."""
     grid = pair.reference.grid
     inside = pair.labels.labels > 0
     X = grid.points(inside)
     U, true_H = evaluate_on_grid(pair.deformation, grid, inside)
-    seen = pair.loaded.grid.contains(pair.foot_motion.apply(X + U))
+    seen = read_mask(folder / "valid.nii.gz").inside[inside]
     x, H = evaluate_on_grid(read_transform(folder / "TransformParameters.1.txt"), grid, inside)
     home: RigidMotion = pair.foot_motion.inverse()
     u = home.apply(X + x) - X
