@@ -21,8 +21,8 @@ class Limits:
     """Where a figure turns a verdict; each pair is (use with care, do not trust).
 
     The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound
-    registrations at SNR 10 to 25 stay above 0.8 and failed ones below 0.6. Those of the voxels come from repeat
-    scans of a knee and a leg: slices of 4 mm gave an apparent maximal shear of 0.1, slices of 6 mm of 0.3.
+    registrations at SNR 10 to 25 stay above 0.8 and failed ones below 0.6. Those of the voxels come from a
+    knee's moved and noisy twin (slices of 4 mm: apparent maximal shear 0.1) and a leg's repeat scan (6 mm: 0.3).
     """
 
     similarity: tuple[float, float] = (0.7, 0.45)
