@@ -13,15 +13,15 @@ import argparse
 import json
 import tempfile
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from dvc import elastix
-from dvc.deformation import Deformation, evaluate_on_grid
+from dvc.deformation import Deformation
 from dvc.elastixtext import parse_parameters
 from dvc.image import Image, Mask
-from dvc.kinematics import StrainField
 from dvc.presets import Preset
 from dvc.registration import Settings, register
 from dvc.resample import shows
@@ -29,6 +29,7 @@ from dvc.transformfile import bspline_from_elastix
 from dvc.worker import Worker, usable_cores
 from mrstrain.provenance import versions
 from phantoms.heel import HeelPair, heel_pair
+from phantoms.score import errors_by_tissue
 
 MARGIN_MM = 4.0
 
@@ -58,31 +59,13 @@ DEFAULT = """
 
 
 def scored(pair: HeelPair, deformation: Deformation) -> dict[str, dict[str, float]]:
-    grid = pair.reference.grid
-    X = grid.points()
+    X = pair.reference.grid.points()
     inside = pair.labels.labels > 0
-    U, true_H = evaluate_on_grid(pair.deformation, grid, inside)
-    seen = shows(pair.loaded, pair.foot_motion.apply(X[inside] + U), MARGIN_MM)
-    u, H = evaluate_on_grid(deformation, grid, inside)
-    truth, found = StrainField.from_gradient(true_H), StrainField.from_gradient(H)
-    label = pair.labels.labels[inside]
-    rows = {}
-    for number, name in pair.labels.names.items():
-        kept = (label == number) & seen & found.valid
-        error = found.max_shear[kept] - truth.max_shear[kept]
-        length = np.linalg.norm(u[kept] - U[kept], axis=1)
-        rows[name] = {
-            "voxels": int(kept.sum()),
-            "true_shear_p50": float(np.median(truth.max_shear[kept])),
-            "true_shear_p95": float(np.percentile(truth.max_shear[kept], 95)),
-            "shear_rmse": float(np.sqrt(np.mean(error**2))),
-            "shear_bias": float(error.mean()),
-            "shear_error_p95": float(np.percentile(np.abs(error), 95)),
-            "u_p50_mm": float(np.median(length)),
-            "u_p95_mm": float(np.percentile(length, 95)),
-            "folded": int(np.count_nonzero(found.jacobian[kept] <= 0)),
-        }
-    return rows
+    where = np.zeros(inside.shape, dtype=bool)
+    true_place = pair.foot_motion.apply(X[inside] + pair.deformation.displacement(X[inside]))
+    where[inside] = shows(pair.loaded, true_place, MARGIN_MM)
+    rows = (asdict(error) for error in errors_by_tissue(pair.labels, pair.deformation, deformation, where))
+    return {row.pop("tissue"): row for row in rows}
 
 
 def elastix_default(pair: HeelPair, worker: Worker, seed: int) -> Deformation:
@@ -133,7 +116,7 @@ def main() -> None:
                 print(f"seed {seed}, load {given.load}, {method}: {seconds:.0f} s")
                 for tissue, row in rows.items():
                     print(
-                        f"  {tissue:8s} true {row['true_shear_p50']:.3f}/{row['true_shear_p95']:.3f}  shear RMSE "
+                        f"  {tissue:8s} true {row['true_p50']:.3f}/{row['true_p95']:.3f}  shear RMSE "
                         f"{row['shear_rmse']:.4f} bias {row['shear_bias']:+.4f} p95 {row['shear_error_p95']:.4f}  "
                         f"u {row['u_p50_mm']:.3f}/{row['u_p95_mm']:.3f} mm  folded {row['folded']}",
                         flush=True,

@@ -5,14 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 
-import numpy as np
-
-from dvc.deformation import RigidMotion, evaluate_on_grid
+from dvc.deformation import Composed
 from dvc.imagewrite import write_image, write_labels, write_mask
-from dvc.kinematics import StrainField
 from dvc.labels import read_mask
 from dvc.report import Section, Table
 from dvc.transformfile import read_transform
@@ -20,6 +18,7 @@ from dvc.whole import write_whole
 from mrstrain.page import write_series_report
 from mrstrain.registering import Series, register
 from phantoms.heel import HeelPair, heel_pair
+from phantoms.score import TissueError, errors_by_tissue
 
 _LOAD = 1.0
 _FIGURES = ("true_p50", "true_p95", "shear_rmse", "shear_bias", "u_p50_mm", "u_p95_mm")
@@ -63,23 +62,27 @@ def demo(out: Path | str, *, seed: int = 1, progress: Callable[[str, str, float]
     )
     if results.failures:
         return results.summary()
-    rows = _errors(pair, target / "results" / "Load1")
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_whole(target / "error.csv", table.getvalue())
-    _report(target / "results", rows, results)
+    errors = _errors(pair, target / "results" / "Load1")
+    _write_table(target / "error.csv", errors)
+    _report(target / "results", errors, results)
     lines = ["Error against the phantom's known truth (maximal shear; displacement in mm):"]
     lines.append(f"{'tissue':<10}{'true median':>12}{'true p95':>10}{'RMSE':>8}{'bias':>8}{'u median':>10}{'u p95':>8}")
-    for row in rows:
-        numbers = (row[k] for k in _FIGURES)
-        widths = (12, 10, 8, 8, 10, 8)
-        lines.append(f"{row['tissue']:<10}" + "".join(f"{v:>{w}.3f}" for v, w in zip(numbers, widths, strict=True)))
+    widths = (12, 10, 8, 8, 10, 8)
+    for error in errors:
+        numbers = "".join(f"{getattr(error, k):>{w}.3f}" for k, w in zip(_FIGURES, widths, strict=True))
+        lines.append(f"{error.tissue:<10}{numbers}")
     return [*lines, *results.summary()]
 
 
-def _report(folder: Path, rows: list[dict[str, str | float]], results: Series) -> None:
+def _write_table(path: Path, errors: Sequence[TissueError]) -> None:
+    table = io.StringIO()
+    writer = csv.DictWriter(table, [f.name for f in fields(TissueError)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(error) for error in errors)
+    write_whole(path, table.getvalue())
+
+
+def _report(folder: Path, errors: Sequence[TissueError], results: Series) -> None:
     """Write the report anew, with the error against the truth ahead of the measurement."""
     section = Section(
         "Error against the truth",
@@ -87,7 +90,7 @@ def _report(folder: Path, rows: list[dict[str, str | float]], results: Series) -
             Table(
                 "Maximal shear and displacement, by tissue",
                 ("tissue", "true shear, median", "true shear, p95", "RMSE", "bias", "u error, median", "u error, p95"),
-                tuple(tuple(row[key] for key in ("tissue", *_FIGURES)) for row in rows),
+                tuple(tuple(getattr(error, key) for key in ("tissue", *_FIGURES)) for error in errors),
                 note="Displacement in mm. The calcaneus and the ankle's bones are rigid: their true shear is zero.",
             ),
         ),
@@ -102,33 +105,9 @@ def _report(folder: Path, rows: list[dict[str, str | float]], results: Series) -
     write_series_report(folder / "report.html", [section, *cases], results.failures, record)
 
 
-def _errors(pair: HeelPair, folder: Path) -> list[dict[str, str | float]]:
+def _errors(pair: HeelPair, folder: Path) -> tuple[TissueError, ...]:
     """Error by tissue, of the transform as it was written, where the result is valid."""
-    grid = pair.reference.grid
-    inside = pair.labels.labels > 0
-    X = grid.points(inside)
-    U, true_H = evaluate_on_grid(pair.deformation, grid, inside)
-    seen = read_mask(folder / "valid.nii.gz").inside[inside]
-    x, H = evaluate_on_grid(read_transform(folder / "TransformParameters.1.txt"), grid, inside)
-    home: RigidMotion = pair.foot_motion.inverse()
-    u = home.apply(X + x) - X
-    found, truth = StrainField.from_gradient(H), StrainField.from_gradient(true_H)
-    label = pair.labels.labels[inside]
-    rows: list[dict[str, str | float]] = []
-    for number, tissue in pair.labels.names.items():
-        kept = (label == number) & seen & found.valid
-        error = found.max_shear[kept] - truth.max_shear[kept]
-        distance = np.linalg.norm(u[kept] - U[kept], axis=1)
-        rows.append(
-            {
-                "tissue": tissue,
-                "voxels": int(kept.sum()),
-                "true_p50": float(np.median(truth.max_shear[kept])),
-                "true_p95": float(np.percentile(truth.max_shear[kept], 95)),
-                "shear_rmse": float(np.sqrt(np.mean(error**2))),
-                "shear_bias": float(error.mean()),
-                "u_p50_mm": float(np.median(distance)),
-                "u_p95_mm": float(np.percentile(distance, 95)),
-            }
-        )
-    return rows
+    whole = read_transform(folder / "TransformParameters.1.txt")
+    of_tissue = Composed([whole, pair.foot_motion.inverse()])
+    valid = read_mask(folder / "valid.nii.gz").inside
+    return errors_by_tissue(pair.labels, pair.deformation, of_tissue, valid)
