@@ -35,6 +35,15 @@ class Deformation(Protocol):
 
 
 @runtime_checkable
+class Motion(Deformation, Protocol):
+    """A deformation whose inverse is known."""
+
+    def inverse(self) -> Motion:
+        """The map back, from the deformed configuration to the reference."""
+        ...
+
+
+@runtime_checkable
 class GridDeformation(Deformation, Protocol):
     """A deformation with a faster way over the voxels of a grid."""
 
@@ -203,6 +212,21 @@ class Composed:
             x = x + u
             H = H + step + step @ H  # (I + step)(I + H) - I without losing small H against I
         return np.asarray(x - start), H
+
+    def inverse(self) -> Composed:
+        """The map back: the parts' inverses in the opposite order.
+
+        Raises
+        ------
+        InputError
+            If a part has no known inverse.
+        """
+        back: list[Deformation] = []
+        for part in reversed(self.parts):
+            if not isinstance(part, Motion):
+                raise InputError(f"A composition has an inverse where its parts have; {type(part).__name__} has none.")
+            back.append(part.inverse())
+        return Composed(back)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

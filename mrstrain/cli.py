@@ -226,6 +226,46 @@ def demo(
 
 
 @app.command()
+def phantom(
+    out: Out,
+    seed: Annotated[int, typer.Option(min=0, help="Of shapes, textures, noise and the foot's motions.")] = 1,
+    load: Annotated[
+        list[str] | None, typer.Option(help="Load1, Load2, Load3 or Load4; repeat for several. Default: all.")
+    ] = None,
+    spacing: Annotated[float, typer.Option(help="Edge of the voxels, mm.")] = 0.8,
+    slice_spacing: Annotated[
+        float | None, typer.Option(help="Their edge along the third axis, where it is another, mm.")
+    ] = None,
+    snr: Annotated[float, typer.Option(help="Fat's signal over the noise's standard deviation.")] = 25.0,
+    no_noise: Annotated[bool, typer.Option("--no-noise", help="Images without noise.")] = False,
+    size: Annotated[float, typer.Option(help="Factor on all shapes; 1 is a calcaneus of about 70 mm.")] = 1.0,
+    pad: Annotated[float, typer.Option(help="Tissue below the calcaneus, skin included, mm.")] = 18.0,
+    skin: Annotated[float, typer.Option(help="Thickness of the skin, mm.")] = 2.0,
+    lobules: Annotated[float, typer.Option(help="Width of the fat's lobules, mm.")] = 6.0,
+) -> None:
+    """Images of a synthetic heel under Load0 to Load4, with their exactly known strain."""
+    from mrstrain.making import phantom as run
+    from mrstrain.progress import live
+    from phantoms.heel import LOADS
+
+    with live() as progress:
+        made = run(
+            out,
+            seed=seed,
+            loads=load or tuple(LOADS),
+            spacing_mm=(spacing, spacing, spacing if slice_spacing is None else slice_spacing),
+            snr=None if no_noise else snr,
+            size=size,
+            pad_mm=pad,
+            skin_mm=skin,
+            lobule_mm=lobules,
+            progress=progress,
+        )
+    for line in made.summary():
+        typer.echo(line)
+
+
+@app.command()
 def doctor() -> None:
     """Is this machine fit to run mrstrain?"""
     from mrstrain.doctor import examine

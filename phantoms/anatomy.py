@@ -14,7 +14,7 @@ from numba import njit, prange
 
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
-from phantoms.motions import EllipsoidUnion, distance
+from phantoms.bodies import EllipsoidUnion, distance
 
 TISSUES: Mapping[int, str] = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "ankle"}
 """Label numbers and names. "bone" is the calcaneus; "ankle" is the other bones, at rest with it."""
@@ -61,6 +61,20 @@ _OUTLINE = (
     ((0.0, 1.0, 62.0), (25.0, 34.5, 78.0), (0.0, 0.0, 0.0)),  # ankle and leg
     ((1.0, -46.0, -2.5), (29.0, 74.0, 30.5), (5.0, 0.0, 0.0)),  # midfoot
 )
+_OUTLINE_NAMES = ("heel", "leg", "midfoot")
+_SOLE = {"heel", "midfoot"}
+_PAD_MM = 18.0
+_SHARP = {"bone": 5.0, "ankle": 8.0, "muscle": 8.0, "outline": 3.5, "flesh": 3.5}
+_RANGES = {
+    "size": (0.7, 1.3),
+    "pad_mm": (10.0, 26.0),
+    "skin_mm": (1.0, 4.0),
+    "cortex_mm": (0.5, 3.0),
+    "lobule_mm": (2.0, 12.0),
+}
+_Ellipsoid = tuple[FloatArray, FloatArray, tuple[float, float, float]]
+_Triple = tuple[float, float, float]
+_Shapes = tuple[tuple[_Triple, _Triple, _Triple], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +85,10 @@ class Heel:
     ----------
     seed : int
         0 or more.
+    size : float
+        Factor on all shapes; 1 is a calcaneus of about 75 mm.
+    pad_mm : float
+        Tissue below the calcaneus' lowest point, skin included, mm at size 1; about, since shapes vary.
     skin_mm, cortex_mm : float
         Thickness of the skin and of the bones' cortical rim, mm.
     lobule_mm : float
@@ -79,7 +97,8 @@ class Heel:
     Raises
     ------
     InputError
-        If the seed is negative or a length is not positive.
+        If the seed is negative, or a length is out of its range: size 0.7 to 1.3, pad 10 to 26 mm, skin 1 to 4 mm,
+        cortex 0.5 to 3 mm, lobules 2 to 12 mm.
 
     Examples
     --------
@@ -90,6 +109,8 @@ class Heel:
     """
 
     seed: int = 1
+    size: float = 1.0
+    pad_mm: float = 18.0
     skin_mm: float = 2.0
     cortex_mm: float = 1.2
     lobule_mm: float = 6.0
@@ -97,29 +118,44 @@ class Heel:
     ankle: EllipsoidUnion = field(init=False)
     muscle: EllipsoidUnion = field(init=False)
     outline: EllipsoidUnion = field(init=False)
+    flesh: EllipsoidUnion = field(init=False)
 
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise InputError(f"The heel's seed must be 0 or more; got {self.seed}.")
-        for name in ("skin_mm", "cortex_mm", "lobule_mm"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} must be positive; got {getattr(self, name)}.")
+        for name, (low, high) in _RANGES.items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name} must lie between {low:g} and {high:g}; got {getattr(self, name)}.")
         random = np.random.default_rng([self.seed, 1])
-        for name, parts, jitter, sharpness in (
-            ("bone", _CALCANEUS, 0.6, 5.0),
-            ("ankle", _ANKLE_BONES, 0.6, 8.0),
-            ("muscle", _MUSCLES, 0.6, 8.0),
-            ("outline", _OUTLINE, 0.4, 3.5),
-        ):
-            varied = [
+        bodies: tuple[tuple[str, _Shapes, float], ...] = (
+            ("bone", _CALCANEUS, 0.6),
+            ("ankle", _ANKLE_BONES, 0.6),
+            ("muscle", _MUSCLES, 0.6),
+            ("outline", _OUTLINE, 0.4),
+        )
+        varied: dict[str, list[_Ellipsoid]] = {}
+        for name, shapes, jitter in bodies:
+            varied[name] = [
                 (
-                    np.add(centre, jitter * random.uniform(-1.0, 1.0, 3)).tolist(),
-                    np.multiply(axes, 1.0 + 0.02 * random.uniform(-1.0, 1.0, 3)).tolist(),
+                    np.add(centre, jitter * random.uniform(-1.0, 1.0, 3)),
+                    np.multiply(axes, 1.0 + 0.02 * random.uniform(-1.0, 1.0, 3)),
                     turns,
                 )
-                for centre, axes, turns in parts
+                for centre, axes, turns in shapes
             ]
-            object.__setattr__(self, name, EllipsoidUnion.of(varied, sharpness))
+        # Only the sole moves with the pad's thickness: half in the centre, half in the semi-axis leaves the top alone.
+        lower = np.array([0.0, 0.0, 0.5 * (self.pad_mm - _PAD_MM)])
+        varied["outline"] = [
+            (centre - lower, axes + lower, turns) if name in _SOLE else (centre, axes, turns)
+            for name, (centre, axes, turns) in zip(_OUTLINE_NAMES, varied["outline"], strict=True)
+        ]
+        # The skin's inner surface: the same shapes with semi-axes shorter by its thickness, which is that exactly at
+        # their ends and a little less between.
+        skin = self.skin_mm / self.size
+        varied["flesh"] = [(centre, axes - skin, turns) for centre, axes, turns in varied["outline"]]
+        for name, parts in varied.items():
+            scaled = [((self.size * c).tolist(), (self.size * a).tolist(), turns) for c, a, turns in parts]
+            object.__setattr__(self, name, EllipsoidUnion.of(scaled, _SHARP[name]))
 
     @property
     def skeleton(self) -> EllipsoidUnion:
@@ -132,8 +168,8 @@ class Heel:
         )
 
     def _parameters(self) -> tuple[FloatArray, ...]:
-        bodies = (self.bone, self.ankle, self.muscle, self.outline)
-        numbers = np.array([self.skin_mm, self.cortex_mm, self.lobule_mm, float(self.seed)])
+        bodies = (self.bone, self.ankle, self.muscle, self.outline, self.flesh)
+        numbers = np.array([self.size, self.cortex_mm, self.lobule_mm, float(self.seed)])
         sharpness = np.array([body.sharpness for body in bodies])
         return (numbers, sharpness, *(a for body in bodies for a in (body.centres_mm, body.forms)))
 
@@ -216,13 +252,17 @@ def _lobule(x, y, z, salt):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _depths(x, y, z, heel):  # type: ignore[no-untyped-def]
-    """Depth of a point below the surface (mm) of the foot, of bone, ankle, tendon and muscle; negative outside."""
-    _, k, bone_c, bone_f, ankle_c, ankle_f, muscle_c, muscle_f, out_c, out_f = heel
+    """Depth of a point below the surface (mm) of the foot, its flesh, bone, ankle, tendon, muscle; negative outside."""
+    numbers, k, bone_c, bone_f, ankle_c, ankle_f, muscle_c, muscle_f, out_c, out_f, flesh_c, flesh_f = heel
     foot = -distance(x, y, z, out_c, out_f, k[3])
     if foot <= -_EDGE_MM:
-        return foot, -1e3, -1e3, -1e3, -1e3
+        return foot, -1e3, -1e3, -1e3, -1e3, -1e3
+    flesh = -distance(x, y, z, flesh_c, flesh_f, k[4])
     bone = -distance(x, y, z, bone_c, bone_f, k[0])
     ankle = -distance(x, y, z, ankle_c, ankle_f, k[1])
+    muscle = -distance(x, y, z, muscle_c, muscle_f, k[2])
+    size = numbers[0]
+    x, y, z = x / size, y / size, z / size
     # Achilles tendon: a flat band down to the back of the tuberosity
     behind = 31.5 + 0.05 * max(z, 0.0)
     wide = 6.0 + 4.0 * np.exp(-(((z - 2.0) / 9.0) ** 2))
@@ -230,16 +270,15 @@ def _depths(x, y, z, heel):  # type: ignore[no-untyped-def]
     # plantar aponeurosis: a sheet under the short flexor, from the medial process forward
     below = -30.2 + 0.13 * (y + 36.0) + 0.006 * (x - 4.0) ** 2 - z
     sheet = min(below, 1.8 - below, 18.0 - y, 11.0 - abs(x - 4.0))
-    muscle = -distance(x, y, z, muscle_c, muscle_f, k[2])
-    return foot, bone, ankle, max(achilles, sheet), muscle
+    return foot, flesh, bone, ankle, size * max(achilles, sheet), muscle
 
 
 @njit(cache=True)
 def _tissue(x, y, z, heel):  # type: ignore[no-untyped-def]
-    foot, bone, ankle, tendon, muscle = _depths(x, y, z, heel)
+    foot, flesh, bone, ankle, tendon, muscle = _depths(x, y, z, heel)
     if foot <= 0.0:
         return 0
-    if foot <= heel[0][0]:
+    if flesh <= 0.0:
         return _SKIN
     if bone >= 0.0:
         return _BONE
@@ -260,9 +299,9 @@ def _share(depth):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _signal(x, y, z, heel):  # type: ignore[no-untyped-def]
+def _signal(x, y, z, depths, heel):  # type: ignore[no-untyped-def]
     """Signals of the tissues at a point by their shares, from the outermost body to the innermost."""
-    foot, bone, ankle, tendon, muscle = _depths(x, y, z, heel)
+    foot, flesh, bone, ankle, tendon, muscle = depths
     numbers = heel[0]
     salt = 16 * int(numbers[3])
     left = _share(foot)
@@ -270,7 +309,7 @@ def _signal(x, y, z, heel):  # type: ignore[no-untyped-def]
         return 0.0
     fine = _noise(x / 1.7, y / 1.7, z / 1.7, salt)
     total = 0.0
-    share = left * _share(numbers[0] - foot)
+    share = left * _share(-flesh)
     if share > 0.0:
         patch = _noise(x / 4.5, y / 4.5, z / 4.5, salt + 11)  # pores, creases and vessels
         total += share * _SKIN_SIGNAL * (1.0 + 0.25 * fine + 0.4 * patch)
@@ -330,11 +369,23 @@ def _tissues(points, heel):  # type: ignore[no-untyped-def]
     return out
 
 
+@njit(cache=True)
+def _within_one_tissue(depths, reach):  # type: ignore[no-untyped-def]
+    """Whether no border lies within reach, mm; in bone, whose signal changes with depth, never."""
+    foot, flesh, bone, ankle, tendon, muscle = depths
+    soft = bone < -reach and ankle < -reach
+    return soft and abs(foot) > reach and abs(flesh) > reach and abs(tendon) > reach and abs(muscle) > reach
+
+
 @njit(parallel=True, cache=True)
 def _signals(points, axes, samples, heel):  # type: ignore[no-untyped-def]
     out = np.empty((points.shape[0], samples))
     for n in prange(points.shape[0]):
         a = axes[n] if axes.shape[0] > 1 else axes[0]
+        centre = _depths(points[n, 0], points[n, 1], points[n, 2], heel)
+        # Distances are of first order, so the corners are given twice their distance.
+        reach = _EDGE_MM + 0.5 * np.sqrt((a * a).sum())
+        alike = _within_one_tissue(centre, reach)
         for m in range(samples):
             s = 0.25 if m & 4 else -0.25
             t = 0.25 if m & 2 else -0.25
@@ -342,5 +393,5 @@ def _signals(points, axes, samples, heel):  # type: ignore[no-untyped-def]
             x = points[n, 0] + s * a[0, 0] + t * a[0, 1] + w * a[0, 2]
             y = points[n, 1] + s * a[1, 0] + t * a[1, 1] + w * a[1, 2]
             z = points[n, 2] + s * a[2, 0] + t * a[2, 1] + w * a[2, 2]
-            out[n, m] = _signal(x, y, z, heel)
+            out[n, m] = _signal(x, y, z, centre if alike else _depths(x, y, z, heel), heel)
     return out

@@ -1,26 +1,44 @@
-"""Pairs of MR images of a heel, unloaded and under a plate, of which the strain is known exactly."""
+"""A heel under a plate: its motions under Load0 to Load4, and its images, of which the strain is known exactly."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dvc.arrays import FloatArray
-from dvc.deformation import RigidMotion
+from dvc.arrays import BoolArray, FloatArray
+from dvc.deformation import Composed, Motion, RigidMotion
 from dvc.errors import InputError
 from dvc.image import Grid, Image, LabelMap, Mask
 from phantoms.anatomy import FAT_SIGNAL, TISSUES, Heel
-from phantoms.motions import EllipsoidUnion, Flow
+from phantoms.bodies import EllipsoidUnion
+from phantoms.flow import Border, Flow
 from phantoms.mri import acquire
+
+LOADS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
+    {
+        "Load1": (6.0, 0.0, 3.0),
+        "Load2": (1.4, 0.0, 0.7),
+        "Load3": (1.4, 4.2, 4.5),
+        "Load4": (1.4, 1.5, 1.5),
+    }
+)
+"""Of each load: how far the plate presses, how far it shears, and how far the pad slides inside its skin, mm.
+
+Chosen for the shear that finite-element models of the heel gave for 140 N, 15 N, 15 + 45 N and 15 + 12 N: in the fat
+around the calcaneus a median and a 90th percentile of about .20 / .40, .05 / .09, .13 / .35, .06 / .13.
+"""
 
 _PRESS_MM = 7.5
 _SHEAR_MM = 5.0
+_SLIDE = 0.1
 _CENTRE_MM = np.array([0.0, 0.0, -6.0])
 _MARGIN_MM = 4.0
 _CHUNK = 300_000
+_COARSE = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +57,7 @@ class HeelPair:
         Tissues on the reference's grid, by voxel centre.
     bone : Mask
         The calcaneus on the reference's grid.
-    deformation : Flow
+    deformation : Motion
         u relative to the bone, and its gradient, in the reference's configuration, LPS mm.
     foot_motion : RigidMotion
         From the reference's frame to the loaded and the repeated scan, LPS mm.
@@ -50,7 +68,7 @@ class HeelPair:
     repeat: Image
     labels: LabelMap
     bone: Mask
-    deformation: Flow
+    deformation: Motion
     foot_motion: RigidMotion
 
 
@@ -63,10 +81,7 @@ def heel_pair(
     foot_motion: RigidMotion | None = None,
     loaded_grid: Grid | None = None,
 ) -> HeelPair:
-    """Images of a heel without load, under load, and without load again.
-
-    The loaded image is I1(y) = I0(phi^-1(R^T (y - t))), where I0 is the anatomy's closed form: nothing
-    that has been sampled is ever resampled. Each image has its own noise and coil sensitivity.
+    """Images of a heel without load, under a smooth load, and without load again.
 
     Parameters
     ----------
@@ -88,33 +103,83 @@ def heel_pair(
     InputError
         If the seed is negative, the load negative or beyond 1.5, or the SNR or the grid out of range.
     """
-    if snr is not None and not snr > 0:
-        raise InputError(f"The SNR must be positive, or None for an image without noise; got {snr}.")
     if not 0.0 <= load <= 1.5:
         raise InputError(f"The load must lie between 0 and 1.5; got {load}.")
     heel = Heel(seed)
-    grid = _centred_grid(shape, spacing_mm)
-    motion = default_motion() if foot_motion is None else foot_motion
+    grid = centred_grid(shape, spacing_mm)
+    foot = default_motion() if foot_motion is None else foot_motion
     flow = pressed(heel, load)
-    labels = LabelMap(grid, heel.tissue_at(grid.points().reshape(-1, 3)).reshape(grid.shape), TISSUES)
+    labels = labels_of(heel, grid)
     bone = labels.region("bone")
-    scan = _covering(grid, motion.apply(bone.points())) if loaded_grid is None else loaded_grid
-
-    def scanned(number: int, where: Grid, truth: Flow, moved: RigidMotion) -> Image:
-        noise, bias = (int(s) for s in np.random.SeedSequence([seed, 2, number]).generate_state(2))
-        signal = loaded_octants(heel, truth, moved, where)
-        return acquire(signal, where, snr=snr, reference_signal=FAT_SIGNAL, seed=noise, bias_seed=bias)
-
-    still = pressed(heel, 0.0)
+    where = covering(grid, foot.apply(bone.points())) if loaded_grid is None else loaded_grid
     return HeelPair(
-        reference=scanned(0, grid, still, RigidMotion.identity()),
-        loaded=scanned(1, scan, flow, motion),
-        repeat=scanned(2, scan, still, motion),
+        reference=scan(heel, grid, snr=snr, number=0),
+        loaded=scan(heel, where, flow, foot, snr=snr, number=1),
+        repeat=scan(heel, where, None, foot, snr=snr, number=2),
         labels=labels,
         bone=bone,
         deformation=flow,
-        foot_motion=motion,
+        foot_motion=foot,
     )
+
+
+def scan(
+    heel: Heel,
+    grid: Grid,
+    motion: Motion | None = None,
+    foot_motion: RigidMotion | None = None,
+    *,
+    snr: float | None,
+    number: int,
+) -> Image:
+    """Image of a heel after a motion of its tissue and then one of the whole foot.
+
+    The image is I(y) = I0(phi^-1(R^T (y - t))), where I0 is the anatomy's closed form: nothing that has been
+    sampled is ever resampled. Noise and coil sensitivity are the acquisition's own.
+
+    Parameters
+    ----------
+    heel : Heel
+    grid : Grid
+        Of the image, LPS mm.
+    motion : Motion, optional
+        Of tissue relative to bone; none for an unloaded heel.
+    foot_motion : RigidMotion, optional
+    snr : float or None
+        Fat's signal over the noise's standard deviation; None for no noise.
+    number : int
+        Of the acquisition: with the heel's seed it draws noise and sensitivity.
+
+    Raises
+    ------
+    InputError
+        If the SNR is out of range.
+    """
+    noise, bias = (int(s) for s in np.random.SeedSequence([heel.seed, 2, number]).generate_state(2))
+    signal = octants(heel, grid, motion, foot_motion or RigidMotion.identity())
+    return acquire(signal, grid, snr=snr, reference_signal=FAT_SIGNAL, seed=noise, bias_seed=bias)
+
+
+def labels_of(heel: Heel, grid: Grid) -> LabelMap:
+    """Tissues by voxel centre."""
+    return LabelMap(grid, heel.tissue_at(grid.points().reshape(-1, 3)).reshape(grid.shape), TISSUES)
+
+
+def labels_to_mesh(heel: Heel, labels: LabelMap) -> LabelMap:
+    """The part that a finite-element model takes: sole and heel, 75 to 100 mL of soft tissue at size 1, and its bone.
+
+    Below a plane through the calcaneus' middle and behind one through its front.
+    """
+    points = labels.grid.points()
+    kept = (points[..., 2] < 0.0) & (points[..., 1] > -20.0 * heel.size)
+    return LabelMap(labels.grid, np.where(kept, labels.labels, 0), labels.names)
+
+
+def drawn_motion(seed: int, number: int) -> RigidMotion:
+    """Draw the foot's motion before an acquisition: up to 3 degrees about and 2 mm along each axis."""
+    random = np.random.default_rng([seed, 3, number])
+    turn = Rotation.from_rotvec(random.uniform(-3.0, 3.0, 3), degrees=True).as_matrix()
+    return RigidMotion.about(np.array([0.0, 5.0, 0.0]), turn, random.uniform(-2.0, 2.0, 3))
 
 
 def default_motion() -> RigidMotion:
@@ -124,22 +189,60 @@ def default_motion() -> RigidMotion:
 
 
 def pressed(heel: Heel, load: float = 1.0) -> Flow:
-    """Return the flow of a heel under a plate moving up and forward, its bones at rest; load scales it."""
+    """Return the flow of a heel under a plate moving up and forward, smooth everywhere, its bones at rest."""
+    return under_plate(heel, press_mm=load * _PRESS_MM, shear_mm=load * _SHEAR_MM)
+
+
+def under_plate(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
+    """Return the smooth flow of a heel under a plate that moves up by ``press_mm`` and forward by ``shear_mm``."""
     bones = heel.skeleton
+    # merged softly, which makes the body larger: the bones stay inside, and motion rises around them smoothly
+    rest = EllipsoidUnion(bones.centres_mm, bones.forms, sharpness=1.25)
     return Flow(
-        load * np.array([0.0, -_SHEAR_MM, _PRESS_MM]),
-        pivot_mm=np.array([0.0, 15.0, -47.0]),
-        # merged softly, which makes the body larger: the bones stay inside, and motion rises around them smoothly
-        rest=EllipsoidUnion(bones.centres_mm, bones.forms, sharpness=1.25),
-        ramp=1.0,
-        centre_mm=np.array([0.0, 14.0, -50.0]),
-        width_mm=np.array([51.0, 58.0, 31.0]),
+        np.array([0.0, -shear_mm, press_mm]),
+        pivot_mm=heel.size * np.array([0.0, 15.0, -47.0]),
+        rest=Border(rest, ramp=1.0),
+        centre_mm=heel.size * np.array([0.0, 14.0, -50.0]),
+        width_mm=heel.size * np.array([51.0, 58.0, 31.0]),
+        steps=max(3, int(np.ceil(1.1 * np.hypot(press_mm, shear_mm)))),
     )
 
 
-def loaded_signal(heel: Heel, flow: Flow, motion: RigidMotion) -> Callable[[FloatArray], FloatArray]:
-    """Noise-free signal of the heel after the flow and then the motion, as a function of points (n, 3) mm."""
-    back, home = flow.inverse(), motion.inverse()
+def sliding(heel: Heel, shear_mm: float) -> Flow:
+    """Return the flow of the heel pad alone, along a skin and a bone that are both at rest.
+
+    Its strain jumps at either border: fat shears right up to them. ``shear_mm`` is about how far tissue moves in the
+    middle of the pad.
+    """
+    return Flow(
+        np.array([0.0, _SLIDE * shear_mm, 0.0]),
+        # far above, so that the potential is about the same all over the pad, and tissue circulates around it
+        pivot_mm=heel.size * np.array([0.0, 14.0, 50.0]),
+        rest=Border(heel.skeleton, ramp=0.6, order=2),
+        skin=Border(heel.flesh, ramp=0.2, order=2),
+        centre_mm=heel.size * np.array([1.0, 15.0, -32.0]),
+        width_mm=heel.size * np.array([22.0, 26.0, 17.0]),
+        steps=max(3, int(np.ceil(1.25 * shear_mm))),
+    )
+
+
+def under_load(heel: Heel, load: str) -> Motion:
+    """Return the motion of a heel under one of LOADS: the pad slides inside its skin, and the plate moves all.
+
+    Raises
+    ------
+    InputError
+        If there is no such load.
+    """
+    if load not in LOADS:
+        raise InputError(f"No load '{load}'; there are {', '.join(LOADS)}.")
+    press, shear, slide = LOADS[load]
+    return Composed([sliding(heel, slide), under_plate(heel, press_mm=press, shear_mm=shear)])
+
+
+def loaded_signal(heel: Heel, motion: Motion, foot_motion: RigidMotion) -> Callable[[FloatArray], FloatArray]:
+    """Noise-free signal of the heel after both motions, as a function of points (n, 3) mm."""
+    back, home = motion.inverse(), foot_motion.inverse()
 
     def signal(points_mm: FloatArray) -> FloatArray:
         x = home.apply(points_mm)
@@ -148,7 +251,45 @@ def loaded_signal(heel: Heel, flow: Flow, motion: RigidMotion) -> Callable[[Floa
     return signal
 
 
-def _centred_grid(shape: tuple[int, int, int], spacing_mm: float | Sequence[float]) -> Grid:
+def octants(heel: Heel, grid: Grid, motion: Motion | None, foot_motion: RigidMotion) -> FloatArray:
+    """The heel's signal in the octants of a grid's voxels, (ni, nj, nk, 2, 2, 2), after both motions.
+
+    Each voxel's centre is carried back exactly; its octants are spread along the edges that the voxel has
+    there, which to first order are columns of F^-1 R^T times the spacing.
+    """
+    home = foot_motion.inverse()
+    edges = home.rotation @ (np.asarray(grid.direction) * grid.spacing_mm)
+    centres = home.apply(grid.points().reshape(-1, 3))
+    out = np.zeros((len(centres), 2, 2, 2))
+    back = None if motion is None else motion.inverse()
+    near = np.flatnonzero(_may_show(heel, grid, back, home).ravel())
+    for start in range(0, len(near), _CHUNK):
+        some = near[start : start + _CHUNK]
+        x = centres[some]
+        if back is None:
+            out[some] = heel.octant_intensity(x, edges)
+        else:
+            u, H = back.evaluate(x)
+            out[some] = heel.octant_intensity(x + u, (H + np.eye(3)) @ edges)
+    return out.reshape(*grid.shape, 2, 2, 2)
+
+
+def _may_show(heel: Heel, grid: Grid, back: Motion | None, home: RigidMotion) -> BoolArray:
+    """Voxels that may hold tissue: near some that do, on every fourth of the grid's planes along each axis."""
+    planes = [np.arange(0, n + _COARSE - 1, _COARSE) for n in grid.shape]
+    corners = home.apply(grid.points_at(np.stack(np.meshgrid(*planes, indexing="ij"), axis=-1).astype(np.float64)))
+    x = corners.reshape(-1, 3)
+    at = x if back is None else x + back.displacement(x)
+    # A voxel is at most half a cell's diagonal from the nearest corner; a factor of two allows for stretch.
+    diagonal = _COARSE * float(np.linalg.norm(grid.spacing_mm))
+    shown = (heel.outline.distance(at) < diagonal + 1.0).reshape([len(p) for p in planes])
+    for axis, n in enumerate(grid.shape):
+        shown = np.repeat(shown, _COARSE, axis=axis).take(np.arange(_COARSE // 2, n + _COARSE // 2), axis=axis)
+    return np.asarray(shown)
+
+
+def centred_grid(shape: tuple[int, int, int], spacing_mm: float | Sequence[float]) -> Grid:
+    """Grid around the calcaneus; spacing in mm, one or three."""
     spacing = np.asarray(spacing_mm, dtype=np.float64)
     if spacing.shape not in {(), (3,)}:
         raise InputError(f"Voxel spacing must be one length or three, mm; got {spacing_mm}.")
@@ -156,7 +297,7 @@ def _centred_grid(shape: tuple[int, int, int], spacing_mm: float | Sequence[floa
     return Grid(shape, spacing, _CENTRE_MM - 0.5 * (np.array(shape) - 1) * spacing)
 
 
-def _covering(grid: Grid, points_mm: FloatArray) -> Grid:
+def covering(grid: Grid, points_mm: FloatArray) -> Grid:
     """Return the grid, extended by whole voxels where points come closer than a margin to its border."""
     if len(points_mm) == 0:
         return grid
@@ -166,24 +307,3 @@ def _covering(grid: Grid, points_mm: FloatArray) -> Grid:
     after = np.maximum(0, np.ceil(indices.max(axis=0) + margin - (np.array(grid.shape) - 1))).astype(int)
     i, j, k = (int(n) for n in np.array(grid.shape) + before + after)
     return Grid((i, j, k), grid.spacing_mm, grid.points_at(-before.astype(np.float64)), grid.direction)
-
-
-def loaded_octants(heel: Heel, flow: Flow, motion: RigidMotion, grid: Grid) -> FloatArray:
-    """The heel's signal in the octants of a grid's voxels, (ni, nj, nk, 2, 2, 2), after flow and rigid motion.
-
-    Each voxel's centre is carried back exactly; its octants are spread along the edges that the voxel has
-    there, which to first order are columns of F^-1 R^T times the spacing.
-    """
-    back, home = flow.inverse(), motion.inverse()
-    edges = home.rotation @ (np.asarray(grid.direction) * grid.spacing_mm)
-    centres = home.apply(grid.points().reshape(-1, 3))
-    out = np.zeros((len(centres), 2, 2, 2))
-    # further out all is air, before and after: no tissue moves by 1.2 times the plate's displacement
-    reach = 1.2 * float(np.linalg.norm(flow.plate_mm)) + 2.0
-    near = np.flatnonzero(heel.outline.distance(centres) < reach)
-    for start in range(0, len(near), _CHUNK):
-        some = near[start : start + _CHUNK]
-        X = centres[some]
-        u, H = back.evaluate(X)
-        out[some] = heel.octant_intensity(X + u, (H + np.eye(3)) @ edges)
-    return out.reshape(*grid.shape, 2, 2, 2)

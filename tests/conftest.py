@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -21,6 +22,20 @@ def real_data() -> Path:
     if not (folder / "README.md").is_file():
         pytest.skip(f"real test data not found at {folder}; set MRSTRAIN_TEST_DATA to its folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def heel():
+    from phantoms.anatomy import Heel
+
+    return Heel(seed=1)
+
+
+@pytest.fixture(scope="session")
+def tissue_points(heel):
+    """Points in soft tissue and bone, all over the heel, LPS mm."""
+    points = np.random.default_rng(5).uniform([-32, -55, -45], [32, 46, 40], (6000, 3))
+    return points[heel.tissue_at(points) > 0]
 
 
 @pytest.fixture(scope="session")

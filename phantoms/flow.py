@@ -1,0 +1,310 @@
+"""Incompressible flows of soft tissue around bone and, where wanted, inside a skin, with exact gradient and inverse.
+
+A flow carries every point for one unit of time along a stationary velocity v. Where div v = 0, volume is
+kept. Following the same velocity backwards is the inverse map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numba import njit, prange
+
+from dvc.arrays import FloatArray, frozen
+from dvc.errors import InputError
+from phantoms.bodies import EllipsoidUnion
+
+_BLOCK = 256
+_NOTHING = 27.0  # exp(-27) = 2e-12: beyond, a rise has ended
+
+
+@njit(cache=True)
+def _rise(x, y, z, parts, numbers, side, q):  # type: ignore[no-untyped-def]
+    """Return chi = 1 - exp(-t^order), t = side (sqrt(Q) - 1) / ramp, its gradient, and its Hessian (xx xy xz yy yz zz).
+
+    side is 1 outside the body and -1 inside it; on the other side chi is 0.
+    """
+    sharpness, ramp, order = numbers[0], numbers[1], numbers[2]
+    end = np.sqrt(_NOTHING) if order == 2.0 else np.cbrt(_NOTHING)
+    nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    all_of_it = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    count = parts.shape[0]
+    least = 1e300
+    for i in range(count):
+        a, b, c = x - parts[i, 0], y - parts[i, 1], z - parts[i, 2]
+        across = parts[i, 4] * a * b + parts[i, 5] * a * c + parts[i, 7] * b * c
+        q[i] = parts[i, 3] * a * a + parts[i, 6] * b * b + parts[i, 8] * c * c + 2.0 * across
+        least = min(least, q[i])
+    if side > 0.0:
+        if least <= 1.0:  # Q is below the least q
+            return nothing
+        if least - np.log(count) / sharpness >= (1.0 + end * ramp) ** 2:
+            return all_of_it
+    elif least <= max(0.0, 1.0 - end * ramp) ** 2:
+        return all_of_it
+    total, g0, g1, g2 = 0.0, 0.0, 0.0, 0.0
+    h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(count):
+        excess = sharpness * (q[i] - least)
+        if excess > _NOTHING:
+            continue
+        a, b, c = x - parts[i, 0], y - parts[i, 1], z - parts[i, 2]
+        d0 = 2.0 * (parts[i, 3] * a + parts[i, 4] * b + parts[i, 5] * c)
+        d1 = 2.0 * (parts[i, 4] * a + parts[i, 6] * b + parts[i, 7] * c)
+        d2 = 2.0 * (parts[i, 5] * a + parts[i, 7] * b + parts[i, 8] * c)
+        weight = np.exp(-excess)
+        total += weight
+        g0 += weight * d0
+        g1 += weight * d1
+        g2 += weight * d2
+        h00 += weight * (2.0 * parts[i, 3] - sharpness * d0 * d0)
+        h01 += weight * (2.0 * parts[i, 4] - sharpness * d0 * d1)
+        h02 += weight * (2.0 * parts[i, 5] - sharpness * d0 * d2)
+        h11 += weight * (2.0 * parts[i, 6] - sharpness * d1 * d1)
+        h12 += weight * (2.0 * parts[i, 7] - sharpness * d1 * d2)
+        h22 += weight * (2.0 * parts[i, 8] - sharpness * d2 * d2)
+    Q = least - np.log(total) / sharpness
+    if Q < 0.01:  # near the middle of a body: nothing outside has risen there, everything inside has
+        return nothing if side > 0.0 else all_of_it
+    root = np.sqrt(Q)
+    t = side * (root - 1.0) / ramp
+    if t <= 0.0:
+        return nothing
+    if t >= end:
+        return all_of_it
+    # By the chain rule from Q to t to chi.
+    tail = np.exp(-t * t) if order == 2.0 else np.exp(-t * t * t)
+    power = 2.0 * t if order == 2.0 else 3.0 * t * t
+    slope = 2.0 if order == 2.0 else 6.0 * t
+    dt = side * 0.5 / (root * ramp)
+    ddt = -side * 0.25 / (Q * root * ramp)
+    dchi = power * tail
+    ddchi = (slope - power * power) * tail
+    c1 = dchi * dt
+    c2 = ddchi * dt * dt + dchi * ddt + c1 * sharpness
+    g0, g1, g2, c3 = g0 / total, g1 / total, g2 / total, c1 / total
+    return (
+        1.0 - tail, c1 * g0, c1 * g1, c1 * g2,
+        c2 * g0 * g0 + c3 * h00, c2 * g0 * g1 + c3 * h01, c2 * g0 * g2 + c3 * h02,
+        c2 * g1 * g1 + c3 * h11, c2 * g1 * g2 + c3 * h12, c2 * g2 * g2 + c3 * h22,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _velocity(p, rest, skin, window, plate, pivot, v, L, q):  # type: ignore[no-untyped-def]
+    """Write the velocity at p into v and its gradient into L; q is room to work in."""
+    v[:] = 0.0
+    L[:, :] = 0.0
+    # The window w = exp(-s / 2), its gradient w * e, its Hessian w * (e e^T - diag(f)).
+    f0, f1, f2 = window[1, 0] ** -2, window[1, 1] ** -2, window[1, 2] ** -2
+    e0, e1, e2 = (window[0, 0] - p[0]) * f0, (window[0, 1] - p[1]) * f1, (window[0, 2] - p[2]) * f2
+    s = e0 * e0 / f0 + e1 * e1 / f1 + e2 * e2 / f2
+    if s > 2.0 * _NOTHING:
+        return
+    chi, g0, g1, g2, h00, h01, h02, h11, h12, h22 = _rise(p[0], p[1], p[2], rest[0], rest[1], 1.0, q)
+    if chi == 0.0:
+        return
+    if skin[0].shape[0]:
+        k, j0, j1, j2, k00, k01, k02, k11, k12, k22 = _rise(p[0], p[1], p[2], skin[0], skin[1], -1.0, q)
+        if k == 0.0:
+            return
+        h00 = chi * k00 + 2.0 * g0 * j0 + k * h00
+        h01 = chi * k01 + g0 * j1 + g1 * j0 + k * h01
+        h02 = chi * k02 + g0 * j2 + g2 * j0 + k * h02
+        h11 = chi * k11 + 2.0 * g1 * j1 + k * h11
+        h12 = chi * k12 + g1 * j2 + g2 * j1 + k * h12
+        h22 = chi * k22 + 2.0 * g2 * j2 + k * h22
+        g0, g1, g2 = chi * j0 + k * g0, chi * j1 + k * g1, chi * j2 + k * g2
+        chi *= k
+
+    # psi = chi w
+    w = np.exp(-0.5 * s)
+    h00 = w * (h00 + 2.0 * g0 * e0 + chi * (e0 * e0 - f0))
+    h11 = w * (h11 + 2.0 * g1 * e1 + chi * (e1 * e1 - f1))
+    h22 = w * (h22 + 2.0 * g2 * e2 + chi * (e2 * e2 - f2))
+    h01 = w * (h01 + g0 * e1 + g1 * e0 + chi * e0 * e1)
+    h02 = w * (h02 + g0 * e2 + g2 * e0 + chi * e0 * e2)
+    h12 = w * (h12 + g1 * e2 + g2 * e1 + chi * e1 * e2)
+    g0, g1, g2 = w * (g0 + chi * e0), w * (g1 + chi * e1), w * (g2 + chi * e2)
+
+    c0, c1, c2 = plate[0], plate[1], plate[2]
+    r0, r1, r2 = p[0] - pivot[0], p[1] - pivot[1], p[2] - pivot[2]
+    along = 0.5 * (g0 * c0 + g1 * c1 + g2 * c2)
+    share = chi * w + 0.5 * (g0 * r0 + g1 * r1 + g2 * r2)
+    v[0], v[1], v[2] = c0 * share - r0 * along, c1 * share - r1 * along, c2 * share - r2 * along
+    # Rows of L = c (x) (3 g + H r) / 2 - r (x) (H c) / 2 - I (g . c) / 2
+    m0 = 1.5 * g0 + 0.5 * (h00 * r0 + h01 * r1 + h02 * r2)
+    m1 = 1.5 * g1 + 0.5 * (h01 * r0 + h11 * r1 + h12 * r2)
+    m2 = 1.5 * g2 + 0.5 * (h02 * r0 + h12 * r1 + h22 * r2)
+    n0 = 0.5 * (h00 * c0 + h01 * c1 + h02 * c2)
+    n1 = 0.5 * (h01 * c0 + h11 * c1 + h12 * c2)
+    n2 = 0.5 * (h02 * c0 + h12 * c1 + h22 * c2)
+    L[0, 0], L[0, 1], L[0, 2] = c0 * m0 - r0 * n0 - along, c0 * m1 - r0 * n1, c0 * m2 - r0 * n2
+    L[1, 0], L[1, 1], L[1, 2] = c1 * m0 - r1 * n0, c1 * m1 - r1 * n1 - along, c1 * m2 - r1 * n2
+    L[2, 0], L[2, 1], L[2, 2] = c2 * m0 - r2 * n0, c2 * m1 - r2 * n1, c2 * m2 - r2 * n2 - along
+
+
+@njit(parallel=True, cache=True)
+def _carry(points, rest, skin, window, plate, pivot, steps, gradient):  # type: ignore[no-untyped-def]
+    """Runge-Kutta 4 on x' = v(x) and, with it, on (F - I)' = grad v F."""
+    count = points.shape[0]
+    u = np.zeros((count, 3))
+    F1 = np.zeros((count if gradient else 0, 3, 3))
+    h = 1.0 / steps
+    nodes = np.array([0.0, 0.5 * h, 0.5 * h, h])
+    shares = np.array([h / 6.0, h / 3.0, h / 3.0, h / 6.0])
+    most = max(rest[0].shape[0], skin[0].shape[0])
+    for block in prange((count + _BLOCK - 1) // _BLOCK):
+        v, L, p, du, q = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(most)
+        M, K, dM = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+        for n in range(block * _BLOCK, min(count, (block + 1) * _BLOCK)):
+            for _ in range(steps):
+                du[:] = 0.0
+                dM[:, :] = 0.0
+                v[:] = 0.0
+                K[:, :] = 0.0
+                moving = False
+                for stage in range(4):
+                    for i in range(3):
+                        p[i] = points[n, i] + u[n, i] + nodes[stage] * v[i]
+                    if gradient:
+                        for i in range(3):
+                            for j in range(3):
+                                M[i, j] = F1[n, i, j] + nodes[stage] * K[i, j]
+                    _velocity(p, rest, skin, window, plate, pivot, v, L, q)
+                    for i in range(3):
+                        du[i] += shares[stage] * v[i]
+                        moving = moving or v[i] != 0.0
+                    if gradient:
+                        for i in range(3):
+                            for j in range(3):
+                                K[i, j] = L[i, j] + L[i, 0] * M[0, j] + L[i, 1] * M[1, j] + L[i, 2] * M[2, j]
+                                dM[i, j] += shares[stage] * K[i, j]
+                if not moving:
+                    break  # a point of a stationary flow that is at rest stays at rest
+                for i in range(3):
+                    u[n, i] += du[i]
+                if gradient:
+                    for i in range(3):
+                        for j in range(3):
+                            F1[n, i, j] += dM[i, j]
+    return u, F1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Border:
+    """A surface behind which tissue is at rest.
+
+    Parameters
+    ----------
+    body : EllipsoidUnion
+        The body with that surface.
+    ramp : float
+        Thickness of the layer over which motion rises from it, in units of the body's radius.
+    order : {2, 3}
+        The velocity's potential rises as 1 - exp(-t^order), t = 0 at the surface and 1 at the end of the ramp.
+        With 3 the strain is zero at the surface; with 2 it jumps there: tissue shears right up to it.
+
+    Raises
+    ------
+    InputError
+        If the ramp is not positive or the order is another.
+    """
+
+    body: EllipsoidUnion
+    ramp: float
+    order: Literal[2, 3] = 3
+
+    def __post_init__(self) -> None:
+        if not self.ramp > 0 or self.order not in {2, 3}:
+            raise InputError(f"A border needs ramp > 0 and order 2 or 3; got {self.ramp} and {self.order}.")
+
+    def _numbers(self) -> tuple[FloatArray, FloatArray]:
+        """Of each ellipsoid its centre and its form's xx, xy, xz, yy, yz, zz; then sharpness, ramp and order."""
+        body = self.body
+        upper = body.forms[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        parts = np.ascontiguousarray(np.concatenate([body.centres_mm, upper], axis=1))
+        return parts, np.array([body.sharpness, self.ramp, float(self.order)])
+
+
+_NO_BORDER = (np.zeros((0, 9)), np.ones(3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flow:
+    """An incompressible flow that moves what lies near a plate with it, around a body at rest.
+
+    The velocity is v = curl(psi a), a(x) = c x (x - o) / 2, of which curl a = c:
+
+        v = psi c + [c (grad psi . r) - r (grad psi . c)] / 2,   r = x - o,
+
+    so that div v = 0 exactly, v = c where psi = 1 and v = 0 where psi = 0. psi is the product of a rise from the
+    body at rest (`Border`), of another from the inner surface of a skin at rest, if there is one, and of a
+    Gaussian window around the sole, which ends the motion upward and forward. Points follow v for one unit of
+    time by Runge-Kutta 4 with fixed steps; F follows dF/dt = (grad v) F by the same scheme, which makes it the
+    derivative of the discrete map itself. No point crosses a border, so u and F are exact up to it on either side.
+
+    Parameters
+    ----------
+    plate_mm : (3,)
+        c, the plate's displacement, LPS mm.
+    pivot_mm : (3,)
+        o, the middle of the plate's contact, LPS mm.
+    rest : Border
+        Inside its body nothing moves.
+    centre_mm, width_mm : (3,)
+        Of the window, LPS mm: its middle, and its standard deviation along each axis.
+    skin : Border, optional
+        Outside its body nothing moves.
+    steps : int
+        Runge-Kutta steps.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite, or the widths or the steps are not positive.
+    """
+
+    plate_mm: FloatArray
+    pivot_mm: FloatArray
+    rest: Border
+    centre_mm: FloatArray
+    width_mm: FloatArray
+    skin: Border | None = None
+    steps: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("plate_mm", "pivot_mm", "centre_mm", "width_mm"):
+            vector = frozen(getattr(self, name), np.float64)
+            if vector.shape != (3,) or not np.isfinite(vector).all():
+                raise InputError(f"A flow's {name} needs three finite components; got {vector.tolist()}.")
+            object.__setattr__(self, name, vector)
+        if not (self.width_mm > 0).all():
+            raise InputError(f"A flow's width_mm must be positive; got {self.width_mm.tolist()}.")
+        if self.steps < 1:
+            raise InputError(f"A flow needs one step or more; got {self.steps}.")
+
+    def _follow(self, points_mm: FloatArray, gradient: bool) -> tuple[FloatArray, FloatArray]:
+        points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 3)
+        window = np.array([self.centre_mm, self.width_mm])
+        skin = _NO_BORDER if self.skin is None else self.skin._numbers()
+        u, H = _carry(points, self.rest._numbers(), skin, window, self.plate_mm, self.pivot_mm, self.steps, gradient)
+        lost = ~np.isfinite(points).all(axis=-1)
+        u[lost] = np.nan
+        if gradient:
+            H[lost] = np.nan
+        return u, H
+
+    def displacement(self, points_mm: FloatArray) -> FloatArray:
+        """u(X), (n, 3) mm, at points X (n, 3) LPS mm."""
+        return self._follow(points_mm, False)[0]
+
+    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """u(X) (n, 3) mm and H = F - I (n, 3, 3) of the discrete map at points X (n, 3) LPS mm."""
+        return self._follow(points_mm, True)
+
+    def inverse(self) -> Flow:
+        """Return the backward flow."""
+        return replace(self, plate_mm=-self.plate_mm)
