@@ -99,6 +99,22 @@ def strain_slices(
     return sheet.png()
 
 
+def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
+    """Standard deviation of the maximal shear in colour over the unloaded image, by the error model of the preset.
+
+    The image stays plain grey where there is no result, and in bone.
+    """
+    sheet = Sheet(view, [""], bar=True)
+    window = window_of(view, reference.values)
+    shades, norm = colormaps["cividis"], Normalize(0.0, largest)
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, reference.values, window)
+        sheet.colours(plane, axes, sigma, shades, norm)
+    beyond = bool((view.shown(sigma) > largest).any())
+    sheet.bar(shades, norm, "standard deviation of the maximal shear, no unit", "max" if beyond else "neither")
+    return sheet.png()
+
+
 def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> bytes:
     """Volume ratio det F in colour over the unloaded image: purple shrinks, orange grows, white keeps its volume.
 

@@ -109,12 +109,12 @@ def shown(value: Cell) -> str:
 def write_report(
     path: Path,
     title: str,
-    verdict: Verdict,
+    verdict: Verdict | None,
     sections: Sequence[Section],
     closing: Sequence[Section],
     provenance: Mapping[str, str],
 ) -> None:
-    """Write a report: verdict first, then the sections, the closing ones, and where it all came from.
+    """Write a report: verdict first, if there is one, then the sections, the closing ones, and where it all came from.
 
     One HTML file without scripts and without anything to fetch; all text is escaped. A list of the sections
     with their verdicts stands at the top where there are two or more.

@@ -112,6 +112,9 @@ def register(
     mesh_frame: MeshFrame = Frame.LPS,
     plate_normal: Plate = None,
     shear_direction: Shear = None,
+    error_model: Annotated[
+        Path | None, typer.Option(help="Error model that `mrstrain accuracy` wrote, instead of the preset's own.")
+    ] = None,
     allow_missing: Annotated[
         bool,
         typer.Option("--allow-missing", help="Leave NaN or infinite voxels out instead of refusing the image."),
@@ -152,6 +155,7 @@ def register(
             mesh_frame=mesh_frame.value,
             plate_normal=plate_normal,
             shear_direction=shear_direction,
+            error_model=error_model,
             allow_missing=allow_missing,
             workers=workers,
             threads=threads,
@@ -263,6 +267,41 @@ def phantom(
         )
     for line in made.summary():
         typer.echo(line)
+
+
+@app.command()
+def accuracy(
+    out: Out,
+    preset: Annotated[list[str] | None, typer.Option(help="Preset to judge; repeat for several.")] = None,
+    spacing: Annotated[list[float] | None, typer.Option(help="Edge of the voxels, mm; repeat for several.")] = None,
+    snr: Annotated[list[float] | None, typer.Option(help="Signal-to-noise ratio; repeat for several.")] = None,
+    motion: Annotated[
+        list[str] | None,
+        typer.Option(help="still, smooth, sliding, Load1 to Load4, wave-L (wavelength L mm); repeat for several."),
+    ] = None,
+    seed: Annotated[
+        list[int] | None,
+        typer.Option(min=0, help="Heel; repeat for several. 9000 to 9999 are for published figures, never for tuning."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Registrations at once. Default: one for each core.")
+    ] = None,
+) -> None:
+    """Error of a preset on phantoms: by tissue, place, strain, noise and resolution. Goes on where it stopped."""
+    from mrstrain.progress import live
+    from mrstrain.studying import CONDITIONS, MOTIONS, PUBLISHED_SEEDS, WAVES, cases_of
+    from mrstrain.studying import accuracy as run
+
+    conditions = CONDITIONS
+    if spacing or snr:
+        conditions = tuple(((s, s, s), r) for s in spacing or [0.8] for r in snr or [25.0])
+    cases = cases_of(preset or ("heel-mr",), conditions, motion or (*MOTIONS, *WAVES), seed or PUBLISHED_SEEDS)
+    with live() as progress:
+        study = run(out, cases=cases, workers=workers, tell_plan=typer.echo, progress=progress)
+    for line in study.summary():
+        typer.echo(line)
+    if study.failures:
+        raise typer.Exit(1)
 
 
 @app.command()

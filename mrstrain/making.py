@@ -23,9 +23,9 @@ from mrstrain.provenance import provenance, write_json
 from phantoms.anatomy import Heel
 from phantoms.heel import (
     LOADS,
-    centred_grid,
     covering,
     drawn_motion,
+    heel_grid,
     labels_of,
     labels_to_mesh,
     scan,
@@ -34,10 +34,7 @@ from phantoms.heel import (
 
 Told = Callable[[str, str, float], None]
 
-_FIELD_MM = (100.8, 112.0, 105.6)
 _BYTES_PER_VOXEL = 12  # of the files of one load, images and truth, as measured
-_LARGEST = 512
-_FINEST_MM, _COARSEST_MM = 0.3, 4.0
 _AGAIN = 100  # number of the repeat scan's acquisition
 
 
@@ -105,7 +102,7 @@ def phantom(
         If the folder cannot be written to, or the disk has too little room.
     """
     heel = Heel(seed, size=size, pad_mm=pad_mm, skin_mm=skin_mm, lobule_mm=lobule_mm)
-    grid = _grid(spacing_mm, size)
+    grid = heel_grid(spacing_mm, size)
     if snr is not None and not 1.0 <= snr <= 1000.0:
         raise InputError(f"The SNR must lie between 1 and 1000; got {snr}. Leave noise out with None.")
     motions = {load: under_load(heel, load) for load in loads}
@@ -173,21 +170,6 @@ def phantom(
     write_json(target / "phantom.json", record)
     tell("phantom", "files", 1.0)
     return PhantomSet(target, images)
-
-
-def _grid(spacing_mm: float | Sequence[float], size: float) -> Grid:
-    spacing = np.asarray(spacing_mm, dtype=np.float64)
-    if spacing.shape not in {(), (3,)} or not ((spacing >= _FINEST_MM) & (spacing <= _COARSEST_MM)).all():
-        raise InputError(
-            f"Voxel spacing is one length or three between {_FINEST_MM} and {_COARSEST_MM} mm; got {spacing_mm}."
-        )
-    i, j, k = (int(n) for n in np.round(size * np.array(_FIELD_MM) / np.broadcast_to(spacing, 3)))
-    if max(i, j, k) > _LARGEST:
-        raise InputError(
-            f"A heel of size {size} at {spacing_mm} mm needs {i} x {j} x {k} voxels, more than {_LARGEST} along an "
-            "axis; choose larger voxels."
-        )
-    return centred_grid((i, j, k), np.broadcast_to(spacing, 3).tolist())
 
 
 def _refuse_small_disk(folder: Path, grid: Grid, images: int) -> None:

@@ -50,7 +50,7 @@ def write_series_report(
     told = [*sections]
     told += [Section(name, Verdict("distrust", (f"Not registered. {reason}",))) for name, reason in failures.items()]
     verdict = worst([s.verdict for s in told if s.verdict is not None])
-    write_report(path, "Strain from MR image pairs", verdict, told, _CLOSING, _flat(record))
+    write_report(path, "Strain from MR image pairs", verdict, told, _CLOSING, flat(record))
 
 
 def view_of(subject: Subject, maps: StrainMaps) -> View:
@@ -74,20 +74,20 @@ def agreement_pictures(
     """Draw how well the images agree, after the rigid part and after all."""
     return {
         "overlay": Picture(
-            "Before and after", _said(figures.overlay), figures.overlay(view, reference, aligned, registered)
+            "Before and after", said(figures.overlay), figures.overlay(view, reference, aligned, registered)
         ),
         "checkerboard": Picture(
-            "Checkerboard", _said(figures.checkerboard), figures.checkerboard(view, reference, aligned, registered)
+            "Checkerboard", said(figures.checkerboard), figures.checkerboard(view, reference, aligned, registered)
         ),
         "similarity": Picture(
             "Where the images agree",
-            _said(figures.similarity_slices),
+            said(figures.similarity_slices),
             figures.similarity_slices(view, local_rigid, local_after),
         ),
     }
 
 
-def _said(draw: Callable[..., bytes]) -> str:
+def said(draw: Callable[..., bytes]) -> str:
     """A figure's docstring: it says how the figure is read."""
     return " ".join((draw.__doc__ or "").split())
 
@@ -105,17 +105,17 @@ def strain_pictures(
     drawn = {
         "strain": Picture(
             "Maximal shear",
-            _said(figures.strain_slices) + " Slices through the bone's lowest point along the plate's normal.",
+            said(figures.strain_slices) + " Slices through the bone's lowest point along the plate's normal.",
             figures.strain_slices(view, reference, maps.max_shear, _SHEAR_SCALE, labels),
         ),
         "curves": Picture(
             "Volume above a strain",
-            _said(figures.shear_curves),
+            said(figures.shear_curves),
             figures.shear_curves(maps.max_shear, labels, None if floor is None else floor.shear_p95),
         ),
         "deformed_grid": Picture(
             "Deformed grid",
-            _said(figures.deformed_grid),
+            said(figures.deformed_grid),
             figures.deformed_grid(
                 view,
                 reference.values if aligned is None else aligned,
@@ -125,7 +125,7 @@ def strain_pictures(
         ),
         "jacobian": Picture(
             "Volume ratio",
-            _said(figures.jacobian_slices),
+            said(figures.jacobian_slices),
             figures.jacobian_slices(view, reference, maps.jacobian),
         ),
     }
@@ -214,7 +214,8 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
     )
 
 
-def _flat(record: Mapping[str, object]) -> dict[str, str]:
+def flat(record: Mapping[str, object]) -> dict[str, str]:
+    """A provenance record as lines of a page."""
     shown: dict[str, str] = {}
     for name, value in record.items():
         if isinstance(value, Mapping):

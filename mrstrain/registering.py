@@ -19,6 +19,7 @@ from dvc.presets import Preset, load_preset, read_parameter_file
 from dvc.registration import Registration, Settings
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
+from dvc.uncertainty import ErrorModel, read_error_model
 from dvc.worker import Worker, usable_cores
 from mrstrain.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
 from mrstrain.page import write_series_report
@@ -76,6 +77,7 @@ def register(
     mesh_frame: str = "LPS",
     plate_normal: Sequence[float] | None = None,
     shear_direction: Sequence[float] | None = None,
+    error_model: Path | str | None = None,
     allow_missing: bool = False,
     workers: int | None = None,
     threads: int | None = None,
@@ -111,6 +113,8 @@ def register(
     plate_normal, shear_direction : (3,), optional
         LPS. The plate's outward normal (default: inferior) finds the bone's lowest point; with a shear direction,
         strain is written in the plate's axes as well.
+    error_model : path, optional
+        Error model of the preset or parameters, as `accuracy` writes it; by default the one that comes with the preset.
     allow_missing : bool
         Leave NaN or infinite voxels out instead of refusing the image.
     workers, threads : int, optional
@@ -143,7 +147,9 @@ def register(
     if landmarks is not None and len(loads) != 1:
         raise InputError(f"--landmarks belong to one loaded image; {len(loads)} are given. Register that one alone.")
     stages = _stages(preset, parameters, allow_unknown_parameters)
-    given = [Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh) if p is not None]
+    given = [
+        Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh, error_model) if p is not None
+    ]
     refuse_touching_inputs(target, cases, given)
     subject = read_subject(
         load0,
@@ -164,6 +170,7 @@ def register(
             "Aligning on the bone needs it: give --bone, or --bone-label with --labels, or another --align."
         )
     images = {name: read_image(path, allow_missing=allow_missing) for name, path in zip(cases, paths, strict=True)}
+    model = None if error_model is None else read_error_model(error_model)
     points = None if landmarks is None else read_landmarks(landmarks)[:2]
     make_output(target)
     cores = usable_cores()
@@ -177,6 +184,7 @@ def register(
             "loads": paths[: len(loads)],
             "repeat": paths[len(loads) :],
             "landmarks": [] if landmarks is None else [Path(landmarks)],
+            "error_model": [] if error_model is None else [Path(error_model)],
         },
         {
             "align": align,
@@ -194,7 +202,7 @@ def register(
         },
     )
     body = subject.tissue or tissue_mask(subject.reference)
-    run = _Run(target, subject, images, settings, body, record, points, progress or (lambda *_: None))
+    run = _Run(target, subject, images, settings, body, record, points, model, progress or (lambda *_: None))
     run.all(at_once, chain)
     finished = [run.cases[name] for name in cases if name in run.cases]
     if not finished:
@@ -224,10 +232,11 @@ class _Run:
         body: Mask,
         record: dict[str, object],
         landmarks: tuple[FloatArray, FloatArray] | None,
+        model: ErrorModel | None,
         tell: Told,
     ) -> None:
         self.out, self.subject, self.images, self.settings, self.body = out, subject, images, settings, body
-        self.record, self.landmarks, self._tell = record, landmarks, tell
+        self.record, self.landmarks, self.model, self._tell = record, landmarks, model, tell
         self.cases: dict[str, Case] = {}
         self.failures: dict[str, str] = {}
         self._telling, self._writing = threading.Lock(), threading.Lock()
@@ -292,6 +301,7 @@ class _Run:
                 None if name == _REPEAT else self.landmarks,
                 floor,
                 is_repeat=name == _REPEAT,
+                model=self.model,
             )
             self._told(name, stage, 1.0)
 

@@ -21,9 +21,11 @@ from dvc.report import Picture, Section
 from dvc.resample import carry, shows
 from dvc.strainmaps import StrainMaps, strain_maps
 from dvc.transformwrite import write_elastix_transform, write_itk_transform
+from dvc.uncertainty import ErrorModel
 from dvc.verdict import Verdict
 from dvc.whole import whole_folder
 from mrstrain import page
+from mrstrain.errorbars import ErrorBars, error_bars
 from mrstrain.inputs import Subject
 from mrstrain.provenance import write_json
 
@@ -92,10 +94,11 @@ def write_case(
     floor: NoiseFloor | None,
     *,
     is_repeat: bool,
+    model: ErrorModel | None = None,
 ) -> Case:
     """Maps, quality and figures of a registered load; its folder is written whole or not at all.
 
-    A repeat scan is judged by its own noise floor.
+    A repeat scan is judged by its own noise floor; the error bars are those of ``model``, or of the preset's own.
     """
     reference, loaded, motion = found.reference, found.loaded, found.alignment.motion
     grid = reference.grid
@@ -121,9 +124,11 @@ def write_case(
     )
     view = page.view_of(subject, maps)
     labels = _regions(measured)
+    bars = error_bars(found, subject, maps, model)
     pictures = {
         **page.agreement_pictures(view, reference, aligned, registered, local_rigid, local_after),
         **page.strain_pictures(view, subject, labels, maps, aligned, floor),
+        **bars.pictures(view, reference),
     }
 
     def more(partial: Path) -> None:
@@ -131,8 +136,9 @@ def write_case(
         write_image(partial / "registered.nii.gz", Image(grid, registered))
         write_elastix_transform(partial, found.bspline, motion, grid)
         write_itk_transform(partial / "transform.h5", found.bspline, motion)
+        bars.write(partial, maps)
 
-    return _written(folder, measured, maps, quality, pictures, _alignment(found), record, more)
+    return _written(folder, measured, maps, quality, pictures, _alignment(found), record, more, bars)
 
 
 def write_measured(folder: Path, measured: Measured, record: Mapping[str, object]) -> Case:
@@ -157,6 +163,7 @@ def _written(
     alignment: Mapping[str, object],
     record: Mapping[str, object],
     more: Callable[[Path], None],
+    bars: ErrorBars | None = None,
 ) -> Case:
     subject = measured.subject
     quantities = {
@@ -166,6 +173,10 @@ def _written(
     }
     regions = region_statistics(_regions(measured), quantities)
     told = quality.as_dict() | {"alignment": dict(alignment)}
+    tables = [page.key_figures(quality, alignment), page.region_table(regions)]
+    if bars is not None:
+        told["error_of_max_shear"] = bars.as_dict()
+        tables += [table for table in (bars.table(),) if table is not None]
     with whole_folder(folder) as partial:
         write_maps(partial, maps, subject.axes)
         write_regions_csv(partial / "regions.csv", regions)
@@ -181,8 +192,9 @@ def _written(
     section = Section(
         measured.name,
         quality.verdict,
-        (page.key_figures(quality, alignment), page.region_table(regions)),
+        tuple(tables),
         tuple(pictures.values()),
+        () if bars is None or bars.uncertainty is not None else (f"No error bars. {bars.told}",),
     )
     return Case(measured.name, section, quality.verdict, shear, noise_floor(maps, _soft(measured)))
 

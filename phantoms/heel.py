@@ -37,6 +37,8 @@ _SHEAR_MM = 5.0
 _SLIDE = 0.1
 _CENTRE_MM = np.array([0.0, 0.0, -6.0])
 _MARGIN_MM = 4.0
+_FIELD_MM = (100.8, 112.0, 105.6)
+_FINEST_MM, _COARSEST_MM, _LARGEST = 0.3, 4.0, 512
 _CHUNK = 300_000
 _COARSE = 4
 
@@ -295,6 +297,28 @@ def centred_grid(shape: tuple[int, int, int], spacing_mm: float | Sequence[float
         raise InputError(f"Voxel spacing must be one length or three, mm; got {spacing_mm}.")
     spacing = np.broadcast_to(spacing, (3,))
     return Grid(shape, spacing, _CENTRE_MM - 0.5 * (np.array(shape) - 1) * spacing)
+
+
+def heel_grid(spacing_mm: float | Sequence[float], size: float = 1.0) -> Grid:
+    """Grid that holds the heel of a size, 101 x 112 x 106 mm at size 1.
+
+    Raises
+    ------
+    InputError
+        If the spacing is not one length or three between 0.3 and 4 mm, or needs more than 512 voxels along an axis.
+    """
+    spacing = np.asarray(spacing_mm, dtype=np.float64)
+    if spacing.shape not in {(), (3,)} or not ((spacing >= _FINEST_MM) & (spacing <= _COARSEST_MM)).all():
+        raise InputError(
+            f"Voxel spacing is one length or three between {_FINEST_MM} and {_COARSEST_MM} mm; got {spacing_mm}."
+        )
+    i, j, k = (int(n) for n in np.round(size * np.array(_FIELD_MM) / np.broadcast_to(spacing, 3)))
+    if max(i, j, k) > _LARGEST:
+        raise InputError(
+            f"A heel of size {size} at {spacing_mm} mm needs {i} x {j} x {k} voxels, more than {_LARGEST} along an "
+            "axis; choose larger voxels."
+        )
+    return centred_grid((i, j, k), spacing_mm)
 
 
 def covering(grid: Grid, points_mm: FloatArray) -> Grid:

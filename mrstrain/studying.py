@@ -1,0 +1,379 @@
+"""`accuracy`: the error of a preset, by tissue, place, strain, noise and resolution, on phantoms of known strain."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import shutil
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from dvc.errors import InputError, MrstrainError, OutputError
+from dvc.presets import load_preset
+from dvc.report import Picture, Section, Table, write_report
+from dvc.uncertainty import POOLED
+from dvc.whole import write_whole
+from dvc.worker import Worker, usable_cores
+from mrstrain.inputs import make_output
+from mrstrain.page import flat, said
+from mrstrain.provenance import provenance, versions, write_json
+from phantoms import figures
+from phantoms.accuracy import (
+    ErrorRow,
+    FloorRow,
+    ResolutionRow,
+    error_rows,
+    fit_error_model,
+    floor_rows,
+    resolution_rows,
+    wavelength_recovered,
+)
+from phantoms.anatomy import Heel
+from phantoms.heel import heel_grid
+from phantoms.study import Case, Samples, measure, motion_named
+
+Told = Callable[[str, str, float], None]
+
+MOTIONS = ("still", "smooth", "sliding", "Load1", "Load2", "Load3", "Load4")
+WAVES = tuple(f"wave-{length}" for length in (6, 8, 12, 16, 24, 48))
+CONDITIONS: tuple[tuple[tuple[float, float, float], float], ...] = (
+    ((0.8, 0.8, 0.8), 25.0),
+    ((0.8, 0.8, 0.8), 12.0),
+    ((0.8, 0.8, 0.8), 50.0),
+    ((1.2, 1.2, 1.2), 25.0),
+    ((0.8, 0.8, 1.6), 25.0),
+)
+"""Voxel (mm) and signal-to-noise ratio of the default study."""
+PUBLISHED_SEEDS = (9000, 9001)
+
+_SECONDS = 75.0  # of one run on one core, as measured: 3,500 iterations, whatever the voxel
+_MEGABYTES = 5.0  # of one run's samples, as measured at 0.8 mm
+_CLOSING = (
+    Section(
+        "How to read this",
+        paragraphs=(
+            "Every pair is a synthetic heel of which the strain is known at every point. Error is found minus true, of "
+            "the maximal shear (E1 - E3)/2 of the Green-Lagrange strain and of the displacement of tissue relative to "
+            "its bone, at one in eight of the heel's voxels.",
+            "Motions: still (foot moved, no strain), smooth (a flow without jumps of strain), sliding (the fat pad "
+            "slides inside bone and skin at rest: strain jumps at both borders), Load1 to Load4 (both together, as "
+            "strong as the forces of the published experiment), wave-L (shear that varies as a cosine of wavelength L "
+            "mm).",
+            "Spatial resolution is the wavelength of which a share of the strain is recovered. A smaller wavelength is "
+            "bought with more noise: give both, or none.",
+            "SD and bias in the error model are given the shear that was found. They hold for tissue strained and "
+            "imaged like these phantoms: neither scanner distortion nor creep during a scan is in them.",
+        ),
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """What a study gave.
+
+    Attributes
+    ----------
+    out : Path
+        With ``errors.csv``, ``zero_strain.csv``, ``resolution.csv``, an error model of each preset and
+        ``report.html``.
+    errors, floors, resolution : tuple of rows
+        As in the tables.
+    failures : dict
+        Case to the reason why it has no result.
+    """
+
+    out: Path
+    errors: tuple[ErrorRow, ...]
+    floors: tuple[FloorRow, ...]
+    resolution: tuple[ResolutionRow, ...]
+    failures: dict[str, str]
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        lines = [
+            f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {r.motion}, {r.tissue}: maximal shear RMSE "
+            f"{r.shear_rmse:.4f}, bias {r.shear_bias:+.4f}; displacement RMSE {r.u_rmse_mm:.3f} mm"
+            for r in self.errors
+            if r.by == "all" and r.tissue == "fat"
+        ]
+        lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
+        return [*lines, f"Report: {self.out / 'report.html'}"]
+
+
+def cases_of(
+    presets: Sequence[str] = ("heel-mr",),
+    conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
+    motions: Sequence[str] = (*MOTIONS, *WAVES),
+    seeds: Sequence[int] = PUBLISHED_SEEDS,
+) -> list[Case]:
+    """Every preset with every condition (voxel in mm, SNR), motion and seed; waves with the first seed alone.
+
+    By default seven motions with two heels each and six waves, at five conditions: 100 registrations.
+    """
+    return [
+        Case(preset, spacing, snr, motion, seed)
+        for preset in presets
+        for spacing, snr in conditions
+        for motion in motions
+        for seed in (seeds[:1] if motion.startswith("wave-") else seeds)
+    ]
+
+
+def expected_minutes(count: int, workers: int) -> float:
+    """About how long so many registrations take."""
+    return count * _SECONDS / workers / 60.0
+
+
+def accuracy(
+    out: Path | str,
+    *,
+    cases: Sequence[Case] | None = None,
+    workers: int | None = None,
+    tell_plan: Callable[[str], None] | None = None,
+    progress: Told | None = None,
+) -> Study:
+    """Measure the error of registration presets on phantoms; a study that was broken off goes on where it stopped.
+
+    Parameters
+    ----------
+    out : path
+        Each run's samples are kept in ``runs`` and used again while preset and versions are the same.
+    cases : sequence of Case
+        The default of `cases_of` where not given.
+    workers : int
+        Registrations at once, on one thread each; by default one for each core.
+    tell_plan : callable, optional
+        Gets a sentence before anything runs: how many registrations, and about how long.
+    progress : callable, optional
+        ``progress(case, stage, fraction)``.
+
+    Returns
+    -------
+    Study
+
+    Raises
+    ------
+    InputError
+        For a case that cannot be: voxel, noise, motion or preset. Before anything runs.
+    OutputError
+        If the folder cannot be written to, or the disk has too little room.
+    MrstrainError
+        If every run failed.
+    """
+    wanted = list(cases_of() if cases is None else cases)
+    if not wanted or len({c.name for c in wanted}) < len(wanted):
+        raise InputError("A study needs at least one case, and each only once.")
+    for case in wanted:
+        _check(case)
+    target = Path(out)
+    make_output(target)
+    runs = target / "runs"
+    runs.mkdir(exist_ok=True)
+    keys = {case.name: _key(case) for case in wanted}
+    found = {c.name: s for c in wanted if (s := Samples.read(runs / f"{c.name}.npz", keys[c.name])) is not None}
+    left = [case for case in wanted if case.name not in found]
+    _refuse_small_disk(target, len(left))
+    at_once = max(1, min(workers or usable_cores(), len(left)))
+    if tell_plan is not None:
+        tell_plan(
+            f"{len(left)} registrations to do ({len(found)} are there already), about "
+            f"{expected_minutes(len(left), at_once):.0f} minutes with {at_once} at once."
+        )
+    failures = _run_all(left, at_once, runs, keys, found, progress or (lambda *_: None), len(wanted))
+    if not found:
+        raise MrstrainError("No case could be measured. " + " ".join(f"{n}: {r}" for n, r in failures.items()))
+    ordered = [found[c.name] for c in wanted if c.name in found]
+    return _write(target, ordered, failures)
+
+
+def _check(case: Case) -> None:
+    load_preset(case.preset)
+    heel_grid(case.spacing_mm)
+    if not 1.0 <= case.snr <= 1000.0:
+        raise InputError(f"The SNR must lie between 1 and 1000; got {case.snr}.")
+    motion = motion_named(Heel(case.seed), case.motion)
+    if motion is None:
+        return
+    points = np.random.default_rng(0).uniform([-32, -50, -44], [32, 44, 40], (2000, 3))
+    _, H = motion.evaluate(points)
+    lowest = float(np.linalg.det(H + np.eye(3)).min())
+    if not lowest > 0.0:
+        raise InputError(f"The motion '{case.motion}' folds (det F = {lowest:.2f}); no image can show it.")
+
+
+def _key(case: Case) -> str:
+    """What a run's result depends on beside its case."""
+    told = versions()
+    text = load_preset(case.preset).text + load_preset("bone-rigid").text
+    return hashlib.sha256((text + told["mrstrain"] + told["itk-elastix"]).encode()).hexdigest()
+
+
+def _refuse_small_disk(folder: Path, count: int) -> None:
+    needed, free = count * _MEGABYTES * 1e6 + 20e6, shutil.disk_usage(folder).free
+    if free < needed:
+        raise OutputError(
+            f"{folder}: the study needs about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. Free "
+            "some, choose another --out, or a smaller study."
+        )
+
+
+def _run_all(
+    cases: Sequence[Case],
+    at_once: int,
+    folder: Path,
+    keys: dict[str, str],
+    found: dict[str, Samples],
+    tell: Told,
+    total: int,
+) -> dict[str, str]:
+    """Measure cases, several at once; each is written as soon as it is there."""
+    local, making, telling = threading.local(), threading.Lock(), threading.Lock()
+    workers: list[Worker] = []
+    failures: dict[str, str] = {}
+    under_way: dict[str, float] = {}
+
+    def told(name: str, fraction: float) -> None:
+        with telling:
+            under_way[name] = fraction
+            done = len(found) + len(failures) + sum(f for n, f in under_way.items() if n not in found)
+            tell("accuracy", f"{len(found)} of {total}", min(1.0, done / total))
+
+    def one(case: Case) -> None:
+        if not hasattr(local, "worker"):
+            local.worker = Worker(threads=1)
+            workers.append(local.worker)
+        try:
+            samples = measure(case, local.worker, making, lambda fraction: told(case.name, fraction))
+            samples.write(folder / f"{case.name}.npz", keys[case.name])
+            found[case.name] = samples
+        except MrstrainError as error:
+            failures[case.name] = str(error)
+        told(case.name, 1.0)
+
+    pool = ThreadPoolExecutor(at_once)
+    try:
+        list(pool.map(one, cases))
+    except BaseException:  # an interrupt: end the workers now, not after their registrations
+        for worker in workers:
+            worker.kill()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        for worker in workers:
+            worker.close()
+    return failures
+
+
+def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> Study:
+    errors, floors, resolution = error_rows(runs), floor_rows(runs), resolution_rows(runs)
+    for name, rows, kind in (
+        ("errors", errors, ErrorRow),
+        ("zero_strain", floors, FloorRow),
+        ("resolution", resolution, ResolutionRow),
+    ):
+        _write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], [asdict(row) for row in rows])
+    presets = list(dict.fromkeys(r.case.preset for r in runs))
+    for preset in presets:
+        some = [r for r in runs if r.case.preset == preset]
+        if any(r.case.wavelength_mm is None for r in some):
+            seeds = sorted({r.case.seed for r in some})
+            source = f"{len(some)} registrations of phantom heels, seeds {seeds}, motions other than waves"
+            fit_error_model(some, source).write(target / f"error_model_{preset}.json")
+    record = provenance(
+        "accuracy",
+        {},
+        {
+            "cases": [r.case.name for r in runs],
+            "failures": dict(failures),
+            "presets": {p: load_preset(p).text for p in presets},
+            "seconds_of_registration": {r.case.name: round(r.seconds, 1) for r in runs},
+        },
+    )
+    write_json(target / "provenance.json", record)
+    sections = _sections(errors, floors, resolution, failures)
+    write_report(target / "report.html", "Accuracy of registration presets", None, sections, _CLOSING, flat(record))
+    return Study(target, tuple(errors), tuple(floors), tuple(resolution), failures)
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, object]]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+    write_whole(path, text.getvalue())
+
+
+def _sections(
+    errors: Sequence[ErrorRow],
+    floors: Sequence[FloorRow],
+    resolution: Sequence[ResolutionRow],
+    failures: dict[str, str],
+) -> list[Section]:
+    sections = []
+    for preset, voxel, snr in dict.fromkeys((r.preset, r.voxel_mm, r.snr) for r in errors):
+        rows = [r for r in errors if (r.preset, r.voxel_mm, r.snr) == (preset, voxel, snr)]
+        table = Table(
+            "Error by motion and tissue",
+            ("motion", "tissue", "shear: bias", "SD", "RMSE", "p95", "u, mm: bias", "SD", "RMSE", "p95"),
+            tuple(
+                (
+                    r.motion, r.tissue, r.shear_bias, r.shear_sd, r.shear_rmse, r.shear_p95,
+                    r.u_bias_mm, r.u_sd_mm, r.u_rmse_mm, r.u_p95_mm,
+                )
+                for r in rows
+                if r.by == "all"
+            ),
+        )  # fmt: skip
+        pictures = tuple(
+            Picture(f"Error by {by.split(',')[0]}", said(figures.errors_by_place), figures.errors_by_place(rows, by))
+            for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
+        )
+        zero = [f for f in floors if (f.preset, f.voxel_mm, f.snr) == (preset, voxel, snr)]
+        floor = Table(
+            "Without strain",
+            ("tissue", "MAER", "SDER", "apparent shear, median", "p95"),
+            tuple((f.tissue, f.maer, f.sder, f.shear_p50, f.shear_p95) for f in zero),
+        )
+        tables = (table, floor) if zero else (table,)
+        sections.append(Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tables, pictures=pictures))
+    if resolution:
+        sections.append(_resolution_section(floors, resolution))
+    if failures:
+        rows_of = tuple((name, reason) for name, reason in failures.items())
+        sections.append(Section("Without a result", tables=(Table("Failures", ("case", "reason"), rows_of),)))
+    return sections
+
+
+def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow]) -> Section:
+    told = []
+    for preset, voxel, snr in dict.fromkeys((r.preset, r.voxel_mm, r.snr) for r in rows):
+        mine = [r for r in rows if (r.preset, r.voxel_mm, r.snr) == (preset, voxel, snr)]
+        zero = [f for f in floors if (f.preset, f.voxel_mm, f.snr, f.tissue) == (preset, voxel, snr, POOLED)]
+        told.append(
+            (
+                preset,
+                f"{voxel} mm",
+                snr,
+                wavelength_recovered(mine, 0.9),
+                wavelength_recovered(mine, 0.5),
+                zero[0].shear_p50 if zero else None,
+                zero[0].maer if zero else None,
+                zero[0].sder if zero else None,
+            )
+        )
+    columns = ("preset", "voxel", "SNR", "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
+    pictures = [Picture("Spatial resolution", said(figures.resolution), figures.resolution(rows))]
+    if floors:
+        pictures.append(
+            Picture("Noise against resolution", said(figures.trade_off), figures.trade_off(floors, rows, POOLED))
+        )
+    table = Table("Spatial resolution and noise in soft tissue", columns, tuple(told))
+    return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))

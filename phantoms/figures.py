@@ -1,0 +1,105 @@
+"""Figures of an accuracy study, each as PNG bytes; what a figure's docstring says is its caption."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from dvc.figures import REGION_COLOURS
+from dvc.sheet import DPI, FONT, INK, WIDTH_IN, png_bytes
+from phantoms.accuracy import SOFT, ErrorRow, FloorRow, ResolutionRow, wavelength_recovered
+
+_MARKS = ("o", "s", "^", "D", "v", "P")
+
+
+def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
+    """Root mean square error (lines) and bias (dashes) of the maximal shear over the middle of each bin, by tissue.
+
+    All motions with strain together, weighted by their number of voxels. The outermost bin has no far end and is
+    drawn at one and a half times its near one.
+    """
+    figure, (axes,) = _page(1)
+    for number, tissue in enumerate(SOFT):
+        mine = [r for r in rows if r.tissue == tissue and r.by == by and r.motion != "still"]
+        lows = sorted({r.low for r in mine})
+        at, rmse, bias = [], [], []
+        for low in lows:
+            some = [r for r in mine if r.low == low]
+            weight = np.array([r.samples for r in some], dtype=np.float64)
+            if weight.sum() < 200:
+                continue
+            high = some[0].high
+            at.append(0.5 * (low + high) if np.isfinite(high) else 1.5 * low)
+            rmse.append(float(np.sqrt(np.average([r.shear_rmse**2 for r in some], weights=weight))))
+            bias.append(float(np.average([r.shear_bias for r in some], weights=weight)))
+        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+        axes.plot(at, rmse, color=colour, marker=_MARKS[number], linewidth=1.8, label=tissue)
+        axes.plot(at, bias, color=colour, linestyle="--", linewidth=1.2)
+    axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
+    _label(axes, by, "error of the maximal shear")
+    axes.legend(fontsize=9, frameon=False)
+    return png_bytes(figure)
+
+
+def resolution(rows: Sequence[ResolutionRow]) -> bytes:
+    """Share of a sinusoidal shear that is recovered, by its wavelength; grey lines at 50 % and 90 %."""
+    figure, (axes,) = _page(1)
+    for number, condition in enumerate(dict.fromkeys(_condition(r) for r in rows)):
+        mine = sorted((r for r in rows if _condition(r) == condition), key=lambda r: r.wavelength_mm)
+        axes.plot(
+            [r.wavelength_mm for r in mine], [r.recovered for r in mine], label=condition, linewidth=1.8,
+            color=REGION_COLOURS[number % len(REGION_COLOURS)], marker=_MARKS[number % len(_MARKS)],
+        )  # fmt: skip
+    for share in (0.5, 0.9):
+        axes.axhline(share, color="#9aa5b1", linewidth=0.8)
+    axes.set_ylim(0.0, 1.1)
+    axes.set_xlim(left=0.0)
+    _label(axes, "wavelength of the strain, mm", "share recovered")
+    axes.legend(fontsize=9, frameon=False)
+    return png_bytes(figure)
+
+
+def trade_off(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], tissue: str) -> bytes:
+    """Noise against spatial resolution. Lower left is better.
+
+    Noise is the apparent maximal shear without strain (median), resolution the wavelength of which 90 % is recovered.
+    """
+    figure, (axes,) = _page(1)
+    for number, condition in enumerate(dict.fromkeys(_condition(r) for r in rows)):
+        mine = [r for r in rows if _condition(r) == condition]
+        floor = [f.shear_p50 for f in floors if _condition(f) == condition and f.tissue == tissue]
+        at = wavelength_recovered(mine, 0.9)
+        if floor and np.isfinite(at):
+            axes.plot(
+                at, floor[0], color=REGION_COLOURS[number % len(REGION_COLOURS)], marker=_MARKS[number % len(_MARKS)],
+                markersize=9, linestyle="none", label=condition,
+            )  # fmt: skip
+    axes.set_xlim(left=0.0)
+    axes.set_ylim(bottom=0.0)
+    _label(axes, "wavelength recovered to 90 %, mm", f"apparent maximal shear without strain, {tissue}")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=9, frameon=False)
+    return png_bytes(figure)
+
+
+def _condition(row: ResolutionRow | FloorRow) -> str:
+    return f"{row.preset}, {row.voxel_mm} mm, SNR {row.snr:g}"
+
+
+def _page(panels: int) -> tuple[Figure, tuple[Axes, ...]]:
+    figure = Figure(figsize=(0.62 * WIDTH_IN * panels, 3.9), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, tuple(np.atleast_1d(figure.subplots(1, panels)))
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x, color=INK, **FONT)
+    axes.set_ylabel(y, color=INK, **FONT)
+    axes.grid(True, color="#d9dee4", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=9)

@@ -1,0 +1,308 @@
+"""One run of the accuracy study: a phantom pair is made, registered, and compared with its truth, voxel by voxel."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from dvc.deformation import Motion, RigidMotion, evaluate_on_grid
+from dvc.errors import InputError
+from dvc.image import LabelMap, Mask
+from dvc.kinematics import StrainField
+from dvc.noise import signal_to_noise
+from dvc.registration import Settings, register
+from dvc.resample import shows
+from dvc.whole import whole_file
+from dvc.worker import Worker
+from phantoms.anatomy import Heel
+from phantoms.heel import LOADS, covering, drawn_motion, heel_grid, labels_of, pressed, scan, sliding, under_load
+from phantoms.motions import ShearWave
+
+RIGID = ("bone", "ankle")
+_STRIDE = 2  # neighbouring voxels say nearly the same: one in eight is kept
+_LAGS = 8
+_WAVE_PEAK = 0.2
+_FORMAT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What one run registers.
+
+    Attributes
+    ----------
+    preset : str
+    spacing_mm : (3,)
+        Of the voxels, mm.
+    snr : float
+        Fat's signal over the noise's standard deviation.
+    motion : str
+        "still", "smooth", "sliding", "Load1" to "Load4", or "wave-L" with a wavelength L in mm.
+    seed : int
+        Of the heel, its images and the foot's motion.
+    """
+
+    preset: str
+    spacing_mm: tuple[float, float, float]
+    snr: float
+    motion: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """For a file and for people."""
+        spacing = "x".join(f"{s:g}" for s in self.spacing_mm)
+        return f"{self.preset}_{spacing}mm_snr{self.snr:g}_{self.motion}_{self.seed}"
+
+    @property
+    def wavelength_mm(self) -> float | None:
+        """Of a wave; None for another motion."""
+        return float(self.motion.removeprefix("wave-")) if self.motion.startswith("wave-") else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """What a run found, at one in eight of the heel's voxels that have a result.
+
+    Attributes
+    ----------
+    case : Case
+    estimated_snr : float
+        As `dvc.noise` finds it in the unloaded image.
+    seconds : float
+        Of the registration.
+    unknown : int
+        Voxels of the heel without a result, of those sampled.
+    tissue : (n,)
+        Label numbers of `phantoms.anatomy.TISSUES`.
+    to_bone_mm, to_border_mm : (n,)
+        Distance to the nearest bone (0 in it) and to the nearest voxel of another tissue, mm.
+    true_shear, shear : (n,)
+        Maximal shear (E_1 - E_3) / 2, true and found.
+    u_error_mm : (n, 3)
+        Found minus true displacement of tissue relative to its bone, LPS mm.
+    mean_abs_strain : (n,)
+        Mean of the absolute values of the six components of the Green-Lagrange strain found.
+    true_slope, slope : (n,)
+        H_dn = d . (grad u) n of a wave, true and found; zero for another motion.
+    folded : int
+        Sampled voxels with det F <= 0.
+    correlation : (lags,)
+        Autocorrelation of the error of the maximal shear in soft tissue at distances of 2, 4, 6, ... voxels.
+    lag_mm : (lags,)
+        Those distances, mm; means over the three axes.
+    """
+
+    case: Case
+    estimated_snr: float
+    seconds: float
+    unknown: int
+    folded: int
+    tissue: IntArray
+    to_bone_mm: Float32Array
+    to_border_mm: Float32Array
+    true_shear: Float32Array
+    shear: Float32Array
+    u_error_mm: Float32Array
+    mean_abs_strain: Float32Array
+    true_slope: Float32Array
+    slope: Float32Array
+    correlation: FloatArray
+    lag_mm: FloatArray
+
+    def write(self, path: Path, key: str) -> None:
+        """Write to a file, whole or not at all; ``key`` says what it was made from."""
+        numbers = {n: getattr(self, n) for n in ("estimated_snr", "seconds", "unknown", "folded")}
+        head = {"format": _FORMAT, "key": key, "case": asdict(self.case)} | numbers
+        arrays = {n: getattr(self, n) for n in _ARRAYS}
+        with whole_file(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, head=np.array(json.dumps(head)), **arrays)
+
+    @classmethod
+    def read(cls, path: Path, key: str) -> Samples | None:
+        """Read what `write` wrote; None where the file is missing, damaged, or made from something else."""
+        try:
+            with np.load(io.BytesIO(path.read_bytes())) as file:
+                head = json.loads(str(file["head"]))
+                if head["format"] != _FORMAT or head["key"] != key:
+                    return None
+                case = Case(**head["case"] | {"spacing_mm": tuple(head["case"]["spacing_mm"])})
+                numbers = {n: head[n] for n in ("estimated_snr", "seconds", "unknown", "folded")}
+                return cls(case=case, **numbers, **{n: file[n] for n in _ARRAYS})
+        except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+            return None
+
+
+_ARRAYS = (
+    "tissue",
+    "to_bone_mm",
+    "to_border_mm",
+    "true_shear",
+    "shear",
+    "u_error_mm",
+    "mean_abs_strain",
+    "true_slope",
+    "slope",
+    "correlation",
+    "lag_mm",
+)
+
+
+def motion_named(heel: Heel, name: str) -> Motion | None:
+    """The motion of a heel's tissue by its name (see `Case`); None for "still".
+
+    Raises
+    ------
+    InputError
+        For a name that is none.
+    """
+    if name == "still":
+        return None
+    if name == "smooth":
+        return pressed(heel)
+    if name == "sliding":
+        return sliding(heel, 4.0)
+    if name in LOADS:
+        return under_load(heel, name)
+    if name.startswith("wave-"):
+        try:
+            wavelength = float(name.removeprefix("wave-"))
+        except ValueError:
+            wavelength = float("nan")
+        # Along the foot, with its crests across the pad's thickness.
+        return ShearWave(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), wavelength, _WAVE_PEAK)
+    raise InputError(f"No motion '{name}'; there are still, smooth, sliding, {', '.join(LOADS)} and wave-L (L in mm).")
+
+
+def measure(
+    case: Case, worker: Worker, making: AbstractContextManager[object], progress: Callable[[float], None]
+) -> Samples:
+    """Make the pair of a case, register it and compare with the truth.
+
+    Parameters
+    ----------
+    case : Case
+    worker : Worker
+        Process in which elastix runs.
+    making : context manager
+        Held while this process itself computes, on all cores: a lock, where several cases are measured at once.
+    progress : callable
+        ``progress(fraction)`` of the registration.
+
+    Raises
+    ------
+    MrstrainError
+        If the case cannot be made or registered.
+    """
+    with making:
+        heel = Heel(case.seed)
+        grid = heel_grid(case.spacing_mm)
+        motion = motion_named(heel, case.motion)
+        wave = case.wavelength_mm is not None
+        foot = RigidMotion.identity() if wave else drawn_motion(case.seed, 1)
+        labels = labels_of(heel, grid)
+        bone, body = labels.region("bone"), Mask(grid, labels.labels > 0)
+        reference = scan(heel, grid, snr=case.snr, number=0)
+        where = covering(grid, foot.apply(bone.points()))
+        loaded = scan(heel, where, motion, foot, snr=case.snr, number=1)
+    # A wave moves the bone too: nothing there to align on.
+    settings = Settings.of(case.preset, align_on="none" if wave else "bone", threads=worker.threads)
+    found = register(
+        reference,
+        loaded,
+        bone=bone,
+        tissue=body,
+        settings=settings,
+        worker=worker,
+        progress=lambda stage, fraction: progress(fraction if stage != "aligning" else 0.0),
+    )
+    with making:
+        edge = float(found.bspline.control.spacing_mm.min())
+        kept = np.zeros(grid.shape, dtype=bool)
+        kept[::_STRIDE, ::_STRIDE, ::_STRIDE] = True
+        kept &= labels.labels > 0
+        u, H = evaluate_on_grid(found.bspline, grid, kept)
+        X = grid.points(kept)
+        known = np.isfinite(u).all(axis=1) & shows(loaded, found.alignment.motion.apply(X + u), edge)
+        true_u, true_H = (np.zeros_like(u), np.zeros_like(H)) if motion is None else motion.evaluate(X)
+        strain, truth = StrainField.from_gradient(H), StrainField.from_gradient(true_H)
+        d, n = (motion.direction, motion.normal) if isinstance(motion, ShearWave) else (np.zeros(3), np.zeros(3))
+        error = (strain.max_shear - truth.max_shear).astype(np.float32)
+        correlation, lag_mm = _autocorrelation(error, known, kept, labels)
+        to_bone, to_border = distances_mm(labels)
+        upper = strain.green_lagrange[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+
+        def single(values: FloatArray) -> Float32Array:
+            return np.asarray(values[known], dtype=np.float32)
+
+        return Samples(
+            case=case,
+            estimated_snr=signal_to_noise(reference, body),
+            seconds=found.seconds,
+            unknown=int(np.count_nonzero(~known)),
+            folded=int(np.count_nonzero(strain.jacobian[known] <= 0)),
+            tissue=labels.labels[kept][known],
+            to_bone_mm=to_bone[kept][known],
+            to_border_mm=to_border[kept][known],
+            true_shear=single(truth.max_shear),
+            shear=single(strain.max_shear),
+            u_error_mm=single(u - true_u),
+            mean_abs_strain=single(np.abs(upper).mean(axis=1)),
+            true_slope=single(np.einsum("i,nij,j->n", d, true_H, n)),
+            slope=single(np.einsum("i,nij,j->n", d, H, n)),
+            correlation=correlation,
+            lag_mm=lag_mm,
+        )
+
+
+def distances_mm(labels: LabelMap) -> tuple[Float32Array, Float32Array]:
+    """Distance of every voxel to the nearest bone (0 in it), and to the nearest voxel of another label, mm.
+
+    Bones are the regions called "bone" and "ankle".
+    """
+    spacing = labels.grid.spacing_mm
+    values = labels.labels
+    bone = np.isin(values, [number for number, name in labels.names.items() if name in RIGID])
+    to_bone = distance_transform_edt(~bone, sampling=spacing)
+    border = np.zeros(values.shape, dtype=bool)
+    for axis in range(3):
+        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        differs = values[tuple(ahead)] != values[tuple(behind)]
+        border[tuple(ahead)] |= differs
+        border[tuple(behind)] |= differs
+    # The surface lies between two voxels, half an edge from either centre.
+    to_border = distance_transform_edt(~border, sampling=spacing) + 0.5 * float(spacing.min())
+    return to_bone.astype(np.float32), to_border.astype(np.float32)
+
+
+def _autocorrelation(
+    error: Float32Array, known: BoolArray, kept: BoolArray, labels: LabelMap
+) -> tuple[FloatArray, FloatArray]:
+    """Of the error in soft tissue, along the three axes together."""
+    coarse = labels.labels[::_STRIDE, ::_STRIDE, ::_STRIDE]
+    field = np.full(labels.labels.shape, np.nan, dtype=np.float32)
+    field[kept] = np.where(known, error, np.nan)
+    field = field[::_STRIDE, ::_STRIDE, ::_STRIDE]
+    field[np.isin(coarse, [number for number, name in labels.names.items() if name in RIGID])] = np.nan
+    field -= np.nanmean(field)
+    variance = float(np.nanmean(field**2))
+    found = np.zeros(_LAGS)
+    for lag in range(1, _LAGS + 1):
+        products = []
+        for axis in range(3):
+            ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+            ahead[axis], behind[axis] = slice(lag, None), slice(None, -lag)
+            products.append(np.nanmean(field[tuple(ahead)] * field[tuple(behind)]))
+        found[lag - 1] = float(np.mean(products)) / variance
+    step = _STRIDE * float(np.mean(labels.grid.spacing_mm))
+    return found, step * np.arange(1.0, _LAGS + 1)

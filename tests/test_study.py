@@ -1,0 +1,232 @@
+"""The accuracy study: what a run keeps, what the tables make of it, and that a study goes on where it stopped."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.errors import InputError, MrstrainError, OutputError
+from dvc.image import Grid, LabelMap
+from dvc.uncertainty import POOLED
+from dvc.worker import Worker
+from mrstrain import accuracy
+from mrstrain.studying import cases_of
+from phantoms.accuracy import (
+    error_rows,
+    fit_error_model,
+    floor_rows,
+    resolution_rows,
+    wavelength_recovered,
+)
+from phantoms.anatomy import TISSUES, Heel
+from phantoms.motions import stretched
+from phantoms.study import Case, Samples, distances_mm, measure, motion_named
+
+COARSE = (2.5, 2.5, 2.5)
+CASE = Case("heel-mr", COARSE, 25.0, "Load1", 4)
+FAT = next(number for number, name in TISSUES.items() if name == "fat")
+BONE = next(number for number, name in TISSUES.items() if name == "bone")
+
+
+def samples(case: Case, bias: float = 0.0, sd: float = 0.01, count: int = 4000, offset: float = 0.0) -> Samples:
+    """Made-up samples of fat, with an error that is known: ``bias`` where the shear is above 0.1, ``sd`` everywhere."""
+    random = np.random.default_rng([case.seed, count])
+    true = random.uniform(0.0, 0.4, count).astype(np.float32)
+    error = np.where(true > 0.1, bias, 0.0) + sd * random.standard_normal(count) + offset
+    slope = np.cos(np.linspace(0.0, 60.0, count)).astype(np.float32)
+    return Samples(
+        case=case,
+        estimated_snr=25.0,
+        seconds=1.0,
+        unknown=0,
+        folded=0,
+        tissue=np.full(count, FAT),
+        to_bone_mm=random.uniform(0.0, 15.0, count).astype(np.float32),
+        to_border_mm=random.uniform(0.5, 6.0, count).astype(np.float32),
+        true_shear=true,
+        shear=np.maximum(true + error, 0.0).astype(np.float32),
+        u_error_mm=np.tile(np.array([0.3, 0.0, -0.4], dtype=np.float32), (count, 1)),
+        mean_abs_strain=np.full(count, 0.02, dtype=np.float32),
+        true_slope=slope,
+        slope=np.float32(0.8) * slope,
+        correlation=np.exp(-np.arange(1.0, 9.0) / 2.0),
+        lag_mm=1.6 * np.arange(1.0, 9.0),
+    )
+
+
+def test_distances_to_bone_and_to_borders() -> None:
+    values = np.full((20, 5, 5), FAT)
+    values[:4] = BONE
+    values[16:] = 0
+    to_bone, to_border = distances_mm(LabelMap(Grid((20, 5, 5), (0.5, 1.0, 1.0), (0, 0, 0)), values, TISSUES))
+    np.testing.assert_allclose(to_bone[:, 2, 2], np.maximum(0.0, 0.5 * (np.arange(20) - 3)))
+    np.testing.assert_allclose(to_border[4:10, 2, 2], 0.25 + 0.5 * np.arange(6))
+
+
+def test_every_motion_has_its_name() -> None:
+    heel = Heel(1)
+    assert motion_named(heel, "still") is None
+    wave = motion_named(heel, "wave-12.5")
+    assert wave is not None
+    assert wave.wavelength_mm == 12.5  # type: ignore[attr-defined]
+    for wrong in ("Load7", "wave-", "wave-x", "wave--3"):
+        with pytest.raises(InputError, match=r"motion|wavelength"):
+            motion_named(heel, wrong)
+
+
+def test_rows_say_what_the_samples_hold() -> None:
+    rows = error_rows([samples(CASE, bias=-0.05), samples(replace(CASE, seed=5), bias=-0.05)])
+    whole = next(r for r in rows if r.tissue == "fat" and r.by == "all")
+    assert (whole.motion, whole.voxel_mm, whole.snr, whole.samples) == ("Load1", "2.5", 25.0, 8000)
+    assert whole.shear_bias == pytest.approx(-0.0375, abs=2e-3)
+    assert whole.shear_rmse == pytest.approx(np.hypot(whole.shear_bias, whole.shear_sd))
+    assert (whole.u_bias_mm, whole.u_rmse_mm, whole.u_p95_mm) == pytest.approx((0.5, 0.5, 0.5))
+    assert whole.u_sd_mm == pytest.approx(0.0, abs=1e-6)
+    by_strain = {r.low: r for r in rows if r.tissue == "fat" and r.by == "true maximal shear"}
+    assert by_strain[0.2].shear_bias == pytest.approx(-0.05, abs=2e-3)
+    assert by_strain[0.05].shear_bias == pytest.approx(0.0, abs=2e-3)
+    assert sum(r.samples for r in rows if r.tissue == "fat" and r.by == "distance to bone, mm") == 8000
+    assert not any(r.tissue == "skin" for r in rows)
+
+
+def test_floor_and_resolution_come_from_their_own_runs() -> None:
+    still, waves = replace(CASE, motion="still"), [replace(CASE, motion=f"wave-{w}") for w in (8, 16)]
+    runs = [samples(CASE), samples(still), *(samples(w) for w in waves)]
+    floor = {r.tissue: r for r in floor_rows(runs)}
+    assert floor["fat"].maer == pytest.approx(0.02)
+    assert floor["fat"].sder == pytest.approx(0.0, abs=1e-6)
+    resolved = resolution_rows(runs)
+    assert [r.wavelength_mm for r in resolved] == [8.0, 16.0]
+    assert resolved[0].recovered == pytest.approx(0.8, abs=1e-6)
+    assert {r.motion for r in error_rows(runs)} == {"Load1", "still"}
+
+
+def test_wavelength_is_read_between_the_rows() -> None:
+    rows = resolution_rows([samples(replace(CASE, motion=f"wave-{w}")) for w in (6, 8, 12)])
+    rows = [replace(r, recovered=v) for r, v in zip(rows, (0.2, 0.4, 0.8), strict=True)]
+    assert wavelength_recovered(rows, 0.5) == pytest.approx(9.0)
+    assert np.isnan(wavelength_recovered(rows, 0.9))
+    assert np.isnan(wavelength_recovered(rows, 0.1))
+
+
+def test_error_model_finds_the_error_that_was_put_in() -> None:
+    runs = [
+        samples(replace(CASE, seed=s), bias=-0.05, sd=0.02, count=30_000, offset=o)
+        for s, o in ((1, 0.01), (2, -0.01), (3, 0.01), (4, -0.01))
+    ]
+    (table,) = fit_error_model([*runs, samples(replace(CASE, motion="wave-8"), bias=9.0)], "made up").tables
+    bias, sd = table.expected("fat", np.array([0.25]), np.array([9.0], dtype=np.float32))
+    assert bias[0] == pytest.approx(-0.05, abs=0.004)
+    assert sd[0] == pytest.approx(np.hypot(0.02, 0.01), abs=0.003)
+    assert table.run_sd["fat"] == pytest.approx(0.01, abs=0.002)
+    assert table.correlation_mm == pytest.approx(3.2, abs=0.02)
+    assert (table.voxel_mm, table.snr) == (2.5, 25.0)
+    # nothing is known of skin: it leans on what soft tissue does
+    np.testing.assert_allclose(table.bias["skin"][0], table.bias[POOLED].mean(axis=0), atol=0.002)
+    # and of shears that did not occur (0.5) what the nearest do, never certainty
+    assert table.sd["fat"][0, -1] == pytest.approx(table.sd["fat"][0, -2], abs=0.005)
+    with pytest.raises(InputError, match="one preset"):
+        fit_error_model([samples(CASE), samples(replace(CASE, preset="other"))], "")
+
+
+def test_samples_survive_their_file_and_a_damaged_one_is_made_anew(tmp_path: Path) -> None:
+    path, made = tmp_path / "run.npz", samples(CASE)
+    made.write(path, "key")
+    again = Samples.read(path, "key")
+    assert again is not None
+    assert again.case == CASE
+    np.testing.assert_array_equal(again.shear, made.shear)
+    assert Samples.read(path, "another preset") is None
+    path.write_bytes(path.read_bytes()[:2000])
+    assert Samples.read(path, "key") is None
+    assert Samples.read(tmp_path / "none.npz", "key") is None
+
+
+def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
+    cases = cases_of()
+    assert len({c.name for c in cases}) == len(cases) < 120
+    assert all(9000 <= c.seed <= 9999 for c in cases)
+    assert {"still", "sliding", "Load1", "wave-8"} <= {c.motion for c in cases}
+
+
+@pytest.mark.slow
+def test_study_measures_writes_and_goes_on(tmp_path: Path) -> None:
+    """Two runs; then a third alone is made, and the page tells of all."""
+    cases = [replace(CASE, motion=m) for m in ("still", "Load1", "wave-24")]
+    plans: list[str] = []
+    first = accuracy(tmp_path, cases=cases[:2], workers=1, tell_plan=plans.append)
+    stamp = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "runs").iterdir()}
+    study = accuracy(tmp_path, cases=cases, workers=1, tell_plan=plans.append)
+    assert [p.split(" to do")[0] for p in plans] == ["2 registrations", "1 registrations"]
+    assert all((tmp_path / "runs" / name).stat().st_mtime_ns == t for name, t in stamp.items())
+    assert not study.failures
+    assert [r for r in study.errors if r.motion == "Load1"] == [r for r in first.errors if r.motion == "Load1"]
+    fat = next(r for r in study.errors if r.motion == "Load1" and r.tissue == "fat" and r.by == "all")
+    assert 0.01 < fat.shear_rmse < 0.15  # voxels of 2.5 mm
+    assert 0.3 < study.resolution[0].recovered < 1.1
+    for name in ("errors.csv", "zero_strain.csv", "resolution.csv", "error_model_heel-mr.json", "report.html"):
+        assert (tmp_path / name).stat().st_size > 100
+    page = (tmp_path / "report.html").read_text()
+    assert "Spatial resolution" in page
+    assert page.count("data:image/png") == 5
+
+
+def test_what_cannot_be_studied_is_refused_before_anything_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object) -> None:
+        pytest.fail("a case was run")
+
+    monkeypatch.setattr("mrstrain.studying.measure", never)
+    for wrong, says in (
+        (replace(CASE, snr=0.0), "SNR"),
+        (replace(CASE, spacing_mm=(0.1, 0.1, 0.1)), "spacing"),
+        (replace(CASE, motion="dance"), "motion"),
+        (replace(CASE, preset="heel-xr"), "heel-mr"),
+    ):
+        with pytest.raises(MrstrainError, match=says):
+            accuracy(tmp_path / "out", cases=[wrong])
+    with pytest.raises(InputError, match="only once"):
+        accuracy(tmp_path / "out", cases=[CASE, CASE])
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 10**6))
+    with pytest.raises(OutputError, match="1 MB left"):
+        accuracy(tmp_path / "out", cases=[CASE])
+
+
+def test_a_folding_motion_is_found_before_any_image_is_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    mirror = stretched(np.ones(3), np.zeros(3))
+    object.__setattr__(mirror, "matrix", np.diag([-1.0, 1.0, 1.0]))
+    monkeypatch.setattr("mrstrain.studying.motion_named", lambda *_: mirror)
+    with pytest.raises(InputError, match="folds"):
+        accuracy(tmp_path / "out", cases=[CASE])
+
+
+def test_a_failed_run_is_told_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def measured(case: Case, *_: object) -> Samples:
+        if case.motion == "Load2":
+            raise MrstrainError("the optimiser diverged")
+        return samples(case)
+
+    monkeypatch.setattr("mrstrain.studying.measure", measured)
+    study = accuracy(tmp_path, cases=[CASE, replace(CASE, motion="Load2")], workers=1)
+    assert list(study.failures.values()) == ["the optimiser diverged"]
+    assert any("FAILED. the optimiser diverged" in line for line in study.summary())
+    assert "the optimiser diverged" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_run_is_that_of_its_case(worker: Worker) -> None:
+    """Still: the truth is zero and what is found is noise; the same case gives the same samples."""
+    case = replace(CASE, motion="still")
+    one, two = (measure(case, worker, nullcontext(), lambda _: None) for _ in range(2))
+    np.testing.assert_array_equal(one.shear, two.shear)
+    assert not one.true_shear.any()
+    assert 0.001 < np.median(one.shear) < 0.1
+    assert one.estimated_snr == pytest.approx(25.0, rel=0.15)
+    assert one.correlation[0] > one.correlation[3]
