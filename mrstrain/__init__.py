@@ -13,11 +13,18 @@ if TYPE_CHECKING:
     from mrstrain.registering import register
     from mrstrain.straining import strain
     from mrstrain.studying import accuracy
+    from mrstrain.twinning import twin
 
 __version__ = "0.1.0"
-__all__ = ["accuracy", "phantom", "register", "strain"]
+__all__ = ["accuracy", "phantom", "register", "strain", "twin"]
 
-_ROOMS = {"accuracy": "studying", "phantom": "making", "register": "registering", "strain": "straining"}
+_ROOMS = {
+    "accuracy": "studying",
+    "phantom": "making",
+    "register": "registering",
+    "strain": "straining",
+    "twin": "twinning",
+}
 
 
 def __getattr__(name: str) -> Any:

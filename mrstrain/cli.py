@@ -270,6 +270,44 @@ def phantom(
 
 
 @app.command()
+def twin(
+    load0: Annotated[Path, typer.Argument(help="Unloaded image of your own.")],
+    deformation: Annotated[
+        Path,
+        typer.Argument(help="The whole motion: elastix .txt, ITK transform (.h5, .tfm), or a displacement image."),
+    ],
+    out: Out,
+    bone: Bone = None,
+    bone_label: BoneLabel = None,
+    tissue: Tissue = None,
+    labels: Labels = None,
+    names: Names = None,
+    frame: Annotated[
+        Frame | None,
+        typer.Option(help="Frame of a displacement image's components, where no JSON beside it tells."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of noise and shading.")] = 1,
+) -> None:
+    """A loaded image made of your own unloaded one, with the truth beside it: to see how well that is found."""
+    from mrstrain.twinning import twin as run
+
+    made = run(
+        load0,
+        deformation,
+        out=out,
+        bone=bone,
+        bone_label=bone_label,
+        tissue=tissue,
+        labels=labels,
+        names=names,
+        frame=None if frame is None else frame.value,
+        seed=seed,
+    )
+    for line in made.summary():
+        typer.echo(line)
+
+
+@app.command()
 def accuracy(
     out: Out,
     preset: Annotated[list[str] | None, typer.Option(help="Preset to judge; repeat for several.")] = None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,12 +11,56 @@ from dvc.deformation import Composed, Deformation, RigidMotion
 from dvc.displacementfile import read_displacement
 from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform
-from mrstrain.inputs import case_names, make_output, read_subject, refuse_touching_inputs
+from mrstrain.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
 from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
 from mrstrain.results import Case, Measured, write_measured
 
 _TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """A deformation that was found elsewhere, with the subject it belongs to.
+
+    Attributes
+    ----------
+    subject : Subject
+    whole : Deformation
+        Of points of the reference to points of the loaded image, LPS mm.
+    source : Path
+    record : dict
+        Provenance.
+    """
+
+    subject: Subject
+    whole: Deformation
+    source: Path
+    record: dict[str, object]
+
+    @property
+    def files(self) -> list[Path]:
+        """All files that were read."""
+        return [self.source, *self.subject.files.values()]
+
+    def measured(self, name: str) -> Measured:
+        """The deformation of tissue relative to its bone, where there is one."""
+        bone = self.subject.bone
+        motion = RigidMotion.identity() if bone is None else motion_of(self.whole, bone)
+        relative = self.whole if bone is None else Composed([self.whole, motion.inverse()])
+        body = self.subject.tissue or tissue_mask(self.subject.reference)
+        return Measured(name, self.subject, body, relative, motion)
+
+
+def read_deformation(
+    subject: Subject, deformation: Path | str, *, frame: str | None, command: str, parameters: Mapping[str, object]
+) -> Given:
+    """Read a deformation of a subject's unloaded image from the file of any tool."""
+    source = Path(deformation)
+    whole: Deformation
+    whole = read_transform(source) if source.suffix.lower() in _TRANSFORMS else read_displacement(source, frame=frame)
+    record = provenance(command, {**subject.files, "deformation": source}, {"frame": frame, **parameters})
+    return Given(subject, whole, source, record)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,27 +129,24 @@ def strain(
         plate_normal=plate_normal,
         shear_direction=shear_direction,
     )
-    name = case_names([source])[0].removesuffix(source.suffix) or "strain"
-    refuse_touching_inputs(target, [name], [source, *subject.files.values()])
-    whole: Deformation
-    whole = read_transform(source) if source.suffix.lower() in _TRANSFORMS else read_displacement(source, frame=frame)
-    motion = RigidMotion.identity() if subject.bone is None else motion_of(whole, subject.bone)
-    relative = whole if subject.bone is None else Composed([whole, motion.inverse()])
-    make_output(target)
-    record = provenance(
-        "strain",
-        {**subject.files, "deformation": source},
-        {
+    given = read_deformation(
+        subject,
+        deformation,
+        frame=frame,
+        command="strain",
+        parameters={
             "bone_label": bone_label,
-            "frame": frame,
             "plate_normal_lps": subject.plate_normal.tolist(),
             "shear_direction_lps": None if shear_direction is None else list(shear_direction),
             "mesh_unit": mesh_unit,
             "mesh_frame": mesh_frame,
         },
     )
-    body = subject.tissue or tissue_mask(subject.reference)
-    case = write_measured(target / name, Measured(name, subject, body, relative, motion), record)
-    write_json(target / "provenance.json", record)
-    write_series_report(target / "report.html", [case.section], {}, record)
+    name = case_names([source])[0].removesuffix(source.suffix) or "strain"
+    refuse_touching_inputs(target, [name], given.files)
+    measured = given.measured(name)
+    make_output(target)
+    case = write_measured(target / name, measured, given.record)
+    write_json(target / "provenance.json", given.record)
+    write_series_report(target / "report.html", [case.section], {}, given.record)
     return Strained(target, case)
