@@ -41,6 +41,8 @@ class ErrorRow:
     low, high : float
         Of the bin, NaN for "all".
     samples : int
+    true_p50, true_p95 : float
+        Percentiles of the true maximal shear.
     shear_bias, shear_sd, shear_rmse, shear_p95 : float
         Of found minus true; the 95th percentile is of the absolute value.
     u_bias_mm, u_sd_mm, u_rmse_mm, u_p95_mm : float
@@ -57,6 +59,8 @@ class ErrorRow:
     low: float
     high: float
     samples: int
+    true_p50: float
+    true_p95: float
     shear_bias: float
     shear_sd: float
     shear_rmse: float
@@ -98,16 +102,14 @@ def error_rows(runs: Sequence[Samples]) -> list[ErrorRow]:
     Waves are left out: they have rows of their own (`resolution_rows`).
     """
     rows = []
-    for (preset, voxel, snr), some in _by_condition(runs):
+    for condition, some in _by_condition(runs):
         plain = [r for r in some if r.case.wavelength_mm is None]
         for motion in dict.fromkeys(r.case.motion for r in plain):
             alike = [r for r in plain if r.case.motion == motion]
             for tissue in (*TISSUES.values(), POOLED):
-                of_tissue = [_tissue(r, tissue) for r in alike]
-                for by, low, high, kept in _bins(alike, of_tissue):
-                    shear, u = _errors(alike, kept)
-                    if len(shear):
-                        rows.append(_row(preset, voxel, snr, motion, tissue, by, low, high, shear, u))
+                for by, low, high, kept in _bins(alike, [_tissue(r, tissue) for r in alike]):
+                    row = _row(condition, (motion, tissue, by, low, high), alike, kept)
+                    rows += [] if row is None else [row]
     return rows
 
 
@@ -303,22 +305,41 @@ def _bins(
             )
 
 
-def _errors(runs: Sequence[Samples], kept: Sequence[BoolArray]) -> tuple[FloatArray, FloatArray]:
-    shear = np.concatenate([(r.shear - r.true_shear)[k] for r, k in zip(runs, kept, strict=True)])
-    u = np.concatenate([r.u_error_mm[k] for r, k in zip(runs, kept, strict=True)])
-    return shear.astype(np.float64), u.astype(np.float64)
-
-
 def _row(
-    preset: str, voxel: str, snr: float, motion: str, tissue: str, by: str, low: float, high: float,
-    shear: FloatArray, u: FloatArray,
-) -> ErrorRow:  # fmt: skip
+    condition: tuple[str, str, float],
+    place: tuple[str, str, str, float, float],
+    runs: Sequence[Samples],
+    kept: Sequence[BoolArray],
+) -> ErrorRow | None:
+    pairs = list(zip(runs, kept, strict=True))
+    true = np.concatenate([r.true_shear[k] for r, k in pairs]).astype(np.float64)
+    if not len(true):
+        return None
+    shear = np.concatenate([r.shear[k] for r, k in pairs]).astype(np.float64) - true
+    u = np.concatenate([r.u_error_mm[k] for r, k in pairs]).astype(np.float64)
     mean = u.mean(axis=0)
     length = np.linalg.norm(u, axis=1)
+    p50, p95 = (float(p) for p in np.percentile(true, [50, 95]))
+    preset, voxel, snr = condition
+    motion, tissue, by, low, high = place
     return ErrorRow(
-        preset, voxel, snr, motion, tissue, by, low, high, len(shear),
-        float(shear.mean()), float(shear.std()), float(np.sqrt(np.mean(shear**2))),
-        float(np.percentile(np.abs(shear), 95)),
-        float(np.linalg.norm(mean)), float(np.sqrt(((u - mean) ** 2).sum(axis=1).mean())),
-        float(np.sqrt(np.mean(length**2))), float(np.percentile(length, 95)),
-    )  # fmt: skip
+        preset=preset,
+        voxel_mm=voxel,
+        snr=snr,
+        motion=motion,
+        tissue=tissue,
+        by=by,
+        low=low,
+        high=high,
+        samples=len(true),
+        true_p50=p50,
+        true_p95=p95,
+        shear_bias=float(shear.mean()),
+        shear_sd=float(shear.std()),
+        shear_rmse=float(np.sqrt(np.mean(shear**2))),
+        shear_p95=float(np.percentile(np.abs(shear), 95)),
+        u_bias_mm=float(np.linalg.norm(mean)),
+        u_sd_mm=float(np.sqrt(((u - mean) ** 2).sum(axis=1).mean())),
+        u_rmse_mm=float(np.sqrt(np.mean(length**2))),
+        u_p95_mm=float(np.percentile(length, 95)),
+    )

@@ -148,7 +148,7 @@ def found_back(whole: Deformation, points_mm: FloatArray, near: RigidMotion) -> 
 
 
 def _refuse_folds(grid: Grid, tissue: Mask, u: FloatArray, H: FloatArray) -> None:
-    known = np.isfinite(H).all(axis=(1, 2)) & np.isfinite(u).all(axis=1)
+    known: BoolArray = np.all(np.isfinite(H), axis=(1, 2)) & np.all(np.isfinite(u), axis=1)
     if np.count_nonzero(known) < 0.5 * len(known):
         raise InputError(f"The deformation is defined in {known.mean():.0%} of the tissue only; half of it is needed.")
     folded = np.flatnonzero(known)[np.linalg.det(H[known] + np.eye(3)) <= 0.0]
