@@ -1,0 +1,30 @@
+"""greedy: diffeomorphic demons with weighted local normalised correlation."""
+
+import SimpleITK as sitk
+from exchange import arguments
+from picsl_greedy import Greedy3D
+
+METRIC = "WNCC 3x3x3"
+SIGMAS = "2.0vox 0.5vox"  # of the update, of the whole
+ITERATIONS = "100x100x50x30"
+MASK_WIDER = 4  # voxels
+
+
+def main() -> None:
+    folder, threads = arguments()
+    fixed = sitk.ReadImage(str(folder / "reference.mha"), sitk.sitkFloat32)
+    moving = sitk.ReadImage(str(folder / "loaded.mha"), sitk.sitkFloat32)
+    mask = sitk.BinaryDilate(sitk.ReadImage(str(folder / "mask.mha"), sitk.sitkUInt8), [MASK_WIDER] * 3)
+    greedy = Greedy3D()
+    greedy.execute(
+        f"-threads {threads} -i fixed moving -gm mask -m {METRIC} -n {ITERATIONS} -s {SIGMAS} -wp 0 -o found",  # -wp 0: the warp is not rounded
+        fixed=fixed,
+        moving=moving,
+        mask=sitk.Cast(mask, sitk.sitkFloat32),
+        found=None,
+    )
+    sitk.WriteImage(greedy["found"], str(folder / "found.mha"))
+
+
+if __name__ == "__main__":
+    main()
