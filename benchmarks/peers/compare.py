@@ -68,10 +68,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="peers-") as prepared:
             write_pair(pair, Path(prepared))
             for peer in missing:
-                kept.append(
-                    {"pair": name, "peer": peer, "threads": given.threads}
-                    | _run(peer, pair, Path(prepared), given.threads)
-                )
+                outcome = _run(peer, pair, Path(prepared), given.threads)
+                kept.append({"pair": name, "peer": peer, "threads": given.threads} | outcome)
                 given.out.parent.mkdir(parents=True, exist_ok=True)
                 given.out.write_text(json.dumps({"versions": about, "runs": kept}, indent=1) + "\n")
                 print(name, peer, kept[-1]["status"], f"{kept[-1]['seconds']:.0f} s", flush=True)
@@ -131,13 +129,14 @@ def _peer_versions() -> dict[str, str]:
 
 
 def table(runs: list[dict[str, Any]]) -> str:
-    """Means over pairs: RMSE of maximal shear; fat's displacement, median / 95th percentile, mm; what was scored of it."""
-    most = {
-        r["pair"]: max(
-            (s["tissues"]["fat"]["voxels"] for s in runs if s["pair"] == r["pair"] and "tissues" in s), default=0
-        )
-        for r in runs
-    }
+    """Means over pairs: RMSE of maximal shear; fat's displacement, median / 95th percentile, mm; time and memory.
+
+    "Fat scored" is the part of fat where the peer has a displacement, of what the peer with the most has.
+    """
+    most: dict[str, int] = {}
+    for run in runs:
+        if "tissues" in run:
+            most[run["pair"]] = max(most.get(run["pair"], 0), run["tissues"]["fat"]["voxels"])
     lines = [
         "| | pairs | fat | muscle | skin | bone | u, fat | fat scored | s | GiB |",
         "|---|---|---|---|---|---|---|---|---|---|",

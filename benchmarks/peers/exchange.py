@@ -1,8 +1,9 @@
 """How an adapter reads its pair and writes what it found; needs SimpleITK and numpy only.
 
-An adapter is a script, run as ``python with_tool.py FOLDER THREADS``. It reads the images of `pairs.write_pair` from the
-folder and leaves there the displacement u(X) of the reference configuration, LPS mm, as ``found.mha`` (a vector image on
-any grid; between its voxels it is taken as a cubic spline), or as a transform: ``found.txt`` (elastix) or ``found.tfm`` (ITK).
+An adapter is a script, run as ``python with_tool.py FOLDER THREADS``. It reads the images of `pairs.write_pair` from
+the folder and leaves there the displacement u(X) of the reference configuration, LPS mm, as ``found.mha`` (a vector
+image on any grid; between its voxels it is taken as a cubic spline), or as a transform: ``found.txt`` (elastix) or
+``found.tfm`` (ITK).
 """
 
 from __future__ import annotations

@@ -28,8 +28,9 @@ def write_pair(pair: HeelPair, folder: Path) -> None:
     """Write what the peers read: MetaImages, whose header is LPS mm as ITK has it.
 
     ``scan0``, ``scan1`` (as acquired), ``bone`` and ``body`` on the reference's grid are what mrstrain is given;
-    ``scan1-moved`` is scan1 with the foot's true motion taken out in its header. The others are prepared, so that every peer has the help that mrstrain has or finds for itself: shading removed,
-    the foot's *true* motion taken out of the loaded image, and only the body's box.
+    ``scan1-moved`` is scan1 with the foot's true motion taken out in its header. The others are prepared, so that every
+    peer has the help that mrstrain has or finds for itself: shading removed, the foot's *true* motion taken out of the
+    loaded image, and only the body's box.
 
     - ``reference``, ``mask``: the body's box with a margin. Beyond the scan the nearest value is repeated.
     - ``loaded``: all of its voxels, the motion taken out in the header alone (its axes are oblique).

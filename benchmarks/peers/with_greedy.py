@@ -16,8 +16,9 @@ def main() -> None:
     moving = sitk.ReadImage(str(folder / "loaded.mha"), sitk.sitkFloat32)
     mask = sitk.BinaryDilate(sitk.ReadImage(str(folder / "mask.mha"), sitk.sitkUInt8), [MASK_WIDER] * 3)
     greedy = Greedy3D()
+    # -wp 0: greedy would round the displacement to a tenth of a voxel
     greedy.execute(
-        f"-threads {threads} -i fixed moving -gm mask -m {METRIC} -n {ITERATIONS} -s {SIGMAS} -wp 0 -o found",  # -wp 0: the warp is not rounded
+        f"-threads {threads} -i fixed moving -gm mask -m {METRIC} -n {ITERATIONS} -s {SIGMAS} -wp 0 -o found",
         fixed=fixed,
         moving=moving,
         mask=sitk.Cast(mask, sitk.sitkFloat32),

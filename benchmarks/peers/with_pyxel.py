@@ -46,13 +46,8 @@ def _tetrahedra(body: np.ndarray, counts: list[int]) -> np.ndarray:
     used = binary_dilation(body)
     corners = _lattice([n - 1 for n in counts])
     reach = np.minimum(corners * ELEMENT + ELEMENT + 1, body.shape)
-    cubes = np.array(
-        [
-            c
-            for c, r in zip(corners, reach, strict=True)
-            if used[tuple(slice(a * ELEMENT, b) for a, b in zip(c, r, strict=True))].any()
-        ]
-    )
+    boxes = [tuple(map(slice, low, high)) for low, high in zip(corners * ELEMENT, reach, strict=True)]
+    cubes = corners[[bool(used[box].any()) for box in boxes]]
     paths = []
     for order in itertools.permutations(range(3)):
         steps = np.vstack([np.zeros(3, int), np.cumsum(np.eye(3, dtype=int)[list(order)], axis=0)])

@@ -1,7 +1,7 @@
 """SimpleITK: B-spline, normalised correlation, LBFGS-B.
 
-LBFGS-B refuses SimpleITK's own refinement of the control grid between levels (it wants as many scales as the coarse grid
-has parameters), so each level is a registration of its own, begun at the refined B-spline of the one before.
+LBFGS-B refuses SimpleITK's own refinement of the control grid between levels (it wants as many scales as the coarse
+grid has parameters), so each level is a registration of its own, begun at the refined B-spline of the one before.
 """
 
 import numpy as np
