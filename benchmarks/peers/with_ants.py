@@ -1,14 +1,13 @@
 """ANTs: symmetric normalisation (SyN) with local normalised correlation."""
 
-import shutil
-
 import ants
+import SimpleITK as sitk
 from exchange import arguments
 
 RADIUS = 2
 STEP = 0.2
 UPDATE_SIGMA, TOTAL_SIGMA = 3.0, 0.0  # variance in voxels
-ITERATIONS = (60, 60, 20)
+ITERATIONS = (100, 100, 20)
 
 
 def main() -> None:
@@ -32,8 +31,8 @@ def main() -> None:
         random_seed=1,
         outprefix=str(folder / "ants"),
     )
-    print(found["fwdtransforms"])
-    shutil.copy(found["fwdtransforms"][0], folder / "found.nii.gz")
+    warp = sitk.ReadImage(next(name for name in found["fwdtransforms"] if "Warp" in name))
+    sitk.WriteImage(warp, str(folder / "found.mha"))  # in NIfTI a reader could not know that its vectors are LPS
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ from exchange import arguments, extrapolated, read_array, write_nodes
 from scipy.ndimage import binary_dilation
 
 ELEMENT = 5  # voxels
-LENGTH = 6.0  # of the regularisation, voxels
-SCALES = [2, 1]  # images binned 2^n times, before the full ones
+START_LENGTH, LENGTH = 15.0, 8.0  # of the regularisation, voxels: on binned images (times the bin), on full ones
+SCALES = [2, 1]  # images binned by 2^n, before the full ones
 
 
 def main() -> None:
@@ -21,7 +21,7 @@ def main() -> None:
     mesh.Connectivity()
     camera = pyxel.CameraVol([1, 0, 0, 0, 0, 0, 0])
     f, g = _volume(reference), _volume(aligned)
-    U = pyxel.MultiscaleInit(f, g, mesh, camera, scales=SCALES, l0=LENGTH)
+    U = pyxel.MultiscaleInit(f, g, mesh, camera, scales=SCALES, l0=START_LENGTH)
     mesh.DVCIntegrationTetVoxel(f, camera)
     f.BuildInterp()
     g.BuildInterp()
