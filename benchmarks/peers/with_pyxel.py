@@ -7,8 +7,8 @@ import pyxel
 from exchange import arguments, extrapolated, read_array, write_nodes
 from scipy.ndimage import binary_dilation
 
-ELEMENT = 5  # voxels
-START_LENGTH, LENGTH = 15.0, 8.0  # of the regularisation, voxels: on binned images (times the bin), on full ones
+ELEMENT = 4  # voxels
+START_LENGTH, LENGTH = 12.0, 6.0  # of the regularisation, voxels: on binned images (times the bin), on full ones
 SCALES = [2, 1]  # images binned by 2^n, before the full ones
 
 
