@@ -1,13 +1,13 @@
-"""greedy: diffeomorphic demons with weighted local normalised correlation."""
+"""greedy: greedy diffeomorphic registration with weighted local normalised correlation."""
 
 import SimpleITK as sitk
 from exchange import arguments
 from picsl_greedy import Greedy3D
 
-METRIC = "WNCC 3x3x3"
-SIGMAS = "2.0vox 0.5vox"  # of the update, of the whole
-ITERATIONS = "100x100x50x30"
-MASK_WIDER = 4  # voxels
+METRIC = "WNCC 4x4x4"
+SIGMAS = "3.0vox 0.5vox"  # of the update, of the whole
+ITERATIONS = "200x200x100x50"
+MASK_WIDER = 2  # voxels
 
 
 def main() -> None:
