@@ -3,8 +3,8 @@
 from al_dvc import dvcpara_default, run_aldvc
 from exchange import arguments, extrapolated, read_array, write_nodes
 
-WINDOW = 10
-STEP = 4
+WINDOW = 8
+STEP = 3
 SEARCH = 6
 SMOOTHING = 0.0
 
