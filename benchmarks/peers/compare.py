@@ -61,10 +61,11 @@ def main() -> None:
         parser.error("the peers' environment is not there: run 'make peers' first")
     kept = json.loads(given.out.read_text())["runs"] if given.out.exists() else []
     about = versions() | _peer_versions()
-    for name, pair in pairs(given.seeds):
+    for name, make in pairs(given.seeds):
         missing = [p for p in given.peers if not any(r["pair"] == name and r["peer"] == p for r in kept)]
         if not missing:
             continue
+        pair = make()
         with tempfile.TemporaryDirectory(prefix="peers-") as prepared:
             write_pair(pair, Path(prepared))
             for peer in missing:

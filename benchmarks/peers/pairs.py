@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,10 @@ from phantoms.heel import HeelPair, heel_pair
 MARGIN_MM = 10.0
 
 
-def pairs(seeds: Iterable[int]) -> Iterator[tuple[str, HeelPair]]:
-    """Name and pair of each seed."""
+def pairs(seeds: Iterable[int]) -> Iterator[tuple[str, Callable[[], HeelPair]]]:
+    """Name of each seed's pair, and what makes it: that takes most of a minute, and may not be needed."""
     for seed in seeds:
-        yield f"heel {seed}", heel_pair(seed=seed, load=1.0)
+        yield f"heel {seed}", partial(heel_pair, seed=seed, load=1.0)
 
 
 def write_pair(pair: HeelPair, folder: Path) -> None:
