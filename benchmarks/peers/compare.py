@@ -29,6 +29,7 @@ from benchmarks.peers.pairs import pairs, write_pair
 from benchmarks.registration_accuracy import scored
 from dvc.deformation import Deformation
 from dvc.displacementfile import read_displacement
+from dvc.errors import MrstrainError
 from dvc.transformfile import read_transform
 from mrstrain.provenance import versions
 from phantoms.heel import HeelPair
@@ -107,15 +108,18 @@ def _run(peer: str, pair: HeelPair, prepared: Path, threads: int) -> dict[str, A
         outcome = {"status": status, "seconds": time.perf_counter() - began, "peak_gib": memory / 2**20}
         if status != "done":
             return outcome
-        return outcome | {"tissues": scored(pair, _found(folder))}
+        try:
+            return outcome | {"tissues": scored(pair, _found(folder))}
+        except MrstrainError as unreadable:
+            return outcome | {"status": f"failed: {unreadable}"}
 
 
 def _found(folder: Path) -> Deformation:
     """The displacement or transform that an adapter has left (see `exchange`)."""
-    image = folder / "found.mha"
+    image, text = folder / "found.mha", folder / "found.txt"
     if image.exists():
         return read_displacement(image)
-    return read_transform(next(folder.glob("found.t*")))
+    return read_transform(text if text.exists() else folder / "found.tfm")
 
 
 def _last_line(log: Path) -> str:
