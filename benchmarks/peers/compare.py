@@ -111,7 +111,7 @@ def _run(peer: str, pair: HeelPair, prepared: Path, threads: int) -> dict[str, A
         try:
             return outcome | {"tissues": scored(pair, _found(folder))}
         except MrstrainError as unreadable:
-            return outcome | {"status": f"failed: {unreadable}"}
+            return outcome | {"status": f"failed: {unreadable}".replace(f"{folder}/", "")}
 
 
 def _found(folder: Path) -> Deformation:
