@@ -6,6 +6,7 @@
 #   make lint    ruff, mypy and the import contract
 #   make format  rewrite the sources as ruff formats them
 #   make lock    renew requirements.lock after a change of the dependencies (needs uv; UPGRADE=--upgrade for newer versions)
+#   make peers   the environment of benchmarks/peers in .venv-peers (2.9 GB; Python 3.11 is what it was tried with)
 #   make clean   remove the environment and the caches
 #
 # Another interpreter: make PYTHON=/path/to/python3.12 setup
@@ -24,11 +25,11 @@ BIN := $(VENV)/bin
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format lock clean
+.PHONY: help setup demo test lint format lock peers clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '3,11p' Makefile | sed 's/^# \{0,1\}//'
+	@sed -n '3,12p' Makefile | sed 's/^# \{0,1\}//'
 
 setup: $(VENV)/installed.stamp
 
@@ -66,5 +67,12 @@ lock:
 	$(UV) pip compile pyproject.toml --group dev --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-emit-index-url --no-emit-find-links --quiet $(UPGRADE) -o requirements.lock
 
+peers: .venv-peers/installed.stamp
+
+.venv-peers/installed.stamp: benchmarks/peers/requirements.txt
+	"$(PYTHON)" -m venv --clear .venv-peers
+	.venv-peers/bin/python -m pip install --disable-pip-version-check --quiet -r $<
+	@touch $@
+
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist
+	rm -rf $(VENV) .venv-peers .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.memory import peak_kib
 from dvc import elastix
 from dvc.elastixtext import format_parameters
 from dvc.image import Grid, Image, Mask
@@ -93,38 +94,13 @@ def memory() -> dict[str, float]:
         ]
         command += ["--bone", str(folder / "bone.nii.gz"), "--out", str(folder / "out")]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        peak = 0
-        while process.poll() is None:
-            peak = max(peak, sum(_share_of(pid) for pid in _family(process.pid)))
-            time.sleep(0.2)
+        peak = peak_kib(process)
         return {
             "exit_status": process.returncode,
             "peak_gib": peak / 2**20,
             "seconds": time.perf_counter() - began,
             "voxels": 256**3,
         }
-
-
-def _family(root: int) -> set[int]:
-    parents = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                parents[int(entry.name)] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
-            except OSError:
-                continue
-    family = {root}
-    while more := {pid for pid, parent in parents.items() if parent in family} - family:
-        family |= more
-    return family
-
-
-def _share_of(pid: int) -> int:
-    try:
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0)
 
 
 def main() -> None:

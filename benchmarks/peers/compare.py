@@ -1,0 +1,170 @@
+"""mrstrain beside its peers: the same pairs, one after the other, each in a process of its own.
+
+    make peers
+    .venv/bin/python -m benchmarks.peers.compare --seeds 9001 9002 --out benchmarks/results/peers.json
+
+Seconds are wall time from the start of the process to its end: start of the interpreter, reading and writing included;
+for the peers (not for mrstrain) shading and the foot's motion have been taken out beforehand. Memory is that of all
+processes of a peer together. A peer that fails, or takes over 15 minutes, is recorded so, and the others go on. Results
+are kept in the file after each run, and what it holds already is not run again: take a run out of it to repeat it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.memory import peak_kib
+from benchmarks.peers.pairs import pairs, write_pair
+from benchmarks.registration_accuracy import scored
+from dvc.deformation import Deformation
+from dvc.displacementfile import read_displacement
+from dvc.errors import MrstrainError
+from dvc.transformfile import read_transform
+from mrstrain.provenance import versions
+from phantoms.heel import HeelPair
+
+LIMIT_S = 900.0
+ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).parent
+PEERS_PYTHON = ROOT / ".venv-peers" / "bin" / "python"
+OURS = [sys.executable, "-m"]
+PEERS: dict[str, tuple[list[str], list[str]]] = {  # command, and what follows FOLDER THREADS
+    "heel-mr": ([*OURS, "benchmarks.peers.with_mrstrain"], []),
+    "elastix default, as acquired": ([*OURS, "benchmarks.peers.with_elastix"], ["as-acquired"]),
+    "elastix default": ([*OURS, "benchmarks.peers.with_elastix"], []),
+    **{
+        name: ([str(PEERS_PYTHON), str(HERE / f"with_{name.lower()}.py")], [])
+        for name in ("ANTs", "greedy", "SimpleITK", "SPAM", "pyALDVC", "pyxel")
+    },
+}
+PINNED = ("antspyx", "picsl-greedy", "SimpleITK", "spam", "al-dvc", "pyxel-dic")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", required=True)
+    parser.add_argument("--peers", nargs="+", choices=list(PEERS), default=list(PEERS))
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    if not PEERS_PYTHON.exists():
+        parser.error("the peers' environment is not there: run 'make peers' first")
+    kept = json.loads(given.out.read_text())["runs"] if given.out.exists() else []
+    about = versions() | _peer_versions()
+    for name, make in pairs(given.seeds):
+        missing = [p for p in given.peers if not any(r["pair"] == name and r["peer"] == p for r in kept)]
+        if not missing:
+            continue
+        pair = make()
+        with tempfile.TemporaryDirectory(prefix="peers-") as prepared:
+            write_pair(pair, Path(prepared))
+            for peer in missing:
+                outcome = _run(peer, pair, Path(prepared), given.threads)
+                kept.append({"pair": name, "peer": peer, "threads": given.threads} | outcome)
+                given.out.parent.mkdir(parents=True, exist_ok=True)
+                given.out.write_text(json.dumps({"versions": about, "runs": kept}, indent=1) + "\n")
+                print(name, peer, kept[-1]["status"], f"{kept[-1]['seconds']:.0f} s", flush=True)
+    print(table(kept))
+
+
+def _run(peer: str, pair: HeelPair, prepared: Path, threads: int) -> dict[str, Any]:
+    """Outcome, wall seconds, peak memory and, where there is a result, the error by tissue."""
+    count = str(threads)
+    names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    command, more = PEERS[peer]
+    with tempfile.TemporaryDirectory(prefix="peer-") as name:
+        folder = Path(name)
+        for file in prepared.iterdir():
+            (folder / file.name).symlink_to(file)
+        log = folder / "log.txt"
+        began, memory = time.perf_counter(), 0
+        with log.open("wb") as told:
+            process = subprocess.Popen(
+                [*command, str(folder), count, *more],
+                cwd=ROOT,
+                env=os.environ | dict.fromkeys(names, count),
+                stdout=told,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # so that its children end with it
+            )
+            try:
+                memory = peak_kib(process, LIMIT_S)
+                status = "done" if process.returncode == 0 else f"failed: {_last_line(log)}"
+            except TimeoutError as late:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+                status = f"stopped: {late}"
+        outcome = {"status": status, "seconds": time.perf_counter() - began, "peak_gib": memory / 2**20}
+        if status != "done":
+            return outcome
+        try:
+            return outcome | {"tissues": scored(pair, _found(folder))}
+        except MrstrainError as unreadable:
+            return outcome | {"status": f"failed: {unreadable}".replace(f"{folder}/", "")}
+
+
+def _found(folder: Path) -> Deformation:
+    """The displacement or transform that an adapter has left (see `exchange`)."""
+    image, text = folder / "found.mha", folder / "found.txt"
+    if image.exists():
+        return read_displacement(image)
+    return read_transform(text if text.exists() else folder / "found.tfm")
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return lines[-1].strip() if lines else "nothing said"
+
+
+def _peer_versions() -> dict[str, str]:
+    ask = "import importlib.metadata as m, sys; print(*(m.version(p) for p in sys.argv[1:]))"
+    told = subprocess.run([str(PEERS_PYTHON), "-c", ask, *PINNED], capture_output=True, text=True, check=True).stdout
+    return {f"peers' {name}": version for name, version in zip(PINNED, told.split(), strict=True)}
+
+
+def table(runs: list[dict[str, Any]]) -> str:
+    """Means over pairs: RMSE of maximal shear; fat's displacement, median / 95th percentile, mm; time and memory.
+
+    "Fat scored" is the part of fat where the peer has a displacement, of what the peer with the most has.
+    """
+    most: dict[str, int] = {}
+    for run in runs:
+        if "tissues" in run:
+            most[run["pair"]] = max(most.get(run["pair"], 0), run["tissues"]["fat"]["voxels"])
+    lines = [
+        "| | pairs | fat | muscle | skin | bone | u, fat | fat scored | s | GiB |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for peer in dict.fromkeys(r["peer"] for r in runs):
+        tried = [r for r in runs if r["peer"] == peer]
+        done = [r for r in tried if "tissues" in r]
+        if not done:
+            lines.append(f"| {peer} | 0 of {len(tried)} | {tried[-1]['status']} |")
+            continue
+
+        def mean(tissue: str, figure: str, done: list[dict[str, Any]] = done) -> float:
+            return float(np.mean([r["tissues"][tissue][figure] for r in done]))
+
+        shear = " | ".join(f"{mean(t, 'shear_rmse'):.4f}" for t in ("fat", "muscle", "skin", "bone"))
+        share = np.mean([r["tissues"]["fat"]["voxels"] / most[r["pair"]] for r in done])
+        seconds, memory = (np.mean([r[k] for r in done]) for k in ("seconds", "peak_gib"))
+        lines.append(
+            f"| {peer} | {len(done)} of {len(tried)} | {shear} | {mean('fat', 'u_p50_mm'):.3f} / "
+            f"{mean('fat', 'u_p95_mm'):.3f} | {share:.3f} | {seconds:.0f} | {memory:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

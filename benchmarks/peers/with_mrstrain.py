@@ -1,0 +1,29 @@
+"""mrstrain with its preset heel-mr: the scans as acquired, body and bone; the foot's motion it finds for itself.
+
+Runs in mrstrain's environment, as ``python -m benchmarks.peers.with_mrstrain FOLDER THREADS``.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from dvc.image import Mask
+from dvc.imagefile import read_image
+from dvc.registration import Settings, register
+from dvc.transformwrite import write_elastix_transform
+
+
+def main() -> None:
+    folder, threads = Path(sys.argv[1]), int(sys.argv[2])
+    reference, loaded = read_image(folder / "scan0.mha"), read_image(folder / "scan1.mha")
+    bone, body = (
+        Mask(mask.grid, mask.values > 0) for mask in (read_image(folder / f"{name}.mha") for name in ("bone", "body"))
+    )
+    settings = Settings.of("heel-mr", threads=threads)
+    found = register(reference, loaded, bone=bone, tissue=body, settings=settings)
+    write_elastix_transform(folder, found.bspline, None, reference.grid)[0].rename(folder / "found.txt")
+
+
+if __name__ == "__main__":
+    main()
