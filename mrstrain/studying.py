@@ -16,25 +16,14 @@ import numpy as np
 
 from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.presets import load_preset
-from dvc.report import Picture, Section, Table, write_report
-from dvc.uncertainty import POOLED
 from dvc.whole import write_whole
 from dvc.worker import Worker, usable_cores
 from mrstrain.inputs import make_output
-from mrstrain.page import flat, said
 from mrstrain.provenance import provenance, versions, write_json
-from phantoms import figures
-from phantoms.accuracy import (
-    ErrorRow,
-    FloorRow,
-    ResolutionRow,
-    error_rows,
-    fit_error_model,
-    floor_rows,
-    resolution_rows,
-    wavelength_recovered,
-)
+from mrstrain.studypage import write_study_report
+from phantoms.accuracy import ErrorRow, FloorRow, ResolutionRow, error_rows, floor_rows, resolution_rows
 from phantoms.anatomy import Heel
+from phantoms.errormodel import CoverageRow, coverage_rows, fit_error_model
 from phantoms.heel import heel_grid
 from phantoms.study import Case, Samples, measure, motion_named
 
@@ -54,24 +43,6 @@ PUBLISHED_SEEDS = (9000, 9001)
 
 _SECONDS = 75.0  # of one run on one core, as measured: 3,500 iterations, whatever the voxel
 _MEGABYTES = 5.0  # of one run's samples, as measured at 0.8 mm
-_CLOSING = (
-    Section(
-        "How to read this",
-        paragraphs=(
-            "Every pair is a synthetic heel of which the strain is known at every point. Error is found minus true, of "
-            "the maximal shear (E1 - E3)/2 of the Green-Lagrange strain and of the displacement of tissue relative to "
-            "its bone, at one in eight of the heel's voxels.",
-            "Motions: still (foot moved, no strain), smooth (a flow without jumps of strain), sliding (the fat pad "
-            "slides inside bone and skin at rest: strain jumps at both borders), Load1 to Load4 (both together, as "
-            "strong as the forces of the published experiment), wave-L (shear that varies as a cosine of wavelength L "
-            "mm).",
-            "Spatial resolution is the wavelength of which a share of the strain is recovered. A smaller wavelength is "
-            "bought with more noise: give both, or none.",
-            "SD and bias in the error model are given the shear that was found. They hold for tissue strained and "
-            "imaged like these phantoms: neither scanner distortion nor creep during a scan is in them.",
-        ),
-    ),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +52,8 @@ class Study:
     Attributes
     ----------
     out : Path
-        With ``errors.csv``, ``zero_strain.csv``, ``resolution.csv``, an error model of each preset and
-        ``report.html``.
+        With ``errors.csv``, ``zero_strain.csv``, ``resolution.csv``, ``coverage.csv``, an error model of each preset
+        and ``report.html``.
     errors, floors, resolution : tuple of rows
         As in the tables.
     failures : dict
@@ -273,10 +244,12 @@ def _run_all(
 
 def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> Study:
     errors, floors, resolution = error_rows(runs), floor_rows(runs), resolution_rows(runs)
+    coverage = coverage_rows(runs)
     for name, rows, kind in (
         ("errors", errors, ErrorRow),
         ("zero_strain", floors, FloorRow),
         ("resolution", resolution, ResolutionRow),
+        ("coverage", coverage, CoverageRow),
     ):
         _write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], [asdict(row) for row in rows])
     presets = list(dict.fromkeys(r.case.preset for r in runs))
@@ -297,8 +270,7 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
         },
     )
     write_json(target / "provenance.json", record)
-    sections = _sections(errors, floors, resolution, failures)
-    write_report(target / "report.html", "Accuracy of registration presets", None, sections, _CLOSING, flat(record))
+    write_study_report(target / "report.html", errors, floors, resolution, coverage, failures, record)
     return Study(target, tuple(errors), tuple(floors), tuple(resolution), failures)
 
 
@@ -309,71 +281,3 @@ def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, obje
     for row in rows:
         writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
     write_whole(path, text.getvalue())
-
-
-def _sections(
-    errors: Sequence[ErrorRow],
-    floors: Sequence[FloorRow],
-    resolution: Sequence[ResolutionRow],
-    failures: dict[str, str],
-) -> list[Section]:
-    sections = []
-    for preset, voxel, snr in dict.fromkeys((r.preset, r.voxel_mm, r.snr) for r in errors):
-        rows = [r for r in errors if (r.preset, r.voxel_mm, r.snr) == (preset, voxel, snr)]
-        table = Table(
-            "Error by motion and tissue",
-            ("motion", "tissue", "true shear: median", "p95", "error: bias", "SD", "RMSE", "p95", "u, mm: RMSE", "p95"),
-            tuple(
-                (
-                    r.motion, r.tissue, r.true_p50, r.true_p95, r.shear_bias, r.shear_sd, r.shear_rmse, r.shear_p95,
-                    r.u_rmse_mm, r.u_p95_mm,
-                )
-                for r in rows
-                if r.by == "all"
-            ),
-        )  # fmt: skip
-        pictures = tuple(
-            Picture(f"Error by {by.split(',')[0]}", said(figures.errors_by_place), figures.errors_by_place(rows, by))
-            for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
-        )
-        zero = [f for f in floors if (f.preset, f.voxel_mm, f.snr) == (preset, voxel, snr)]
-        floor = Table(
-            "Without strain",
-            ("tissue", "MAER", "SDER", "apparent shear, median", "p95"),
-            tuple((f.tissue, f.maer, f.sder, f.shear_p50, f.shear_p95) for f in zero),
-        )
-        tables = (table, floor) if zero else (table,)
-        sections.append(Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tables, pictures=pictures))
-    if resolution:
-        sections.append(_resolution_section(floors, resolution))
-    if failures:
-        rows_of = tuple((name, reason) for name, reason in failures.items())
-        sections.append(Section("Without a result", tables=(Table("Failures", ("case", "reason"), rows_of),)))
-    return sections
-
-
-def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow]) -> Section:
-    told = []
-    for preset, voxel, snr in dict.fromkeys((r.preset, r.voxel_mm, r.snr) for r in rows):
-        mine = [r for r in rows if (r.preset, r.voxel_mm, r.snr) == (preset, voxel, snr)]
-        zero = [f for f in floors if (f.preset, f.voxel_mm, f.snr, f.tissue) == (preset, voxel, snr, POOLED)]
-        told.append(
-            (
-                preset,
-                f"{voxel} mm",
-                snr,
-                wavelength_recovered(mine, 0.9),
-                wavelength_recovered(mine, 0.5),
-                zero[0].shear_p50 if zero else None,
-                zero[0].maer if zero else None,
-                zero[0].sder if zero else None,
-            )
-        )
-    columns = ("preset", "voxel", "SNR", "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
-    pictures = [Picture("Spatial resolution", said(figures.resolution), figures.resolution(rows))]
-    if floors:
-        pictures.append(
-            Picture("Noise against resolution", said(figures.trade_off), figures.trade_off(floors, rows, POOLED))
-        )
-    table = Table("Spatial resolution and noise in soft tissue", columns, tuple(told))
-    return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))

@@ -1,4 +1,4 @@
-"""From the samples of an accuracy study: errors by tissue, place and strain, spatial resolution, an error model."""
+"""From the samples of an accuracy study: errors by tissue, place and strain, noise, and spatial resolution."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from dvc.arrays import BoolArray, Float32Array, FloatArray
-from dvc.errors import InputError
-from dvc.uncertainty import POOLED, ErrorModel, ErrorTable
+from dvc.arrays import BoolArray, Float32Array
+from dvc.uncertainty import POOLED
 from phantoms.anatomy import TISSUES
 from phantoms.study import RIGID, Samples
 
@@ -18,12 +17,6 @@ SOFT = tuple(name for name in TISSUES.values() if name not in RIGID)
 BONE_BINS_MM = (0.0, 1.5, 3.0, 6.0, 12.0, np.inf)
 BORDER_BINS_MM = (0.0, 1.0, 2.0, 4.0, np.inf)
 SHEAR_BINS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, np.inf)
-
-_KNOTS = np.array([0.005, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5])
-_EDGES = np.concatenate([[0.0], 0.5 * (_KNOTS[1:] + _KNOTS[:-1]), [np.inf]])
-_BONE_MM = np.array([0.0, 2.0, 4.0, 8.0])
-_PRIOR = 400.0  # samples that a cell's parent counts for
-_FEW = 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,12 +95,12 @@ def error_rows(runs: Sequence[Samples]) -> list[ErrorRow]:
     Waves are left out: they have rows of their own (`resolution_rows`).
     """
     rows = []
-    for condition, some in _by_condition(runs):
+    for condition, some in by_condition(runs):
         plain = [r for r in some if r.case.wavelength_mm is None]
         for motion in dict.fromkeys(r.case.motion for r in plain):
             alike = [r for r in plain if r.case.motion == motion]
             for tissue in (*TISSUES.values(), POOLED):
-                for by, low, high, kept in _bins(alike, [_tissue(r, tissue) for r in alike]):
+                for by, low, high, kept in _bins(alike, [of_tissue(r, tissue) for r in alike]):
                     row = _row(condition, (motion, tissue, by, low, high), alike, kept)
                     rows += [] if row is None else [row]
     return rows
@@ -116,11 +109,11 @@ def error_rows(runs: Sequence[Samples]) -> list[ErrorRow]:
 def floor_rows(runs: Sequence[Samples]) -> list[FloorRow]:
     """Apparent strain of the pairs without strain, by condition and tissue."""
     rows = []
-    for (preset, voxel, snr), some in _by_condition(runs):
+    for (preset, voxel, snr), some in by_condition(runs):
         still = [r for r in some if r.case.motion == "still"]
         for tissue in (*TISSUES.values(), POOLED) if still else ():
-            mean = np.concatenate([r.mean_abs_strain[_tissue(r, tissue)] for r in still])
-            shear = np.concatenate([r.shear[_tissue(r, tissue)] for r in still])
+            mean = np.concatenate([r.mean_abs_strain[of_tissue(r, tissue)] for r in still])
+            shear = np.concatenate([r.shear[of_tissue(r, tissue)] for r in still])
             if len(mean):
                 p50, p95 = (float(p) for p in np.percentile(shear, [50, 95]))
                 rows.append(FloorRow(preset, voxel, snr, tissue, float(mean.mean()), float(mean.std()), p50, p95))
@@ -130,11 +123,11 @@ def floor_rows(runs: Sequence[Samples]) -> list[FloorRow]:
 def resolution_rows(runs: Sequence[Samples]) -> list[ResolutionRow]:
     """Share of a sinusoidal strain that is recovered, by condition and wavelength, rising."""
     rows = []
-    for (preset, voxel, snr), some in _by_condition(runs):
+    for (preset, voxel, snr), some in by_condition(runs):
         lengths = sorted({r.case.wavelength_mm for r in some if r.case.wavelength_mm is not None})
         for length in lengths:
             waves = [r for r in some if r.case.wavelength_mm == length]
-            kept = [_tissue(r, POOLED) for r in waves]
+            kept = [of_tissue(r, POOLED) for r in waves]
             true = np.concatenate([r.true_slope[k] for r, k in zip(waves, kept, strict=True)]).astype(np.float64)
             found = np.concatenate([r.slope[k] for r, k in zip(waves, kept, strict=True)]).astype(np.float64)
             rows.append(ResolutionRow(preset, voxel, snr, length, float(true @ found / (true @ true))))
@@ -158,121 +151,8 @@ def wavelength_recovered(rows: Sequence[ResolutionRow], share: float) -> float:
     return float(lengths[i] + part * (lengths[i + 1] - lengths[i]))
 
 
-def fit_error_model(runs: Sequence[Samples], source: str) -> ErrorModel:
-    """Fit the error of the maximal shear, as `register` uses it, to all motions but waves.
-
-    Parameters
-    ----------
-    runs : sequence of Samples
-        Of one preset.
-    source : str
-        The study, in a sentence.
-
-    Raises
-    ------
-    InputError
-        If the runs are of several presets, or there is none.
-    """
-    presets = {r.case.preset for r in runs}
-    plain = [r for r in runs if r.case.wavelength_mm is None]
-    if len(presets) != 1 or not plain:
-        raise InputError(f"An error model is of one preset and needs motions other than waves; got {sorted(presets)}.")
-    tables = tuple(_table(some) for _, some in _by_condition(plain))
-    return ErrorModel(presets.pop(), tables, source)
-
-
-def _table(runs: Sequence[Samples]) -> ErrorTable:
-    rows = {tissue: _cells(runs, tissue) for tissue in (*SOFT, POOLED)}
-    bias = {tissue: b for tissue, (b, _) in rows.items()}
-    sd = {tissue: s for tissue, (_, s) in rows.items()}
-    spacing = np.array(runs[0].case.spacing_mm)
-    table = ErrorTable(
-        float(np.cbrt(spacing.prod())),
-        float(np.median([r.estimated_snr for r in runs])),
-        _KNOTS,
-        _BONE_MM,
-        bias,
-        sd,
-        {},
-        _correlation_mm(runs),
-    )
-    run_sd = {tissue: _between_runs(runs, tissue, table) for tissue in (*SOFT, POOLED)}
-    return ErrorTable(table.voxel_mm, table.snr, table.shear, table.to_bone_mm, bias, sd, run_sd, table.correlation_mm)
-
-
-def _cells(runs: Sequence[Samples], tissue: str) -> tuple[FloatArray, FloatArray]:
-    """Bias and standard deviation by distance to bone and shear found.
-
-    Cells with few samples lean on their tissue's mean over all distances, and this on that of all soft tissue.
-    """
-    whole = _filled(_moments(runs, POOLED, None))
-    own = whole if tissue == POOLED else _leaning(_moments(runs, tissue, None), whole)
-    bias, sd = np.empty((len(_BONE_MM), len(_KNOTS))), np.empty((len(_BONE_MM), len(_KNOTS)))
-    for k in range(len(_BONE_MM)):
-        _, mean, square = _leaning(_moments(runs, tissue, k), own)
-        bias[k], sd[k] = mean, np.sqrt(np.maximum(square - mean**2, 1e-10))
-    return bias, sd
-
-
-_Moments = tuple[FloatArray, FloatArray, FloatArray]
-
-
-def _moments(runs: Sequence[Samples], tissue: str, bone_bin: int | None) -> _Moments:
-    """Number, mean and mean square of the errors by shear found; every run counts the same."""
-    ends = [*_BONE_MM, np.inf]
-    count, total, square = (np.zeros(len(_KNOTS)) for _ in range(3))
-    for run in runs:
-        kept = _tissue(run, tissue)
-        if bone_bin is not None:
-            kept = kept & (run.to_bone_mm >= ends[bone_bin]) & (run.to_bone_mm < ends[bone_bin + 1])
-        cell = np.searchsorted(_EDGES, run.shear[kept], side="right") - 1
-        error = (run.shear - run.true_shear)[kept].astype(np.float64)
-        count += np.bincount(cell, minlength=len(_KNOTS))
-        total += np.bincount(cell, error, minlength=len(_KNOTS))
-        square += np.bincount(cell, error**2, minlength=len(_KNOTS))
-    some = np.maximum(count, 1.0)
-    return count, total / some, square / some
-
-
-def _filled(moments: _Moments) -> _Moments:
-    """Shears that hardly occurred take the figures of the nearest that did."""
-    count, mean, square = moments
-    often = np.flatnonzero(count >= _FEW)
-    if not len(often):
-        raise InputError(f"A study needs at least {_FEW:.0f} samples of soft tissue to tell an error.")
-    nearest = often[np.argmin(np.abs(_KNOTS[:, None] - _KNOTS[often]), axis=1)]
-    return count, mean[nearest], square[nearest]
-
-
-def _leaning(own: _Moments, parent: _Moments) -> _Moments:
-    weight = own[0] / (own[0] + _PRIOR)
-    mean = weight * own[1] + (1 - weight) * parent[1]
-    return own[0] + _PRIOR, mean, weight * own[2] + (1 - weight) * parent[2]
-
-
-def _between_runs(runs: Sequence[Samples], tissue: str, table: ErrorTable) -> float:
-    left = []
-    for run in runs:
-        kept = _tissue(run, tissue)
-        if np.count_nonzero(kept) > 100:
-            expected, _ = table.expected(tissue, run.shear[kept].astype(np.float64), run.to_bone_mm[kept])
-            left.append(float(np.mean((run.shear - run.true_shear)[kept] - expected)))
-    return float(np.sqrt(np.mean(np.square(left)))) if left else 0.0
-
-
-def _correlation_mm(runs: Sequence[Samples]) -> float:
-    mean = np.mean([r.correlation for r in runs], axis=0)
-    lags = np.concatenate([[0.0], runs[0].lag_mm])
-    values = np.concatenate([[1.0], mean])
-    below = np.flatnonzero(values < np.exp(-1.0))
-    if not len(below):
-        return float(lags[-1])
-    i = int(below[0])
-    part = (values[i - 1] - np.exp(-1.0)) / (values[i - 1] - values[i])
-    return float(lags[i - 1] + part * (lags[i] - lags[i - 1]))
-
-
-def _by_condition(runs: Sequence[Samples]) -> Iterator[tuple[tuple[str, str, float], list[Samples]]]:
+def by_condition(runs: Sequence[Samples]) -> Iterator[tuple[tuple[str, str, float], list[Samples]]]:
+    """Runs of equal preset, voxel and noise, with these three as tables name them."""
     conditions = dict.fromkeys((r.case.preset, r.case.spacing_mm, r.case.snr) for r in runs)
     for preset, spacing, snr in conditions:
         same = len(set(spacing)) == 1
@@ -281,15 +161,14 @@ def _by_condition(runs: Sequence[Samples]) -> Iterator[tuple[tuple[str, str, flo
         yield (preset, voxel, snr), alike
 
 
-def _tissue(run: Samples, name: str) -> BoolArray:
+def of_tissue(run: Samples, name: str) -> BoolArray:
+    """Which samples lie in a tissue; "soft tissue" is all of SOFT."""
     numbers = [n for n, tissue in TISSUES.items() if tissue == name or (name == POOLED and tissue in SOFT)]
     return np.isin(run.tissue, numbers)
 
 
-def _bins(
-    runs: Sequence[Samples], of_tissue: Sequence[BoolArray]
-) -> Iterator[tuple[str, float, float, list[BoolArray]]]:
-    yield "all", float("nan"), float("nan"), list(of_tissue)
+def _bins(runs: Sequence[Samples], tissue: Sequence[BoolArray]) -> Iterator[tuple[str, float, float, list[BoolArray]]]:
+    yield "all", float("nan"), float("nan"), list(tissue)
     ways: Mapping[str, tuple[Callable[[Samples], Float32Array], tuple[float, ...]]] = {
         "distance to bone, mm": (lambda r: r.to_bone_mm, BONE_BINS_MM),
         "distance to a border, mm": (lambda r: r.to_border_mm, BORDER_BINS_MM),
@@ -301,7 +180,7 @@ def _bins(
                 by,
                 low,
                 high,
-                [k & (value(r) >= low) & (value(r) < high) for r, k in zip(runs, of_tissue, strict=True)],
+                [k & (value(r) >= low) & (value(r) < high) for r, k in zip(runs, tissue, strict=True)],
             )
 
 

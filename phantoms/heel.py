@@ -80,10 +80,11 @@ def heel_pair(
     spacing_mm: float | Sequence[float] = 0.8,
     snr: float | None = 25.0,
     load: float = 1.0,
+    motion: Motion | None = None,
     foot_motion: RigidMotion | None = None,
     loaded_grid: Grid | None = None,
 ) -> HeelPair:
-    """Images of a heel without load, under a smooth load, and without load again.
+    """Images of a heel without load, under a load, and without load again.
 
     Parameters
     ----------
@@ -95,6 +96,8 @@ def heel_pair(
         Fat's signal over the noise's standard deviation; None for no noise.
     load : float
         Factor on the plate's motion; 1 is a press of 7.5 mm with a shear of 5 mm forward.
+    motion : Motion, optional
+        Of tissue relative to bone, instead of that smooth load; it belongs to the heel of this seed.
     foot_motion : RigidMotion
         Of the whole foot between scans; a few degrees and mm by default.
     loaded_grid : Grid
@@ -110,7 +113,7 @@ def heel_pair(
     heel = Heel(seed)
     grid = centred_grid(shape, spacing_mm)
     foot = default_motion() if foot_motion is None else foot_motion
-    flow = pressed(heel, load)
+    flow = pressed(heel, load) if motion is None else motion
     labels = labels_of(heel, grid)
     bone = labels.region("bone")
     where = covering(grid, foot.apply(bone.points())) if loaded_grid is None else loaded_grid

@@ -16,14 +16,9 @@ from dvc.uncertainty import POOLED
 from dvc.worker import Worker
 from mrstrain import accuracy
 from mrstrain.studying import cases_of
-from phantoms.accuracy import (
-    error_rows,
-    fit_error_model,
-    floor_rows,
-    resolution_rows,
-    wavelength_recovered,
-)
+from phantoms.accuracy import error_rows, floor_rows, resolution_rows, wavelength_recovered
 from phantoms.anatomy import TISSUES, Heel
+from phantoms.errormodel import coverage_rows, fit_error_model
 from phantoms.motions import stretched
 from phantoms.study import Case, Samples, distances_mm, measure, motion_named
 
@@ -132,6 +127,19 @@ def test_error_model_finds_the_error_that_was_put_in() -> None:
     assert table.sd["fat"][0, -1] == pytest.approx(table.sd["fat"][0, -2], abs=0.005)
     with pytest.raises(InputError, match="one preset"):
         fit_error_model([samples(CASE), samples(replace(CASE, preset="other"))], "")
+
+
+def test_coverage_judges_each_heel_by_the_others() -> None:
+    """Alike heels: 95 %. A heel that is off by three deviations is found out: its own error is not in its model."""
+    alike = [samples(replace(CASE, seed=s), sd=0.02, count=20_000) for s in (1, 2, 3)]
+    fat = {r.tissue: r for r in coverage_rows(alike)}["fat"]
+    assert fat.within == pytest.approx(0.95, abs=0.02)
+    assert abs(fat.left_over) < 0.002
+    off = [*alike[:2], samples(replace(CASE, seed=3, motion="Load2"), sd=0.02, count=20_000, offset=0.06)]
+    rows = {(r.motion, r.tissue): r for r in coverage_rows(off)}
+    assert rows["Load2", "fat"].within < 0.3
+    assert rows["Load2", "fat"].left_over == pytest.approx(0.06, abs=0.01)
+    assert coverage_rows(alike[:1]) == []
 
 
 def test_samples_survive_their_file_and_a_damaged_one_is_made_anew(tmp_path: Path) -> None:

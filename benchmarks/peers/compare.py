@@ -1,7 +1,7 @@
 """mrstrain beside its peers: the same pairs, one after the other, each in a process of its own.
 
     make peers
-    .venv/bin/python -m benchmarks.peers.compare --seeds 9001 9002 --out benchmarks/results/peers.json
+    .venv/bin/python -m benchmarks.peers.compare --out benchmarks/results/peers.json
 
 Seconds are wall time from the start of the process to its end: start of the interpreter, reading and writing included;
 for the peers (not for mrstrain) shading and the foot's motion have been taken out beforehand. Memory is that of all
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.memory import peak_kib
-from benchmarks.peers.pairs import pairs, write_pair
+from benchmarks.peers.pairs import PAIRS, pair_named, write_pair
 from benchmarks.registration_accuracy import scored
 from dvc.deformation import Deformation
 from dvc.displacementfile import read_displacement
@@ -53,7 +53,7 @@ PINNED = ("antspyx", "picsl-greedy", "SimpleITK", "spam", "al-dvc", "pyxel-dic")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", required=True)
+    parser.add_argument("--pairs", nargs="+", choices=list(PAIRS), default=list(PAIRS))
     parser.add_argument("--peers", nargs="+", choices=list(PEERS), default=list(PEERS))
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
@@ -62,11 +62,11 @@ def main() -> None:
         parser.error("the peers' environment is not there: run 'make peers' first")
     kept = json.loads(given.out.read_text())["runs"] if given.out.exists() else []
     about = versions() | _peer_versions()
-    for name, make in pairs(given.seeds):
+    for name in given.pairs:
         missing = [p for p in given.peers if not any(r["pair"] == name and r["peer"] == p for r in kept)]
         if not missing:
             continue
-        pair = make()
+        pair = pair_named(name)
         with tempfile.TemporaryDirectory(prefix="peers-") as prepared:
             write_pair(pair, Path(prepared))
             for peer in missing:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +11,23 @@ from dvc.image import Grid, Image, Mask
 from dvc.imagewrite import write_image, write_mask
 from dvc.resample import carry, fill_missing
 from dvc.shading import without_shading
+from phantoms.anatomy import Heel
 from phantoms.heel import HeelPair, heel_pair
+from phantoms.study import motion_named
 
 # Air left around the body: more than tissue moves, so that its true place is inside the aligned image as well.
 MARGIN_MM = 10.0
 
 
-def pairs(seeds: Iterable[int]) -> Iterator[tuple[str, Callable[[], HeelPair]]]:
-    """Name of each seed's pair, and what makes it: that takes most of a minute, and may not be needed."""
-    for seed in seeds:
-        yield f"heel {seed}", partial(heel_pair, seed=seed, load=1.0)
+# A smooth flow; one whose strain jumps at bone and skin; both together, pressed and sheared. Seeds set aside.
+PAIRS = {"smooth 9000": ("smooth", 9000), "sliding 9001": ("sliding", 9001)}
+PAIRS |= {"Load1 9002": ("Load1", 9002), "Load3 9003": ("Load3", 9003)}
+
+
+def pair_named(name: str) -> HeelPair:
+    """Make one of PAIRS, which takes most of a minute."""
+    motion, seed = PAIRS[name]
+    return heel_pair(seed=seed, motion=motion_named(Heel(seed), motion))
 
 
 def write_pair(pair: HeelPair, folder: Path) -> None:
