@@ -19,6 +19,7 @@ from dvc.image import Image
 from dvc.imagefile import read_image
 from dvc.imagewrite import write_image, write_labels, write_mask
 from dvc.transformfile import read_transform
+from dvc.uncertainty import POOLED, ErrorModel, ErrorTable
 from mrstrain.registering import register
 from mrstrain.straining import strain
 
@@ -54,6 +55,10 @@ def study(tmp_path_factory, small_pair) -> Path:
     write_mask(folder / "bone.nii.gz", small_pair.bone)
     write_labels(folder / "tissues.nrrd", small_pair.labels)
     (folder / "quick.txt").write_text(QUICK)
+    knots, rows = np.array([0.0, 0.2]), {"fat": [[0.01, 0.02]], POOLED: [[0.02, 0.03]]}
+    cells = {tissue: np.array(row) for tissue, row in rows.items()}
+    table = ErrorTable(1.6, 25.0, knots, np.zeros(1), cells, cells, {POOLED: 0.002}, 8.0)
+    ErrorModel("quick.txt", (table,), "made up").write(folder / "errors.json")
     points = small_pair.labels.region("fat").points()[::4000]
     x = small_pair.foot_motion.apply(points + small_pair.deformation.displacement(points))
     with (folder / "points.csv").open("w", newline="") as file:
@@ -78,6 +83,7 @@ def results(study):
         repeat=study / "again.nii.gz",
         landmarks=study / "points.csv",
         mesh=study / "mesh.vtu",
+        error_model=study / "errors.json",
         shear_direction=(0.0, -1.0, 0.0),
         workers=1,
         threads=1,
@@ -90,7 +96,8 @@ PROMISED = [
     "max_shear.nii.gz", "jacobian.nii.gz", "valid.nii.gz", "aligned.nii.gz", "registered.nii.gz",
     "TransformParameters.0.txt", "TransformParameters.1.txt", "transform.h5", "regions.csv", "quality.json",
     "provenance.json", "figures/strain.png", "figures/overlay.png", "figures/checkerboard.png",
-    "figures/deformed_grid.png", "mesh.vtu", "nodal_displacements.csv",
+    "figures/deformed_grid.png", "mesh.vtu", "nodal_displacements.csv", "sigma_max_shear.nii.gz", "intervals.csv",
+    "figures/sigma.png",
 ]  # fmt: skip
 
 
@@ -98,6 +105,26 @@ PROMISED = [
 def test_every_promised_file_is_there(results, study, name):
     assert not results.failures
     assert (study / "out" / "Load1" / name).stat().st_size > 0
+
+
+def test_error_bars_are_those_of_the_model(results, study, small_pair):
+    folder = study / "out" / "Load1"
+    shear = read_image(folder / "max_shear.nii.gz", allow_missing=True).values
+    sigma = read_image(folder / "sigma_max_shear.nii.gz", allow_missing=True).values
+    for tissue, low, high in (("fat", 0.01, 0.02), ("muscle", 0.02, 0.03)):
+        inside = small_pair.labels.region(tissue).inside & np.isfinite(shear)
+        np.testing.assert_allclose(sigma[inside], np.interp(shear[inside], [0.0, 0.2], [low, high]), atol=1e-6)
+    assert np.isnan(sigma[small_pair.bone.inside]).all()
+    with (folder / "intervals.csv").open() as file:
+        rows = {(r["region"], r["figure"]): r for r in csv.DictReader(file)}
+    fat = rows["fat", "median"]
+    assert float(fat["low"]) < float(fat["estimate"]) < float(fat["high"])
+    # the bias of 0.01 to 0.02 is taken out
+    assert 0.008 < float(fat["found"]) - float(fat["estimate"]) < 0.022
+    assert ("bone", "median") not in rows
+    told = json.loads((folder / "quality.json").read_text())["error_of_max_shear"]
+    assert told["known"] is True
+    assert "made up" in (study / "out" / "report.html").read_text()
 
 
 def test_nothing_half_written_is_left(results, study):

@@ -1,0 +1,101 @@
+"""Error bars are put on where the error is known, and a reason is given where it is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dvc.image import Grid, Image, LabelMap, Mask
+from dvc.presets import load_preset
+from dvc.strainmaps import StrainMaps
+from dvc.uncertainty import POOLED, ErrorModel, ErrorTable, error_model_of
+from mrstrain.errorbars import error_bars
+from mrstrain.inputs import Subject
+
+GRID = Grid((40, 40, 40), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))
+NAMES = {1: "Calcaneus", 2: "fat", 3: "Left talus"}
+
+
+def model(preset: str = "heel-mr", voxel_mm: float = 0.8, snr: float = 25.0) -> ErrorModel:
+    rows = {POOLED: np.full((1, 2), 0.03), "fat": np.full((1, 2), 0.02)}
+    table = ErrorTable(voxel_mm, snr, np.array([0.0, 0.5]), np.zeros(1), rows, rows, {POOLED: 0.001}, 4.0)
+    return ErrorModel(preset, (table,), "made up")
+
+
+def given(with_labels: bool = True, with_bone: bool = True):
+    """A block of tissue in air at SNR 25, with a bone, another bone and fat."""
+    inside = np.zeros(GRID.shape, dtype=bool)
+    inside[6:34, 6:34, 6:34] = True
+    random = np.random.default_rng(0)
+    noise = 20.0 * random.standard_normal((2, *GRID.shape))
+    image = Image(GRID, np.hypot(np.where(inside, 500.0, 0.0) + noise[0], noise[1]).astype(np.float32))
+    labels = np.where(inside, 2, 0)
+    labels[6:12, 6:34, 6:34] = 1
+    labels[28:34, 6:34, 6:34] = 3
+    bone = Mask(GRID, labels == 1) if with_bone else None
+    names = LabelMap(GRID, labels, NAMES) if with_labels else None
+    subject = Subject(image, bone, None, names, None, np.array([0.0, 0.0, -1.0]), None)
+    shear = np.where(inside, 0.1, np.nan).astype(np.float32)
+    maps = StrainMaps(GRID, inside, np.zeros((*GRID.shape, 3)), np.zeros((*GRID.shape, 6)), shear, np.ones(GRID.shape))
+    settings = SimpleNamespace(presets=(load_preset("heel-mr"),), seed=1)
+    return SimpleNamespace(settings=settings, tissue=Mask(GRID, inside)), subject, maps
+
+
+def test_every_bone_is_left_out_whatever_its_name() -> None:
+    found, subject, maps = given()
+    bars = error_bars(found, subject, maps, model())
+    assert bars.uncertainty is not None
+    assert {i.region for i in bars.uncertainty.intervals} == {"fat"}
+    known = np.isfinite(bars.uncertainty.sigma)
+    assert subject.labels is not None
+    np.testing.assert_array_equal(known, subject.labels.labels == 2)
+    assert np.nanmax(np.abs(bars.uncertainty.sigma - 0.02)) < 1e-6
+
+
+def test_without_labels_all_but_bone_is_soft_tissue() -> None:
+    found, subject, maps = given(with_labels=False)
+    bars = error_bars(found, subject, maps, model())
+    assert bars.uncertainty is not None
+    assert {i.region for i in bars.uncertainty.intervals} == {POOLED}
+    assert np.nanmax(np.abs(bars.uncertainty.sigma - 0.03)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("used", "labels", "bone", "says"),
+    [
+        (model("heel-fine"), True, True, "heel-fine, and heel-mr was used"),
+        (model(voxel_mm=2.0), True, True, "too far"),
+        (model(snr=100.0), True, True, "too far"),
+        (model(), False, False, "no bone was given"),
+    ],
+)
+def test_where_the_error_is_not_known_the_reason_is_told(
+    used: ErrorModel, labels: bool, bone: bool, says: str, tmp_path: Path
+) -> None:
+    found, subject, maps = given(labels, bone)
+    bars = error_bars(found, subject, maps, used)
+    assert bars.uncertainty is None
+    assert says in bars.told
+    assert bars.as_dict() == {"known": False, "reason": bars.told}
+    bars.write(tmp_path, maps)
+    assert not list(tmp_path.iterdir())
+    assert bars.table() is None
+
+
+def test_a_preset_without_a_model_is_told() -> None:
+    found, subject, maps = given()
+    found.settings.presets = (load_preset("bone-rigid"),)
+    bars = error_bars(found, subject, maps, None)
+    assert "bone-rigid has not been measured" in bars.told
+
+
+def test_the_preset_for_heels_comes_with_its_error() -> None:
+    stored = error_model_of("heel-mr")
+    assert stored is not None
+    table = stored.table_for(0.8, 25.0)
+    bias, sd = table.expected("fat", np.array([0.02, 0.3]), np.array([6.0, 0.5], dtype=np.float32))
+    assert bias[0] > 0.005  # noise lifts small shears
+    assert sd[1] > sd[0] > 0.002
