@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -373,6 +374,8 @@ def main() -> None:
         except ImportError as error:
             _stop(str(error))
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         app()
     except Exception as error:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -213,6 +218,38 @@ def test_a_folding_motion_is_found_before_any_image_is_made(monkeypatch: pytest.
     monkeypatch.setattr("mrstrain.studying.motion_named", lambda *_: mirror)
     with pytest.raises(InputError, match="folds"):
         accuracy(tmp_path / "out", cases=[CASE])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are needed to see that none is left")
+def test_a_study_that_is_told_to_end_leaves_no_process_behind(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mrstrain", "accuracy", "--out", str(tmp_path), "--spacing", "2.5"]
+    options = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "start_new_session": True}
+    with subprocess.Popen([*command, "--motion", "Load1", "--seed", "4"], **options) as running:
+        try:
+            for line in running.stderr:  # until elastix is at work
+                if b"accuracy: 0 of 1" in line:
+                    break
+            time.sleep(2.0)
+            running.terminate()
+            assert running.wait(timeout=30.0) == 128 + signal.SIGTERM
+            for _ in range(60):
+                if not _alive(running.pid):
+                    break
+                time.sleep(0.5)
+            assert not _alive(running.pid)
+        finally:
+            if _alive(running.pid):
+                os.killpg(running.pid, signal.SIGKILL)
+    assert not list((tmp_path / "runs").iterdir())
+
+
+def _alive(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 def test_a_failed_run_is_told_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
