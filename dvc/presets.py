@@ -110,6 +110,17 @@ def load_preset(name: str) -> Preset:
     return _checked(name, text, allow_unknown=False)
 
 
+def preset_or_file(name: str) -> Preset:
+    """A preset by its name, or a user's own elastix parameter file by a path that ends in .txt.
+
+    Raises
+    ------
+    ParameterError, InputError
+        As `load_preset` and `read_parameter_file`.
+    """
+    return read_parameter_file(name) if name.endswith(".txt") else load_preset(name)
+
+
 def read_parameter_file(path: Path | str, *, allow_unknown: bool = False) -> Preset:
     """A user's own elastix parameter file, checked.
 

@@ -311,7 +311,9 @@ def twin(
 @app.command()
 def accuracy(
     out: Out,
-    preset: Annotated[list[str] | None, typer.Option(help="Preset to judge; repeat for several.")] = None,
+    preset: Annotated[
+        list[str] | None, typer.Option(help="Preset to judge, or an elastix parameter file (.txt); repeat for several.")
+    ] = None,
     spacing: Annotated[list[float] | None, typer.Option(help="Edge of the voxels, mm; repeat for several.")] = None,
     snr: Annotated[list[float] | None, typer.Option(help="Signal-to-noise ratio; repeat for several.")] = None,
     motion: Annotated[

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from dvc.errors import InputError, MrstrainError, OutputError
-from dvc.presets import load_preset
+from dvc.presets import load_preset, preset_or_file
 from dvc.whole import write_whole
 from dvc.worker import Worker, usable_cores
 from mrstrain.inputs import make_output
@@ -165,7 +165,7 @@ def accuracy(
 
 
 def _check(case: Case) -> None:
-    load_preset(case.preset)
+    preset_or_file(case.preset)
     heel_grid(case.spacing_mm)
     if not 1.0 <= case.snr <= 1000.0:
         raise InputError(f"The SNR must lie between 1 and 1000; got {case.snr}.")
@@ -182,7 +182,7 @@ def _check(case: Case) -> None:
 def _key(case: Case) -> str:
     """What a run's result depends on beside its case."""
     told = versions()
-    text = load_preset(case.preset).text + load_preset("bone-rigid").text
+    text = preset_or_file(case.preset).text + load_preset("bone-rigid").text
     return hashlib.sha256((text + told["mrstrain"] + told["itk-elastix"]).encode()).hexdigest()
 
 
@@ -258,14 +258,14 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
         if any(r.case.wavelength_mm is None for r in some):
             seeds = sorted({r.case.seed for r in some})
             source = f"{len(some)} registrations of phantom heels, seeds {seeds}, motions other than waves"
-            fit_error_model(some, source).write(target / f"error_model_{preset}.json")
+            fit_error_model(some, source).write(target / f"error_model_{Path(preset).stem}.json")
     record = provenance(
         "accuracy",
         {},
         {
             "cases": [r.case.name for r in runs],
             "failures": dict(failures),
-            "presets": {p: load_preset(p).text for p in presets},
+            "presets": {p: preset_or_file(p).text for p in presets},
             "seconds_of_registration": {r.case.name: round(r.seconds, 1) for r in runs},
         },
     )

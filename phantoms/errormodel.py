@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -63,7 +64,7 @@ def fit_error_model(runs: Sequence[Samples], source: str) -> ErrorModel:
     if len(presets) != 1 or not plain:
         raise InputError(f"An error model is of one preset and needs motions other than waves; got {sorted(presets)}.")
     tables = tuple(_table(some) for _, some in by_condition(plain))
-    return ErrorModel(presets.pop(), tables, source)
+    return ErrorModel(Path(presets.pop()).name, tables, source)
 
 
 def coverage_rows(runs: Sequence[Samples]) -> list[CoverageRow]:

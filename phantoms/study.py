@@ -19,6 +19,7 @@ from dvc.errors import InputError
 from dvc.image import LabelMap, Mask
 from dvc.kinematics import StrainField
 from dvc.noise import signal_to_noise
+from dvc.presets import preset_or_file
 from dvc.registration import Settings, register
 from dvc.resample import shows
 from dvc.whole import whole_file
@@ -41,6 +42,7 @@ class Case:
     Attributes
     ----------
     preset : str
+        Name of a preset, or path of an elastix parameter file (.txt).
     spacing_mm : (3,)
         Of the voxels, mm.
     snr : float
@@ -61,7 +63,7 @@ class Case:
     def name(self) -> str:
         """For a file and for people."""
         spacing = "x".join(f"{s:g}" for s in self.spacing_mm)
-        return f"{self.preset}_{spacing}mm_snr{self.snr:g}_{self.motion}_{self.seed}"
+        return f"{Path(self.preset).stem}_{spacing}mm_snr{self.snr:g}_{self.motion}_{self.seed}"
 
     @property
     def wavelength_mm(self) -> float | None:
@@ -215,7 +217,7 @@ def measure(
         where = covering(grid, foot.apply(bone.points()))
         loaded = scan(heel, where, motion, foot, snr=case.snr, number=1)
     # A wave moves the bone too: nothing there to align on.
-    settings = Settings.of(case.preset, align_on="none" if wave else "bone", threads=worker.threads)
+    settings = Settings((preset_or_file(case.preset),), "none" if wave else "bone", threads=worker.threads)
     found = register(
         reference,
         loaded,

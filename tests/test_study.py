@@ -160,6 +160,14 @@ def test_samples_survive_their_file_and_a_damaged_one_is_made_anew(tmp_path: Pat
     assert Samples.read(tmp_path / "none.npz", "key") is None
 
 
+def test_parameter_files_of_ones_own_can_be_judged(tmp_path: Path) -> None:
+    """Named after the file; the error model then is for `register --parameters` with that file."""
+    (tmp_path / "mine.txt").write_text('(Transform "BSplineTransform")\n')
+    case = replace(CASE, preset=str(tmp_path / "mine.txt"))
+    assert case.name.startswith("mine_2.5x2.5x2.5mm")
+    assert fit_error_model([samples(case)], "").preset == "mine.txt"
+
+
 def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
     cases = cases_of()
     assert len({c.name for c in cases}) == len(cases) < 120
