@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import distance_transform_edt
 
 from dvc.errors import InputError
 from dvc.image import Image, Mask
@@ -41,8 +41,7 @@ def noise_sd(image: Image, tissue: Mask) -> float:
     if not tissue.grid.same_as(image.grid) or not tissue.inside.any():
         raise InputError("The noise needs a tissue mask that is on the image's grid and not empty.")
     known = ~image.missing
-    steps = max(1, int(np.ceil(_AIR_MM / image.grid.spacing_mm.min())))
-    air = image.values[known & ~binary_dilation(tissue.inside, iterations=steps)]
+    air = image.values[known & (distance_transform_edt(~tissue.inside, sampling=image.grid.spacing_mm) > _AIR_MM)]
     air = air[air > 0] if np.count_nonzero(air > 0) > 0.9 * max(air.size, 1) else air[:0]
     if air.size >= _LEAST and np.ptp(air) > 0:
         return float(np.median(air) / _RAYLEIGH_MEDIAN)

@@ -1,9 +1,9 @@
 """How sure a maximal shear is: bias and standard deviation measured on phantoms, and the intervals that follow.
 
-An error model is a table, made by an accuracy study of one registration preset: of voxels in which a shear m was
-found, by tissue and distance to bone, how far it lay from the truth on average (bias) and how much that varied
-(standard deviation). Given m, the truth is then about m - bias, with that deviation. This holds for tissue that is
-strained and imaged like the study's phantoms, and for no other.
+An error model is made by an accuracy study of one registration preset: of voxels in which a shear m was found, by
+tissue and distance to bone, how far it lay from the truth on average (bias) and how much that varied (standard
+deviation), for each registration of the study and for all together. Given m, the truth is then about m - bias, with
+that deviation. This holds for tissue that is strained and imaged like the study's phantoms, and for no other.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filter1d
 
-from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import InputError
 from dvc.image import Grid
 from dvc.regions import SHEAR_THRESHOLDS
@@ -38,40 +38,45 @@ class ErrorTable:
 
     Attributes
     ----------
-    voxel_mm : float
-        Cube root of the voxel's volume, mm.
+    spacing_mm : (3,)
+        Of the voxels, mm.
     snr : float
         As `dvc.noise.signal_to_noise` finds it.
     shear : (m,)
         Values of the shear found, rising, at which bias and deviation are given; linear between, constant beyond.
     to_bone_mm : (k,)
         Lower ends of the bins of distance to bone, mm, rising from 0.
-    bias, sd : mapping of tissue to (k, m)
-        Mean and standard deviation of found minus true shear.
-    run_sd : mapping of tissue to float
-        Standard deviation, from image to image, of the error's mean over the tissue.
+    whole : mapping of tissue to (2, k, m)
+        Mean and standard deviation of found minus true shear, over all registrations of the study.
+    runs : tuple of mapping of tissue to (2, k, m)
+        The same of each registration alone: how errors differ from image to image.
     correlation_mm : float
         Distance at which the error's autocorrelation has fallen to 1/e, mm.
     """
 
-    voxel_mm: float
+    spacing_mm: FloatArray
     snr: float
     shear: FloatArray
     to_bone_mm: FloatArray
-    bias: Mapping[str, FloatArray]
-    sd: Mapping[str, FloatArray]
-    run_sd: Mapping[str, float]
+    whole: Mapping[str, FloatArray]
+    runs: tuple[Mapping[str, FloatArray], ...]
     correlation_mm: float
 
-    def expected(self, tissue: str, shear: FloatArray, to_bone_mm: Float32Array) -> tuple[FloatArray, FloatArray]:
-        """Bias and standard deviation (n,) of shears (n,) found in a tissue at distances (n,) mm from bone."""
-        row = tissue if tissue in self.bias else POOLED
+    def expected(
+        self, tissue: str, shear: FloatArray, to_bone_mm: Float32Array, run: int | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Bias and standard deviation (n,) of shears (n,) found in a tissue at distances (n,) mm from bone.
+
+        Over all registrations, or in the one numbered ``run``.
+        """
+        cells = self.whole if run is None else self.runs[run]
+        rows = cells[tissue if tissue in cells else POOLED]
         bins = np.clip(np.searchsorted(self.to_bone_mm, to_bone_mm, side="right") - 1, 0, len(self.to_bone_mm) - 1)
         bias, sd = np.empty(len(shear)), np.empty(len(shear))
         for k in range(len(self.to_bone_mm)):
             here = bins == k
-            bias[here] = np.interp(shear[here], self.shear, self.bias[row][k])
-            sd[here] = np.interp(shear[here], self.shear, self.sd[row][k])
+            bias[here] = np.interp(shear[here], self.shear, rows[0, k])
+            sd[here] = np.interp(shear[here], self.shear, rows[1, k])
         return bias, sd
 
 
@@ -82,33 +87,38 @@ class ErrorModel:
     Attributes
     ----------
     preset : str
+    parameters_sha256 : str
+        Of the preset's text: other parameters under the same name have another error.
     tables : tuple of ErrorTable
     source : str
         The study in a sentence.
     """
 
     preset: str
+    parameters_sha256: str
     tables: tuple[ErrorTable, ...]
     source: str
 
-    def table_for(self, voxel_mm: float, snr: float) -> ErrorTable:
-        """The table nearest to a voxel size and a signal-to-noise ratio, both within a factor of 1.6.
+    def table_for(self, spacing_mm: FloatArray, snr: float) -> ErrorTable:
+        """The table nearest to a voxel and a signal-to-noise ratio: edges, by size, and ratio within 1.6 times.
 
         Raises
         ------
         InputError
             If none is that near; the message names those there are.
         """
+        edges = np.sort(spacing_mm)
 
         def far(table: ErrorTable) -> float:
-            return float(max(abs(np.log(voxel_mm / table.voxel_mm)), abs(np.log(snr / table.snr))))
+            voxel = np.abs(np.log(edges / np.sort(table.spacing_mm))).max()
+            return float(max(voxel, abs(np.log(snr / table.snr))))
 
         nearest = min(self.tables, key=far)
         if not far(nearest) <= np.log(_FAR):
-            known = "; ".join(f"{t.voxel_mm:.2g} mm at SNR {t.snr:.0f}" for t in self.tables)
+            known = "; ".join(f"{_told(t.spacing_mm)} mm at SNR {t.snr:.0f}" for t in self.tables)
             raise InputError(
-                f"The error of {self.preset} is known for voxels of {known}. This image has voxels of {voxel_mm:.2g} "
-                f"mm at SNR {snr:.0f}, too far from any of these."
+                f"The error of {self.preset} is known for voxels of {known}. These images have voxels of "
+                f"{_told(spacing_mm)} mm at SNR {snr:.0f}, too far from any of these."
             )
         return nearest
 
@@ -116,21 +126,29 @@ class ErrorModel:
         """Write as JSON, whole or not at all."""
         from dvc.whole import write_whole
 
+        def plain(cells: Mapping[str, FloatArray]) -> dict[str, object]:
+            return {tissue: np.round(rows, 4).tolist() for tissue, rows in cells.items()}
+
         tables = [
             {
-                "voxel_mm": t.voxel_mm,
+                "spacing_mm": t.spacing_mm.tolist(),
                 "snr": t.snr,
                 "shear": t.shear.tolist(),
                 "to_bone_mm": t.to_bone_mm.tolist(),
-                "bias": {k: np.round(v, 5).tolist() for k, v in t.bias.items()},
-                "sd": {k: np.round(v, 5).tolist() for k, v in t.sd.items()},
-                "run_sd": {k: round(v, 6) for k, v in t.run_sd.items()},
+                "bias_and_sd": plain(t.whole),
+                "bias_and_sd_of_each_run": [plain(run) for run in t.runs],
                 "correlation_mm": t.correlation_mm,
             }
             for t in self.tables
         ]
-        told = {"format": _FORMAT, "preset": self.preset, "source": self.source, "tables": tables}
-        write_whole(path, json.dumps(told, indent=1, allow_nan=False) + "\n")
+        told = {
+            "format": _FORMAT,
+            "preset": self.preset,
+            "parameters_sha256": self.parameters_sha256,
+            "source": self.source,
+            "tables": tables,
+        }
+        write_whole(path, json.dumps(told, allow_nan=False) + "\n")
 
 
 def read_error_model(path: Path | str) -> ErrorModel:
@@ -159,22 +177,55 @@ def _parsed(text: str) -> ErrorModel:
     told = json.loads(text)
     if told["format"] != _FORMAT:
         raise ValueError(f"format {told['format']}, not {_FORMAT}")
+
+    def cells(given: Mapping[str, list[object]]) -> dict[str, FloatArray]:
+        return {tissue: np.asarray(rows, dtype=np.float64) for tissue, rows in given.items()}
+
     tables = tuple(
         ErrorTable(
-            float(t["voxel_mm"]),
+            np.asarray(t["spacing_mm"], dtype=np.float64),
             float(t["snr"]),
             np.asarray(t["shear"], dtype=np.float64),
             np.asarray(t["to_bone_mm"], dtype=np.float64),
-            {k: np.asarray(v, dtype=np.float64) for k, v in t["bias"].items()},
-            {k: np.asarray(v, dtype=np.float64) for k, v in t["sd"].items()},
-            {k: float(v) for k, v in t["run_sd"].items()},
+            cells(t["bias_and_sd"]),
+            tuple(cells(run) for run in t["bias_and_sd_of_each_run"]),
             float(t["correlation_mm"]),
         )
         for t in told["tables"]
     )
-    if not tables or any(POOLED not in t.bias for t in tables):
+    if not tables or any(POOLED not in cells for t in tables for cells in (t.whole, *t.runs)):
         raise ValueError(f"no table, or one without a row '{POOLED}'")
-    return ErrorModel(str(told["preset"]), tables, str(told["source"]))
+    if not all(t.runs for t in tables):
+        raise ValueError("a table without runs")
+    return ErrorModel(str(told["preset"]), str(told["parameters_sha256"]), tables, str(told["source"]))
+
+
+def _told(spacing_mm: FloatArray) -> str:
+    same = np.ptp(spacing_mm) < 1e-6
+    return f"{spacing_mm[0]:.2g}" if same else " x ".join(f"{s:.2g}" for s in spacing_mm)
+
+
+def to_surface_mm(body: BoolArray, spacing_mm: FloatArray) -> Float32Array:
+    """Distance (mm) of voxels' centres to the surface of a body of voxels: 0 inside it, infinite without one.
+
+    The surface lies half an edge from the centre of a voxel that touches it.
+    """
+    if not body.any():
+        return np.full(body.shape, np.inf, dtype=np.float32)
+    touching = np.full(body.shape, np.inf, dtype=np.float32)
+    for axis in range(body.ndim):
+        ahead, behind = [slice(None)] * body.ndim, [slice(None)] * body.ndim
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        differs = body[tuple(ahead)] != body[tuple(behind)]
+        half = np.where(differs, np.float32(0.5 * spacing_mm[axis]), np.float32(np.inf))
+        for side in (tuple(ahead), tuple(behind)):
+            np.minimum(touching[side], half, out=touching[side])
+    touching[body] = np.inf
+    at = np.isfinite(touching)
+    if not at.any():
+        return np.zeros(body.shape, dtype=np.float32)
+    distance, nearest = distance_transform_edt(~at, sampling=spacing_mm, return_indices=True)
+    return np.where(body, 0.0, distance + touching[tuple(nearest)]).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +257,7 @@ class Uncertainty:
     Attributes
     ----------
     sigma : (ni, nj, nk)
-        Standard deviation of the maximal shear about its bias; NaN where not defined, and in bone.
+        Standard deviation of the maximal shear about its bias; NaN where not defined and outside the regions.
     intervals : tuple of Interval
     table : ErrorTable
     """
@@ -245,8 +296,8 @@ def uncertainty_of(
 
     Notes
     -----
-    The truth is drawn 200 times: found shear, less bias, less a Gaussian field of the table's standard deviation and
-    correlation length, less a constant of the tissue's own for what differs from image to image; not below zero.
+    The truth is drawn 200 times: found shear, less the bias of one of the study's registrations, drawn anew each time,
+    less a Gaussian field of its standard deviation and of the table's correlation length; not below zero.
     """
     sigma = np.full(grid.shape, np.nan, dtype=np.float32)
     intervals: list[Interval] = []
@@ -279,23 +330,15 @@ def _intervals(
     if not kept.any():
         lattice, kept, step = box, where[box], 1
     found = max_shear[lattice][kept].astype(np.float64)
-    bias, sd = table.expected(name, found, to_bone_mm[lattice][kept])
-    run_sd = table.run_sd.get(name, table.run_sd[POOLED])
     volume = np.count_nonzero(where) * grid.voxel_volume_mm3 / 1000.0
-    width = 0.5 * table.correlation_mm / (step * grid.spacing_mm)
-    at = np.nonzero(kept)
-    drawn = np.stack(
-        [
-            _figures(
-                np.maximum(found - bias - sd * _field(kept.shape, width, at, random) - run_sd * random.normal(), 0.0),
-                volume,
-                thresholds,
-            )
-            for _ in range(_DRAWS)
-        ]
-    )
+    noise = _Field(kept, 0.5 * table.correlation_mm / (step * grid.spacing_mm), random)
+    expected = [table.expected(name, found, to_bone_mm[lattice][kept], run) for run in range(len(table.runs))]
+    drawn = np.empty((_DRAWS, 3 + len(thresholds)))
+    for draw in range(_DRAWS):
+        bias, sd = expected[random.integers(len(expected))]
+        drawn[draw] = figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds)
     low, middle, high = np.percentile(drawn, [2.5, 50.0, 97.5], axis=0)
-    measured = _figures(max_shear[where].astype(np.float64), volume, thresholds)
+    measured = figures_of(max_shear[where].astype(np.float64), volume, thresholds)
     names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]
     return [
         Interval(name, figure, float(m), float(e), float(a), float(b))
@@ -303,15 +346,28 @@ def _intervals(
     ]
 
 
-def _figures(shear: FloatArray, volume_ml: float, thresholds: Sequence[float]) -> FloatArray:
+def figures_of(shear: FloatArray, volume_ml: float, thresholds: Sequence[float]) -> FloatArray:
+    """Median, 90th and 95th percentile, and the volumes above thresholds (mL) of a tissue of a volume."""
     above = [volume_ml * np.count_nonzero(shear > t) / len(shear) for t in thresholds]
     return np.array([*np.percentile(shear, [50.0, 90.0, 95.0]), *above])
 
 
-def _field(
-    shape: tuple[int, ...], width: FloatArray, at: tuple[IntArray, ...], random: np.random.Generator
-) -> FloatArray:
-    """Gaussian field of unit variance, smooth over ``width`` voxels, at some voxels."""
-    smooth = gaussian_filter(random.standard_normal(shape), width, mode="wrap")
-    values = smooth[at]
-    return np.asarray(values / max(float(smooth.std()), 1e-12))
+class _Field:
+    """Gaussian fields of unit variance at the voxels of a region, smooth over ``width`` voxels."""
+
+    def __init__(self, inside: BoolArray, width: FloatArray, random: np.random.Generator) -> None:
+        self._width, self._random = width, random
+        # Room around, so that the field, which is periodic, does not meet itself.
+        room = np.ceil(6.0 * width).astype(int)
+        self._shape = tuple(int(n + r) for n, r in zip(inside.shape, room, strict=True))
+        self._at = np.nonzero(inside)
+        spread = np.ones(())
+        for w in width:
+            kernel = gaussian_filter1d(np.eye(1, 2 * int(4 * w + 1) + 1, int(4 * w + 1))[0], w, mode="constant")
+            spread = spread * (kernel**2).sum()
+        self._scale = 1.0 / np.sqrt(float(spread))
+
+    def drawn(self) -> FloatArray:
+        """Draw the values at the region's voxels, (n,)."""
+        smooth = gaussian_filter(self._random.standard_normal(self._shape), self._width, mode="wrap")
+        return np.asarray(self._scale * smooth[self._at])

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
+import re
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from dvc import figures
-from dvc.arrays import BoolArray
+from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
 from dvc.image import Image
 from dvc.imagewrite import write_image
@@ -21,12 +22,23 @@ from dvc.planes import View
 from dvc.registration import Registration
 from dvc.report import Picture, Table
 from dvc.strainmaps import StrainMaps
-from dvc.uncertainty import POOLED, ErrorModel, Interval, Uncertainty, error_model_of, uncertainty_of
+from dvc.tissue import tissue_mask
+from dvc.uncertainty import (
+    POOLED,
+    ErrorModel,
+    ErrorTable,
+    Interval,
+    Uncertainty,
+    error_model_of,
+    to_surface_mm,
+    uncertainty_of,
+)
 from dvc.whole import write_whole
 from mrstrain.inputs import Subject
 from mrstrain.page import said
 
-_BONES = ("bone", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform", "metatarsal")
+_BONES = {"bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform"}
+_SOFT = {"fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage"}
 _MOSTLY = 0.5
 _SIGMA_SCALE = 0.1
 
@@ -50,7 +62,8 @@ class ErrorBars:
         if self.uncertainty is None:
             return {"known": False, "reason": self.told}
         table = self.uncertainty.table
-        return {"known": True, "source": self.told, "voxel_mm": table.voxel_mm, "snr": round(table.snr, 1)}
+        voxel = table.spacing_mm.tolist()
+        return {"known": True, "source": self.told, "voxel_mm": voxel, "snr": round(table.snr, 1)}
 
     def write(self, folder: Path, maps: StrainMaps) -> None:
         """Write ``sigma_max_shear.nii.gz`` and ``intervals.csv``, where the errors are known."""
@@ -91,33 +104,53 @@ def error_bars(found: Registration, subject: Subject, maps: StrainMaps, model: E
     model : ErrorModel or None
         The user's own; where None, that of the preset.
     """
-    preset = found.settings.presets[-1].name
-    chosen = model or error_model_of(preset)
-    if chosen is None:
-        return ErrorBars(None, f"The error of {preset} has not been measured; `mrstrain accuracy` does that.")
-    if chosen.preset != preset:
-        return ErrorBars(None, f"The error model is that of {chosen.preset}, and {preset} was used.")
     grid = maps.grid
-    voxel_mm = float(np.cbrt(grid.voxel_volume_mm3))
     try:
-        table = chosen.table_for(voxel_mm, signal_to_noise(subject.reference, found.tissue))
-    except InputError as far:
-        return ErrorBars(None, str(far))
-    bone, regions = _bone_and_tissues(subject, found.tissue.inside)
+        chosen = _model_for(found, model)
+        table = chosen.table_for(*_poorer(found))
+    except InputError as reason:
+        return ErrorBars(None, str(reason))
+    bone, regions = _bone_and_tissues(subject, found.tissue.inside, table)
     if not bone.any():
         return ErrorBars(None, "The error depends on the distance to bone, and no bone was given.")
-    to_bone = distance_transform_edt(~bone, sampling=grid.spacing_mm).astype(np.float32)
+    to_bone = to_surface_mm(bone, grid.spacing_mm)
     sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=found.settings.seed)
-    known = ", ".join(name for name in regions if name in table.bias and name != POOLED)
+    known = ", ".join(name for name in regions if name in table.whole and name != POOLED)
+    voxel = " x ".join(f"{s:.2g}" for s in table.spacing_mm)
     told = (
-        f"Error model of {chosen.preset} for voxels of {table.voxel_mm:.2g} mm at SNR {table.snr:.0f}: "
+        f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}: "
         f"{chosen.source}. Tissues with figures of their own: {known or 'none'}; others take those of soft tissue "
         "together. It holds for tissue that is strained and imaged like those phantoms."
     )
     return ErrorBars(sure, told)
 
 
-def _bone_and_tissues(subject: Subject, tissue: BoolArray) -> tuple[BoolArray, Mapping[str, BoolArray]]:
+def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
+    """The error model of what was used; InputError with the reason where there is none."""
+    stages = found.settings.presets
+    used = stages[-1]
+    if len(stages) > 1:
+        raise InputError("The error of several stages, one after the other, has not been measured.")
+    chosen = given or error_model_of(used.name)
+    if chosen is None:
+        raise InputError(f"The error of {used.name} has not been measured; `mrstrain accuracy` does that.")
+    if chosen.preset != used.name:
+        raise InputError(f"The error model is that of {chosen.preset}, and {used.name} was used.")
+    if chosen.parameters_sha256 != hashlib.sha256(used.text.encode()).hexdigest():
+        raise InputError(f"The error of {used.name} was measured with other parameters; run `mrstrain accuracy` again.")
+    return chosen
+
+
+def _poorer(found: Registration) -> tuple[FloatArray, float]:
+    """The larger voxel, edge by edge, and the lower signal-to-noise ratio of the two images."""
+    spacing = np.maximum(np.sort(found.reference.grid.spacing_mm), np.sort(found.loaded.grid.spacing_mm))
+    ratio = signal_to_noise(found.reference, found.tissue)
+    return spacing, min(ratio, signal_to_noise(found.loaded, tissue_mask(found.loaded)))
+
+
+def _bone_and_tissues(
+    subject: Subject, tissue: BoolArray, table: ErrorTable
+) -> tuple[BoolArray, Mapping[str, BoolArray]]:
     """Every bone that is known, and the soft tissues by name."""
     bone = np.zeros(tissue.shape, dtype=bool) if subject.bone is None else subject.bone.inside.copy()
     soft: dict[str, BoolArray] = {}
@@ -125,11 +158,12 @@ def _bone_and_tissues(subject: Subject, tissue: BoolArray) -> tuple[BoolArray, M
         for number, name in subject.labels.names.items():
             inside = subject.labels.labels == number
             count = np.count_nonzero(inside)
-            named = any(word in name.lower() for word in _BONES)
+            words = set(re.split(r"[^a-z]+", name.lower()))
+            named = bool(words & _BONES) and not words & _SOFT
             if named or (count and np.count_nonzero(inside & bone) > _MOSTLY * count):
                 bone |= inside
             elif count:
-                soft[name] = inside
+                soft[name.lower() if name.lower() in table.whole else name] = inside
     if not soft:
         soft = {POOLED: tissue & ~bone}
     return bone, {name: inside & ~bone for name, inside in soft.items()}

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,16 @@ from dvc.worker import Worker, usable_cores
 from mrstrain.inputs import make_output
 from mrstrain.provenance import provenance, versions, write_json
 from mrstrain.studypage import write_study_report
-from phantoms.accuracy import ErrorRow, FloorRow, ResolutionRow, error_rows, floor_rows, resolution_rows
+from phantoms.accuracy import (
+    ErrorRow,
+    FloorRow,
+    ResolutionRow,
+    RunRow,
+    error_rows,
+    floor_rows,
+    resolution_rows,
+    run_rows,
+)
 from phantoms.anatomy import Heel
 from phantoms.errormodel import CoverageRow, coverage_rows, fit_error_model
 from phantoms.heel import heel_grid
@@ -30,7 +40,7 @@ from phantoms.study import Case, Samples, measure, motion_named
 Told = Callable[[str, str, float], None]
 
 MOTIONS = ("still", "smooth", "sliding", "Load1", "Load2", "Load3", "Load4")
-WAVES = tuple(f"wave-{length}" for length in (6, 8, 12, 16, 24, 48))
+WAVES = tuple(f"wave-{length}" for length in (6, 8, 10, 12, 16, 20, 24, 48))
 CONDITIONS: tuple[tuple[tuple[float, float, float], float], ...] = (
     ((0.8, 0.8, 0.8), 25.0),
     ((0.8, 0.8, 0.8), 12.0),
@@ -41,6 +51,8 @@ CONDITIONS: tuple[tuple[tuple[float, float, float], float], ...] = (
 """Voxel (mm) and signal-to-noise ratio of the default study."""
 PUBLISHED_SEEDS = (9000, 9001)
 
+# What makes the images: a study goes on only with runs made by the same.
+_MAKING = {"anatomy.py", "bodies.py", "flow.py", "heel.py", "motions.py", "mri.py", "study.py"}
 _SECONDS = 75.0  # of one run on one core, as measured: 3,500 iterations, whatever the voxel
 _MEGABYTES = 5.0  # of one run's samples, as measured at 0.8 mm
 
@@ -86,7 +98,7 @@ def cases_of(
 ) -> list[Case]:
     """Every preset with every condition (voxel in mm, SNR), motion and seed; waves with the first seed alone.
 
-    By default seven motions with two heels each and six waves, at five conditions: 100 registrations.
+    By default seven motions with two heels each and eight waves, at five conditions: 110 registrations.
     """
     return [
         Case(preset, spacing, snr, motion, seed)
@@ -183,7 +195,8 @@ def _key(case: Case) -> str:
     """What a run's result depends on beside its case."""
     told = versions()
     text = preset_or_file(case.preset).text + load_preset("bone-rigid").text
-    return hashlib.sha256((text + told["mrstrain"] + told["itk-elastix"]).encode()).hexdigest()
+    sources = "".join(file.read_text() for file in sorted(files("phantoms").iterdir(), key=str) if file.name in _MAKING)
+    return hashlib.sha256((text + told["mrstrain"] + told["itk-elastix"] + sources).encode()).hexdigest()
 
 
 def _refuse_small_disk(folder: Path, count: int) -> None:
@@ -250,15 +263,20 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
         ("zero_strain", floors, FloorRow),
         ("resolution", resolution, ResolutionRow),
         ("coverage", coverage, CoverageRow),
+        ("runs", run_rows(runs), RunRow),
     ):
         _write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], [asdict(row) for row in rows])
     presets = list(dict.fromkeys(r.case.preset for r in runs))
     for preset in presets:
         some = [r for r in runs if r.case.preset == preset]
         if any(r.case.wavelength_mm is None for r in some):
-            seeds = sorted({r.case.seed for r in some})
-            source = f"{len(some)} registrations of phantom heels, seeds {seeds}, motions other than waves"
-            fit_error_model(some, source).write(target / f"error_model_{Path(preset).stem}.json")
+            plain = [r for r in some if r.case.wavelength_mm is None]
+            seeds = sorted({r.case.seed for r in plain})
+            motions = ", ".join(dict.fromkeys(r.case.motion for r in plain))
+            source = f"{len(plain)} registrations of phantom heels, seeds {seeds}, motions {motions}"
+            fit_error_model(some, preset_or_file(preset).text, source).write(
+                target / f"error_model_{Path(preset).stem}.json"
+            )
     record = provenance(
         "accuracy",
         {},

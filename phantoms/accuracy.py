@@ -80,13 +80,37 @@ class FloorRow:
 
 @dataclass(frozen=True, slots=True)
 class ResolutionRow:
-    """How much of a sinusoidal shear of one wavelength is found in soft tissue: the slope of found on true H_dn."""
+    """How much of a sinusoidal shear of one wavelength is found in a tissue: the slope of found on true H_dn."""
 
     preset: str
     voxel_mm: str
     snr: float
+    tissue: str
     wavelength_mm: float
     recovered: float
+
+
+@dataclass(frozen=True, slots=True)
+class RunRow:
+    """One registration: its time, the share of the heel without a result, and folded voxels of those sampled."""
+
+    case: str
+    estimated_snr: float
+    seconds: float
+    without_result: float
+    folded: int
+    shear_rmse: float
+
+
+def run_rows(runs: Sequence[Samples]) -> list[RunRow]:
+    """Tell of each run, with the root mean square error of the maximal shear in its soft tissue."""
+    rows = []
+    for run in runs:
+        error = (run.shear - run.true_shear)[of_tissue(run, POOLED)].astype(np.float64)
+        without = run.unknown / (run.unknown + len(run.shear))
+        rmse = float(np.sqrt(np.mean(error**2)))
+        rows.append(RunRow(run.case.name, run.estimated_snr, run.seconds, without, run.folded, rmse))
+    return rows
 
 
 def error_rows(runs: Sequence[Samples]) -> list[ErrorRow]:
@@ -121,23 +145,26 @@ def floor_rows(runs: Sequence[Samples]) -> list[FloorRow]:
 
 
 def resolution_rows(runs: Sequence[Samples]) -> list[ResolutionRow]:
-    """Share of a sinusoidal strain that is recovered, by condition and wavelength, rising."""
+    """Share of a sinusoidal strain that is recovered, by condition, tissue and wavelength, rising."""
     rows = []
     for (preset, voxel, snr), some in by_condition(runs):
         lengths = sorted({r.case.wavelength_mm for r in some if r.case.wavelength_mm is not None})
-        for length in lengths:
-            waves = [r for r in some if r.case.wavelength_mm == length]
-            kept = [of_tissue(r, POOLED) for r in waves]
-            true = np.concatenate([r.true_slope[k] for r, k in zip(waves, kept, strict=True)]).astype(np.float64)
-            found = np.concatenate([r.slope[k] for r, k in zip(waves, kept, strict=True)]).astype(np.float64)
-            rows.append(ResolutionRow(preset, voxel, snr, length, float(true @ found / (true @ true))))
+        for tissue in (*SOFT, POOLED):
+            for length in lengths:
+                waves = [r for r in some if r.case.wavelength_mm == length]
+                kept = [of_tissue(r, tissue) for r in waves]
+                true = np.concatenate([r.true_slope[k] for r, k in zip(waves, kept, strict=True)]).astype(np.float64)
+                found = np.concatenate([r.slope[k] for r, k in zip(waves, kept, strict=True)]).astype(np.float64)
+                if len(true):
+                    share = float(true @ found / (true @ true))
+                    rows.append(ResolutionRow(preset, voxel, snr, tissue, length, share))
     return rows
 
 
 def wavelength_recovered(rows: Sequence[ResolutionRow], share: float) -> float:
     """Shortest wavelength (mm) from which on a share of the strain is recovered; NaN where the rows do not tell.
 
-    Linear between the wavelengths of the rows, which are of one condition.
+    Linear between the wavelengths of the rows, which are of one condition and tissue.
     """
     lengths = np.array([r.wavelength_mm for r in rows])
     recovered = np.array([r.recovered for r in rows])

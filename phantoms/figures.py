@@ -46,10 +46,13 @@ def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
 
 
 def resolution(rows: Sequence[ResolutionRow]) -> bytes:
-    """Share of a sinusoidal shear that is recovered, by its wavelength; grey lines at 50 % and 90 %."""
+    """Share of a sinusoidal shear that is recovered, by its wavelength; grey lines at 50 % and 90 %.
+
+    Shear along the foot that varies through the pad's thickness, largest 0.2; no foot motion.
+    """
     figure, (axes,) = _page(1)
-    for number, condition in enumerate(dict.fromkeys(_condition(r) for r in rows)):
-        mine = sorted((r for r in rows if _condition(r) == condition), key=lambda r: r.wavelength_mm)
+    for number, condition in enumerate(dict.fromkeys(_of_tissue(r) for r in rows)):
+        mine = sorted((r for r in rows if _of_tissue(r) == condition), key=lambda r: r.wavelength_mm)
         axes.plot(
             [r.wavelength_mm for r in mine], [r.recovered for r in mine], label=condition, linewidth=1.8,
             color=REGION_COLOURS[number % len(REGION_COLOURS)], marker=_MARKS[number % len(_MARKS)],
@@ -70,7 +73,7 @@ def trade_off(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], tissue:
     """
     figure, (axes,) = _page(1)
     for number, condition in enumerate(dict.fromkeys(_condition(r) for r in rows)):
-        mine = [r for r in rows if _condition(r) == condition]
+        mine = [r for r in rows if _condition(r) == condition and r.tissue == tissue]
         floor = [f.shear_p50 for f in floors if _condition(f) == condition and f.tissue == tissue]
         at = wavelength_recovered(mine, 0.9)
         if floor and np.isfinite(at):
@@ -88,6 +91,10 @@ def trade_off(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], tissue:
 
 def _condition(row: ResolutionRow | FloorRow) -> str:
     return f"{row.preset}, {row.voxel_mm} mm, SNR {row.snr:g}"
+
+
+def _of_tissue(row: ResolutionRow) -> str:
+    return f"{row.tissue}: {_condition(row)}"
 
 
 def _page(panels: int) -> tuple[Figure, tuple[Axes, ...]]:

@@ -26,7 +26,7 @@ LOADS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
         "Load4": (1.4, 1.5, 1.5),
     }
 )
-"""Of each load: how far the plate presses, how far it shears, and how far the pad slides inside its skin, mm.
+"""Of each load: how far the plate presses, how far it shears, and how far the pad slides inside its skin, mm at size 1.
 
 Chosen for the shear that finite-element models of the heel gave for 140 N, 15 N, 15 + 45 N and 15 + 12 N: in the fat
 around the calcaneus a median and a 90th percentile of about .20 / .40, .05 / .09, .13 / .35, .06 / .13.
@@ -199,12 +199,15 @@ def pressed(heel: Heel, load: float = 1.0) -> Flow:
 
 
 def under_plate(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
-    """Return the smooth flow of a heel under a plate that moves up by ``press_mm`` and forward by ``shear_mm``."""
+    """Return the smooth flow of a heel under a plate that moves up by ``press_mm`` and forward by ``shear_mm``.
+
+    Both are of a heel of size 1, and grow with it.
+    """
     bones = heel.skeleton
     # merged softly, which makes the body larger: the bones stay inside, and motion rises around them smoothly
     rest = EllipsoidUnion(bones.centres_mm, bones.forms, sharpness=1.25)
     return Flow(
-        np.array([0.0, -shear_mm, press_mm]),
+        heel.size * np.array([0.0, -shear_mm, press_mm]),
         pivot_mm=heel.size * np.array([0.0, 15.0, -47.0]),
         rest=Border(rest, ramp=1.0),
         centre_mm=heel.size * np.array([0.0, 14.0, -50.0]),
@@ -217,10 +220,10 @@ def sliding(heel: Heel, shear_mm: float) -> Flow:
     """Return the flow of the heel pad alone, along a skin and a bone that are both at rest.
 
     Its strain jumps at either border: fat shears right up to them. ``shear_mm`` is about how far tissue moves in the
-    middle of the pad.
+    middle of the pad of a heel of size 1, and grows with it.
     """
     return Flow(
-        np.array([0.0, _SLIDE * shear_mm, 0.0]),
+        heel.size * np.array([0.0, _SLIDE * shear_mm, 0.0]),
         # far above, so that the potential is about the same all over the pad, and tissue circulates around it
         pivot_mm=heel.size * np.array([0.0, 14.0, 50.0]),
         rest=Border(heel.skeleton, ramp=0.6, order=2),

@@ -5,13 +5,13 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.deformation import Motion, RigidMotion, evaluate_on_grid
@@ -22,6 +22,7 @@ from dvc.noise import signal_to_noise
 from dvc.presets import preset_or_file
 from dvc.registration import Settings, register
 from dvc.resample import shows
+from dvc.uncertainty import to_surface_mm
 from dvc.whole import whole_file
 from dvc.worker import Worker
 from phantoms.anatomy import Heel
@@ -32,7 +33,7 @@ RIGID = ("bone", "ankle")
 _STRIDE = 2  # neighbouring voxels say nearly the same: one in eight is kept
 _LAGS = 8
 _WAVE_PEAK = 0.2
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +99,12 @@ class Samples:
         H_dn = d . (grad u) n of a wave, true and found; zero for another motion.
     folded : int
         Sampled voxels with det F <= 0.
+    voxel : (n, 3)
+        Index on the study's grid.
     correlation : (lags,)
-        Autocorrelation of the error of the maximal shear in soft tissue at distances of 2, 4, 6, ... voxels.
+        Autocorrelation of the error of the maximal shear in soft tissue.
     lag_mm : (lags,)
-        Those distances, mm; means over the three axes.
+        At these distances, mm: multiples of two voxels' longest edge, along the axes that have it.
     """
 
     case: Case
@@ -118,6 +121,7 @@ class Samples:
     mean_abs_strain: Float32Array
     true_slope: Float32Array
     slope: Float32Array
+    voxel: IntArray
     correlation: FloatArray
     lag_mm: FloatArray
 
@@ -154,6 +158,7 @@ _ARRAYS = (
     "mean_abs_strain",
     "true_slope",
     "slope",
+    "voxel",
     "correlation",
     "lag_mm",
 )
@@ -180,8 +185,9 @@ def motion_named(heel: Heel, name: str) -> Motion | None:
             wavelength = float(name.removeprefix("wave-"))
         except ValueError:
             wavelength = float("nan")
-        # Along the foot, with its crests across the pad's thickness.
-        return ShearWave(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), wavelength, _WAVE_PEAK)
+        # Along the foot, with its crests across the pad's thickness; each heel sees another phase.
+        phase = float(np.random.default_rng([heel.seed, 4]).uniform(0.0, 2.0 * np.pi))
+        return ShearWave(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), wavelength, _WAVE_PEAK, phase)
     raise InputError(f"No motion '{name}'; there are still, smooth, sliding, {', '.join(LOADS)} and wave-L (L in mm).")
 
 
@@ -210,12 +216,14 @@ def measure(
         grid = heel_grid(case.spacing_mm)
         motion = motion_named(heel, case.motion)
         wave = case.wavelength_mm is not None
-        foot = RigidMotion.identity() if wave else drawn_motion(case.seed, 1)
+        # Every pair is scanned anew, with noise, shading and foot motion of its own; presets see the same pairs.
+        number = zlib.crc32(f"{case.motion} {case.spacing_mm} {case.snr}".encode())
+        foot = RigidMotion.identity() if wave else drawn_motion(case.seed, number)
         labels = labels_of(heel, grid)
         bone, body = labels.region("bone"), Mask(grid, labels.labels > 0)
-        reference = scan(heel, grid, snr=case.snr, number=0)
+        reference = scan(heel, grid, snr=case.snr, number=number)
         where = covering(grid, foot.apply(bone.points()))
-        loaded = scan(heel, where, motion, foot, snr=case.snr, number=1)
+        loaded = scan(heel, where, motion, foot, snr=case.snr, number=number + 1)
     # A wave moves the bone too: nothing there to align on.
     settings = Settings((preset_or_file(case.preset),), "none" if wave else "bone", threads=worker.threads)
     found = register(
@@ -261,36 +269,30 @@ def measure(
             mean_abs_strain=single(np.abs(upper).mean(axis=1)),
             true_slope=single(np.einsum("i,nij,j->n", d, true_H, n)),
             slope=single(np.einsum("i,nij,j->n", d, H, n)),
+            voxel=np.argwhere(kept)[known].astype(np.int64),
             correlation=correlation,
             lag_mm=lag_mm,
         )
 
 
 def distances_mm(labels: LabelMap) -> tuple[Float32Array, Float32Array]:
-    """Distance of every voxel to the nearest bone (0 in it), and to the nearest voxel of another label, mm.
+    """Distance of every voxel to the surface of the nearest bone (0 in it), and to that of another tissue, mm.
 
     Bones are the regions called "bone" and "ankle".
     """
-    spacing = labels.grid.spacing_mm
-    values = labels.labels
+    values, spacing = labels.labels, labels.grid.spacing_mm
     bone = np.isin(values, [number for number, name in labels.names.items() if name in RIGID])
-    to_bone = distance_transform_edt(~bone, sampling=spacing)
-    border = np.zeros(values.shape, dtype=bool)
-    for axis in range(3):
-        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
-        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
-        differs = values[tuple(ahead)] != values[tuple(behind)]
-        border[tuple(ahead)] |= differs
-        border[tuple(behind)] |= differs
-    # The surface lies between two voxels, half an edge from either centre.
-    to_border = distance_transform_edt(~border, sampling=spacing) + 0.5 * float(spacing.min())
-    return to_bone.astype(np.float32), to_border.astype(np.float32)
+    to_border = np.full(values.shape, np.inf, dtype=np.float32)
+    for number in np.unique(values):
+        inside = values == number
+        to_border[inside] = to_surface_mm(~inside, spacing)[inside]
+    return to_surface_mm(bone, spacing), to_border
 
 
 def _autocorrelation(
     error: Float32Array, known: BoolArray, kept: BoolArray, labels: LabelMap
 ) -> tuple[FloatArray, FloatArray]:
-    """Of the error in soft tissue, along the three axes together."""
+    """Of the error in soft tissue, along the axes with the longest edge."""
     coarse = labels.labels[::_STRIDE, ::_STRIDE, ::_STRIDE]
     field = np.full(labels.labels.shape, np.nan, dtype=np.float32)
     field[kept] = np.where(known, error, np.nan)
@@ -298,13 +300,14 @@ def _autocorrelation(
     field[np.isin(coarse, [number for number, name in labels.names.items() if name in RIGID])] = np.nan
     field -= np.nanmean(field)
     variance = float(np.nanmean(field**2))
+    spacing = labels.grid.spacing_mm
+    longest = [axis for axis in range(3) if spacing[axis] > spacing.max() - 1e-6]
     found = np.zeros(_LAGS)
     for lag in range(1, _LAGS + 1):
         products = []
-        for axis in range(3):
+        for axis in longest:
             ahead, behind = [slice(None)] * 3, [slice(None)] * 3
             ahead[axis], behind[axis] = slice(lag, None), slice(None, -lag)
             products.append(np.nanmean(field[tuple(ahead)] * field[tuple(behind)]))
         found[lag - 1] = float(np.mean(products)) / variance
-    step = _STRIDE * float(np.mean(labels.grid.spacing_mm))
-    return found, step * np.arange(1.0, _LAGS + 1)
+    return found, _STRIDE * float(spacing.max()) * np.arange(1.0, _LAGS + 1)

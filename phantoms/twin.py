@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
+from scipy.spatial import cKDTree
 from skimage.restoration import denoise_nl_means
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
@@ -70,7 +71,7 @@ def loaded_twin(
     whole : Deformation
         The whole motion phi, the foot's own included: X to X + u(X), LPS mm.
     near : RigidMotion, optional
-        A rigid motion close to the whole, from which the inverse is sought: the bone's.
+        A rigid motion close to the whole, the bone's: tissue is looked for within 30 mm of where it puts it.
     seed : int
         Of noise and receive field.
     shading : bool
@@ -118,13 +119,13 @@ def loaded_twin(
     return Twin(Image(reference.grid, values), sigma, float(in_view.mean()))
 
 
-def found_back(whole: Deformation, points_mm: FloatArray, near: RigidMotion) -> FloatArray:
-    """Points X (n, 3) mm that a deformation moves to given points x; NaN where none is found.
+def found_back(whole: Deformation, points_mm: FloatArray, start_mm: FloatArray) -> FloatArray:
+    """Points X (n, 3) mm that a deformation moves to given points x (n, 3) mm; NaN where none is found.
 
-    Newton's method on X + u(X) = x from the inverse of a rigid motion; where it leaves the deformation's domain or does
-    not come within 1e-7 mm, there is no answer.
+    Newton's method on X + u(X) = x from ``start_mm`` (n, 3); where it leaves the deformation's domain or does not come
+    within 1e-7 mm, there is no answer.
     """
-    X = near.inverse().apply(points_mm)
+    X = np.asarray(start_mm, dtype=np.float64)
     going = np.arange(len(X))
     found = np.full(X.shape, np.nan)
     for _ in range(_ROUNDS):
@@ -168,8 +169,8 @@ def _without_noise(image: Image, tissue: Mask, sigma: float) -> Image:
         values = denoise_nl_means(
             values, patch_size=3, patch_distance=4, h=sigma, sigma=sigma, fast_mode=True, preserve_range=True
         )
-        # magnitudes are lifted by noise: E[m^2] = s^2 + 2 sigma^2
-        values = np.sqrt(np.maximum(values**2 - 2.0 * sigma**2, 0.0))
+        # Magnitudes are lifted by noise: E[m]^2 is about s^2 + sigma^2 where the signal stands clear of it.
+        values = np.sqrt(np.maximum(values**2 - sigma**2, 0.0))
     return Image(image.grid.part(box), values.astype(np.float32))
 
 
@@ -177,12 +178,20 @@ def _carried(clean: Image, tissue: Mask, whole: Deformation, near: RigidMotion) 
     grid = tissue.grid
     coefficients = spline_filter(clean.values.astype(np.float64), order=3, mode="mirror")
     back = whole.inverse() if isinstance(whole, Motion) else None
+    # Newton's method begins at the voxel that lands nearest.
+    home = tissue.points()
+    there = home + whole.displacement(home)
+    home = home[np.all(np.isfinite(there), axis=1)]
+    moved = cKDTree(there[np.all(np.isfinite(there), axis=1)])
     out = np.zeros(int(np.prod(grid.shape)), dtype=np.float32)
     x = grid.points().reshape(-1, 3)
     where = np.flatnonzero(_near(tissue, x, near))
     for start in range(0, len(where), _CHUNK):
         some = where[start : start + _CHUNK]
-        X = x[some] + back.displacement(x[some]) if back is not None else found_back(whole, x[some], near)
+        if back is not None:
+            X = x[some] + back.displacement(x[some])
+        else:
+            X = found_back(whole, x[some], home[moved.query(x[some])[1]])
         inside = np.flatnonzero(np.isfinite(X).all(axis=1))
         inside = inside[_in_mask(tissue, X[inside])]
         at = clean.grid.indices_of(X[inside]).T

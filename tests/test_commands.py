@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import subprocess
 import sys
@@ -55,10 +56,11 @@ def study(tmp_path_factory, small_pair) -> Path:
     write_mask(folder / "bone.nii.gz", small_pair.bone)
     write_labels(folder / "tissues.nrrd", small_pair.labels)
     (folder / "quick.txt").write_text(QUICK)
-    knots, rows = np.array([0.0, 0.2]), {"fat": [[0.01, 0.02]], POOLED: [[0.02, 0.03]]}
-    cells = {tissue: np.array(row) for tissue, row in rows.items()}
-    table = ErrorTable(1.6, 25.0, knots, np.zeros(1), cells, cells, {POOLED: 0.002}, 8.0)
-    ErrorModel("quick.txt", (table,), "made up").write(folder / "errors.json")
+    rows = {"fat": [[0.01, 0.02]], POOLED: [[0.02, 0.03]]}
+    cells = {tissue: np.array([row, row]) for tissue, row in rows.items()}
+    table = ErrorTable(np.full(3, 1.6), 25.0, np.array([0.0, 0.2]), np.zeros(1), cells, (cells,), 8.0)
+    digest = hashlib.sha256(QUICK.encode()).hexdigest()
+    ErrorModel("quick.txt", digest, (table,), "made up").write(folder / "errors.json")
     points = small_pair.labels.region("fat").points()[::4000]
     x = small_pair.foot_motion.apply(points + small_pair.deformation.displacement(points))
     with (folder / "points.csv").open("w", newline="") as file:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,10 +21,11 @@ GRID = Grid((40, 40, 40), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))
 NAMES = {1: "Calcaneus", 2: "fat", 3: "Left talus"}
 
 
-def model(preset: str = "heel-mr", voxel_mm: float = 0.8, snr: float = 25.0) -> ErrorModel:
-    rows = {POOLED: np.full((1, 2), 0.03), "fat": np.full((1, 2), 0.02)}
-    table = ErrorTable(voxel_mm, snr, np.array([0.0, 0.5]), np.zeros(1), rows, rows, {POOLED: 0.001}, 4.0)
-    return ErrorModel(preset, (table,), "made up")
+def model(preset: str = "heel-mr", voxel_mm: float = 0.8, snr: float = 25.0, text: str | None = None) -> ErrorModel:
+    rows = {POOLED: np.full((2, 1, 2), 0.03), "fat": np.full((2, 1, 2), 0.02)}
+    table = ErrorTable(np.full(3, voxel_mm), snr, np.array([0.0, 0.5]), np.zeros(1), rows, (rows,), 4.0)
+    used = load_preset("heel-mr").text if text is None else text
+    return ErrorModel(preset, hashlib.sha256(used.encode()).hexdigest(), (table,), "made up")
 
 
 def given(with_labels: bool = True, with_bone: bool = True):
@@ -41,7 +44,7 @@ def given(with_labels: bool = True, with_bone: bool = True):
     shear = np.where(inside, 0.1, np.nan).astype(np.float32)
     maps = StrainMaps(GRID, inside, np.zeros((*GRID.shape, 3)), np.zeros((*GRID.shape, 6)), shear, np.ones(GRID.shape))
     settings = SimpleNamespace(presets=(load_preset("heel-mr"),), seed=1)
-    return SimpleNamespace(settings=settings, tissue=Mask(GRID, inside)), subject, maps
+    return SimpleNamespace(settings=settings, tissue=Mask(GRID, inside), reference=image, loaded=image), subject, maps
 
 
 def test_every_bone_is_left_out_whatever_its_name() -> None:
@@ -69,6 +72,7 @@ def test_without_labels_all_but_bone_is_soft_tissue() -> None:
         (model("heel-fine"), True, True, "heel-fine, and heel-mr was used"),
         (model(voxel_mm=2.0), True, True, "too far"),
         (model(snr=100.0), True, True, "too far"),
+        (model(text="(Edited 1)"), True, True, "other parameters"),
         (model(), False, False, "no bone was given"),
     ],
 )
@@ -85,6 +89,30 @@ def test_where_the_error_is_not_known_the_reason_is_told(
     assert bars.table() is None
 
 
+def test_a_muscle_named_after_a_bone_is_no_bone() -> None:
+    found, subject, maps = given()
+    assert subject.labels is not None
+    names = {1: "Calcaneus", 2: "Tibialis posterior", 3: "ankle fat"}
+    subject = replace(subject, labels=replace(subject.labels, names=names))
+    bars = error_bars(found, subject, maps, model())
+    assert bars.uncertainty is not None
+    assert {i.region for i in bars.uncertainty.intervals} == {"Tibialis posterior", "ankle fat"}
+
+
+def test_the_noisier_image_counts() -> None:
+    found, subject, maps = given()
+    random = np.random.default_rng(1)
+    noise = 60.0 * random.standard_normal((2, *GRID.shape))
+    found.loaded = Image(GRID, np.hypot(found.reference.values + noise[0], noise[1]).astype(np.float32))
+    assert "too far" in error_bars(found, subject, maps, model()).told
+
+
+def test_several_stages_have_no_known_error() -> None:
+    found, subject, maps = given()
+    found.settings.presets = (load_preset("heel-mr"), load_preset("heel-mr"))
+    assert "several stages" in error_bars(found, subject, maps, model()).told
+
+
 def test_a_preset_without_a_model_is_told() -> None:
     found, subject, maps = given()
     found.settings.presets = (load_preset("bone-rigid"),)
@@ -95,7 +123,8 @@ def test_a_preset_without_a_model_is_told() -> None:
 def test_the_preset_for_heels_comes_with_its_error() -> None:
     stored = error_model_of("heel-mr")
     assert stored is not None
-    table = stored.table_for(0.8, 25.0)
+    assert stored.parameters_sha256 == hashlib.sha256(load_preset("heel-mr").text.encode()).hexdigest()
+    table = stored.table_for(np.full(3, 0.8), 25.0)
     bias, sd = table.expected("fat", np.array([0.02, 0.3]), np.array([6.0, 0.5], dtype=np.float32))
     assert bias[0] > 0.005  # noise lifts small shears
     assert sd[1] > sd[0] > 0.002
