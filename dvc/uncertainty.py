@@ -118,7 +118,8 @@ class ErrorModel:
             known = "; ".join(f"{_told(t.spacing_mm)} mm at SNR {t.snr:.0f}" for t in self.tables)
             raise InputError(
                 f"The error of {self.preset} is known for voxels of {known}. These images have voxels of "
-                f"{_told(spacing_mm)} mm at SNR {snr:.0f}, too far from any of these."
+                f"{_told(spacing_mm)} mm at SNR {snr:.0f}, too far from any of these: measure it with `mrstrain "
+                "accuracy` (--spacing, --slice-spacing, --snr) and give its file as --error-model."
             )
         return nearest
 
@@ -195,8 +196,16 @@ def _parsed(text: str) -> ErrorModel:
     )
     if not tables or any(POOLED not in cells for t in tables for cells in (t.whole, *t.runs)):
         raise ValueError(f"no table, or one without a row '{POOLED}'")
-    if not all(t.runs for t in tables):
-        raise ValueError("a table without runs")
+    for t in tables:
+        shape = (2, len(t.to_bone_mm), len(t.shear))
+        numbers = [rows for cells_of in (t.whole, *t.runs) for rows in cells_of.values()]
+        if not t.runs or any(
+            rows.shape != shape or not np.isfinite(rows).all() or (rows[1] < 0).any() for rows in numbers
+        ):
+            raise ValueError(f"a table without runs, or whose figures are not {shape} finite numbers")
+        rising = np.all(np.diff(t.shear) > 0) and np.all(np.diff(t.to_bone_mm) > 0)
+        if not (rising and t.spacing_mm.shape == (3,) and min(*t.spacing_mm, t.snr, t.correlation_mm) > 0):
+            raise ValueError("a voxel, noise or bin that is not positive and rising")
     return ErrorModel(str(told["preset"]), str(told["parameters_sha256"]), tables, str(told["source"]))
 
 

@@ -315,6 +315,9 @@ def accuracy(
         list[str] | None, typer.Option(help="Preset to judge, or an elastix parameter file (.txt); repeat for several.")
     ] = None,
     spacing: Annotated[list[float] | None, typer.Option(help="Edge of the voxels, mm; repeat for several.")] = None,
+    slice_spacing: Annotated[
+        float | None, typer.Option(help="Their edge along the third axis, where it is another, mm.")
+    ] = None,
     snr: Annotated[list[float] | None, typer.Option(help="Signal-to-noise ratio; repeat for several.")] = None,
     motion: Annotated[
         list[str] | None,
@@ -322,21 +325,25 @@ def accuracy(
     ] = None,
     seed: Annotated[
         list[int] | None,
-        typer.Option(min=0, help="Heel; repeat for several. 9000 to 9999 are for published figures, never for tuning."),
+        typer.Option(min=0, help="Heel; repeat for several. Default: 1 and 2. 9000 to 9999 are for published figures."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Registrations at once. Default: one for each core.")
     ] = None,
 ) -> None:
-    """Error of a preset on phantoms: by tissue, place, strain, noise and resolution. Goes on where it stopped."""
+    """Error of a preset on phantoms: by tissue, place, strain, noise and resolution. Goes on where it stopped.
+
+    Without options 110 registrations: heel-mr, seven motions and eight waves, voxels of 0.8 mm at SNR 25, 12 and 50,
+    of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr these alone (default 0.8 mm, 25).
+    """
     from mrstrain.progress import live
-    from mrstrain.studying import CONDITIONS, MOTIONS, PUBLISHED_SEEDS, WAVES, cases_of
+    from mrstrain.studying import CONDITIONS, MOTIONS, SEEDS, WAVES, cases_of
     from mrstrain.studying import accuracy as run
 
     conditions = CONDITIONS
-    if spacing or snr:
-        conditions = tuple(((s, s, s), r) for s in spacing or [0.8] for r in snr or [25.0])
-    cases = cases_of(preset or ("heel-mr",), conditions, motion or (*MOTIONS, *WAVES), seed or PUBLISHED_SEEDS)
+    if spacing or snr or slice_spacing:
+        conditions = tuple(((s, s, slice_spacing or s), r) for s in spacing or [0.8] for r in snr or [25.0])
+    cases = cases_of(preset or ("heel-mr",), conditions, motion or (*MOTIONS, *WAVES), seed or SEEDS)
     with live() as progress:
         study = run(out, cases=cases, workers=workers, tell_plan=typer.echo, progress=progress)
     for line in study.summary():

@@ -29,7 +29,6 @@ from dvc.uncertainty import (
     ErrorTable,
     Interval,
     Uncertainty,
-    error_model_of,
     to_surface_mm,
     uncertainty_of,
 )
@@ -102,7 +101,7 @@ def error_bars(found: Registration, subject: Subject, maps: StrainMaps, model: E
     Parameters
     ----------
     model : ErrorModel or None
-        The user's own; where None, that of the preset.
+        The user's own or the preset's; None where there is neither.
     """
     grid = maps.grid
     try:
@@ -131,14 +130,13 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
     used = stages[-1]
     if len(stages) > 1:
         raise InputError("The error of several stages, one after the other, has not been measured.")
-    chosen = given or error_model_of(used.name)
-    if chosen is None:
+    if given is None:
         raise InputError(f"The error of {used.name} has not been measured; `mrstrain accuracy` does that.")
-    if chosen.preset != used.name:
-        raise InputError(f"The error model is that of {chosen.preset}, and {used.name} was used.")
-    if chosen.parameters_sha256 != hashlib.sha256(used.text.encode()).hexdigest():
+    if given.preset != used.name:
+        raise InputError(f"The error model is that of {given.preset}, and {used.name} was used.")
+    if given.parameters_sha256 != hashlib.sha256(used.text.encode()).hexdigest():
         raise InputError(f"The error of {used.name} was measured with other parameters; run `mrstrain accuracy` again.")
-    return chosen
+    return given
 
 
 def _poorer(found: Registration) -> tuple[FloatArray, float]:

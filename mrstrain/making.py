@@ -104,7 +104,9 @@ def phantom(
     heel = Heel(seed, size=size, pad_mm=pad_mm, skin_mm=skin_mm, lobule_mm=lobule_mm)
     grid = heel_grid(spacing_mm, size)
     if snr is not None and not 1.0 <= snr <= 1000.0:
-        raise InputError(f"The SNR must lie between 1 and 1000; got {snr}. Leave noise out with None.")
+        raise InputError(
+            f"The SNR must lie between 1 and 1000; got {snr}; or None (--no-noise) for images without noise."
+        )
     motions = {load: under_load(heel, load) for load in loads}
     if not motions:
         raise InputError(f"Name at least one load out of {', '.join(LOADS)}.")

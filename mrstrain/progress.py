@@ -27,7 +27,7 @@ def live() -> Iterator[Told]:
         else:
             yield _lines()
     except KeyboardInterrupt:
-        console.print("Interrupted. Loads that were finished are kept; nothing half-written is.")
+        console.print("Interrupted. What was finished is kept; nothing half-written is.")
         raise
 
 

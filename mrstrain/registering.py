@@ -19,7 +19,7 @@ from dvc.presets import Preset, load_preset, read_parameter_file
 from dvc.registration import Registration, Settings
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
-from dvc.uncertainty import ErrorModel, read_error_model
+from dvc.uncertainty import ErrorModel, error_model_of, read_error_model
 from dvc.worker import Worker, usable_cores
 from mrstrain.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
 from mrstrain.page import write_series_report
@@ -170,7 +170,8 @@ def register(
             "Aligning on the bone needs it: give --bone, or --bone-label with --labels, or another --align."
         )
     images = {name: read_image(path, allow_missing=allow_missing) for name, path in zip(cases, paths, strict=True)}
-    model = None if error_model is None else read_error_model(error_model)
+    # Read now: what is wrong with it must not be found after an hour.
+    model = error_model_of(stages[-1].name) if error_model is None else read_error_model(error_model)
     points = None if landmarks is None else read_landmarks(landmarks)[:2]
     make_output(target)
     cores = usable_cores()

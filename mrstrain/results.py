@@ -44,6 +44,8 @@ class Case:
         Region to (median, 95th percentile) of the maximal shear.
     own_floor : NoiseFloor or None
         What this case's strain amounts to as a noise floor; meaningful for a repeat scan only.
+    without_error_bars : str
+        Why it has none; empty where it has.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Case:
     verdict: Verdict
     shear: dict[str, tuple[float, float]]
     own_floor: NoiseFloor | None
+    without_error_bars: str = ""
 
     def summary(self) -> list[str]:
         """The verdict with its reasons and the strain, for a person."""
@@ -59,6 +62,7 @@ class Case:
             f"{self.name}: {self.verdict.words}.",
             *(f"    {reason}" for reason in self.verdict.reasons),
             f"    maximal shear, median / 95th percentile: {shear}",
+            *([f"    no error bars: {self.without_error_bars}"] if self.without_error_bars else []),
         ]
 
 
@@ -98,7 +102,7 @@ def write_case(
 ) -> Case:
     """Maps, quality and figures of a registered load; its folder is written whole or not at all.
 
-    A repeat scan is judged by its own noise floor; the error bars are those of ``model``, or of the preset's own.
+    A repeat scan is judged by its own noise floor; the error bars are those of ``model``, if there is one.
     """
     reference, loaded, motion = found.reference, found.loaded, found.alignment.motion
     grid = reference.grid
@@ -196,7 +200,8 @@ def _written(
         tuple(pictures.values()),
         () if bars is None or bars.uncertainty is not None else (f"No error bars. {bars.told}",),
     )
-    return Case(measured.name, section, quality.verdict, shear, noise_floor(maps, _soft(measured)))
+    without = "" if bars is None or bars.uncertainty is not None else bars.told
+    return Case(measured.name, section, quality.verdict, shear, noise_floor(maps, _soft(measured)), without)
 
 
 def _soft(measured: Measured) -> BoolArray:

@@ -49,7 +49,8 @@ CONDITIONS: tuple[tuple[tuple[float, float, float], float], ...] = (
     ((0.8, 0.8, 1.6), 25.0),
 )
 """Voxel (mm) and signal-to-noise ratio of the default study."""
-PUBLISHED_SEEDS = (9000, 9001)
+SEEDS = (1, 2)
+"""Published figures come from 9000 to 9999, on which nothing is ever tuned."""
 
 # What makes the images: a study goes on only with runs made by the same.
 _MAKING = {"anatomy.py", "bodies.py", "flow.py", "heel.py", "motions.py", "mri.py", "study.py"}
@@ -94,7 +95,7 @@ def cases_of(
     presets: Sequence[str] = ("heel-mr",),
     conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
     motions: Sequence[str] = (*MOTIONS, *WAVES),
-    seeds: Sequence[int] = PUBLISHED_SEEDS,
+    seeds: Sequence[int] = SEEDS,
 ) -> list[Case]:
     """Every preset with every condition (voxel in mm, SNR), motion and seed; waves with the first seed alone.
 
@@ -127,7 +128,8 @@ def accuracy(
     Parameters
     ----------
     out : path
-        Each run's samples are kept in ``runs`` and used again while preset and versions are the same.
+        Each run's samples are kept in ``runs``, and used again while preset, versions and phantom are the same. Tables
+        and page are of all that lies there: a later call with other cases adds to them.
     cases : sequence of Case
         The default of `cases_of` where not given.
     workers : int
@@ -159,26 +161,43 @@ def accuracy(
     make_output(target)
     runs = target / "runs"
     runs.mkdir(exist_ok=True)
-    keys = {case.name: _key(case) for case in wanted}
-    found = {c.name: s for c in wanted if (s := Samples.read(runs / f"{c.name}.npz", keys[c.name])) is not None}
+    found = _finished(runs)
     left = [case for case in wanted if case.name not in found]
     _refuse_small_disk(target, len(left))
     at_once = max(1, min(workers or usable_cores(), len(left)))
     if tell_plan is not None:
         tell_plan(
-            f"{len(left)} registrations to do ({len(found)} are there already), about "
+            f"{len(left)} registrations to do ({len(wanted) - len(left)} are there already), about "
             f"{expected_minutes(len(left), at_once):.0f} minutes with {at_once} at once."
         )
-    failures = _run_all(left, at_once, runs, keys, found, progress or (lambda *_: None), len(wanted))
+    failures = _run_all(left, at_once, runs, found, progress or (lambda *_: None))
     if not found:
         raise MrstrainError("No case could be measured. " + " ".join(f"{n}: {r}" for n, r in failures.items()))
-    ordered = [found[c.name] for c in wanted if c.name in found]
-    return _write(target, ordered, failures)
+    return _write(target, [found[name] for name in sorted(found)], failures)
+
+
+def _finished(folder: Path) -> dict[str, Samples]:
+    """Runs of this and of earlier calls that are as they would be made now."""
+    found: dict[str, Samples] = {}
+    for path in sorted(folder.glob("*.npz")):
+        try:
+            samples = Samples.read(path, _key)
+        except MrstrainError:  # its preset is gone
+            continue
+        if samples is not None:
+            found[samples.case.name] = samples
+    return found
 
 
 def _check(case: Case) -> None:
-    preset_or_file(case.preset)
+    preset = preset_or_file(case.preset)
+    if "BSplineTransform" not in preset.transform:
+        raise InputError(
+            f"{preset.name} finds no B-spline ({preset.transform}); a study judges non-rigid registration."
+        )
     heel_grid(case.spacing_mm)
+    if case.wavelength_mm is not None and not case.wavelength_mm >= 2.0 * max(case.spacing_mm):
+        raise InputError(f"{case.motion}: a wave needs at least two voxels of {max(case.spacing_mm):g} mm.")
     if not 1.0 <= case.snr <= 1000.0:
         raise InputError(f"The SNR must lie between 1 and 1000; got {case.snr}.")
     motion = motion_named(Heel(case.seed), case.motion)
@@ -209,13 +228,7 @@ def _refuse_small_disk(folder: Path, count: int) -> None:
 
 
 def _run_all(
-    cases: Sequence[Case],
-    at_once: int,
-    folder: Path,
-    keys: dict[str, str],
-    found: dict[str, Samples],
-    tell: Told,
-    total: int,
+    cases: Sequence[Case], at_once: int, folder: Path, found: dict[str, Samples], tell: Told
 ) -> dict[str, str]:
     """Measure cases, several at once; each is written as soon as it is there."""
     local, making, telling = threading.local(), threading.Lock(), threading.Lock()
@@ -226,8 +239,8 @@ def _run_all(
     def told(name: str, fraction: float) -> None:
         with telling:
             under_way[name] = fraction
-            done = len(found) + len(failures) + sum(f for n, f in under_way.items() if n not in found)
-            tell("accuracy", f"{len(found)} of {total}", min(1.0, done / total))
+            # of those to do now, so that the time left is that of this session
+            tell("accuracy", f"{len(cases)} registrations", sum(under_way.values()) / len(cases))
 
     def one(case: Case) -> None:
         if not hasattr(local, "worker"):
@@ -235,7 +248,7 @@ def _run_all(
             workers.append(local.worker)
         try:
             samples = measure(case, local.worker, making, lambda fraction: told(case.name, fraction))
-            samples.write(folder / f"{case.name}.npz", keys[case.name])
+            samples.write(folder / f"{case.name}.npz", _key(case))
             found[case.name] = samples
         except MrstrainError as error:
             failures[case.name] = str(error)

@@ -12,7 +12,7 @@ from mrstrain.results import Case, write_measured
 from mrstrain.straining import read_deformation
 from phantoms.twin import loaded_twin
 
-_TRUTH = "truth"
+_TRUTH = Path("truth") / "twin"
 _IMAGE = "twin.nii.gz"
 
 
@@ -24,14 +24,15 @@ class Twinned:
     truth: Path
     case: Case
     shown: float
+    register: str
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
         shear = ", ".join(f"{region} {p50:.3f} / {p95:.3f}" for region, (p50, p95) in self.case.shear.items())
         return [
-            f"Made image: {self.image}; {self.shown:.0%} of the tissue is in view. Truth: {self.truth}",
+            f"Made image: {self.image}; {self.shown:.0%} of the tissue is in it. Truth: {self.truth}",
             f"True maximal shear, median / 95th percentile: {shear}",
-            f"To see how well it is found: mrstrain register LOAD0 {self.image} --bone MASK --out DIR",
+            f"To register it: {self.register}",
         ]
 
 
@@ -58,7 +59,7 @@ def twin(
         The whole motion, the foot's own included: an elastix or ITK transform or a displacement image, such as the
         ``TransformParameters.1.txt`` of a load that was registered. It maps points of ``load0`` to the loaded foot.
     out : path
-        Gets ``twin.nii.gz`` and ``truth`` in the layout of `register`'s results.
+        Gets ``twin.nii.gz`` and ``truth/twin`` in the layout of `register`'s results.
     bone, bone_label, labels, names, tissue, frame
         As in `strain`; the truth is relative to the bone. ``tissue`` is also all that the made image shows.
     seed : int
@@ -78,11 +79,16 @@ def twin(
     given = read_deformation(
         subject, deformation, frame=frame, command="twin", parameters={"bone_label": bone_label, "seed": seed}
     )
-    refuse_touching_inputs(target, [_TRUTH, _IMAGE], given.files)
-    measured = given.measured(_TRUTH)
+    refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], given.files)
+    measured = given.measured(_TRUTH.name)
     make_output(target)
     made = loaded_twin(subject.reference, measured.tissue, given.whole, near=measured.bone_motion, seed=seed)
     write_image(target / _IMAGE, made.image)
+    (target / _TRUTH).parent.mkdir(exist_ok=True)
     case = write_measured(target / _TRUTH, measured, given.record)
     write_json(target / "provenance.json", given.record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
-    return Twinned(target / _IMAGE, target / _TRUTH, case, made.shown)
+    options = {"--bone": bone, "--bone-label": bone_label, "--tissue": tissue, "--labels": labels, "--names": names}
+    told = " ".join(f"{option} {value}" for option, value in options.items() if value is not None)
+    align = "" if bone is not None or bone_label is not None else " --align none"
+    command = f"mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}"
+    return Twinned(target / _IMAGE, target / _TRUTH, case, made.shown, command)

@@ -20,7 +20,7 @@ def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
     """Root mean square error (lines) and bias (dashes) of the maximal shear over the middle of each bin, by tissue.
 
     All motions with strain together, weighted by their number of voxels. The outermost bin has no far end and is
-    drawn at one and a half times its near one.
+    drawn at one and a half times its near one; bins of fewer than 200 samples are left out.
     """
     figure, (axes,) = _page(1)
     for number, tissue in enumerate(SOFT):
@@ -36,9 +36,11 @@ def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
             at.append(0.5 * (low + high) if np.isfinite(high) else 1.5 * low)
             rmse.append(float(np.sqrt(np.average([r.shear_rmse**2 for r in some], weights=weight))))
             bias.append(float(np.average([r.shear_bias for r in some], weights=weight)))
+        if not at:
+            continue
         colour = REGION_COLOURS[number % len(REGION_COLOURS)]
         axes.plot(at, rmse, color=colour, marker=_MARKS[number], linewidth=1.8, label=tissue)
-        axes.plot(at, bias, color=colour, linestyle="--", linewidth=1.2)
+        axes.plot(at, bias, color=colour, linestyle="--", marker=".", linewidth=1.2)
     axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
     _label(axes, by, "error of the maximal shear")
     axes.legend(fontsize=9, frameon=False)
@@ -77,15 +79,14 @@ def trade_off(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], tissue:
         floor = [f.shear_p50 for f in floors if _condition(f) == condition and f.tissue == tissue]
         at = wavelength_recovered(mine, 0.9)
         if floor and np.isfinite(at):
-            axes.plot(
-                at, floor[0], color=REGION_COLOURS[number % len(REGION_COLOURS)], marker=_MARKS[number % len(_MARKS)],
-                markersize=9, linestyle="none", label=condition,
-            )  # fmt: skip
+            colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+            axes.plot(at, floor[0], color=colour, marker=_MARKS[number % len(_MARKS)], markersize=9)
+            axes.annotate(
+                condition, (at, floor[0]), xytext=(-8, 8), textcoords="offset points", ha="right", fontsize=9, color=INK
+            )
     axes.set_xlim(left=0.0)
     axes.set_ylim(bottom=0.0)
-    _label(axes, "wavelength recovered to 90 %, mm", f"apparent maximal shear without strain, {tissue}")
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=9, frameon=False)
+    _label(axes, "wavelength recovered to 90 %, mm", f"apparent maximal shear\nwithout strain, {tissue}")
     return png_bytes(figure)
 
 

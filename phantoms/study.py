@@ -134,14 +134,16 @@ class Samples:
             np.savez_compressed(file, head=np.array(json.dumps(head)), **arrays)
 
     @classmethod
-    def read(cls, path: Path, key: str) -> Samples | None:
-        """Read what `write` wrote; None where the file is missing, damaged, or made from something else."""
+    def read(cls, path: Path, key: Callable[[Case], str]) -> Samples | None:
+        """Read what `write` wrote; None where the file is missing, damaged, or its key is not that of its case."""
         try:
             with np.load(io.BytesIO(path.read_bytes())) as file:
                 head = json.loads(str(file["head"]))
-                if head["format"] != _FORMAT or head["key"] != key:
+                if head["format"] != _FORMAT:
                     return None
                 case = Case(**head["case"] | {"spacing_mm": tuple(head["case"]["spacing_mm"])})
+                if head["key"] != key(case):
+                    return None
                 numbers = {n: head[n] for n in ("estimated_snr", "seconds", "unknown", "folded")}
                 return cls(case=case, **numbers, **{n: file[n] for n in _ARRAYS})
         except (OSError, KeyError, ValueError, zipfile.BadZipFile):

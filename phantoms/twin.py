@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import binary_dilation, map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 from skimage.restoration import denoise_nl_means
 
@@ -26,6 +26,7 @@ _TOLERANCE_MM = 1e-7
 _ROUNDS = 60
 _CHUNK = 200_000
 _MARGIN_MM = 12.0
+_RIM_VOXELS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +40,7 @@ class Twin:
     noise_sd : float
         Of the unloaded image and of the twin, in the image's own unit.
     shown : float
-        Share of the tissue whose deformed place lies in the image.
+        Share of the tissue whose deformed place is known and lies in the image.
     """
 
     image: Image
@@ -101,22 +102,25 @@ def loaded_twin(
     _refuse_folds(reference.grid, tissue, u, H)
     points = tissue.points()
     moved = points + u
-    in_view = reference.grid.contains(np.nan_to_num(moved, nan=np.inf))
-    if np.count_nonzero(in_view) < 0.5 * len(points):
+    known = np.flatnonzero(np.all(np.isfinite(moved), axis=1))
+    in_view = np.count_nonzero(reference.grid.contains(moved[known])) / len(points)
+    if in_view < 0.5:
         raise InputError(
-            f"The deformation moves {1 - in_view.mean():.0%} of the tissue out of the unloaded image's field of view, "
-            "or is not defined there. Give one of this image, bone motion included, or a mask that fits."
+            f"The deformation moves {1 - in_view:.0%} of the tissue out of the unloaded image's field of view, or is "
+            "not defined there. Give one of this image, bone motion included, or a mask that fits."
         )
     sigma = noise_sd(reference, tissue)
     clean = _without_noise(reference, tissue, sigma)
-    values = _carried(clean, tissue, whole, near or RigidMotion.identity())
+    # With the rim of air around it the skin keeps its partial volume, wherever the deformation is defined there.
+    drawn = Mask(tissue.grid, binary_dilation(tissue.inside, iterations=_RIM_VOXELS))
+    values = _carried(clean, drawn, whole, near or RigidMotion.identity())
     if shading:
         values *= sensitivity(reference.grid, seed + 1)
     random = np.random.default_rng(seed)
     noise = np.float32(sigma)
     values += noise * random.standard_normal(values.shape, dtype=np.float32)
     values = np.hypot(values, noise * random.standard_normal(values.shape, dtype=np.float32))
-    return Twin(Image(reference.grid, values), sigma, float(in_view.mean()))
+    return Twin(Image(reference.grid, values), sigma, in_view)
 
 
 def found_back(whole: Deformation, points_mm: FloatArray, start_mm: FloatArray) -> FloatArray:
@@ -177,7 +181,7 @@ def _without_noise(image: Image, tissue: Mask, sigma: float) -> Image:
 def _carried(clean: Image, tissue: Mask, whole: Deformation, near: RigidMotion) -> Float32Array:
     grid = tissue.grid
     coefficients = spline_filter(clean.values.astype(np.float64), order=3, mode="mirror")
-    back = whole.inverse() if isinstance(whole, Motion) else None
+    back = _known_inverse(whole)
     # Newton's method begins at the voxel that lands nearest.
     home = tissue.points()
     there = home + whole.displacement(home)
@@ -197,6 +201,13 @@ def _carried(clean: Image, tissue: Mask, whole: Deformation, near: RigidMotion) 
         at = clean.grid.indices_of(X[inside]).T
         out[some[inside]] = map_coordinates(coefficients, at, order=3, mode="mirror", prefilter=False)
     return np.maximum(out, 0.0).reshape(grid.shape)
+
+
+def _known_inverse(whole: Deformation) -> Deformation | None:
+    try:
+        return whole.inverse() if isinstance(whole, Motion) else None
+    except InputError:  # a composition, one of whose parts has none
+        return None
 
 
 def _near(tissue: Mask, points_mm: FloatArray, near: RigidMotion) -> BoolArray:

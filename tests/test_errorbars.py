@@ -116,7 +116,7 @@ def test_several_stages_have_no_known_error() -> None:
 def test_a_preset_without_a_model_is_told() -> None:
     found, subject, maps = given()
     found.settings.presets = (load_preset("bone-rigid"),)
-    bars = error_bars(found, subject, maps, None)
+    bars = error_bars(found, subject, maps, error_model_of("bone-rigid"))
     assert "bone-rigid has not been measured" in bars.told
 
 

@@ -96,6 +96,18 @@ def test_motion_rises_smoothly_from_the_bone(heel: Heel) -> None:
     assert moved[-1] > 1.0
 
 
+@pytest.mark.parametrize(("size", "pad"), [(0.7, 12.0), (1.3, 24.0)])
+def test_small_and_large_heels_are_as_exact_and_as_strained(size: float, pad: float) -> None:
+    other = Heel(3, size=size, pad_mm=pad)
+    points = size * np.random.default_rng(5).uniform([-32, -20, -48], [32, 46, 0], (8000, 3))
+    fat = points[other.tissue_at(points) == 2]
+    motion = under_load(other, "Load1")
+    u, H = motion.evaluate(fat)
+    assert np.abs(u + motion.inverse().displacement(fat + u)).max() < 1.3e-6
+    np.testing.assert_allclose(np.linalg.det(H + np.eye(3)), 1.0, atol=1e-5)
+    assert 0.12 < np.median(StrainField.from_gradient(H).max_shear) < 0.3
+
+
 def test_strain_jumps_at_bone_and_skin_and_displacement_does_not(heel: Heel) -> None:
     """Along rays through either border of the pad: at rest beyond it, sheared right up to it, never torn."""
     slide = sliding(heel, 4.0)

@@ -163,14 +163,14 @@ def test_coverage_judges_each_heel_by_the_others() -> None:
 def test_samples_survive_their_file_and_a_damaged_one_is_made_anew(tmp_path: Path) -> None:
     path, made = tmp_path / "run.npz", samples(CASE)
     made.write(path, "key")
-    again = Samples.read(path, "key")
+    again = Samples.read(path, lambda _: "key")
     assert again is not None
     assert again.case == CASE
     np.testing.assert_array_equal(again.shear, made.shear)
-    assert Samples.read(path, "another preset") is None
+    assert Samples.read(path, lambda _: "another preset") is None
     path.write_bytes(path.read_bytes()[:2000])
-    assert Samples.read(path, "key") is None
-    assert Samples.read(tmp_path / "none.npz", "key") is None
+    assert Samples.read(path, lambda _: "key") is None
+    assert Samples.read(tmp_path / "none.npz", lambda _: "key") is None
 
 
 def test_parameter_files_of_ones_own_can_be_judged(tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_parameter_files_of_ones_own_can_be_judged(tmp_path: Path) -> None:
 def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
     cases = cases_of()
     assert len({c.name for c in cases}) == len(cases) < 120
-    assert all(9000 <= c.seed <= 9999 for c in cases)
+    assert not any(9000 <= c.seed <= 9999 for c in cases)  # set aside for published figures
     assert {"still", "sliding", "Load1", "wave-8"} <= {c.motion for c in cases}
 
 
@@ -196,7 +196,14 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path) -> None:
     first = accuracy(tmp_path, cases=cases[:2], workers=1, tell_plan=plans.append)
     stamp = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "runs").iterdir()}
     study = accuracy(tmp_path, cases=cases, workers=1, tell_plan=plans.append)
-    assert [p.split(" to do")[0] for p in plans] == ["2 registrations", "1 registrations"]
+    assert [p.split(", about")[0] for p in plans] == [
+        "2 registrations to do (0 are there already)",
+        "1 registrations to do (2 are there already)",
+    ]
+    # a smaller call adds nothing and takes nothing away
+    again = accuracy(tmp_path, cases=cases[:1], workers=1, tell_plan=plans.append)
+    assert plans[-1].startswith("0 registrations to do (1 are there already)")
+    assert again.errors == study.errors
     assert all((tmp_path / "runs" / name).stat().st_mtime_ns == t for name, t in stamp.items())
     assert not study.failures
     assert [r for r in study.errors if r.motion == "Load1"] == [r for r in first.errors if r.motion == "Load1"]
@@ -222,6 +229,8 @@ def test_what_cannot_be_studied_is_refused_before_anything_runs(
         (replace(CASE, spacing_mm=(0.1, 0.1, 0.1)), "spacing"),
         (replace(CASE, motion="dance"), "motion"),
         (replace(CASE, preset="heel-xr"), "heel-mr"),
+        (replace(CASE, preset="bone-rigid"), "no B-spline"),
+        (replace(CASE, motion="wave-3"), "two voxels"),
     ):
         with pytest.raises(MrstrainError, match=says):
             accuracy(tmp_path / "out", cases=[wrong])
@@ -249,7 +258,7 @@ def test_a_study_that_is_told_to_end_leaves_no_process_behind(tmp_path: Path) ->
     with subprocess.Popen([*command, "--motion", "Load1", "--seed", "4"], **options) as running:
         try:
             for line in running.stderr:  # until elastix is at work
-                if b"accuracy: 0 of 1" in line:
+                if b"accuracy: 1 registrations" in line:
                     break
             time.sleep(2.0)
             running.terminate()

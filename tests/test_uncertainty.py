@@ -68,6 +68,23 @@ def test_what_is_no_model_is_refused(tmp_path: Path, text: str) -> None:
         read_error_model(tmp_path / "model.json")
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"snr": -3.0},
+        {"runs": ()},
+        {"shear": KNOTS[::-1]},
+        {"whole": {"fat": FAT}},
+        {"whole": {POOLED: FAT[:, :1]}},
+        {"runs": ({POOLED: -WHOLE[POOLED]},)},
+    ],
+)
+def test_damaged_tables_are_refused_when_read(tmp_path: Path, change: dict) -> None:
+    ErrorModel("heel-mr", "", (replace(TABLE, **change),), "made up").write(tmp_path / "model.json")
+    with pytest.raises(InputError, match="no error model"):
+        read_error_model(tmp_path / "model.json")
+
+
 def test_nearest_table_is_taken_and_a_far_one_refused() -> None:
     model = ErrorModel("heel-mr", "", (TABLE, replace(TABLE, snr=50.0)), "made up")
     assert model.table_for(np.full(3, 0.9), 45.0).snr == 50.0
