@@ -107,8 +107,9 @@ def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
             )
             for r in rows
         ),
-        "95 % if the error model is right. Each heel is judged by a model fitted to the others under the same motions. "
-        "Voxels: within 1.96 standard deviations. Figures: percentiles and volumes within their intervals.",
+        "Each heel is judged by a model fitted to the others under the same motions. Voxels: truth within 1.96 SD, "
+        "95 % if the model is right. Figures: percentiles and volumes within the intervals that `register` "
+        "would give.",
     )
     return Section("Does the error model hold?", tables=(table,))
 

@@ -126,6 +126,20 @@ def test_sigma_lies_where_the_shear_is_known_and_nowhere_else() -> None:
     assert np.nanmax(np.abs(found.sigma - 0.01)) < 1e-6
 
 
+def test_intervals_are_widened_from_their_middle_and_stay_possible() -> None:
+    everywhere, far = np.ones(GRID.shape, dtype=bool), np.full(GRID.shape, 9.0, dtype=np.float32)
+    shear = np.random.default_rng(3).uniform(0.0, 0.6, GRID.shape).astype(np.float32)
+    plain, wide = (
+        uncertainty_of(shear, GRID, {"x": everywhere}, far, replace(TABLE, widening=w)).intervals for w in (1.0, 400.0)
+    )
+    half = uncertainty_of(shear, GRID, {"x": everywhere}, far, replace(TABLE, widening=2.0)).intervals
+    assert half[0].estimate == plain[0].estimate
+    assert half[0].high - half[0].estimate == pytest.approx(2.0 * (plain[0].high - plain[0].estimate))
+    assert all(i.low >= 0.0 for i in wide)
+    volume = everywhere.size * GRID.voxel_volume_mm3 / 1000.0
+    assert all(i.high <= volume for i in wide if i.figure.startswith("volume"))
+
+
 def test_intervals_cover_the_truth_as_often_as_they_claim() -> None:
     """Truths of images whose bias is their own, 60 times: 95 % intervals miss few; by the mean bias alone, many."""
 
