@@ -287,7 +287,9 @@ def _resolvable(parameters: dict[str, tuple[str, ...]], grid: Grid) -> dict[str,
     if np.all(spacing <= asked + 1e-9):
         return parameters
     told = " x ".join(f"{s:.3g}" for s in spacing)
-    _log.warning("Voxels of %s are too coarse for control points every %g mm; %s mm are used.", grid, given[0], told)
+    _log.warning(
+        "The unloaded image, %s, is too coarse for control points every %g mm; %s mm are used.", grid, given[0], told
+    )
     return parameters | {name: tuple(f"{s:.6g}" for s in spacing)}
 
 

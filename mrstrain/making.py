@@ -35,6 +35,7 @@ from phantoms.heel import (
 Told = Callable[[str, str, float], None]
 
 _BYTES_PER_VOXEL = 12  # of the files of one load, images and truth, as measured
+_STAGE = "images and truth"
 _AGAIN = 100  # number of the repeat scan's acquisition
 
 
@@ -116,9 +117,9 @@ def phantom(
     tell = progress or (lambda *_: None)
     steps, done = 2 + 2 * len(motions), 0
 
-    def step(what: str) -> None:
+    def step() -> None:
         nonlocal done
-        tell("phantom", what, done / steps)
+        tell("phantom", _STAGE, done / steps)
         done += 1
 
     record = provenance(
@@ -148,7 +149,7 @@ def phantom(
             images[name] = target / f"{name}.nii.gz"
             writing.append(pool.submit(write_image, images[name], image))
 
-        step("Load0")
+        step()
         keep("Load0", scan(heel, grid, snr=snr, number=0))
         writing.append(pool.submit(write_mask, target / "calcaneus.nii.gz", bone))
         writing.append(pool.submit(write_labels, target / "tissues.nii.gz", labels))
@@ -157,10 +158,10 @@ def phantom(
         for name, number in acquisitions.items():
             foot = moved[name] = drawn_motion(seed, number)
             where = covering(grid, foot.apply(bone.points()))
-            step(name)
+            step()
             keep(name, scan(heel, where, motions.get(name), foot, snr=snr, number=number))
             if name in motions:
-                step(f"truth of {name}")
+                step()
                 maps = strain_maps(motions[name], body)
                 writing.append(pool.submit(_write_truth, target / "truth" / name, maps, labels, record))
         for file in writing:
@@ -170,7 +171,7 @@ def phantom(
         for name, m in moved.items()
     }
     write_json(target / "phantom.json", record)
-    tell("phantom", "files", 1.0)
+    tell("phantom", _STAGE, 1.0)
     return PhantomSet(target, images)
 
 

@@ -205,10 +205,11 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path) -> None:
     # a smaller call adds nothing and takes nothing away
     again = accuracy(tmp_path, cases=cases[:1], workers=1, tell_plan=plans.append)
     assert plans[-1].startswith("0 registrations to do (1 are there already)")
-    assert again.errors == study.errors
+    assert repr(again.errors) == repr(study.errors)  # NaN, the ends of a bin that is none, equals nothing
     assert all((tmp_path / "runs" / name).stat().st_mtime_ns == t for name, t in stamp.items())
     assert not study.failures
-    assert [r for r in study.errors if r.motion == "Load1"] == [r for r in first.errors if r.motion == "Load1"]
+    of_load = [[r for r in s.errors if r.motion == "Load1"] for s in (first, study)]
+    assert repr(of_load[0]) == repr(of_load[1])
     fat = next(r for r in study.errors if r.motion == "Load1" and r.tissue == "fat" and r.by == "all")
     assert 0.01 < fat.shear_rmse < 0.15  # voxels of 2.5 mm
     assert 0.3 < study.resolution[0].recovered < 1.1
