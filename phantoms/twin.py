@@ -90,8 +90,8 @@ def loaded_twin(
     the twin has less of it than a scan would; what noise it leaves moves with the tissue; partial volume at borders is
     that of the unloaded scan, blurred once more by the interpolation. The first makes a registration look worse, the
     second better. On a phantom at SNR 25 and 0.8 mm, 0.42 of the noise's amplitude was left and 0.18 of the finest
-    texture lost; a registration's error of the maximal shear came out 1.2 times as large in fat, 1.5 times in muscle and
-    2.5 times in bone (benchmarks/README.md).
+    texture lost; a registration's error of the maximal shear came out 1.2 times as large in fat, 1.5 times in muscle
+    and 2.5 times in bone (benchmarks/README.md).
 
     References
     ----------
