@@ -85,18 +85,8 @@ def strain_slices(
     """
     if not largest > 0:
         raise InputError(f"The end of the colour bar for maximal shear must be positive; got {largest}.")
-    sheet = Sheet(view, [""], bar=True)
-    window = window_of(view, reference.values)
-    shades, norm = colormaps["viridis"], Normalize(0.0, largest)
-    for plane, axes in sheet.rows[0].items():
-        sheet.grey(plane, axes, reference.values, window)
-        sheet.colours(plane, axes, max_shear, shades, norm)
-        if outline is not None:
-            labels = view.cut(outline.labels, plane)
-            sheet.outlines(plane, axes, (labels == label for label in outline.names))
-    beyond = bool((view.shown(max_shear) > largest).any())
-    sheet.bar(shades, norm, "maximal shear strain (E₁ − E₃)/2, no unit", "max" if beyond else "neither")
-    return sheet.png()
+    told = "maximal shear strain (E₁ − E₃)/2, no unit"
+    return _coloured(view, reference, max_shear, largest, "viridis", told, outline)
 
 
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
@@ -104,14 +94,24 @@ def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: flo
 
     The image stays plain grey where there is no result, and in bone.
     """
+    told = "standard deviation of the maximal shear, no unit"
+    return _coloured(view, reference, sigma, largest, "cividis", told, None)
+
+
+def _coloured(
+    view: View, reference: Image, values: Float32Array, largest: float, shades: str, told: str, outline: LabelMap | None
+) -> bytes:
     sheet = Sheet(view, [""], bar=True)
     window = window_of(view, reference.values)
-    shades, norm = colormaps["cividis"], Normalize(0.0, largest)
+    colours, norm = colormaps[shades], Normalize(0.0, largest)
     for plane, axes in sheet.rows[0].items():
         sheet.grey(plane, axes, reference.values, window)
-        sheet.colours(plane, axes, sigma, shades, norm)
-    beyond = bool((view.shown(sigma) > largest).any())
-    sheet.bar(shades, norm, "standard deviation of the maximal shear, no unit", "max" if beyond else "neither")
+        sheet.colours(plane, axes, values, colours, norm)
+        if outline is not None:
+            labels = view.cut(outline.labels, plane)
+            sheet.outlines(plane, axes, (labels == label for label in outline.names))
+    beyond = bool((view.shown(values) > largest).any())
+    sheet.bar(colours, norm, told, "max" if beyond else "neither")
     return sheet.png()
 
 

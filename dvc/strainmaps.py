@@ -43,6 +43,12 @@ class StrainMaps:
     max_shear: Float32Array
     jacobian: Float32Array
 
+    @property
+    def by_quantity(self) -> dict[str, Float32Array]:
+        """What tables by region tell of: max_shear, jacobian, and displacement_mm as a length."""
+        length = np.linalg.norm(self.displacement_mm, axis=-1)
+        return {"max_shear": self.max_shear, "jacobian": self.jacobian, "displacement_mm": length}
+
 
 def strain_maps(
     deformation: Deformation, mask: Mask, seen: Callable[[FloatArray], BoolArray] | None = None

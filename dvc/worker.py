@@ -11,7 +11,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as FutureTimeout
 from typing import Any, TypeVar
 
@@ -21,6 +22,7 @@ from loky.process_executor import ShutdownExecutorError, TerminatedWorkerError
 from dvc.errors import WorkerError
 
 _T = TypeVar("_T")
+_I = TypeVar("_I")
 _POLL_S = 0.5
 
 
@@ -102,6 +104,40 @@ class Worker:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def each_in_workers(items: Iterable[_I], task: Callable[[_I, Worker], None], *, at_once: int, threads: int) -> None:
+    """Run ``task(item, worker)`` for every item, ``at_once`` at a time, each thread with a worker of its own.
+
+    Whatever ends it, an interrupt too, the workers end with it: now, and not after what they are doing.
+
+    Parameters
+    ----------
+    at_once : int
+        Items at a time.
+    threads : int
+        Of each worker.
+    """
+    local = threading.local()
+    workers: list[Worker] = []
+
+    def one(item: _I) -> None:
+        if not hasattr(local, "worker"):
+            local.worker = Worker(threads)
+            workers.append(local.worker)
+        task(item, local.worker)
+
+    pool = ThreadPoolExecutor(at_once)
+    try:
+        list(pool.map(one, items))
+    except BaseException:
+        for worker in workers:
+            worker.kill()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        for worker in workers:
+            worker.close()
 
 
 def _end_with(parent: int) -> None:

@@ -243,7 +243,7 @@ def phantom(
     ] = None,
     snr: Annotated[float, typer.Option(help="Fat's signal over the noise's standard deviation.")] = 25.0,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Images without noise.")] = False,
-    size: Annotated[float, typer.Option(help="Factor on all shapes; 1 is a calcaneus of about 70 mm.")] = 1.0,
+    size: Annotated[float, typer.Option(help="Factor on all shapes; 1 is a calcaneus 67 mm long.")] = 1.0,
     pad: Annotated[float, typer.Option(help="Tissue below the calcaneus, skin included, mm.")] = 18.0,
     skin: Annotated[float, typer.Option(help="Thickness of the skin, mm.")] = 2.0,
     lobules: Annotated[float, typer.Option(help="Width of the fat's lobules, mm.")] = 6.0,

@@ -150,7 +150,10 @@ def _poorer(found: Registration) -> tuple[FloatArray, float]:
     """The larger voxel, edge by edge, and the lower signal-to-noise ratio of the two images."""
     spacing = np.maximum(np.sort(found.reference.grid.spacing_mm), np.sort(found.loaded.grid.spacing_mm))
     ratio = signal_to_noise(found.reference, found.tissue)
-    return spacing, min(ratio, signal_to_noise(found.loaded, tissue_mask(found.loaded)))
+    try:
+        return spacing, min(ratio, signal_to_noise(found.loaded, tissue_mask(found.loaded)))
+    except InputError:  # no threshold finds the body there; the unloaded image has to do
+        return spacing, ratio
 
 
 def _bone_and_tissues(

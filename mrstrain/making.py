@@ -186,13 +186,8 @@ def _refuse_small_disk(folder: Path, grid: Grid, images: int) -> None:
 
 
 def _write_truth(folder: Path, maps: StrainMaps, labels: LabelMap, record: dict[str, object]) -> None:
-    quantities = {
-        "max_shear": maps.max_shear,
-        "jacobian": maps.jacobian,
-        "displacement_mm": np.linalg.norm(maps.displacement_mm, axis=-1),
-    }
     folder.parent.mkdir(exist_ok=True)
     with whole_folder(folder) as partial:
         write_maps(partial, maps)
-        write_regions_csv(partial / "regions.csv", region_statistics(labels, quantities))
+        write_regions_csv(partial / "regions.csv", region_statistics(labels, maps.by_quantity))
         write_json(partial / "provenance.json", record)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from dvc.registration import Registration, Settings
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
 from dvc.uncertainty import ErrorModel, error_model_of, read_error_model
-from dvc.worker import Worker, usable_cores
+from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
 from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
@@ -246,14 +245,9 @@ class _Run:
             self._floor_known.set()
 
     def all(self, at_once: int, chain: bool) -> None:
-        local = threading.local()
-        workers: list[Worker] = []
         last: list[BSpline] = []
 
-        def one(name: str) -> None:
-            if not hasattr(local, "worker"):
-                local.worker = Worker(self.settings.threads)
-                workers.append(local.worker)
+        def one(name: str, worker: Worker) -> None:
             start = last[-1] if chain and last and name != _REPEAT else None
             try:
                 found = register_pair(
@@ -263,7 +257,7 @@ class _Run:
                     tissue=self.body,
                     settings=self.settings,
                     start=start,
-                    worker=local.worker,
+                    worker=worker,
                     progress=lambda stage, fraction: self._told(name, stage, fraction),
                 )
                 if name != _REPEAT:
@@ -276,17 +270,8 @@ class _Run:
                 if name == _REPEAT:
                     self._floor_known.set()
 
-        pool = ThreadPoolExecutor(at_once)
-        try:
-            list(pool.map(one, sorted(self.images, key=lambda name: name != _REPEAT)))  # its floor is waited for
-        except BaseException:  # an interrupt: end the workers now, not after their registrations
-            for worker in workers:
-                worker.kill()
-            raise
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-            for worker in workers:
-                worker.close()
+        names = sorted(self.images, key=lambda name: name != _REPEAT)  # its floor is waited for
+        each_in_workers(names, one, at_once=at_once, threads=self.settings.threads)
 
     def _write(self, name: str, found: Registration) -> None:
         stage = "strain and figures"

@@ -170,12 +170,7 @@ def _written(
     bars: ErrorBars | None = None,
 ) -> Case:
     subject = measured.subject
-    quantities = {
-        "max_shear": maps.max_shear,
-        "jacobian": maps.jacobian,
-        "displacement_mm": np.linalg.norm(maps.displacement_mm, axis=-1),
-    }
-    regions = region_statistics(_regions(measured), quantities)
+    regions = region_statistics(_regions(measured), maps.by_quantity)
     told = quality.as_dict() | {"alignment": dict(alignment)}
     tables = [page.key_figures(quality, alignment), page.region_table(regions)]
     if bars is not None:

@@ -8,7 +8,6 @@ import io
 import shutil
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.presets import load_preset, preset_or_file
 from dvc.whole import write_whole
-from dvc.worker import Worker, usable_cores
+from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.inputs import make_output
 from mrstrain.provenance import provenance, versions, write_json
 from mrstrain.studypage import write_study_report
@@ -231,8 +230,7 @@ def _run_all(
     cases: Sequence[Case], at_once: int, folder: Path, found: dict[str, Samples], tell: Told
 ) -> dict[str, str]:
     """Measure cases, several at once; each is written as soon as it is there."""
-    local, making, telling = threading.local(), threading.Lock(), threading.Lock()
-    workers: list[Worker] = []
+    making, telling = threading.Lock(), threading.Lock()
     failures: dict[str, str] = {}
     under_way: dict[str, float] = {}
 
@@ -242,29 +240,16 @@ def _run_all(
             # of those to do now, so that the time left is that of this session
             tell("accuracy", f"{len(cases)} registrations", sum(under_way.values()) / len(cases))
 
-    def one(case: Case) -> None:
-        if not hasattr(local, "worker"):
-            local.worker = Worker(threads=1)
-            workers.append(local.worker)
+    def one(case: Case, worker: Worker) -> None:
         try:
-            samples = measure(case, local.worker, making, lambda fraction: told(case.name, fraction))
+            samples = measure(case, worker, making, lambda fraction: told(case.name, fraction))
             samples.write(folder / f"{case.name}.npz", _key(case))
             found[case.name] = samples
         except MrstrainError as error:
             failures[case.name] = str(error)
         told(case.name, 1.0)
 
-    pool = ThreadPoolExecutor(at_once)
-    try:
-        list(pool.map(one, cases))
-    except BaseException:  # an interrupt: end the workers now, not after their registrations
-        for worker in workers:
-            worker.kill()
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        for worker in workers:
-            worker.close()
+    each_in_workers(cases, one, at_once=at_once, threads=1)
     return failures
 
 

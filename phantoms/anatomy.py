@@ -86,7 +86,7 @@ class Heel:
     seed : int
         0 or more.
     size : float
-        Factor on all shapes; 1 is a calcaneus of about 75 mm.
+        Factor on all shapes; 1 is a calcaneus 67 mm long.
     pad_mm : float
         Tissue below the calcaneus' lowest point, skin included, mm at size 1; about, since shapes vary.
     skin_mm, cortex_mm : float

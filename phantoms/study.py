@@ -88,7 +88,7 @@ class Samples:
     tissue : (n,)
         Label numbers of `phantoms.anatomy.TISSUES`.
     to_bone_mm, to_border_mm : (n,)
-        Distance to the nearest bone (0 in it) and to the nearest voxel of another tissue, mm.
+        Distance to the surface of the nearest bone (0 in it) and to that of another tissue, mm.
     true_shear, shear : (n,)
         Maximal shear (E_1 - E_3) / 2, true and found.
     u_error_mm : (n, 3)

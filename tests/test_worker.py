@@ -10,7 +10,7 @@ import time
 import pytest
 
 from dvc.errors import RegistrationError, WorkerError
-from dvc.worker import Worker
+from dvc.worker import Worker, each_in_workers
 
 
 def _crash() -> None:
@@ -60,3 +60,27 @@ def test_a_worker_that_is_killed_from_outside_ends_its_task_at_once():
         worker.run("sleeping", time.sleep, 60.0)
     assert time.monotonic() - began < 20.0
     worker.close()
+
+
+def test_each_item_is_done_once_and_one_that_fails_ends_all() -> None:
+    """Three items on two workers; then one whose task raises: its error comes up, and no worker is left."""
+    done: list[tuple[int, int]] = []
+    used: set[Worker] = set()
+
+    def task(item: int, worker: Worker) -> None:
+        used.add(worker)
+        done.append((item, worker.run("a square", pow, item, 2)))
+
+    each_in_workers([1, 2, 3], task, at_once=2, threads=1)
+    assert sorted(done) == [(1, 1), (2, 4), (3, 9)]
+    assert 1 <= len(used) <= 2
+
+    def wrong(item: int, worker: Worker) -> None:
+        worker.run("a square", pow, item, 2)
+        used.add(worker)
+        raise KeyError(item)
+
+    used.clear()
+    with pytest.raises(KeyError):
+        each_in_workers([1], wrong, at_once=1, threads=1)
+    assert all(worker._executor is None for worker in used)
