@@ -161,6 +161,23 @@ def scale_length_mm(width_mm: float) -> float:
     return max((n for n in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0) if n <= width_mm / 3), default=1.0)
 
 
+def chart(panels: int = 1) -> tuple[Figure, tuple[Axes, ...]]:
+    """An empty figure with so many axes side by side, for curves."""
+    figure = Figure(figsize=(0.62 * WIDTH_IN * panels, 3.9), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, tuple(np.atleast_1d(figure.subplots(1, panels)))
+
+
+def label_axes(axes: Axes, x: str, y: str) -> None:
+    """Name the axes of a `chart`, and draw its grid."""
+    axes.set_xlabel(x, color=INK, **FONT)
+    axes.set_ylabel(y, color=INK, **FONT)
+    axes.grid(True, color="#d9dee4", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=9)
+
+
 def png_bytes(figure: Figure) -> bytes:
     """Return a figure as a PNG file's bytes; equal figures give equal bytes."""
     file = io.BytesIO()

@@ -353,6 +353,31 @@ def accuracy(
 
 
 @app.command()
+def fit(
+    curve: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV with columns stretch and nominal_stress_kpa (or _mpa, or true_stress_...), perhaps test."
+        ),
+    ],
+    out: Out,
+    law: Annotated[str, typer.Option(help="neo-Hooke, Isihara, Yeoh, Ogden, Ogden-2, Ogden-3 or Hencky.")],
+    test: Annotated[
+        str | None, typer.Option(help="uniaxial, equibiaxial or 'pure shear', where the file has no column for it.")
+    ] = None,
+    nu: Annotated[float, typer.Option(help="Poisson's ratio to simulate with.")] = 0.4999,
+    tissue: Annotated[
+        str, typer.Option(help="Region that the law is for, in the material set that is written.")
+    ] = "fat",
+) -> None:
+    """Parameters of a material law from a stretch-stress curve, with 95 % intervals and the range of stability."""
+    from mrstrain.fitting import fit as run
+
+    for line in run(curve, law, out=out, test=test, nu=nu, tissue=tissue).summary():
+        typer.echo(line)
+
+
+@app.command()
 def doctor() -> None:
     """Is this machine fit to run mrstrain?"""
     from mrstrain.doctor import examine

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from dvc.figures import REGION_COLOURS
-from dvc.sheet import DPI, FONT, INK, WIDTH_IN, png_bytes
+from dvc.sheet import INK, chart, label_axes, png_bytes
 from phantoms.accuracy import SOFT, ErrorRow, FloorRow, ResolutionRow, wavelength_recovered
 
 _MARKS = ("o", "s", "^", "D", "v", "P")
@@ -22,7 +19,7 @@ def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
     All motions with strain together, weighted by their number of voxels. The outermost bin has no far end and is
     drawn at one and a half times its near one; bins of fewer than 200 samples are left out.
     """
-    figure, (axes,) = _page(1)
+    figure, (axes,) = chart(1)
     for number, tissue in enumerate(SOFT):
         mine = [r for r in rows if r.tissue == tissue and r.by == by and r.motion != "still"]
         lows = sorted({r.low for r in mine})
@@ -42,7 +39,7 @@ def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
         axes.plot(at, rmse, color=colour, marker=_MARKS[number], linewidth=1.8, label=tissue)
         axes.plot(at, bias, color=colour, linestyle="--", marker=".", linewidth=1.2)
     axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
-    _label(axes, by, "error of the maximal shear")
+    label_axes(axes, by, "error of the maximal shear")
     axes.legend(fontsize=9, frameon=False)
     return png_bytes(figure)
 
@@ -52,7 +49,7 @@ def resolution(rows: Sequence[ResolutionRow]) -> bytes:
 
     Shear along the foot that varies through the pad's thickness, largest 0.2; no foot motion.
     """
-    figure, (axes,) = _page(1)
+    figure, (axes,) = chart(1)
     for number, condition in enumerate(dict.fromkeys(_of_tissue(r) for r in rows)):
         mine = sorted((r for r in rows if _of_tissue(r) == condition), key=lambda r: r.wavelength_mm)
         axes.plot(
@@ -63,7 +60,7 @@ def resolution(rows: Sequence[ResolutionRow]) -> bytes:
         axes.axhline(share, color="#9aa5b1", linewidth=0.8)
     axes.set_ylim(0.0, 1.1)
     axes.set_xlim(left=0.0)
-    _label(axes, "wavelength of the strain, mm", "share recovered")
+    label_axes(axes, "wavelength of the strain, mm", "share recovered")
     axes.legend(fontsize=9, frameon=False)
     return png_bytes(figure)
 
@@ -73,7 +70,7 @@ def trade_off(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], tissue:
 
     Noise is the apparent maximal shear without strain (median), resolution the wavelength of which 90 % is recovered.
     """
-    figure, (axes,) = _page(1)
+    figure, (axes,) = chart(1)
     for number, condition in enumerate(dict.fromkeys(_condition(r) for r in rows)):
         mine = [r for r in rows if _condition(r) == condition and r.tissue == tissue]
         floor = [f.shear_p50 for f in floors if _condition(f) == condition and f.tissue == tissue]
@@ -86,7 +83,7 @@ def trade_off(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], tissue:
             )
     axes.set_xlim(left=0.0)
     axes.set_ylim(bottom=0.0)
-    _label(axes, "wavelength recovered to 90 %, mm", f"apparent maximal shear\nwithout strain, {tissue}")
+    label_axes(axes, "wavelength recovered to 90 %, mm", f"apparent maximal shear\nwithout strain, {tissue}")
     return png_bytes(figure)
 
 
@@ -96,18 +93,3 @@ def _condition(row: ResolutionRow | FloorRow) -> str:
 
 def _of_tissue(row: ResolutionRow) -> str:
     return f"{row.tissue}: {_condition(row)}"
-
-
-def _page(panels: int) -> tuple[Figure, tuple[Axes, ...]]:
-    figure = Figure(figsize=(0.62 * WIDTH_IN * panels, 3.9), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, tuple(np.atleast_1d(figure.subplots(1, panels)))
-
-
-def _label(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x, color=INK, **FONT)
-    axes.set_ylabel(y, color=INK, **FONT)
-    axes.grid(True, color="#d9dee4", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=9)

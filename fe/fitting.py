@@ -1,0 +1,327 @@
+"""Parameters of a law from stretch-stress curves, with confidence intervals."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import OptimizeResult, least_squares
+from scipy.stats import f as fisher
+from scipy.stats import t as student
+
+from dvc.arrays import FloatArray
+from dvc.errors import InputError
+from fe.hyperelastic import HENCKY, OGDEN
+from fe.materials import MODES, Hencky, Material, NeoHooke, Ogden, Yeoh, nominal_stress
+
+_STRESS = {
+    "nominal_stress_kpa": (1e-3, False),
+    "nominal_stress_mpa": (1.0, False),
+    "true_stress_kpa": (1e-3, True),
+    "true_stress_mpa": (1.0, True),
+}
+_EXPONENTS = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # starts of an Ogden fit
+_MOST = 60.0  # an exponent beyond this is not one that a curve can tell
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """A test of an incompressible solid.
+
+    Attributes
+    ----------
+    mode : str
+        One of `fe.materials.MODES`: uniaxial, equibiaxial, pure shear.
+    stretch : (n,)
+        Length over undeformed length along the loading axis; below 1 in compression.
+    stress_mpa : (n,)
+        Force over undeformed area, MPa; below 0 in compression.
+    """
+
+    mode: str
+    stretch: FloatArray
+    stress_mpa: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A fitted number and the interval that holds it with 95 % confidence."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A law fitted to curves.
+
+    Attributes
+    ----------
+    material : Material
+    parameters : tuple of Parameter
+        Moduli in MPa; an Ogden term's ``mu`` is its initial shear modulus.
+    r2 : mapping of mode to float
+        1 less the residual's sum of squares over that of the stress about its mean, by kind of test.
+    rmse_mpa : float
+        Of the nominal stress over all points.
+    others : tuple of Material
+        Laws of the same form that these curves cannot tell from this one.
+    stable : mapping of mode to (float, float)
+        Stretches between which the law is stable, of 1/5 to 5 (`Material.stable_range`).
+    reached : mapping of mode to (float, float)
+        Least and greatest stretch of the curves.
+    """
+
+    material: Material
+    parameters: tuple[Parameter, ...]
+    r2: Mapping[str, float]
+    rmse_mpa: float
+    others: tuple[Material, ...]
+    stable: Mapping[str, tuple[float, float]]
+    reached: Mapping[str, tuple[float, float]]
+
+    @property
+    def stable_where_measured(self) -> bool:
+        """Whether the law is stable at every stretch of the curves."""
+        return all(self.stable[m][0] <= low and high <= self.stable[m][1] for m, (low, high) in self.reached.items())
+
+
+@dataclass(frozen=True, slots=True)
+class _Law:
+    """A law as the fit sees it: names of its parameters, their vector, the material, and first guesses."""
+
+    names: tuple[str, ...]
+    vector: Callable[[FloatArray], FloatArray]
+    material: Callable[[FloatArray, float], Material]
+    exponents: int = 0  # of the last parameters, those in which the stress is not linear
+
+
+def _polynomial(*names: str) -> _Law:
+    def vector(values: FloatArray) -> FloatArray:
+        return np.concatenate([values, np.zeros(4 - len(values))])
+
+    def material(values: FloatArray, nu: float) -> Material:
+        c10, c20, c30 = (*values.tolist(), 0.0)[:3]
+        return Yeoh.of(c10, c20, c30, nu)
+
+    return _Law(names, vector, material)
+
+
+def _ogden(terms: int) -> _Law:
+    def vector(values: FloatArray) -> FloatArray:
+        return np.concatenate([np.zeros(OGDEN), np.column_stack([values[:terms], values[terms:]]).ravel()])
+
+    numbers = [""] if terms == 1 else [str(q + 1) for q in range(terms)]
+    names = (*(f"mu{n}" for n in numbers), *(f"alpha{n}" for n in numbers))
+    return _Law(names, vector, lambda values, nu: Ogden.of(values[:terms], values[terms:], nu), terms)
+
+
+LAWS: Mapping[str, _Law] = {
+    "neo-Hooke": _Law(
+        ("mu",), lambda v: np.array([0.5 * v[0], 0.0, 0.0, 0.0]), lambda v, nu: NeoHooke.of(float(v[0]), nu)
+    ),
+    "Isihara": _polynomial("C10", "C20"),
+    "Yeoh": _polynomial("C10", "C20", "C30"),
+    "Ogden": _ogden(1),
+    "Ogden-2": _ogden(2),
+    "Ogden-3": _ogden(3),
+    "Hencky": _Law(("mu",), lambda v: v[0] * np.eye(1, OGDEN, HENCKY)[0], lambda v, nu: Hencky.of(float(v[0]), nu)),
+}
+"""Laws that can be fitted. Isihara's is Yeoh's without C30."""
+
+
+def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
+    """Curves of a CSV file, one for each kind of test.
+
+    Columns: ``stretch``; one of ``nominal_stress_kpa``, ``nominal_stress_mpa``, ``true_stress_kpa``,
+    ``true_stress_mpa`` (nominal: force over undeformed area; true: over deformed); and ``test``, a name of
+    `fe.materials.MODES`, unless ``mode`` gives it for the whole file. In other columns nothing is read.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a column is missing or ambiguous, or a value is no number; with its line.
+    """
+    try:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+            columns = [c.strip().lower() for c in reader.fieldnames or []]
+    except (OSError, UnicodeDecodeError, csv.Error) as failure:
+        raise InputError(f"Cannot read the curve {path}: {failure}.") from failure
+    stress = [c for c in columns if c in _STRESS]
+    if "stretch" not in columns or len(stress) != 1:
+        raise InputError(
+            f"{path}: a curve needs a column 'stretch' and one of {', '.join(_STRESS)}, so that unit and kind of "
+            f"stress are said; its columns are {', '.join(columns) or 'none'}."
+        )
+    if mode is None and "test" not in columns:
+        raise InputError(f"{path}: say which test it is: {', '.join(MODES)} (--test, or a column 'test').")
+    scale, true = _STRESS[stress[0]]
+    tests: dict[str, list[tuple[float, float]]] = {}
+    for line, row in enumerate(rows, start=2):
+        told = {(k or "").strip().lower(): (v or "").strip() for k, v in row.items() if not isinstance(v, list)}
+        try:
+            stretch, value = float(told["stretch"]), scale * float(told[stress[0]])
+        except ValueError as failure:
+            raise InputError(f"{path}, line {line}: {failure}.") from failure
+        if not (np.isfinite([stretch, value]).all() and stretch > 0.0):
+            raise InputError(f"{path}, line {line}: a stretch is positive, and both numbers finite; got {told}.")
+        name = mode or told["test"]
+        if name not in MODES:
+            raise InputError(f"{path}, line {line}: no test '{name}'; there are {', '.join(MODES)}.")
+        tests.setdefault(name, []).append((stretch, value / stretch if true else value))
+    if not tests:
+        raise InputError(f"{path}: no row under the header.")
+    return [Curve(name, *np.array(points).T) for name, points in tests.items()]
+
+
+def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
+    """Fit a law to curves of an incompressible solid by least squares of the nominal stress.
+
+    Parameters
+    ----------
+    curves : sequence of Curve
+        All are fitted together, every point with the same weight.
+    law : str
+        A name of `LAWS`.
+    nu : float
+        Poisson's ratio of the material made; the fit itself takes the tissue as incompressible.
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    InputError
+        If there are too few points, or none away from a stretch of 1; if no parameters can be told from these
+        curves; or if the best fit has no positive shear modulus.
+
+    Notes
+    -----
+    A curve of one test may leave two exponents open: in uniaxial compression, alpha and about -alpha / 2 give nearly
+    the same stress. Of optima that an F test at 5 % does not tell apart, one whose exponents are all positive is
+    taken, and the rest are named.
+
+    Intervals are those of linearised regression with Student's t: they assume independent errors of the same
+    standard deviation at every point, and claim nothing of errors that a curve shares, such as a wrong area.
+    Parameters in which the stress is linear start at their best; an Ogden law's exponents from every combination
+    of eight values.
+    """
+    if law not in LAWS:
+        raise InputError(f"No law '{law}' to fit; there are {', '.join(LAWS)}.")
+    sought = LAWS[law]
+    count = len(sought.names)
+    stress = np.concatenate([c.stress_mpa for c in curves]) if curves else np.empty(0)
+    stretch = np.concatenate([c.stretch for c in curves]) if curves else np.empty(0)
+    apart = len(np.unique(np.round(stretch[np.abs(stretch - 1.0) > 1e-6], 9)))
+    if len(stress) < count + 2 or apart < count:
+        raise InputError(
+            f"{law} has {count} parameters and needs {count + 2} points or more, {count} of them at different "
+            f"stretches other than 1; got {len(stress)} points, {apart} such stretches."
+        )
+    size = float(np.sqrt(np.mean(stress**2)))
+    if size == 0.0:
+        raise InputError("The stress is 0 at every point of the curves.")
+
+    def modelled(values: FloatArray) -> FloatArray:
+        return np.concatenate([nominal_stress(sought.vector(values), c.stretch, c.mode) for c in curves])
+
+    optima: list[OptimizeResult] = []
+    for start in _starts(sought, modelled, stress):
+        scales = np.where(np.arange(count) < count - sought.exponents, np.maximum(np.abs(start), 1e-3 * size), 1.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = least_squares(
+                lambda v: np.nan_to_num((modelled(v) - stress) / size, nan=1e6, posinf=1e6, neginf=-1e6),
+                start, jac="3-point", x_scale=scales, xtol=1e-14, ftol=1e-14, gtol=1e-14,
+            )  # fmt: skip
+        optima.append(found)
+    best, others = _chosen(sought, optima, len(stress))
+    values = best.x
+    if sought.exponents and np.abs(values[-sought.exponents :]).max() > _MOST:
+        raise InputError(f"{law}: the best exponent is beyond {_MOST:g}; these curves cannot tell it. Use fewer terms.")
+    intervals = _intervals(values, best.jac, best.fun)
+    if intervals is None:
+        raise InputError(
+            f"{law}: its parameters cannot be told apart from these curves (singular); use a law with fewer."
+        )
+    try:
+        material = sought.material(values, nu)
+    except InputError as unusable:
+        raise InputError(
+            f"The best fit is no law to compute with ({unusable}) Give points nearer to a stretch of 1, or use a law "
+            "with fewer parameters."
+        ) from unusable
+    residual = best.fun * size
+    ends = np.cumsum([0, *(len(c.stress_mpa) for c in curves)])
+    r2, reached = {}, {}
+    for curve, first, last in zip(curves, ends, ends[1:], strict=False):
+        spread = float(((curve.stress_mpa - curve.stress_mpa.mean()) ** 2).sum())
+        r2[curve.mode] = 1.0 - float((residual[first:last] ** 2).sum()) / spread if spread > 0 else float("nan")
+        reached[curve.mode] = (float(min(1.0, curve.stretch.min())), float(max(1.0, curve.stretch.max())))
+    return Fit(
+        material,
+        tuple(
+            Parameter(n, float(v), float(v - w), float(v + w))
+            for n, v, w in zip(sought.names, values, intervals, strict=True)
+        ),
+        r2,
+        float(np.sqrt(np.mean(residual**2))),
+        tuple(sought.material(o.x, nu) for o in others),
+        {mode: material.stable_range(mode) for mode in MODES},
+        reached,
+    )
+
+
+def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: FloatArray) -> list[FloatArray]:
+    """First guesses: moduli by linear least squares, for each combination of exponents where there are any."""
+    linear = len(law.names) - law.exponents
+    starts = []
+    for exponents in itertools.combinations(_EXPONENTS, law.exponents):
+        columns = np.column_stack([modelled(np.array([*unit, *exponents])) for unit in np.eye(linear)])
+        moduli, *_ = np.linalg.lstsq(columns, stress, rcond=None)
+        cost = float(((columns @ moduli - stress) ** 2).sum())
+        starts.append((cost, np.array([*moduli, *exponents])))
+    starts.sort(key=lambda pair: pair[0])
+    return [start for _, start in starts[:4]]
+
+
+def _chosen(
+    law: _Law, optima: Sequence[OptimizeResult], points: int
+) -> tuple[OptimizeResult, tuple[OptimizeResult, ...]]:
+    """The optimum to report, and those that the data do not tell from it."""
+    ranked = sorted(optima, key=lambda o: o.cost)
+    freedom = points - len(law.names)
+    limit = ranked[0].cost * (1.0 + fisher.ppf(0.95, 1, freedom) / freedom)
+    different: list[OptimizeResult] = []
+    for optimum in ranked:
+        near = [np.allclose(optimum.x, other.x, rtol=1e-3, atol=1e-9) for other in different]
+        if optimum.cost <= limit and not any(near) and law.vector(optimum.x)[OGDEN::2].min(initial=0.0) >= 0.0:
+            different.append(optimum)
+    different = different or ranked[:1]
+    exponents = slice(len(law.names) - law.exponents, None)
+    different.sort(key=lambda o: not (o.x[exponents] > 0.0).all())
+    return different[0], tuple(different[1:])
+
+
+def _intervals(values: FloatArray, jacobian: FloatArray, residual: FloatArray) -> FloatArray | None:
+    """Half widths of the 95 % intervals; None where the parameters cannot be told apart."""
+    scaled = jacobian * np.maximum(np.abs(values), 1e-300)
+    lengths = np.linalg.norm(scaled, axis=0)
+    if not (lengths > 0.0).all():
+        return None
+    _, sizes, right = np.linalg.svd(scaled / lengths, full_matrices=False)
+    if sizes[-1] < 1e-10 * sizes[0]:
+        return None
+    freedom = len(residual) - len(values)
+    variance = float(residual @ residual) / freedom
+    covariance = variance * (right.T / sizes**2) @ right
+    deviation = np.sqrt(np.diag(covariance)) / lengths * np.abs(values)
+    return np.asarray(student.ppf(0.975, freedom) * deviation)

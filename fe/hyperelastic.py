@@ -1,0 +1,223 @@
+"""Response of an isotropic hyperelastic solid at a point, in its principal frame (numba kernels).
+
+With F = U diag(s) V^T, logarithmic stretches e_i = ln s_i and their isochoric part ebar_i = e_i - sum(e) / 3,
+
+    W(F, p) = Wbar(ebar) + p (J - 1),
+    Wbar = sum_k C_k0 (I1bar - 3)^k + mu_H sum_i ebar_i^2 + sum_q 2 mu_q / alpha_q^2 (sum_i exp(alpha_q ebar_i) - 3),
+
+I1bar = sum_i exp(2 ebar_i): Yeoh's polynomial, Hencky's quadratic, Ogden's terms. One sum holds every law, so there is
+one kernel. A law is a vector (C10, C20, C30, mu_H, mu_1, alpha_1, mu_2, alpha_2, ...), MPa but for the alphas, in which
+mu_q is the term's initial shear modulus. p is the pressure-like multiplier of the volume, MPa, positive in tension.
+
+The first Piola-Kirchhoff stress of an isotropic solid is P = U diag(dW/ds) V^T, and its derivative has in the principal
+frame only the components (R. W. Ogden, Non-Linear Elastic Deformations, 1984, section 6.1.4)
+
+    A_iijj = d2W / ds_i ds_j,
+    A_ijij + A_ijji = (W_i - W_j) / (s_i - s_j),   A_ijij - A_ijji = (W_i + W_j) / (s_i + s_j),   i != j.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from dvc.arrays import FloatArray
+
+POLYNOMIAL, HENCKY, OGDEN = 0, 3, 4
+"""Where a law's vector holds C10; mu_H; and its first Ogden pair."""
+
+_EQUAL = (
+    1e-5  # principal stretches nearer than this, relatively: the quotient is replaced by its limit, in error by 1e-10
+)
+_SWEEPS = 30
+
+
+@njit(cache=True)
+def isochoric(law: FloatArray, e: FloatArray, slope: FloatArray, curvature: FloatArray) -> float:
+    """Wbar (MPa) at logarithmic stretches ``e`` (3,), with its derivatives by e.
+
+    Written: ``slope`` (3,), the deviatoric principal Kirchhoff stresses, and ``curvature`` (3, 3).
+    """
+    mean = (e[0] + e[1] + e[2]) / 3.0
+    energy, invariant = 0.0, 0.0
+    curvature[:, :] = 0.0
+    for i in range(3):
+        invariant += np.expm1(2.0 * (e[i] - mean))  # I1bar - 3, without cancellation
+    first = law[0] + 2.0 * law[1] * invariant + 3.0 * law[2] * invariant**2
+    second = 2.0 * law[1] + 6.0 * law[2] * invariant
+    energy += invariant * (law[0] + invariant * (law[1] + invariant * law[2]))
+    for i in range(3):
+        bar = e[i] - mean
+        square = np.exp(2.0 * bar)
+        slope[i] = 2.0 * first * square + 2.0 * law[3] * bar
+        curvature[i, i] += 4.0 * first * square + 2.0 * law[3]
+        energy += law[3] * bar * bar
+        for j in range(3):
+            curvature[i, j] += 4.0 * second * square * np.exp(2.0 * (e[j] - mean))
+        for q in range(4, len(law), 2):
+            mu, alpha = law[q], law[q + 1]
+            if mu != 0.0:
+                rise = np.expm1(alpha * bar)
+                energy += 2.0 * mu / alpha**2 * rise
+                slope[i] += 2.0 * mu / alpha * (rise + 1.0)
+                curvature[i, i] += 2.0 * mu * (rise + 1.0)
+    # ebar is e less its mean: both derivatives are projected on what has no trace.
+    trace = (slope[0] + slope[1] + slope[2]) / 3.0
+    rows = curvature.sum(axis=1) / 3.0
+    whole = rows.sum() / 3.0
+    for i in range(3):
+        slope[i] -= trace
+    for i in range(3):
+        for j in range(i, 3):
+            value = curvature[i, j] - rows[i] - rows[j] + whole
+            curvature[i, j] = value
+            curvature[j, i] = value
+    return float(energy)
+
+
+@njit(cache=True)
+def along(law: FloatArray, strains: FloatArray, axes: FloatArray) -> FloatArray:
+    """dWbar/dt (n,) MPa at e = t ``axes`` for each t of ``strains`` (n,)."""
+    slope, curvature = np.empty(3), np.empty((3, 3))
+    found = np.empty(len(strains))
+    for n in range(len(strains)):
+        isochoric(law, strains[n] * axes, slope, curvature)
+        found[n] = slope[0] * axes[0] + slope[1] * axes[1] + slope[2] * axes[2]
+    return found
+
+
+@njit(cache=True)
+def least_stiffness(law: FloatArray, strains: FloatArray) -> FloatArray:
+    """Least eigenvalue (n,) MPa of d2Wbar/de2 at e (n, 3), over changes that keep the volume: Drucker's condition."""
+    slope, c = np.empty(3), np.empty((3, 3))
+    found = np.empty(len(strains))
+    for n in range(len(strains)):
+        isochoric(law, strains[n], slope, c)
+        # Basis (1, -1, 0) / sqrt 2, (1, 1, -2) / sqrt 6; the rows of c sum to 0.
+        a = 0.5 * (c[0, 0] + c[1, 1]) - c[0, 1]
+        b = 1.5 * c[2, 2]
+        mixed = np.sqrt(3.0) / 2.0 * (c[0, 0] - c[1, 1])
+        found[n] = 0.5 * (a + b) - np.sqrt(0.25 * (a - b) ** 2 + mixed**2)
+    return found
+
+
+@njit(cache=True)
+def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) -> float:
+    """F = U diag(s) V^T of a matrix (3, 3) with positive determinant; U, s and V are written, det F is returned.
+
+    Jacobi's rotations of F^T F. Where det F <= 0 nothing is written.
+    """
+    J = (
+        F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
+        - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
+        + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0])
+    )
+    if not J > 0.0:
+        return float(J)
+    C = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = F[0, i] * F[0, j] + F[1, i] * F[1, j] + F[2, i] * F[2, j]
+            V[i, j] = 1.0 if i == j else 0.0
+    for _ in range(_SWEEPS):
+        off = C[0, 1] ** 2 + C[0, 2] ** 2 + C[1, 2] ** 2
+        if off <= 1e-34 * (C[0, 0] ** 2 + C[1, 1] ** 2 + C[2, 2] ** 2):
+            break
+        for p, q in ((0, 1), (0, 2), (1, 2)):
+            if C[p, q] == 0.0:
+                continue
+            theta = (C[q, q] - C[p, p]) / (2.0 * C[p, q])
+            t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
+            c = 1.0 / np.sqrt(t * t + 1.0)
+            sine = t * c
+            for k in range(3):
+                left, right = C[k, p], C[k, q]
+                C[k, p], C[k, q] = c * left - sine * right, sine * left + c * right
+            for k in range(3):
+                left, right = C[p, k], C[q, k]
+                C[p, k], C[q, k] = c * left - sine * right, sine * left + c * right
+            for k in range(3):
+                left, right = V[k, p], V[k, q]
+                V[k, p], V[k, q] = c * left - sine * right, sine * left + c * right
+    for i in range(3):
+        s[i] = np.sqrt(C[i, i])
+        for k in range(3):
+            U[k, i] = (F[k, 0] * V[0, i] + F[k, 1] * V[1, i] + F[k, 2] * V[2, i]) / s[i]
+    return float(J)
+
+
+@njit(cache=True)
+def principal_response(
+    law: FloatArray, s: FloatArray, J: float, p: float, stress: FloatArray, direct: FloatArray, swapped: FloatArray
+) -> float:
+    """W(F, p) in MPa at principal stretches ``s`` (3,), with its stress and tangent in the principal frame.
+
+    Written: ``stress`` (3,) = W_i; ``direct`` (3, 3) with A_ijij, A_iiii on its diagonal; ``swapped`` (3, 3, 2) with
+    A_iijj first and A_ijji second, i != j.
+    """
+    e, slope, curvature = np.empty(3), np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        e[i] = np.log(s[i])
+    energy = isochoric(law, e, slope, curvature) + p * (J - 1.0)
+    for i in range(3):
+        stress[i] = (slope[i] + p * J) / s[i]
+        direct[i, i] = (curvature[i, i] - slope[i]) / s[i] ** 2
+    for i in range(3):
+        for j in range(i + 1, 3):
+            mixed = (curvature[i, j] + p * J) / (s[i] * s[j])
+            if abs(s[i] - s[j]) > _EQUAL * (s[i] + s[j]):
+                together = (stress[i] - stress[j]) / (s[i] - s[j])
+            else:
+                together = 0.5 * (direct[i, i] + direct[j, j]) - mixed
+            apart = (stress[i] + stress[j]) / (s[i] + s[j])
+            direct[i, j] = 0.5 * (together + apart)
+            direct[j, i] = direct[i, j]
+            swapped[i, j, 0] = mixed
+            swapped[j, i, 0] = mixed
+            swapped[i, j, 1] = 0.5 * (together - apart)
+            swapped[j, i, 1] = swapped[i, j, 1]
+    return float(energy)
+
+
+@njit(cache=True)
+def stress_and_tangent(
+    law: FloatArray, bulk: float, gradients: FloatArray, energy: FloatArray, stress: FloatArray, tangent: FloatArray
+) -> None:
+    """Energy (n,), first Piola-Kirchhoff stress (n, 3, 3) and tangent dP/dF (n, 3, 3, 3, 3) for F (n, 3, 3), MPa.
+
+    The volume's part is bulk / 2 (J - 1)^2. Everything is NaN where det F <= 0.
+    """
+    U, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    principal, direct, swapped = np.empty(3), np.empty((3, 3)), np.zeros((3, 3, 2))
+    for n in range(len(gradients)):
+        J = singular_values(gradients[n], U, s, V)
+        if not J > 0.0:
+            energy[n], stress[n], tangent[n] = np.nan, np.nan, np.nan
+            continue
+        p = bulk * (J - 1.0)
+        energy[n] = principal_response(law, s, J, p, principal, direct, swapped) - 0.5 * p * (J - 1.0)
+        for i in range(3):
+            for j in range(3):  # the pressure follows the volume: dp/ds_j = bulk J / s_j
+                added = bulk * J * J / (s[i] * s[j])
+                if i == j:
+                    direct[i, i] += added
+                else:
+                    swapped[i, j, 0] += added
+        stress[n] = 0.0
+        tangent[n] = 0.0
+        for i in range(3):
+            for k in range(3):
+                for m in range(3):
+                    stress[n, k, m] += principal[i] * U[k, i] * V[m, i]
+        for k in range(3):
+            for m in range(3):
+                for q in range(3):
+                    for r in range(3):
+                        value = 0.0
+                        for i in range(3):
+                            for j in range(3):
+                                value += direct[i, j] * U[k, i] * V[m, j] * U[q, i] * V[r, j]
+                                if i != j:
+                                    value += swapped[i, j, 0] * U[k, i] * V[m, i] * U[q, j] * V[r, j]
+                                    value += swapped[i, j, 1] * U[k, i] * V[m, j] * U[q, j] * V[r, i]
+                        tangent[n, k, m, q, r] = value

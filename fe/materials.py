@@ -1,0 +1,258 @@
+"""Laws of nearly incompressible, isotropic soft tissue: neo-Hooke, Yeoh, Ogden, Hencky.
+
+Every law is W(F) = Wbar(F J^(-1/3)) + K / 2 (J - 1)^2 with J = det F. The bulk modulus K comes from the initial shear
+modulus mu0 and Poisson's ratio, K = 2 mu0 (1 + nu) / (3 (1 - 2 nu)). Units: MPa; stretches have none.
+
+What a number means depends on the program that it was made for; the constructors say which: `Ogden.from_ansys`,
+`Ogden.from_abaqus`, `Ogden.from_febio`. The same mu and alpha give initial shear moduli that differ by alpha / 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from dvc.arrays import BoolArray, FloatArray, frozen
+from dvc.errors import InputError
+from fe.hyperelastic import HENCKY, OGDEN, POLYNOMIAL, along, least_stiffness, stress_and_tangent
+
+HIGHEST_NU = 0.49999
+"""Above it the bulk modulus is over 50,000 times the shear modulus: no measurement tells that from incompressible."""
+
+MODES: Mapping[str, tuple[float, float, float]] = {
+    "uniaxial": (1.0, -0.5, -0.5),
+    "equibiaxial": (1.0, 1.0, -2.0),
+    "pure shear": (1.0, 0.0, -1.0),
+}
+"""Logarithmic stretches of an incompressible test over that of its axis of loading."""
+
+_SEARCHED = float(np.log(5.0))  # stretches of 1/5 to 5 are searched for a loss of stability
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Material:
+    """A hyperelastic law with its numbers; made by `NeoHooke`, `Yeoh`, `Ogden` and `Hencky`.
+
+    Attributes
+    ----------
+    vector : (4 + 2 n,)
+        As `fe.hyperelastic` takes it: C10, C20, C30, mu_H, then pairs mu_q (initial shear modulus), alpha_q; MPa.
+    nu : float
+        Poisson's ratio at small strain.
+    told : str
+        Law and numbers, for people.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite, nu is not in 0 <= nu <= 0.49999, or the initial shear modulus is not positive.
+    """
+
+    vector: FloatArray
+    nu: float
+    told: str
+    law: ClassVar[str] = "hyperelastic"
+
+    def __post_init__(self) -> None:
+        vector = frozen(self.vector, np.float64)
+        object.__setattr__(self, "vector", vector)
+        if not (np.isfinite(vector).all() and np.isfinite(self.nu)):
+            raise InputError(f"{self.told}: every number of a law must be finite.")
+        if not 0.0 <= self.nu <= HIGHEST_NU:
+            raise InputError(
+                f"{self.told}: Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {self.nu:g}. For tissue that "
+                "does not change its volume give 0.4999."
+            )
+        if not self.shear_modulus_mpa > 0.0:
+            raise InputError(
+                f"{self.told}: the initial shear modulus must be positive, and is {_kpa(self.shear_modulus_mpa)}."
+            )
+
+    @property
+    def shear_modulus_mpa(self) -> float:
+        """Initial shear modulus mu0 = 2 C10 + mu_H + sum mu_q, MPa."""
+        return float(2.0 * self.vector[POLYNOMIAL] + self.vector[HENCKY] + self.vector[OGDEN::2].sum())
+
+    @property
+    def bulk_modulus_mpa(self) -> float:
+        """K = 2 mu0 (1 + nu) / (3 (1 - 2 nu)), MPa."""
+        return 2.0 * self.shear_modulus_mpa * (1.0 + self.nu) / (3.0 * (1.0 - 2.0 * self.nu))
+
+    def energy(self, F: npt.ArrayLike) -> FloatArray:
+        """W (n,) MPa (N mm / mm3 of the reference configuration) for F (n, 3, 3); NaN where det F <= 0."""
+        return self._response(F)[0]
+
+    def stress(self, F: npt.ArrayLike) -> FloatArray:
+        """First Piola-Kirchhoff stress P = dW/dF (n, 3, 3), MPa, for F (n, 3, 3); NaN where det F <= 0."""
+        return self._response(F)[1]
+
+    def tangent(self, F: npt.ArrayLike) -> FloatArray:
+        """A[i, j, k, l] = dP_ij / dF_kl (n, 3, 3, 3, 3), MPa, for F (n, 3, 3); NaN where det F <= 0."""
+        return self._response(F)[2]
+
+    def _response(self, F: npt.ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+        gradients = np.ascontiguousarray(F, dtype=np.float64)
+        if gradients.ndim != 3 or gradients.shape[1:] != (3, 3):
+            raise InputError(f"Deformation gradients have shape (n, 3, 3); got {gradients.shape}.")
+        n = len(gradients)
+        energy, stress, tangent = np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3, 3, 3, 3))
+        stress_and_tangent(self.vector, self.bulk_modulus_mpa, gradients, energy, stress, tangent)
+        return energy, stress, tangent
+
+    def nominal_stress(self, stretch: npt.ArrayLike, mode: str = "uniaxial") -> FloatArray:
+        """Force over undeformed area (n,), MPa, of the incompressible solid at stretches (n,) of a test in `MODES`.
+
+        In an equibiaxial test, that of one of the two axes. The true (Cauchy) stress is stretch times this.
+
+        Examples
+        --------
+        >>> NeoHooke.of(mu_mpa=1.0).nominal_stress([2.0]).tolist()  # mu (stretch - 1 / stretch^2)
+        [1.75]
+        """
+        return nominal_stress(self.vector, np.asarray(stretch, dtype=np.float64), mode)
+
+    def is_stable(self, F: npt.ArrayLike) -> BoolArray:
+        """Whether Drucker's condition holds at F (n, 3, 3), volume kept: d tau : d(ln V) > 0 for every small change.
+
+        tau is the Kirchhoff stress; False where det F <= 0.
+        """
+        gradients = np.asarray(F, dtype=np.float64)
+        stretches = np.linalg.svd(gradients, compute_uv=False)
+        folded = np.linalg.det(gradients) <= 0.0
+        strains = np.log(np.where(folded[:, None], 1.0, stretches))
+        return np.asarray(~folded & (least_stiffness(self.vector, strains) > 0.0))
+
+    def stable_range(self, mode: str) -> tuple[float, float]:
+        """Least and greatest stretch of a test, between 1/5 and 5, between which the law is stable (Drucker).
+
+        Examples
+        --------
+        >>> NeoHooke.of(mu_mpa=0.1).stable_range("uniaxial")
+        (0.2, 5.0)
+        """
+        _check_mode(mode)
+        axes = np.array(MODES[mode])
+        ends = []
+        for sign in (-1.0, 1.0):
+            strains = sign * np.linspace(0.0, _SEARCHED, 2001)
+            lost = np.flatnonzero(~(least_stiffness(self.vector, strains[:, None] * axes) > 0.0))
+            ends.append(float(np.exp(strains[-1] if not len(lost) else strains[max(lost[0] - 1, 0)])))
+        return round(ends[0], 6), round(ends[1], 6)
+
+
+def nominal_stress(vector: FloatArray, stretch: FloatArray, mode: str) -> FloatArray:
+    """As `Material.nominal_stress`, for a law's vector alone."""
+    _check_mode(mode)
+    if not (stretch > 0.0).all():
+        raise InputError("Stretches must be positive.")
+    axes = np.array(MODES[mode])
+    loaded = np.count_nonzero(axes == 1.0)  # axes that carry the load
+    return np.asarray(along(vector, np.log(stretch).ravel(), axes) / (loaded * stretch.ravel())).reshape(stretch.shape)
+
+
+def _check_mode(mode: str) -> None:
+    if mode not in MODES:
+        raise InputError(f"No test '{mode}'; there are {', '.join(MODES)}.")
+
+
+def _kpa(value_mpa: float) -> str:
+    return f"{1000.0 * value_mpa:.4g} kPa"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NeoHooke(Material):
+    """Wbar = mu / 2 (I1bar - 3)."""
+
+    law: ClassVar[str] = "neo-Hooke"
+
+    @classmethod
+    def of(cls, mu_mpa: float, nu: float = 0.4999) -> NeoHooke:
+        """From the initial shear modulus, MPa."""
+        return cls(np.array([0.5 * mu_mpa, 0.0, 0.0, 0.0]), nu, f"neo-Hooke, mu {_kpa(mu_mpa)}, nu {nu:g}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Yeoh(Material):
+    """Wbar = C10 (I1bar - 3) + C20 (I1bar - 3)^2 + C30 (I1bar - 3)^3; without C30 also called Isihara's."""
+
+    law: ClassVar[str] = "Yeoh"
+
+    @classmethod
+    def of(cls, c10_mpa: float, c20_mpa: float, c30_mpa: float = 0.0, nu: float = 0.4999) -> Yeoh:
+        """From the coefficients of the polynomial, MPa."""
+        told = f"Yeoh, C10 {_kpa(c10_mpa)}, C20 {_kpa(c20_mpa)}, C30 {_kpa(c30_mpa)}, nu {nu:g}"
+        return cls(np.array([c10_mpa, c20_mpa, c30_mpa, 0.0]), nu, told)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hencky(Material):
+    """Wbar = mu sum_i ebar_i^2: linear elastic in logarithmic strain.
+
+    It is what a linear elastic material amounts to in a run with large displacements; Saint Venant-Kirchhoff's law,
+    which is linear in the Green-Lagrange strain, collapses in compression.
+    """
+
+    law: ClassVar[str] = "linear elastic (Hencky)"
+
+    @classmethod
+    def of(cls, mu_mpa: float, nu: float = 0.4999) -> Hencky:
+        """From the shear modulus, MPa: Young's modulus is 2 mu (1 + nu)."""
+        return cls(np.array([0.0, 0.0, 0.0, mu_mpa]), nu, f"linear elastic (Hencky), mu {_kpa(mu_mpa)}, nu {nu:g}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ogden(Material):
+    """Wbar = sum_q 2 mu_q / alpha_q^2 (l_1^alpha_q + l_2^alpha_q + l_3^alpha_q - 3), l the isochoric stretches.
+
+    mu_q is what the term adds to the initial shear modulus. Programs print other numbers: use the constructor of the
+    program that yours are from.
+
+    Examples
+    --------
+    The same two numbers in three programs:
+
+    >>> fat = {"mu_mpa": 0.0034, "alpha": 6.2}
+    >>> [round(1000 * law(**fat).shear_modulus_mpa, 2) for law in (Ogden.from_ansys, Ogden.from_abaqus)]
+    [10.54, 3.4]
+    >>> round(1000 * Ogden.from_febio(c_mpa=0.0034, m=6.2).shear_modulus_mpa, 2)
+    1.7
+    """
+
+    law: ClassVar[str] = "Ogden"
+
+    @classmethod
+    def of(cls, shear_modulus_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+        """From each term's initial shear modulus (MPa) and exponent.
+
+        Raises
+        ------
+        InputError
+            If there is not one exponent, other than 0, for each modulus.
+        """
+        moduli, exponents = np.atleast_1d(shear_modulus_mpa).astype(float), np.atleast_1d(alpha).astype(float)
+        if moduli.shape != exponents.shape or moduli.ndim != 1 or not len(moduli):
+            raise InputError(f"Ogden: {moduli.size} moduli and {exponents.size} exponents; as many of each are needed.")
+        if not (np.abs(exponents) > 1e-6).all():
+            raise InputError("Ogden: an exponent of 0 has no meaning; Hencky's law is the limit.")
+        pairs = "; ".join(f"mu0 {_kpa(m)}, alpha {a:g}" for m, a in zip(moduli, exponents, strict=True))
+        vector = np.concatenate([np.zeros(OGDEN), np.column_stack([moduli, exponents]).ravel()])
+        return cls(vector, nu, f"Ogden, {pairs}, nu {nu:g}")
+
+    @classmethod
+    def from_ansys(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+        """W = sum mu / alpha (sum l^alpha - 3), so mu0 = mu alpha / 2."""
+        return cls.of(0.5 * np.asarray(mu_mpa) * np.asarray(alpha), alpha, nu)
+
+    @classmethod
+    def from_abaqus(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+        """W = sum 2 mu / alpha^2 (sum l^alpha - 3), so mu0 = mu; CalculiX writes it so as well."""
+        return cls.of(mu_mpa, alpha, nu)
+
+    @classmethod
+    def from_febio(cls, c_mpa: npt.ArrayLike, m: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+        """W = sum c / m^2 (sum l^m - 3), so mu0 = c / 2."""
+        return cls.of(0.5 * np.asarray(c_mpa), m, nu)

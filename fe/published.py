@@ -1,0 +1,269 @@
+"""Sets of material laws, tissue by tissue: seven published ones, and the user's own in the same form."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from types import MappingProxyType
+
+from dvc.errors import InputError
+from fe.hyperelastic import OGDEN
+from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
+
+WHOLE = "all"
+"""Name of the tissue in a set that has one law for everything."""
+
+_INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat")}
+
+
+@dataclass(frozen=True, slots=True)
+class _Form:
+    """How a law is written in a file: what makes it, and which of its numbers are stresses."""
+
+    made: Callable[..., Material]
+    stresses: tuple[str, ...]
+    plain: tuple[str, ...] = ("nu",)
+    optional: tuple[str, ...] = ()
+
+
+_LAWS: Mapping[str, _Form] = {
+    "neo-Hooke": _Form(NeoHooke.of, ("mu",)),
+    "Yeoh": _Form(Yeoh.of, ("c10", "c20", "c30"), optional=("c30",)),
+    "linear elastic": _Form(Hencky.of, ("mu",)),
+}
+_OGDEN: Mapping[str, _Form] = {
+    "ansys": _Form(Ogden.from_ansys, ("mu",), ("alpha", "nu")),
+    "abaqus": _Form(Ogden.from_abaqus, ("mu",), ("alpha", "nu")),
+    "febio": _Form(Ogden.from_febio, ("c",), ("m", "nu")),
+}
+_TO_MPA = {"_mpa": 1.0, "_kpa": 1e-3}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaterialSet:
+    """Laws of the tissues of one study.
+
+    Attributes
+    ----------
+    name, title, source : str
+        Short name, who proposed it, and where the numbers are printed.
+    laws : mapping of tissue to Material
+        "all" where one law serves every tissue.
+    """
+
+    name: str
+    title: str
+    source: str
+    laws: Mapping[str, Material]
+
+    def for_regions(self, regions: Iterable[str]) -> tuple[dict[str, Material], tuple[str, ...]]:
+        """The law of each region of a mesh, and a sentence for each region that has none of its own.
+
+        Tendon and aponeurosis take muscle's law, or else fat's; any other region without a law takes fat's.
+
+        Raises
+        ------
+        InputError
+            If a region has no law and the set none to put in its place.
+
+        Examples
+        --------
+        >>> laws, notes = material_set("friedman").for_regions(["fat", "skin", "muscle"])
+        >>> laws["muscle"] is laws["fat"], notes
+        (True, ("friedman has no law for muscle; fat's is used.",))
+        """
+        found: dict[str, Material] = {}
+        notes = []
+        for region in regions:
+            if WHOLE in self.laws:
+                found[region] = self.laws[WHOLE]
+                continue
+            tried = (region, *_INSTEAD.get(region, ("fat",)))
+            name = next((t for t in tried if t in self.laws), None)
+            if name is None:
+                raise InputError(
+                    f"The set {self.name} has no law for the region '{region}', nor one for "
+                    f"{' or '.join(tried[1:])} to put in its place; it has {', '.join(self.laws)}."
+                )
+            found[region] = self.laws[name]
+            if name != region:
+                notes.append(f"{self.name} has no law for {region}; {name}'s is used.")
+        return found, tuple(notes)
+
+
+def published_names() -> list[str]:
+    """Names of the sets that come with mrstrain."""
+    return list(_published())
+
+
+def material_set(name: str | Path) -> MaterialSet:
+    """A published set by its name, or the only set of a user's file by its path (.toml).
+
+    Raises
+    ------
+    InputError
+        If there is no set of that name, or the file cannot be used.
+
+    Examples
+    --------
+    >>> material_set("erdemir").laws["all"].told
+    'Ogden, mu0 56.09 kPa, alpha 6.82, nu 0.49'
+    """
+    if str(name).endswith(".toml"):
+        sets = read_material_sets(name)
+        if len(sets) > 1:
+            raise InputError(f"{name} holds {len(sets)} sets ({', '.join(sets)}); split it, or read them all.")
+        return next(iter(sets.values()))
+    known = _published()
+    if name not in known:
+        near = difflib.get_close_matches(str(name), known, n=1)
+        hint = f"; the nearest is '{near[0]}'" if near else ""
+        raise InputError(f"No material set '{name}'{hint}. There are {', '.join(known)}; or give a file (.toml).")
+    return known[str(name)]
+
+
+def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
+    """Every set of a file, by name; the form is that of ``fe/published.toml``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a key is unknown or missing, or a number is out of range; with file, set and tissue.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as failure:
+        raise InputError(f"Cannot read the material sets {path}: {failure}.") from failure
+    return _parsed(str(path), text)
+
+
+def as_toml(name: str, title: str, laws: Mapping[str, Material]) -> str:
+    """A set as text in the form that `read_material_sets` takes; Ogden's numbers in the convention of Abaqus.
+
+    Examples
+    --------
+    >>> print(as_toml("mine", "Ours", {"fat": Ogden.of(0.0105, 6.2)}), end="")
+    [mine]
+    title = "Ours"
+    <BLANKLINE>
+    [mine.fat]
+    law = "Ogden"
+    convention = "abaqus"
+    mu_mpa = [0.0105]
+    alpha = [6.2]
+    nu = 0.4999
+    """
+    key = json.dumps(name) if not re.fullmatch(r"[\w-]+", name, re.ASCII) else name
+    lines = [f"[{key}]", f"title = {json.dumps(title)}"]
+    for tissue, law in laws.items():
+        at = json.dumps(tissue) if not re.fullmatch(r"[\w-]+", tissue, re.ASCII) else tissue
+        lines += ["", f"[{key}.{at}]", f'law = "{_NAMES[type(law)]}"']
+        lines += [f"{k} = {v}" for k, v in _told(law).items()]
+    return "\n".join(lines) + "\n"
+
+
+_NAMES: Mapping[type[Material], str] = {NeoHooke: "neo-Hooke", Yeoh: "Yeoh", Hencky: "linear elastic", Ogden: "Ogden"}
+
+
+def _told(law: Material) -> dict[str, object]:
+    """The numbers of a law as a file has them."""
+    c10, c20, c30, hencky = law.vector[:OGDEN].tolist()
+    given: dict[type[Material], dict[str, object]] = {
+        NeoHooke: {"mu_mpa": 2.0 * c10},
+        Yeoh: {"c10_mpa": c10, "c20_mpa": c20, "c30_mpa": c30},
+        Hencky: {"mu_mpa": hencky},
+        Ogden: {
+            "convention": '"abaqus"',
+            "mu_mpa": law.vector[OGDEN::2].tolist(),
+            "alpha": law.vector[OGDEN + 1 :: 2].tolist(),
+        },
+    }
+    return given[type(law)] | {"nu": law.nu}
+
+
+@cache
+def _published() -> dict[str, MaterialSet]:
+    return _parsed("published.toml", (files("fe") / "published.toml").read_text(encoding="utf-8"))
+
+
+def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
+    try:
+        told = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as failure:
+        raise InputError(f"{where}: not a TOML file: {failure}.") from failure
+    sets = {}
+    for name, content in told.items():
+        if not isinstance(content, dict):
+            raise InputError(
+                f"{where}: '{name}' stands outside any set; a file starts with the set's name in brackets."
+            )
+        head = {key: content.get(key, "") for key in ("title", "source")}
+        tissues = {key: value for key, value in content.items() if key not in head}
+        if not tissues:
+            raise InputError(f"{where}: the set '{name}' has no tissue; add [{name}.fat] with a law.")
+        laws = {tissue: _law(f"{where}, {name}.{tissue}", given) for tissue, given in tissues.items()}
+        sets[name] = MaterialSet(name, str(head["title"]), str(head["source"]), MappingProxyType(laws))
+    if not sets:
+        raise InputError(f"{where}: no material set in it.")
+    return sets
+
+
+def _law(where: str, given: object) -> Material:
+    if not isinstance(given, dict):
+        raise InputError(f"{where}: a tissue is a table with a law and its numbers; got {given!r}.")
+    law = given.get("law")
+    form = _form(where, law, given.get("convention"))
+    values: dict[str, float | list[float]] = {}
+    for key, value in given.items():
+        if key in ("law", "convention"):
+            continue
+        bare, scale = next(((key.removesuffix(u), f) for u, f in _TO_MPA.items() if key.endswith(u)), (key, None))
+        if key in form.stresses:
+            raise InputError(f"{where}: '{key}' needs its unit: {key}_kpa or {key}_mpa.")
+        if bare not in (form.stresses if scale else form.plain):
+            wanted = ", ".join([f"{name}_kpa (or _mpa)" for name in form.stresses] + list(form.plain))
+            raise InputError(f"{where}: {law} has no '{key}'; it takes {wanted}.")
+        argument = f"{bare}_mpa" if scale else bare
+        if argument in values:
+            raise InputError(f"{where}: '{bare}' is given twice.")
+        values[argument] = _numbers(where, key, value, scale or 1.0, several=law == "Ogden" and bare != "nu")
+    needed = {f"{name}_mpa": f"{name}_kpa" for name in form.stresses} | {name: name for name in form.plain}
+    missing = [told for name, told in needed.items() if name not in values and told[:-4] not in form.optional]
+    if missing:
+        raise InputError(f"{where}: {law} needs {', '.join(missing)}.")
+    try:
+        return form.made(**values)
+    except InputError as refused:
+        raise InputError(f"{where}: {refused}") from refused
+
+
+def _form(where: str, law: object, convention: object) -> _Form:
+    if law == "Ogden":
+        if convention not in _OGDEN:
+            raise InputError(
+                f"{where}: an Ogden law needs convention = {' or '.join(map(repr, _OGDEN))}, the program that its "
+                f"numbers are for: the same numbers differ by a factor of alpha / 2 in stiffness; got {convention!r}."
+            )
+        return _OGDEN[str(convention)]
+    if law not in _LAWS:
+        raise InputError(f"{where}: law must be one of {', '.join((*_LAWS, 'Ogden'))}; got {law!r}.")
+    if convention is not None:
+        raise InputError(f"{where}: convention is for Ogden laws only; {law} has one form.")
+    return _LAWS[str(law)]
+
+
+def _numbers(where: str, key: str, value: object, scale: float, *, several: bool) -> float | list[float]:
+    given: list[object] = value if isinstance(value, list) and several else [value]
+    numbers = [float(v) for v in given if isinstance(v, (int, float)) and not isinstance(v, bool)]
+    if not numbers or len(numbers) < len(given):
+        wanted = "a number or a list of numbers" if several else "a number"
+        raise InputError(f"{where}: {key} must be {wanted}; got {value!r}.")
+    scaled = [scale * v for v in numbers]
+    return scaled if isinstance(value, list) else scaled[0]

@@ -1,0 +1,139 @@
+"""Fitting gives back a curve's own law; with noise, its intervals hold the truth as often as they say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.errors import InputError
+from fe.fitting import LAWS, Curve, fit, read_curves
+from fe.materials import MODES, Material, NeoHooke, Ogden, Yeoh
+from fe.published import material_set
+
+TABLE_2 = {"fat": ("Ogden", np.linspace(0.5, 1.0, 30)), "skin": ("Isihara", np.linspace(1.0, 1.5, 30)),
+           "muscle": ("Yeoh", np.linspace(1.0, 1.4, 30))}  # fmt: skip
+
+
+def curve_of(law: Material, stretch: np.ndarray, mode: str = "uniaxial", noise: np.ndarray | float = 0.0) -> Curve:
+    return Curve(mode, stretch, law.nominal_stress(stretch, mode) + noise)
+
+
+@pytest.mark.parametrize("tissue", TABLE_2)
+def test_curves_of_table_2_give_table_2_back(tissue: str) -> None:
+    name, stretch = TABLE_2[tissue]
+    law = material_set("trebbi").laws[tissue]
+    found = fit([curve_of(law, stretch)], name)
+    assert found.material.vector == pytest.approx(law.vector, rel=1e-9, abs=1e-12)
+    assert found.r2["uniaxial"] == pytest.approx(1.0, abs=1e-12)
+    assert found.stable_where_measured
+    assert [p.name for p in found.parameters] == list(LAWS[name].names)
+
+
+def test_two_terms_from_three_tests_at_once() -> None:
+    law = Ogden.of([0.01, 0.02], [6.0, -3.0])
+    found = fit([curve_of(law, np.linspace(0.6, 1.6, 40), mode) for mode in MODES], "Ogden-2")
+    assert sorted(p.value for p in found.parameters) == pytest.approx([-3.0, 0.01, 0.02, 6.0], rel=1e-6)
+    assert found.reached["pure shear"] == (0.6, 1.6)
+
+
+@pytest.mark.parametrize(
+    ("name", "law", "stretch", "mode", "noise"),
+    [
+        ("Ogden", material_set("trebbi").laws["fat"], np.linspace(0.5, 1.0, 30), "uniaxial", 0.03),
+        ("Isihara", material_set("trebbi").laws["skin"], np.linspace(1.0, 1.5, 30), "pure shear", 0.03),
+        ("neo-Hooke", NeoHooke.of(0.02), np.linspace(0.8, 1.2, 12), "equibiaxial", 0.1),
+    ],
+)
+def test_intervals_hold_the_truth_as_often_as_they_say(
+    name: str, law: Material, stretch: np.ndarray, mode: str, noise: float
+) -> None:
+    random = np.random.default_rng(1)
+    exact = curve_of(law, stretch, mode)
+    truth = [p.value for p in fit([exact], name).parameters]
+    size = noise * np.abs(exact.stress_mpa).max()
+    tries, held = 400, np.zeros(len(truth))
+    for _ in range(tries):
+        noisy = Curve(mode, stretch, exact.stress_mpa + random.normal(0.0, size, len(stretch)))
+        held += [p.low <= t <= p.high for p, t in zip(fit([noisy], name).parameters, truth, strict=True)]
+    # 95 % of 400: a standard deviation is 1.1 %
+    assert (held / tries > 0.95 - 0.033).all(), held / tries
+    assert (held / tries < 0.95 + 0.033).all(), held / tries
+
+
+def test_exponents_that_one_test_leaves_open_are_named() -> None:
+    random = np.random.default_rng(3)
+    fat = material_set("trebbi").laws["fat"]
+    stretch = np.linspace(0.5, 1.0, 30)
+    exact = curve_of(fat, stretch)
+    noisy = Curve(
+        "uniaxial", stretch, exact.stress_mpa + 0.03 * random.normal(size=30) * np.abs(exact.stress_mpa).max()
+    )
+    alone = fit([noisy], "Ogden")
+    assert alone.parameters[1].value > 0
+    assert [law.vector[5] < 0 for law in alone.others] == [True]
+    # Pure shear tells them apart; equibiaxial tension would be uniaxial compression over again.
+    both = fit([noisy, curve_of(fat, np.linspace(1.0, 1.8, 30), "pure shear")], "Ogden")
+    assert both.others == ()
+
+
+def test_true_stress_is_turned_into_nominal(tmp_path: Path) -> None:
+    law = Yeoh.of(0.265, 1.923)
+    stretch = np.linspace(1.05, 1.5, 12)
+    true_kpa = 1000 * stretch * law.nominal_stress(stretch)
+    file = tmp_path / "skin.csv"
+    lines = [f"{a},{b},x" for a, b in zip(stretch, true_kpa, strict=True)]
+    file.write_text("Stretch, true_stress_kpa, remark\n" + "\n".join(lines) + "\n")
+    found = fit(read_curves(file, "uniaxial"), "Isihara")
+    assert [p.value for p in found.parameters] == pytest.approx([0.265, 1.923], rel=1e-9)
+
+
+def test_several_tests_in_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "both.csv"
+    file.write_text("test,stretch,nominal_stress_mpa\nuniaxial,1.1,0.1\npure shear,1.2,0.3\nuniaxial,1.2,0.2\n")
+    curves = {c.mode: c for c in read_curves(file)}
+    assert curves["uniaxial"].stretch.tolist() == [1.1, 1.2]
+    assert curves["pure shear"].stress_mpa.tolist() == [0.3]
+
+
+def test_an_unstable_fit_is_reported() -> None:
+    law = Yeoh.of(0.1, -0.02)
+    found = fit([curve_of(law, np.linspace(1.0, 3.0, 40))], "Isihara")
+    assert found.stable["uniaxial"][1] < 3.0
+    assert not found.stable_where_measured
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "said"),
+    [
+        ("stretch,stress\n1.1,2\n", "uniaxial", "one of nominal_stress_kpa"),
+        ("stretch,nominal_stress_kpa,true_stress_kpa\n", "uniaxial", "a column 'stretch' and one of"),
+        ("stretch,nominal_stress_kpa\n1.1,2\n", None, "say which test it is"),
+        ("stretch,nominal_stress_kpa\n1.1,two\n", "uniaxial", r"line 2: could not convert"),
+        ("stretch,nominal_stress_kpa\n1.1,2\n-1,2\n", "uniaxial", r"line 3: a stretch is positive"),
+        ("stretch,nominal_stress_kpa\n1.1,nan\n", "uniaxial", r"line 2: .*finite"),
+        ("stretch,nominal_stress_kpa,test\n1.1,2,biaxial\n", None, r"line 2: no test 'biaxial'"),
+        ("stretch,nominal_stress_kpa\n", "uniaxial", "no row under the header"),
+    ],
+)
+def test_a_curve_that_cannot_be_read_says_where(tmp_path: Path, text: str, mode: str | None, said: str) -> None:
+    file = tmp_path / "curve.csv"
+    file.write_text(text)
+    with pytest.raises(InputError, match=said) as refused:
+        read_curves(file, mode)
+    assert "curve.csv" in str(refused.value)
+
+
+def test_curves_that_tell_nothing_are_refused() -> None:
+    fat, stretch = NeoHooke.of(0.01), np.linspace(0.8, 1.2, 20)
+    with pytest.raises(InputError, match="No law 'Mooney'"):
+        fit([curve_of(fat, stretch)], "Mooney")
+    with pytest.raises(InputError, match="needs 5 points or more"):
+        fit([curve_of(fat, stretch[:4])], "Yeoh")
+    with pytest.raises(InputError, match="needs 4 points or more"):
+        fit([curve_of(fat, np.full(20, 1.2))], "Isihara")
+    with pytest.raises(InputError, match="0 at every point"):
+        fit([Curve("uniaxial", stretch, np.zeros(20))], "neo-Hooke")
+    with pytest.raises(InputError, match="no law to compute with"):
+        fit([Curve("uniaxial", stretch, -(stretch - 1))], "neo-Hooke")
+    with pytest.raises(InputError, match="Cannot read the curve nowhere"):
+        read_curves("nowhere.csv", "uniaxial")

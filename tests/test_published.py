@@ -1,0 +1,123 @@
+"""Published sets are what tables 2 and 3 print, in the convention named; a user's file is checked as closely."""
+
+from pathlib import Path
+
+import pytest
+
+from dvc.errors import InputError
+from fe.published import material_set, published_names, read_material_sets
+
+# Initial shear modulus (kPa) and Poisson's ratio by hand from the printed numbers.
+PRINTED = {
+    ("trebbi", "fat"): (3.4 * 6.2 / 2, 0.4999),
+    ("trebbi", "skin"): (2 * 265.0, 0.4999),
+    ("trebbi", "muscle"): (2 * 5.0, 0.4999),
+    ("akrami", "all"): (385.9, 0.49),
+    ("erdemir", "all"): (16.45 * 6.82 / 2, 0.49),
+    ("erdemir-as-published", "all"): (16.45, 0.49),
+    ("friedman", "skin"): (324.7, 0.495),
+    ("friedman", "fat"): (0.290, 0.495),
+    ("luboz", "skin"): (66.89, 0.495),
+    ("luboz", "fat"): (10.07, 0.49),
+    ("luboz", "muscle"): (20.07, 0.495),
+    ("spears", "skin"): (640.0 * 6.8 / 2, 0.49),
+    ("spears", "fat"): (0.290 * 8.8 / 2, 0.495),
+    ("spears-as-published", "skin"): (640.0, 0.49),
+    ("spears-as-published", "fat"): (0.290, 0.495),
+    ("zwam", "skin"): (50.0 * 2.3 / 2, 0.49),
+    ("zwam", "fat"): (16.45 * 6.82 / 2, 0.49),
+    ("zwam", "muscle"): (20.07, 0.49),
+}
+
+
+def test_every_published_law_has_the_printed_modulus() -> None:
+    found = {(name, tissue): law for name in published_names() for tissue, law in material_set(name).laws.items()}
+    assert found.keys() == PRINTED.keys()
+    for key, (modulus_kpa, nu) in PRINTED.items():
+        assert 1000 * found[key].shear_modulus_mpa == pytest.approx(modulus_kpa, rel=1e-12), key
+        assert found[key].nu == nu, key
+
+
+@pytest.mark.parametrize("name", published_names())
+def test_published_laws_are_stable_and_say_where_they_are_from(name: str) -> None:
+    published = material_set(name)
+    assert published.title
+    assert "able" in published.source
+    for law in published.laws.values():
+        for mode in ("uniaxial", "equibiaxial", "pure shear"):
+            low, high = law.stable_range(mode)
+            assert low <= 0.5
+            assert high >= 2.0
+
+
+def test_a_region_without_a_law_takes_its_neighbours_and_says_so() -> None:
+    laws, notes = material_set("luboz").for_regions(["skin", "fat", "muscle", "tendon"])
+    assert laws["tendon"] is laws["muscle"]
+    assert notes == ("luboz has no law for tendon; muscle's is used.",)
+    laws, notes = material_set("spears").for_regions(["skin", "fat", "muscle", "tendon"])
+    assert laws["tendon"] is laws["muscle"] is laws["fat"]
+    assert len(notes) == 2
+    laws, notes = material_set("akrami").for_regions(["skin", "tendon"])
+    assert laws["skin"] is laws["tendon"]
+    assert notes == ()
+
+
+def test_a_set_without_fat_refuses_a_region_it_cannot_serve(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text('[mine.skin]\nlaw = "neo-Hooke"\nmu_kpa = 100\nnu = 0.49\n')
+    with pytest.raises(InputError, match="no law for the region 'tendon', nor one for muscle or fat"):
+        material_set(file).for_regions(["skin", "tendon"])
+
+
+def test_own_sets_in_all_forms(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(
+        '[one]\ntitle = "Ours"\n[one.fat]\nlaw = "Ogden"\nconvention = "febio"\nc_kpa = [20, 4.0]\nm = [6, -2]\n'
+        'nu = 0.499\n[two.skin]\nlaw = "Yeoh"\nc10_mpa = 0.2\nc20_mpa = 1\nc30_kpa = 30\nnu = 0.4999\n'
+    )
+    sets = read_material_sets(file)
+    assert sets["one"].title == "Ours"
+    assert sets["one"].laws["fat"].shear_modulus_mpa == pytest.approx(0.012)
+    assert sets["two"].laws["skin"].vector.tolist() == pytest.approx([0.2, 1.0, 0.03, 0.0])
+    with pytest.raises(InputError, match="holds 2 sets"):
+        material_set(file)
+
+
+GOOD = 'law = "neo-Hooke"\nmu_kpa = 100\nnu = 0.49\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[a.fat\n", "not a TOML file"),
+        ("", "no material set"),
+        ("mu = 1\n", "'mu' stands outside any set"),
+        ('[a]\ntitle = "x"\n', "has no tissue"),
+        ("[a]\nfat = 3\n", "a tissue is a table"),
+        ("[a.fat]\nmu_kpa = 1\n", "law must be one of neo-Hooke, Yeoh, linear elastic, Ogden; got None"),
+        ('[a.fat]\nlaw = "Ogden"\nmu_kpa = 1\nalpha = 2\nnu = 0.4\n', "needs convention = 'ansys' or 'abaqus' or"),
+        ("[a.fat]\nconvention = 'ansys'\n" + GOOD, "convention is for Ogden laws only"),
+        ("[a.fat]\n" + GOOD.replace("mu_kpa", "mu"), "'mu' needs its unit: mu_kpa or mu_mpa"),
+        ("[a.fat]\n" + GOOD.replace("mu_kpa", "mew_kpa"), "has no 'mew_kpa'; it takes mu_kpa"),
+        ("[a.fat]\n" + GOOD.replace("nu =", "nu_kpa ="), "has no 'nu_kpa'"),
+        ("[a.fat]\n" + GOOD + "mu_mpa = 0.1\n", "'mu' is given twice"),
+        ("[a.fat]\n" + GOOD.replace("nu = 0.49\n", ""), "needs nu"),
+        ("[a.fat]\n" + GOOD.replace("100", "'soft'"), "mu_kpa must be a number; got 'soft'"),
+        ("[a.fat]\n" + GOOD.replace("100", "[1, 2]"), "mu_kpa must be a number; got"),
+        ("[a.fat]\n" + GOOD.replace("100", "true"), "mu_kpa must be a number; got True"),
+        ("[a.fat]\n" + GOOD.replace("0.49", "0.5"), "a.fat: neo-Hooke.*Poisson's ratio"),
+    ],
+)
+def test_a_file_that_cannot_be_used_says_where_and_why(tmp_path: Path, text: str, said: str) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=said) as refused:
+        material_set(file)
+    assert "mine.toml" in str(refused.value)
+
+
+def test_names_that_are_not_there() -> None:
+    with pytest.raises(InputError, match="the nearest is 'trebbi'"):
+        material_set("trebi")
+    with pytest.raises(InputError, match=r"Cannot read the material sets nowhere\.toml"):
+        material_set("nowhere.toml")
