@@ -1,0 +1,162 @@
+"""A deformation given at the nodes of a tetrahedral mesh, evaluated at any points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from dvc.arrays import FloatArray, IntArray, frozen
+from dvc.errors import InputError
+from dvc.mesh import TetMesh
+
+_TOLERANCE = 1e-9  # of a barycentric coordinate: points on a face belong to the cells on either side
+_CELLS_PER_BIN = 2.0
+
+
+class Locator:
+    """Finds the cells in which points lie.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    """
+
+    def __init__(self, mesh: TetMesh) -> None:
+        corners = mesh.points_mm[mesh.cells]
+        self._origin = corners[:, 0]
+        jacobian = np.stack([corners[:, i] - corners[:, 0] for i in (1, 2, 3)], axis=2)
+        self.inverse = np.asarray(np.linalg.inv(jacobian), dtype=np.float64)
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        self._low = low.min(axis=0)
+        extent = high.max(axis=0) - self._low
+        self._width = float(np.cbrt(extent.prod() * _CELLS_PER_BIN / len(mesh.cells)))
+        self._shape = np.floor(extent / self._width).astype(np.int64) + 1
+        first = np.floor((low - self._low) / self._width).astype(np.int64)
+        last = np.minimum(np.floor((high - self._low) / self._width).astype(np.int64), self._shape - 1)
+        self._starts, self._members = _binned(first, last, self._shape)
+
+    def find(self, points_mm: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
+        """Cell of each point (n,), -1 outside the mesh, and its reference coordinates in it (n, 3).
+
+        Where a point lies on a face, edge or node, the cell with the lowest number is taken.
+        """
+        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        cells, inside = np.full(len(points), -1), np.full((len(points), 3), np.nan)
+        _find(
+            points, self._low, self._width, self._shape, self._starts, self._members, self._origin, self.inverse,
+            cells, inside,
+        )  # fmt: skip
+        return cells, inside
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OnMesh:
+    """Displacements of a mesh's nodes as a `Deformation`: linear in each cell, with the gradient of that cell.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+        Reference configuration, LPS mm.
+    u_mm : (n, 3)
+        Displacement of its nodes, LPS mm.
+
+    Raises
+    ------
+    InputError
+        If there is not one finite displacement for each node.
+    """
+
+    mesh: TetMesh
+    u_mm: FloatArray
+    _locator: Locator = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        u = frozen(self.u_mm, np.float64)
+        if u.shape != self.mesh.points_mm.shape or not np.isfinite(u).all():
+            raise InputError(
+                f"A displacement on a mesh of {len(self.mesh.points_mm)} nodes needs three finite numbers for each; "
+                f"got shape {u.shape}, {np.count_nonzero(~np.isfinite(u))} of them not finite."
+            )
+        object.__setattr__(self, "u_mm", u)
+        object.__setattr__(self, "_locator", Locator(self.mesh))
+
+    @property
+    def cell_gradients(self) -> FloatArray:
+        """H = du/dX of each cell, (m, 3, 3)."""
+        u = self.u_mm[self.mesh.cells]
+        steps = np.stack([u[:, i] - u[:, 0] for i in (1, 2, 3)], axis=2)
+        return np.asarray(steps @ self._locator.inverse)
+
+    def displacement(self, points_mm: FloatArray) -> FloatArray:
+        """u(X) (n, 3) mm at points X (n, 3) LPS mm; NaN outside the mesh."""
+        return self.evaluate(points_mm)[0]
+
+    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """u(X) (n, 3) mm and H (n, 3, 3) at points X (n, 3) LPS mm; NaN outside the mesh."""
+        cells, at = self._locator.find(points_mm)
+        u = self.u_mm[self.mesh.cells[cells]]
+        weights = np.concatenate([1.0 - at.sum(axis=1, keepdims=True), at], axis=1)
+        outside = cells < 0
+        H = self.cell_gradients[cells]
+        H[outside] = np.nan
+        return np.einsum("na,nai->ni", weights, u), H
+
+
+@njit(cache=True)
+def _binned(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntArray, IntArray]:
+    """Cells whose box touches each bin, in rising order: starts (bins + 1,) and members."""
+    starts = np.zeros(shape[0] * shape[1] * shape[2] + 1, dtype=np.int64)
+    for filling in range(2):
+        if filling:
+            starts = np.cumsum(starts)
+            members = np.empty(starts[-1], dtype=np.int64)
+            at = starts[:-1].copy()
+        for n in range(len(first)):
+            for i in range(first[n, 0], last[n, 0] + 1):
+                for j in range(first[n, 1], last[n, 1] + 1):
+                    for k in range(first[n, 2], last[n, 2] + 1):
+                        bin_ = (i * shape[1] + j) * shape[2] + k
+                        if filling:
+                            members[at[bin_]] = n
+                            at[bin_] += 1
+                        else:
+                            starts[bin_ + 1] += 1
+    return starts, members
+
+
+@njit(cache=True, parallel=True)
+def _find(
+    points: FloatArray,
+    low: FloatArray,
+    width: float,
+    shape: IntArray,
+    starts: IntArray,
+    members: IntArray,
+    origin: FloatArray,
+    inverse: FloatArray,
+    cells: IntArray,
+    inside: FloatArray,
+) -> None:
+    for n in prange(len(points)):
+        bin_, known = 0, True
+        for axis in range(3):
+            place = np.floor((points[n, axis] - low[axis]) / width)
+            if not (0.0 <= place < shape[axis]):
+                known = False
+                break
+            bin_ = bin_ * shape[axis] + int(place)
+        if not known:
+            continue
+        for m in range(starts[bin_], starts[bin_ + 1]):
+            cell = members[m]
+            x, y, z = points[n, 0] - origin[cell, 0], points[n, 1] - origin[cell, 1], points[n, 2] - origin[cell, 2]
+            a = inverse[cell, 0, 0] * x + inverse[cell, 0, 1] * y + inverse[cell, 0, 2] * z
+            b = inverse[cell, 1, 0] * x + inverse[cell, 1, 1] * y + inverse[cell, 1, 2] * z
+            c = inverse[cell, 2, 0] * x + inverse[cell, 2, 1] * y + inverse[cell, 2, 2] * z
+            if min(a, b, c, 1.0 - a - b - c) >= -_TOLERANCE:
+                cells[n] = cell
+                inside[n, 0], inside[n, 1], inside[n, 2] = a, b, c
+                break

@@ -1,0 +1,381 @@
+"""Residual and tangent of a mixed finite-element model, assembled into one symmetric sparse matrix (numba kernels).
+
+Unknowns are the displacements of the nodes (three for each, mm) and then the pressures (MPa). Each stands in an
+equation of its own, in none where it is fixed, or in one that it shares with others, as do nodes that are taped to a
+rigid plate. The pattern of the matrix is made once, for all nodes that may ever be taped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from scipy import sparse
+
+from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.mesh import TetMesh
+from fe.elements import Element, Space
+from fe.hyperelastic import principal_response, singular_values
+from fe.materials import Material
+
+_CHUNK = 16384  # cells whose matrices are held at once
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """A mesh with its laws, cut into elements.
+
+    Attributes
+    ----------
+    element : Element
+    space : Space
+    volumes_mm3 : (m,)
+    inverse : (m, 3, 3)
+        Reference coordinates by position, 1/mm.
+    vectors : (k, v)
+        Laws, as `fe.hyperelastic` takes them.
+    shear_mpa, bulk_mpa : (k,)
+        Initial moduli of the laws.
+    law : (m,)
+        Number of each cell's law.
+    """
+
+    element: Element
+    space: Space
+    volumes_mm3: FloatArray
+    inverse: FloatArray
+    vectors: FloatArray
+    shear_mpa: FloatArray
+    bulk_mpa: FloatArray
+    law: IntArray
+
+    @classmethod
+    def of(cls, mesh: TetMesh, laws: Mapping[str, Material], element: Element) -> Model:
+        """The model of a mesh whose regions are those of ``laws``; each cell is in one of them."""
+        law = np.full(len(mesh.cells), -1)
+        for number, region in enumerate(laws):
+            law[mesh.regions[region]] = number
+        assert (law >= 0).all()
+        corners = mesh.points_mm[mesh.cells]
+        jacobian = np.stack([corners[:, i] - corners[:, 0] for i in (1, 2, 3)], axis=2)
+        length = max(len(material.vector) for material in laws.values())
+        vectors = np.array([np.pad(m.vector, (0, length - len(m.vector))) for m in laws.values()])
+        return cls(
+            element,
+            Space.on(mesh, element.name, law),
+            mesh.volumes_mm3,
+            np.asarray(np.linalg.inv(jacobian), dtype=np.float64),
+            vectors,
+            np.array([m.shear_modulus_mpa for m in laws.values()]),
+            np.array([m.bulk_modulus_mpa for m in laws.values()]),
+            law,
+        )
+
+    @property
+    def unknowns(self) -> int:
+        """Displacements and pressures."""
+        return 3 * len(self.space.nodes_mm) + self.space.pressures
+
+    def unknowns_of_cells(self) -> IntArray:
+        """Unknowns of each cell (m, 3 a + 4): its nodes' x, y, z one node after the other, then its pressures."""
+        nodes = self.space.cells
+        displacement = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
+        return np.hstack([displacement, 3 * len(self.space.nodes_mm) + self.space.pressure_cells])
+
+    def gradients(self, state: FloatArray) -> FloatArray:
+        """H = du/dX of each cell (m, 3, 3), mean over its quadrature points, at a state of all unknowns."""
+        table = np.einsum("q,qaj->aj", self.element.weights, self.element.gradients)
+        u = state[: 3 * len(self.space.nodes_mm)].reshape(-1, 3)[self.space.cells]
+        return np.asarray(np.einsum("mai,aj,mjk->mik", u, table, self.inverse))
+
+
+FIXED = -1
+
+
+class Assembler:
+    """The sparse system of a model under changing constraints.
+
+    Parameters
+    ----------
+    model : Model
+    fixed : (f,) int
+        Unknowns whose value never changes.
+    shared : mapping of int to (s,) int
+        For each shared equation, numbered from 0, the unknowns that may ever be told to follow it.
+    """
+
+    def __init__(self, model: Model, fixed: IntArray, shared: Mapping[int, IntArray]) -> None:
+        self.model = model
+        self._cells = model.unknowns_of_cells()
+        free = np.ones(model.unknowns, dtype=bool)
+        free[fixed] = False
+        self._own = np.where(free, np.cumsum(free) - 1, FIXED)
+        self.own_equations = int(free.sum())
+        self.size = self.own_equations + len(shared)
+        self._may_share = np.zeros(model.unknowns, dtype=bool)
+        for unknowns in shared.values():
+            self._may_share[unknowns] = True
+        self.indptr, self.indices = self._pattern(shared)
+        self._touched = self._may_share[self._cells].any(axis=1)
+        pairs = self._cells.shape[1] * (self._cells.shape[1] + 1) // 2
+        self._places = np.empty((len(self._cells), pairs), dtype=np.int32)
+        self.equation = self._own.copy()
+        _locate(self._cells, self.equation, self.indptr, self.indices, np.arange(len(self._cells)), self._places)
+
+    def share(self, followers: Mapping[int, IntArray]) -> None:
+        """Let unknowns follow a shared equation, given for each; all others stand in their own."""
+        equation = self._own.copy()
+        for number, unknowns in followers.items():
+            equation[unknowns] = self.own_equations + number
+        if np.array_equal(equation, self.equation):
+            return
+        self.equation = equation
+        _locate(self._cells, equation, self.indptr, self.indices, np.flatnonzero(self._touched), self._places)
+
+    @property
+    def force_equations(self) -> BoolArray:
+        """Which equations are a balance of forces, (size,); the others say that volume follows pressure."""
+        forces = np.ones(self.size, dtype=bool)
+        pressures = self.equation[3 * len(self.model.space.nodes_mm) :]
+        forces[pressures[pressures >= 0]] = False
+        return forces
+
+    @property
+    def idle(self) -> IntArray:
+        """Equations that no unknown stands in now; their diagonal is 1 and their residual 0."""
+        used = np.zeros(self.size, dtype=bool)
+        used[self.equation[self.equation >= 0]] = True
+        return np.flatnonzero(~used)
+
+    def residual(self, state: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Internal forces by unknown and by equation, and the least det F, at a state.
+
+        Forces are in N for displacements, volume defects in mm3 for pressures. Where det F <= 0 forces are NaN.
+        """
+        by_unknown = np.zeros(self.model.unknowns)
+        lowest = self._run(state, by_unknown, None)
+        return by_unknown, self._by_equation(by_unknown), lowest
+
+    def tangent(self, state: FloatArray) -> FloatArray:
+        """Values of the upper triangle of the tangent, in the order of `indices`."""
+        data = np.zeros(len(self.indices))
+        self._run(state, np.zeros(self.model.unknowns), data)
+        data[self.indptr[self.idle]] = 1.0  # the diagonal stands first in its row
+        return data
+
+    def spread(self, change: FloatArray) -> FloatArray:
+        """Change of every unknown from that of every equation; fixed ones do not change."""
+        return np.where(self.equation >= 0, change[self.equation], 0.0)
+
+    def _by_equation(self, by_unknown: FloatArray) -> FloatArray:
+        inside = self.equation >= 0
+        return np.asarray(
+            np.bincount(self.equation[inside], weights=by_unknown[inside], minlength=self.size), dtype=np.float64
+        )
+
+    def _run(self, state: FloatArray, forces: FloatArray, data: FloatArray | None) -> float:
+        m, space, element = self.model, self.model.space, self.model.element
+        u = np.ascontiguousarray(state[: 3 * len(space.nodes_mm)].reshape(-1, 3))
+        p = np.ascontiguousarray(state[3 * len(space.nodes_mm) :])
+        width = self._cells.shape[1]
+        lowest = np.inf
+        local_forces = np.empty((_CHUNK, width))
+        local = np.empty((_CHUNK if data is not None else 1, self._places.shape[1]))
+        volumes = np.empty(_CHUNK)
+        for start in range(0, len(self._cells), _CHUNK):
+            part = slice(start, min(start + _CHUNK, len(self._cells)))
+            _elements(
+                space.cells[part], space.pressure_cells[part], m.volumes_mm3[part], m.inverse[part], m.law[part],
+                m.vectors, m.shear_mpa, m.bulk_mpa, element.weights, element.gradients, element.pressure,
+                element.stabilisation, u, p, data is not None, local_forces, local, volumes,
+            )  # fmt: skip
+            count = part.stop - part.start
+            lowest = min(lowest, float(volumes[:count].min()))
+            _add_forces(self._cells[part], local_forces, forces)
+            if data is not None:
+                _add_tangents(self._places[part], local, data)
+        return lowest
+
+    def _pattern(self, shared: Mapping[int, IntArray]) -> tuple[IntArray, IntArray]:
+        """Upper triangle: equations of unknowns that meet in a cell, and shared ones with all that may follow them."""
+        count, width = self._cells.shape
+        cell = np.repeat(np.arange(count), width)
+        meets = sparse.csr_matrix((np.ones(cell.size, dtype=np.int32), (cell, self._cells.ravel())))
+        rows, columns = [self._own], [np.arange(self.model.unknowns)]
+        for number, unknowns in shared.items():
+            rows.append(np.full(len(unknowns), self.own_equations + number))
+            columns.append(unknowns)
+        row, column = np.concatenate(rows), np.concatenate(columns)
+        kept = row >= 0
+        stands = sparse.csr_matrix(
+            (np.ones(kept.sum(), dtype=np.int32), (row[kept], column[kept])), shape=(self.size, self.model.unknowns)
+        )
+        touches = stands @ meets.T
+        coupled = sparse.triu(touches @ touches.T + sparse.identity(self.size, dtype=np.int32), format="csr")
+        coupled.sort_indices()
+        return coupled.indptr.astype(np.int32), coupled.indices.astype(np.int32)
+
+
+@njit(cache=True, parallel=True)
+def _locate(
+    cells: IntArray, equation: IntArray, indptr: IntArray, indices: IntArray, which: IntArray, places: IntArray
+) -> None:
+    """For each pair of a cell's unknowns the place of its entry in the upper triangle.
+
+    -1 where one is fixed; -2 - place where the entry counts twice.
+    """
+    width = cells.shape[1]
+    for n in prange(len(which)):
+        cell, pair = which[n], 0
+        for i in range(width):
+            for j in range(i, width):
+                row, column = equation[cells[cell, i]], equation[cells[cell, j]]
+                place = -1
+                if row >= 0 and column >= 0:
+                    if row > column:
+                        row, column = column, row
+                    low, high = indptr[row], indptr[row + 1] - 1
+                    while low < high:
+                        middle = (low + high) // 2
+                        if indices[middle] < column:
+                            low = middle + 1
+                        else:
+                            high = middle
+                    # Two unknowns of one equation: both halves of the symmetric pair come to its diagonal.
+                    place = low if row < column or i == j else -2 - low
+                places[cell, pair] = place
+                pair += 1
+
+
+@njit(cache=True)
+def _add_forces(cells: IntArray, local: FloatArray, forces: FloatArray) -> None:
+    for n in range(len(cells)):
+        for i in range(cells.shape[1]):
+            forces[cells[n, i]] += local[n, i]
+
+
+@njit(cache=True)
+def _add_tangents(places: IntArray, local: FloatArray, data: FloatArray) -> None:
+    for n in range(len(places)):
+        for pair in range(places.shape[1]):
+            place = places[n, pair]
+            if place >= 0:
+                data[place] += local[n, pair]
+            elif place < -1:
+                data[-2 - place] += 2.0 * local[n, pair]
+
+
+@njit(cache=True, parallel=True)
+def _elements(
+    cells: IntArray,
+    pressure_cells: IntArray,
+    volumes: FloatArray,
+    inverse: FloatArray,
+    law: IntArray,
+    vectors: FloatArray,
+    shear: FloatArray,
+    bulk: FloatArray,
+    weights: FloatArray,
+    tables: FloatArray,
+    pressure: FloatArray,
+    tau: float,
+    u: FloatArray,
+    p: FloatArray,
+    with_tangent: bool,
+    forces: FloatArray,
+    tangents: FloatArray,
+    lowest: FloatArray,
+) -> None:
+    """Forces and tangents of cells, and the least det F at the quadrature points of each."""
+    nodes, points = tables.shape[1], tables.shape[0]
+    width = 3 * nodes + 4
+    for n in prange(len(cells)):
+        g, h = np.empty((nodes, 3)), np.empty((nodes, 3))
+        F, U, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+        stress, direct, swapped = np.empty(3), np.empty((3, 3)), np.zeros((3, 3, 2))
+        block, half = np.empty((3, 3)), np.empty((3, 3))
+        K = np.zeros((width, width))
+        f = np.zeros(width)
+        which = law[n]
+        lowest[n] = np.inf
+        for q in range(points):
+            weight = weights[q] * volumes[n]
+            F[:, :] = 0.0
+            for i in range(3):
+                F[i, i] = 1.0
+            for a in range(nodes):
+                for j in range(3):
+                    g[a, j] = (
+                        tables[q, a, 0] * inverse[n, 0, j]
+                        + tables[q, a, 1] * inverse[n, 1, j]
+                        + tables[q, a, 2] * inverse[n, 2, j]
+                    )
+                    for i in range(3):
+                        F[i, j] += u[cells[n, a], i] * g[a, j]
+            pq = 0.0
+            for c in range(4):
+                pq += pressure[q, c] * p[pressure_cells[n, c]]
+            J = singular_values(F, U, s, V)
+            lowest[n] = min(lowest[n], J)
+            if not J > 0.0:
+                f[:] = np.nan
+                break
+            principal_response(vectors[which], s, J, pq, stress, direct, swapped)
+            for a in range(nodes):  # gradients in the principal frame
+                for j in range(3):
+                    h[a, j] = g[a, 0] * V[0, j] + g[a, 1] * V[1, j] + g[a, 2] * V[2, j]
+            for a in range(nodes):
+                for i in range(3):
+                    value = 0.0
+                    for k in range(3):
+                        value += U[i, k] * stress[k] * h[a, k]
+                    f[3 * a + i] += weight * value
+            for c in range(4):
+                f[3 * nodes + c] += weight * pressure[q, c] * (J - 1.0)
+            if not with_tangent:
+                continue
+            for a in range(nodes):
+                for b in range(a, nodes):
+                    for i in range(3):
+                        for k in range(3):
+                            if i == k:
+                                block[i, i] = (
+                                    direct[i, 0] * h[a, 0] * h[b, 0]
+                                    + direct[i, 1] * h[a, 1] * h[b, 1]
+                                    + direct[i, 2] * h[a, 2] * h[b, 2]
+                                )
+                            else:
+                                block[i, k] = (
+                                    swapped[i, k, 0] * h[a, i] * h[b, k] + swapped[i, k, 1] * h[a, k] * h[b, i]
+                                )
+                    for i in range(3):
+                        for k in range(3):
+                            half[i, k] = block[i, 0] * U[k, 0] + block[i, 1] * U[k, 1] + block[i, 2] * U[k, 2]
+                    for i in range(3):
+                        for k in range(3):
+                            K[3 * a + i, 3 * b + k] += weight * (
+                                U[i, 0] * half[0, k] + U[i, 1] * half[1, k] + U[i, 2] * half[2, k]
+                            )
+                for i in range(3):
+                    value = 0.0
+                    for k in range(3):
+                        value += U[i, k] * h[a, k] / s[k]
+                    for c in range(4):
+                        K[3 * a + i, 3 * nodes + c] += weight * J * value * pressure[q, c]
+        # Pressure with itself: its mass matrix over the bulk modulus, and the stabilisation.
+        for c in range(4):
+            for d in range(4):
+                mass = volumes[n] / 20.0 * (2.0 if c == d else 1.0)
+                value = mass / bulk[which] + tau / shear[which] * (mass - volumes[n] / 16.0)
+                f[3 * nodes + c] -= value * p[pressure_cells[n, d]]
+                K[3 * nodes + c, 3 * nodes + d] -= value
+        for i in range(width):
+            forces[n, i] = f[i]
+        if with_tangent:
+            pair = 0
+            for i in range(width):
+                for j in range(i, width):
+                    tangents[n, pair] = K[i, j]
+                    pair += 1

@@ -1,0 +1,161 @@
+"""Tetrahedra for nearly incompressible tissue: displacement and pressure are two fields (mixed elements).
+
+The weak form, with W(F) the isochoric part of the law, K the bulk modulus and p the pressure (positive in tension), is
+stationary at the solution of
+
+    integral W(F) + p (J - 1) - p^2 / (2 K) dX  -  work of the forces,
+
+which for p = K (J - 1) is the law itself. Pressure is linear in each tetrahedron and continuous within a tissue, and
+may jump from one tissue to the next. Three choices of displacement:
+
+- ``P1``: linear. Alone it is unstable; S = tau / mu0 (M - Mbar) is subtracted, in which M is the pressure's mass matrix
+  and Mbar that of its mean in the cell (Bochev, Dohrmann, Gunzburger 2006, doi:10.1137/S0036142905444482).
+- ``MINI``: linear and a quartic bubble (Arnold, Brezzi, Fortin 1984, doi:10.1007/BF02576171); stable.
+- ``P2``: quadratic (Taylor, Hood 1973); stable, second order in the strain, and dear.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvc.arrays import FloatArray, IntArray
+from dvc.errors import InputError
+from dvc.mesh import TetMesh
+
+EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
+"""Corners of a quadratic tetrahedron's edges, in the order of its nodes 4 to 9."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Element:
+    """A mixed tetrahedron, tabulated at its quadrature points.
+
+    Attributes
+    ----------
+    name : str
+    weights : (q,)
+        Share of the cell's volume that each quadrature point stands for; their sum is 1.
+    gradients : (q, a, 3)
+        Of the a displacement functions, with respect to the reference coordinates (those of nodes 1, 2 and 3).
+    pressure : (q, 4)
+        The pressure's functions.
+    stabilisation : float
+        tau, no unit; 0 where the element needs none.
+    """
+
+    name: str
+    weights: FloatArray
+    gradients: FloatArray
+    pressure: FloatArray
+    stabilisation: float = 0.0
+
+    @property
+    def nodes(self) -> int:
+        """Displacement functions in a cell."""
+        return int(self.gradients.shape[1])
+
+
+def element(name: str, stabilisation: float = 1.0) -> Element:
+    """An element by its name: P1, MINI or P2.
+
+    Parameters
+    ----------
+    stabilisation : float
+        tau of P1.
+    """
+    if name not in _MADE:
+        raise InputError(f"No element '{name}'; there are {', '.join(_MADE)}.")
+    barycentric, weights = _MADE[name][1]
+    gradients = np.array([_MADE[name][0](b) for b in barycentric])
+    return Element(name, weights, gradients, barycentric, stabilisation if name == "P1" else 0.0)
+
+
+_LINEAR = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _p1(b: FloatArray) -> FloatArray:
+    return _LINEAR
+
+
+def _mini(b: FloatArray) -> FloatArray:
+    others = np.array([np.prod(np.delete(b, i)) for i in range(4)])
+    return np.vstack([_LINEAR, 256.0 * others @ _LINEAR])
+
+
+def _p2(b: FloatArray) -> FloatArray:
+    corners = (4.0 * b[:, None] - 1.0) * _LINEAR
+    return np.vstack([corners, [4.0 * (b[i] * _LINEAR[j] + b[j] * _LINEAR[i]) for i, j in EDGES]])
+
+
+def _points(*orbits: tuple[float, tuple[float, ...]]) -> tuple[FloatArray, FloatArray]:
+    """Barycentric points and weights from one point of each orbit and the weight of each of its points."""
+    points, weights = [], []
+    for weight, first in orbits:
+        different = sorted({tuple(np.array(first)[list(order)]) for order in _ORDERS})
+        points += different
+        weights += [weight] * len(different)
+    return np.array(points), np.array(weights)
+
+
+_ORDERS = [(i, j, k, 6 - i - j - k) for i in range(4) for j in range(4) for k in range(4) if len({i, j, k}) == 3]
+_CENTRE = (0.25, 0.25, 0.25, 0.25)
+_A = 0.1381966011250105  # (5 - sqrt 5) / 20
+_B, _C, _D = 1.0 / 3.0, 1.0 / 11.0, 0.0665501535736643
+
+_MADE = {
+    "P1": (_p1, _points((1.0, _CENTRE))),
+    # Degree 5, 15 points: P. Keast 1986, doi:10.1016/0045-7825(86)90059-9
+    "MINI": (
+        _mini,
+        _points(
+            (0.1817020685825351, _CENTRE),
+            (0.0361607142857143, (0.0, _B, _B, _B)),
+            (0.0698714945161738, (8.0 * _C, _C, _C, _C)),
+            (0.0656948493683187, (_D, _D, 0.5 - _D, 0.5 - _D)),
+        ),
+    ),
+    # Degree 2, 4 points
+    "P2": (_p2, _points((0.25, (_A, _A, _A, 1.0 - 3.0 * _A)))),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Space:
+    """Where the unknowns of a mesh lie.
+
+    Attributes
+    ----------
+    nodes_mm : (n, 3)
+        Reference position of each displacement node; a bubble's is its cell's centroid.
+    cells : (m, a)
+        Displacement nodes of each cell, the mesh's own four first.
+    pressure_cells : (m, 4)
+        Pressure unknowns at the corners of each cell.
+    pressures : int
+        Their number.
+    """
+
+    nodes_mm: FloatArray
+    cells: IntArray
+    pressure_cells: IntArray
+    pressures: int
+
+    @classmethod
+    def on(cls, mesh: TetMesh, kind: str, tissue: IntArray) -> Space:
+        """The space of an element on a mesh; ``tissue`` (m,) numbers the cells between which pressure may jump."""
+        points, cells = mesh.points_mm, mesh.cells
+        if kind == "P2":
+            ends = np.sort(np.concatenate([cells[:, list(edge)] for edge in EDGES]), axis=1)
+            edges, which = np.unique(ends, axis=0, return_inverse=True)
+            middle = len(points) + which.reshape(len(EDGES), -1).T
+            points = np.concatenate([points, points[edges].mean(axis=1)])
+            cells = np.hstack([cells, middle])
+        elif kind == "MINI":
+            cells = np.hstack([cells, len(points) + np.arange(len(cells))[:, None]])
+            points = np.concatenate([points, mesh.centroids_mm])
+        # A corner has one pressure for each tissue that meets there.
+        pairs = mesh.cells + len(mesh.points_mm) * np.asarray(tissue)[:, None]
+        known, numbered = np.unique(pairs, return_inverse=True)
+        return cls(points, np.ascontiguousarray(cells), numbered.reshape(pairs.shape), len(known))

@@ -1,0 +1,106 @@
+"""Direct solution of the symmetric, indefinite systems of the solver: the one file that knows which library does it.
+
+PARDISO of Intel's MKL where it runs (x86-64), SciPy's SuperLU elsewhere. A factorisation is kept and solved with as
+often as wanted: it takes most of a simulation's time.
+"""
+
+from __future__ import annotations
+
+import platform
+from typing import Protocol
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import linalg
+
+from dvc.arrays import FloatArray, IntArray
+from dvc.errors import MrstrainError
+
+
+class SingularError(MrstrainError, RuntimeError):
+    """A matrix that cannot be factorised: a part of the model is free to move, or memory is short."""
+
+
+class Factors(Protocol):
+    """A matrix of fixed pattern, factorised anew whenever its values change."""
+
+    def factorise(self, data: FloatArray) -> None:
+        """Take new values of the upper triangle, in the order of the pattern."""
+        ...
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solve with the last values that were taken."""
+        ...
+
+    def close(self) -> None:
+        """Give the memory back."""
+        ...
+
+
+def factors(indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None) -> Factors:
+    """A solver for symmetric matrices whose upper triangle has this pattern (CSR, sorted, with its whole diagonal).
+
+    Parameters
+    ----------
+    threads : int
+        Threads of PARDISO.
+    library : {"pardiso", "superlu"}, optional
+        By default the fastest that this machine has.
+    """
+    chosen = library or ("pardiso" if platform.machine().lower() in ("x86_64", "amd64") else "superlu")
+    return _Pardiso(indptr, indices, threads) if chosen == "pardiso" else _SuperLU(indptr, indices)
+
+
+class _Pardiso:
+    def __init__(self, indptr: IntArray, indices: IntArray, threads: int) -> None:
+        from pypardiso import PyPardisoSolver
+
+        size = len(indptr) - 1
+        self._matrix = sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
+        self._solver = PyPardisoSolver(mtype=-2)  # real, symmetric, indefinite
+        self._solver.libmkl.MKL_Set_Num_Threads(threads)
+        self._analysed = False
+
+    def factorise(self, data: FloatArray) -> None:
+        from pypardiso.pardiso_wrapper import PyPardisoError
+
+        self._matrix.data = np.ascontiguousarray(data)
+        empty = np.zeros(self._matrix.shape[0])
+        try:
+            for phase in (22,) if self._analysed else (11, 22):
+                self._solver.set_phase(phase)
+                self._solver._call_pardiso(self._matrix, empty)
+        except PyPardisoError as failure:
+            raise SingularError(f"The system cannot be factorised (PARDISO, error {failure.value}).") from failure
+        self._analysed = True
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        self._solver.set_phase(33)
+        return np.asarray(self._solver._call_pardiso(self._matrix, np.ascontiguousarray(right)))
+
+    def close(self) -> None:
+        self._solver.free_memory(everything=True)
+
+
+class _SuperLU:
+    def __init__(self, indptr: IntArray, indices: IntArray) -> None:
+        size = len(indptr) - 1
+        self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
+        self._factors: linalg.SuperLU | None = None
+
+    def factorise(self, data: FloatArray) -> None:
+        self._upper.data = np.ascontiguousarray(data)
+        whole = self._upper + sparse.triu(self._upper, 1).T
+        try:
+            self._factors = linalg.splu(
+                whole.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+        except RuntimeError as failure:
+            raise SingularError(f"The system cannot be factorised (SuperLU: {failure}).") from failure
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        assert self._factors is not None
+        return np.asarray(self._factors.solve(right))
+
+    def close(self) -> None:
+        self._factors = None

@@ -1,0 +1,284 @@
+"""From a label map to a conforming mesh of linear tetrahedra, with named tissues and surfaces."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dvc.arrays import FloatArray, IntArray
+from dvc.errors import InputError, MrstrainError, WorkerError
+from dvc.image import LabelMap
+from dvc.mesh import TetMesh
+from dvc.worker import Worker
+from fe.surfaces import Borders, borders_of, labels_at
+
+BONE, OUTER, CUT = "bone", "skin", "cut"
+"""Named facets: the interface with bone, the body's outer surface, and where the label map was cut off."""
+
+_ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
+_FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+_REFINED_MM = 2.0  # spacing of the lattice that carries a finer edge length
+
+
+@dataclass(frozen=True, slots=True)
+class MeshQuality:
+    """What a mesh is like.
+
+    Attributes
+    ----------
+    cells, nodes : int
+    least_angle_deg, greatest_angle_deg : float
+        Of the dihedral angles.
+    edge_mm : (5th percentile, median, 95th percentile)
+    volumes_ml : tuple of (region, mesh, label map)
+    thin : tuple of (region, share)
+        For regions between two surfaces: share of their cells that reach from one to the other.
+    """
+
+    cells: int
+    nodes: int
+    least_angle_deg: float
+    greatest_angle_deg: float
+    edge_mm: tuple[float, float, float]
+    volumes_ml: tuple[tuple[str, float, float], ...]
+    thin: tuple[tuple[str, float], ...]
+
+
+def mesh_labels(
+    labels: LabelMap,
+    edge_mm: float,
+    *,
+    bones: Sequence[str] = ("bone",),
+    finer: tuple[str, float] | None = None,
+    limit_s: float = 3600.0,
+    watch: Callable[[float], None] = lambda _: None,
+) -> tuple[TetMesh, MeshQuality]:
+    """Mesh the soft tissues of a label map.
+
+    Parameters
+    ----------
+    labels : LabelMap
+    edge_mm : float
+        Length of edges wanted, mm. Thin tissues get shorter ones.
+    bones : sequence of str
+        Regions that are cut out; their surface is named "bone".
+    finer : (region, edge in mm), optional
+        Another edge length in a region and close to it: 1 mm in a skin of 2 mm makes it two cells thick.
+    limit_s : float
+        Time after which meshing is given up.
+    watch : callable
+        Gets the seconds spent, about twice a second.
+
+    Returns
+    -------
+    mesh : TetMesh
+        LPS mm, with a region for each soft tissue, and the facets "bone", "skin" (the outer surface) and "cut".
+    quality : MeshQuality
+
+    Raises
+    ------
+    InputError
+        If the edge length is out of range, or a region is not in the label map.
+    MrstrainError
+        If a tissue vanished, or meshing took too long.
+
+    Notes
+    -----
+    The tetrahedra are fTetWild's (Hu and others 2020, doi:10.1145/3386569.3392385). They differ a little from one run
+    to the next: keep a mesh, and its hash, with what was computed on it.
+    """
+    spacing = float(labels.grid.spacing_mm.min())
+    if not 0.5 * spacing <= edge_mm <= 20.0:
+        raise InputError(
+            f"The edge length must lie between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm}."
+        )
+    numbers = {name: number for number, name in labels.names.items() if (labels.labels == number).any()}
+    for name in (*bones, *((finer[0],) if finer else ())):
+        if name not in numbers:
+            raise InputError(f"The label map has no region '{name}'; it has {', '.join(sorted(numbers))}.")
+    soft = {name: number for name, number in numbers.items() if name not in bones}
+    if not soft:
+        raise InputError(f"No soft tissue is left in the label map beside {', '.join(bones)}.")
+    borders = borders_of(labels)
+    lattice = None if finer is None else _lattice(labels, numbers[finer[0]], edge_mm, finer[1])
+    points, cells = _limited(borders, edge_mm, _ENVELOPE * spacing, lattice, limit_s, watch)
+    found = labels_at(borders, points[cells].mean(axis=1))
+    mesh = _named(points, cells, found, soft, [numbers[b] for b in bones], labels)
+    return mesh, _quality(mesh, labels, soft)
+
+
+def _limited(
+    borders: Borders,
+    edge_mm: float,
+    envelope_mm: float,
+    lattice: tuple[FloatArray, IntArray, FloatArray] | None,
+    limit_s: float,
+    watch: Callable[[float], None],
+) -> tuple[FloatArray, IntArray]:
+    """Tetrahedra of the whole box, made in a process of its own that ends when its time is over."""
+    began = time.monotonic()
+    worker = Worker(threads=1)
+    over = threading.Timer(limit_s, worker.kill)
+    over.start()
+    try:
+        return worker.run(
+            "meshing", _tetrahedra, borders.points_mm, borders.triangles, edge_mm, envelope_mm, lattice,
+            watch=lambda: watch(time.monotonic() - began),
+        )  # fmt: skip
+    except WorkerError as ended:
+        if time.monotonic() - began >= limit_s:
+            raise MrstrainError(
+                f"Meshing was given up after {limit_s:.0f} s. Ask for longer edges, mend the label map (specks and "
+                "holes of a few voxels cost most), or allow more time."
+            ) from ended
+        raise
+    finally:
+        over.cancel()
+        worker.close()
+
+
+def _tetrahedra(
+    points_mm: FloatArray,
+    triangles: IntArray,
+    edge_mm: float,
+    envelope_mm: float,
+    lattice: tuple[FloatArray, IntArray, FloatArray] | None,
+) -> tuple[FloatArray, IntArray]:
+    import pytetwild
+
+    size = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
+    names = ("bg_vertices", "bg_tets", "bg_values")
+    finer = {} if lattice is None else dict(zip(names, lattice, strict=True))
+    points, cells = pytetwild.tetrahedralize(
+        points_mm, triangles.astype(np.int32), edge_length_abs=edge_mm, epsilon=envelope_mm / size,
+        disable_filtering=True, num_threads=1, vtk_ordering=True, quiet=True, **finer,
+    )  # fmt: skip
+    return np.asarray(points), np.asarray(cells, dtype=np.int64)
+
+
+def _lattice(labels: LabelMap, label: int, edge_mm: float, finer_mm: float) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Edge lengths on a lattice of tetrahedra: ``finer_mm`` in a region, rising to ``edge_mm`` away from it."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not 0.0 < finer_mm < edge_mm:
+        raise InputError(f"The finer edge length must lie between 0 and {edge_mm} mm; got {finer_mm}.")
+    grid = labels.grid
+    inside = np.nonzero(labels.labels)
+    away = distance_transform_edt(labels.labels != label, sampling=grid.spacing_mm)
+    low, high = ([f(a) for a in inside] for f in (np.min, np.max))
+    axes = [
+        np.arange(lo - 2, hi + 3 + _REFINED_MM / s, _REFINED_MM / s)
+        for lo, hi, s in zip(low, high, grid.spacing_mm, strict=True)
+    ]
+    at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    nearest = np.clip(np.round(at), 0, np.array(grid.shape) - 1).astype(int)
+    distance = away[tuple(np.moveaxis(nearest, -1, 0))]
+    values = np.clip(finer_mm + 0.3 * np.maximum(distance - _REFINED_MM, 0.0), finer_mm, edge_mm)
+    points = (at.reshape(-1, 3) * grid.spacing_mm) @ grid.direction.T + grid.origin_mm
+    number = np.arange(len(axes[0]) * len(axes[1]) * len(axes[2])).reshape([len(a) for a in axes])
+    corner = [number[i : number.shape[0] - 1 + i, j : number.shape[1] - 1 + j, k : number.shape[2] - 1 + k].ravel()
+              for i in (0, 1) for j in (0, 1) for k in (0, 1)]  # fmt: skip
+    # Kuhn's six tetrahedra around the cube's diagonal
+    paths = [(0, a, b, 7) for a, b in ((1, 3), (1, 5), (2, 3), (2, 6), (4, 5), (4, 6))]
+    cells = np.concatenate([np.column_stack([corner[c] for c in path]) for path in paths])
+    return points, cells.astype(np.int32), values.ravel()
+
+
+def _named(
+    points: FloatArray, cells: IntArray, found: IntArray, soft: dict[str, int], bones: list[int], labels: LabelMap
+) -> TetMesh:
+    kept = np.isin(found, list(soft.values()))
+    lost = [name for name, number in soft.items() if not (found == number).any()]
+    if lost:
+        raise MrstrainError(
+            f"No cell is left of {', '.join(lost)}: smaller than the mesh can show. Ask for shorter edges, or give its "
+            "label to a neighbour."
+        )
+    body, tissue = cells[kept], found[kept]
+    faces = np.sort(np.concatenate([body[:, face] for face in _FACES]), axis=1)
+    _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
+    outer = first[count == 1]
+    triangles, owner = faces[outer], np.tile(tissue, 4)[outer]
+    bone_faces = np.sort(np.concatenate([cells[np.isin(found, bones)][:, face] for face in _FACES]), axis=1)
+    at_bone = _rows_in(triangles, bone_faces)
+    free = ~at_bone
+    cut = np.zeros(len(triangles), dtype=bool)
+    if OUTER in soft:
+        cut = free & (owner != soft[OUTER])
+        cut |= _rim(points, triangles, free & ~cut, cut, labels)
+    facets = {BONE: triangles[at_bone], OUTER: triangles[free & ~cut], CUT: triangles[cut]}
+    regions = {name: np.flatnonzero(tissue == number) for name, number in soft.items()}
+    return TetMesh(points, body, regions, {name: rows for name, rows in facets.items() if len(rows)})
+
+
+def _rows_in(rows: IntArray, others: IntArray) -> IntArray:
+    """Which rows are among others, all sorted."""
+    together = np.concatenate([others, rows])
+    _, which = np.unique(together, axis=0, return_inverse=True)
+    which = which.ravel()
+    return np.asarray(np.isin(which[len(others) :], which[: len(others)]))
+
+
+def _rim(points: FloatArray, triangles: IntArray, asked: FloatArray, cut: FloatArray, labels: LabelMap) -> FloatArray:
+    """Faces of the skin that lie in the plane of a cut close by: the skin's own section."""
+    rim = np.zeros(len(triangles), dtype=bool)
+    if not cut.any() or not asked.any():
+        return rim
+    corners = points[triangles]
+    centre = corners.mean(axis=1)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    far = 5.0 * float(labels.grid.spacing_mm.max())
+    distance, nearest = cKDTree(centre[cut]).query(centre[asked])
+    plane = normal[cut][nearest]
+    aligned = np.abs(np.einsum("ij,ij->i", plane, normal[asked])) > 0.9
+    offset = np.abs(np.einsum("ij,ij->i", plane, centre[asked] - centre[cut][nearest]))
+    rim[asked] = aligned & (distance < far) & (offset < 0.25 * far)
+    return rim
+
+
+def _quality(mesh: TetMesh, labels: LabelMap, soft: dict[str, int]) -> MeshQuality:
+    angles = dihedral_angles_deg(mesh.points_mm[mesh.cells])
+    ends = [mesh.points_mm[mesh.cells[:, i]] - mesh.points_mm[mesh.cells[:, j]] for i in range(4) for j in range(i)]
+    low, middle, high = np.percentile(np.linalg.norm(np.concatenate(ends), axis=1), [5, 50, 95])
+    voxel_ml = labels.grid.voxel_volume_mm3 / 1000.0
+    volumes = tuple(
+        (name, float(mesh.volumes_mm3[mesh.regions[name]].sum()) / 1000.0, voxel_ml * float((labels.labels == n).sum()))
+        for name, n in soft.items()
+    )
+    return MeshQuality(
+        len(mesh.cells), len(mesh.points_mm), float(angles.min()), float(angles.max()),
+        (float(low), float(middle), float(high)), volumes, _thin(mesh),
+    )  # fmt: skip
+
+
+def _thin(mesh: TetMesh) -> tuple[tuple[str, float], ...]:
+    """Share of the outer tissue's cells that reach from the outer surface to the tissue beneath."""
+    if OUTER not in mesh.regions or OUTER not in mesh.facets:
+        return ()
+    outer = np.zeros(len(mesh.points_mm), dtype=bool)
+    outer[mesh.facets[OUTER]] = True
+    beneath = np.zeros(len(mesh.points_mm), dtype=bool)
+    for name, cells in mesh.regions.items():
+        if name != OUTER:
+            beneath[mesh.cells[cells]] = True
+    skin = mesh.cells[mesh.regions[OUTER]]
+    across = outer[skin].any(axis=1) & beneath[skin].any(axis=1)
+    return ((OUTER, float(across.mean())),)
+
+
+def dihedral_angles_deg(corners: FloatArray) -> FloatArray:
+    """The six angles between the faces of tetrahedra (m, 6), degrees, from their corners (m, 4, 3)."""
+    normals = []
+    for a, b, c, d in ((1, 2, 3, 0), (0, 2, 3, 1), (0, 1, 3, 2), (0, 1, 2, 3)):
+        normal = np.cross(corners[:, b] - corners[:, a], corners[:, c] - corners[:, a])
+        inward = np.einsum("ij,ij->i", normal, corners[:, d] - corners[:, a]) > 0
+        normal[inward] *= -1.0
+        normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    cosines = [np.einsum("ij,ij->i", normals[i], normals[j]) for i in range(4) for j in range(i)]
+    return np.asarray(180.0 - np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))).T

@@ -1,0 +1,145 @@
+"""Newton's method for one state of load: steps that keep every cell from folding, and a count of what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvc.arrays import FloatArray, IntArray
+from fe.assembly import Assembler
+from fe.linear import Factors, SingularError
+
+_LEAST_SHARE = 1.0 / 256.0
+_NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at
+_LEAST_VOLUME = 0.02  # det F at a quadrature point below this is on its way to folding
+_MOST_GROWTH = 3.0  # of the residual in one step
+_HELD = 1e12  # put on the diagonal of an equation whose unknown is held
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """When a state counts as in equilibrium.
+
+    Attributes
+    ----------
+    force : float
+        Largest norm of the forces out of balance, as a share of the forces on the plate and fixed nodes.
+    step_mm : float
+        Largest change of a displacement in the last step, mm.
+    iterations : int
+        Steps before giving up.
+    """
+
+    force: float = 1e-4
+    step_mm: float = 1e-3
+    iterations: int = 25
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Converged:
+    """A state in equilibrium, and what it took.
+
+    Attributes
+    ----------
+    state : (unknowns,)
+    forces : (unknowns,)
+        Internal forces, N.
+    iterations : int
+    """
+
+    state: FloatArray
+    forces: FloatArray
+    iterations: int
+
+
+def equilibrium(
+    assembler: Assembler,
+    factors: Factors,
+    state: FloatArray,
+    outside: FloatArray,
+    held: IntArray,
+    moves: FloatArray,
+    tolerance: Tolerance,
+    changed: Callable[[FloatArray, FloatArray], bool] = lambda _state, _forces: False,
+    told: Callable[[str], None] = lambda _: None,
+) -> Converged | None:
+    """Find the state in which internal forces balance those from outside.
+
+    Parameters
+    ----------
+    state : (unknowns,)
+        First guess.
+    outside : (equations,)
+        Forces from outside, N.
+    held : (h,) int
+        Equations whose unknowns are prescribed.
+    moves : (h,)
+        How far those go from the first guess, mm.
+    tolerance : Tolerance
+    changed : callable
+        ``changed(state, forces)`` is asked once a state is near equilibrium, and again there: whether what the unknowns
+        follow has changed, as where more of a surface touches. It may move the state to where that is so.
+    told : callable
+        Gets a line for each step.
+
+    Returns
+    -------
+    Converged or None
+        None if it does not converge.
+    """
+    now = state.copy()
+    left = moves.copy()
+    displacements = 3 * len(assembler.model.space.nodes_mm)
+    forces, residual, lowest = assembler.residual(now)
+    if not lowest > 0.0:
+        return None
+    for iteration in range(1, tolerance.iterations + 1):
+        data = assembler.tangent(now)
+        data[assembler.indptr[held]] += _HELD
+        right = outside - residual
+        right[held] = _HELD * left
+        right[assembler.idle] = 0.0
+        try:
+            factors.factorise(data)
+        except SingularError:
+            return None
+        change = assembler.spread(factors.solve(right))
+        if not np.isfinite(change).all():
+            return None
+        before, share = _norm(right, held, assembler), 1.0
+        while True:
+            tried = now + share * change
+            forces, residual, lowest = assembler.residual(tried)
+            after = _norm(outside - residual, held, assembler)
+            if lowest > _LEAST_VOLUME and (left.any() or after <= _MOST_GROWTH * before or iteration == 1):
+                break
+            share *= 0.5
+            if share < _LEAST_SHARE:
+                return None
+        now, left = tried, (1.0 - share) * left
+        largest = share * float(np.abs(change[:displacements]).max())
+        balance = after / max(_reaction(assembler, forces), 1e-9)
+        told(f"    {iteration}: out of balance {balance:.1e}, step {largest:.1e} mm, least det F {lowest:.3f}")
+        if left.any() or balance > _NEAR:
+            continue
+        if changed(now, forces):
+            forces, residual, lowest = assembler.residual(now)
+        elif balance <= tolerance.force and largest <= tolerance.step_mm:
+            return Converged(now, forces, iteration)
+    return None
+
+
+def _norm(residual: FloatArray, held: IntArray, assembler: Assembler) -> float:
+    """Of the forces out of balance, N."""
+    balance = residual.copy()
+    balance[held] = 0.0
+    balance[assembler.idle] = 0.0
+    return float(np.linalg.norm(balance[assembler.force_equations]))
+
+
+def _reaction(assembler: Assembler, forces: FloatArray) -> float:
+    """Norm of the force that fixed nodes and shared equations carry, N."""
+    carried = (assembler.equation < 0) | (assembler.equation >= assembler.own_equations)
+    return float(np.linalg.norm(forces[carried]))

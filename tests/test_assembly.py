@@ -1,0 +1,177 @@
+"""Mixed elements: tables, tangent, patch test, closed forms of homogeneous states, shared equations, both solvers."""
+
+import math
+
+import numpy as np
+import pytest
+
+from fe.assembly import Assembler, Model
+from fe.elements import Space, element
+from fe.linear import SingularError, factors
+from fe.materials import Hencky, NeoHooke, Ogden, Yeoh
+from fe.newton import Tolerance, equilibrium
+from tests.blocks import block
+
+ELEMENTS = ("P1", "MINI", "P2")
+DEGREE = {"P1": 1, "MINI": 5, "P2": 2}
+SOFT, STIFF = Ogden.from_ansys(0.0034, 6.2), Yeoh.of(0.265, 1.923)
+
+
+def model_of(name: str, layers: int = 2, count: int = 2) -> Model:
+    mesh = block((2 * count, count, count), (8.0, 4.0, 4.0), layers, wobble=0.15)
+    laws = {f"layer {k}": (SOFT, STIFF)[k % 2] for k in range(layers)}
+    return Model.of(mesh, laws, element(name))
+
+
+def unknowns(nodes: np.ndarray, *axes: int) -> np.ndarray:
+    return (3 * nodes[:, None] + np.array(axes)).ravel()
+
+
+@pytest.mark.parametrize("name", ELEMENTS)
+def test_quadrature_is_exact_to_its_degree(name: str) -> None:
+    table = element(name)
+    x, y, z = table.pressure[:, 1:].T
+    wrong = {}
+    for degree in range(DEGREE[name] + 2):
+        for i in range(degree + 1):
+            for j in range(degree + 1 - i):
+                k = degree - i - j
+                exact = 6 * math.prod(map(math.factorial, (i, j, k))) / math.factorial(degree + 3)
+                wrong[degree] = max(wrong.get(degree, 0.0), abs((table.weights * x**i * y**j * z**k).sum() - exact))
+    assert max(wrong[d] for d in range(DEGREE[name] + 1)) < 1e-15
+    assert wrong[DEGREE[name] + 1] > 1e-6  # and to no more
+
+
+@pytest.mark.parametrize("name", ELEMENTS)
+def test_the_functions_gradients(name: str) -> None:
+    table = element(name)
+    share = table.gradients[:, : 4 if name == "MINI" else None]
+    assert np.abs(share.sum(axis=1)).max() < 1e-14  # a translation has no gradient
+    if name == "P2":  # the function of an edge's middle is 4 b_i b_j
+        h, b = 1e-6, table.pressure[0]
+        for axis in range(3):
+            step = h * np.eye(4)[axis + 1] - h * np.eye(4)[0]
+            plus, minus = (4 * c[1] * c[2] for c in (b + step, b - step))
+            assert table.gradients[0, 5, axis] == pytest.approx((plus - minus) / (2 * h), abs=1e-8)
+
+
+def test_pressure_jumps_between_tissues_and_nowhere_else() -> None:
+    mesh = block((4, 2, 2), (8.0, 4.0, 4.0), layers=2)
+    tissue = np.zeros(len(mesh.cells), dtype=int)
+    tissue[mesh.regions["layer 1"]] = 1
+    space = Space.on(mesh, "P1", tissue)
+    border = int(np.isclose(mesh.points_mm[:, 0], 4.0).sum())
+    assert space.pressures == len(mesh.points_mm) + border
+
+
+@pytest.mark.parametrize("name", ELEMENTS)
+def test_tangent_is_the_derivative_of_the_residual(name: str) -> None:
+    model = model_of(name)
+    nodes = model.space.nodes_mm
+    left, right = (np.flatnonzero(np.isclose(nodes[:, 0], x)) for x in (0.0, 8.0))
+    assembler = Assembler(model, unknowns(left, 0, 1, 2), {k: unknowns(right, k) for k in range(3)})
+    random = np.random.default_rng(0)
+    state = np.zeros(model.unknowns)
+    corner = np.unique(model.space.cells[:, :4])
+    state[unknowns(corner, 0, 1, 2)] = 0.05 * random.normal(size=3 * len(corner))
+    state[3 * len(nodes) :] = 0.01 * random.normal(size=model.space.pressures)
+    for followers in ({}, {k: unknowns(right[::2], k) for k in range(3)}):
+        assembler.share(followers)
+        change = random.normal(size=assembler.size)
+        change[assembler.idle] = 0.0
+        h = 1e-6
+        ahead, behind = (assembler.residual(state + s * h * assembler.spread(change))[1] for s in (1, -1))
+        upper = np.zeros((assembler.size, assembler.size))
+        data = assembler.tangent(state)
+        for row in range(assembler.size):
+            at = slice(assembler.indptr[row], assembler.indptr[row + 1])
+            upper[row, assembler.indices[at]] = data[at]
+        whole = upper + np.triu(upper, 1).T
+        expected = (ahead - behind) / (2 * h)
+        assert np.abs(whole @ change - expected).max() < 1e-8 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("name", ELEMENTS)
+def test_patch(name: str) -> None:
+    """A uniform deformation of one tissue, its border moved accordingly, is found exactly on a crooked mesh."""
+    model = model_of(name, layers=1)
+    nodes = model.space.nodes_mm
+    corners = np.zeros(len(nodes), dtype=bool)
+    corners[np.unique(model.space.cells[:, : 10 if name == "P2" else 4])] = True
+    rim = corners & ((nodes <= 1e-9) | (nodes >= np.array([8.0, 4.0, 4.0]) - 1e-9)).any(axis=1)
+    F = np.array([[1.2, 0.3, 0.0], [0.0, 0.9, 0.1], [0.05, 0.0, 0.95]])
+    F /= np.cbrt(np.linalg.det(F) / 1.0002)
+    assembler = Assembler(model, unknowns(np.flatnonzero(rim), 0, 1, 2), {})
+    state = np.zeros(model.unknowns)
+    for share in (0.5, 1.0):
+        gradient = (np.eye(3) + share * (F - np.eye(3))) - np.eye(3)
+        state[unknowns(np.flatnonzero(corners), 0, 1, 2)] = (nodes[corners] @ gradient.T).ravel()
+        found = equilibrium(
+            assembler, factors(assembler.indptr, assembler.indices), state, np.zeros(assembler.size),
+            np.empty(0, dtype=int), np.empty(0), Tolerance(force=1e-10, step_mm=1e-9, iterations=20),
+        )  # fmt: skip
+        assert found is not None
+        state = found.state.copy()
+    gradients = model.gradients(state)
+    assert np.abs(gradients - (F - np.eye(3))).max() < 1e-9
+    pressure = state[3 * len(nodes) :]
+    assert pressure == pytest.approx(SOFT.bulk_modulus_mpa * 2e-4, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ELEMENTS)
+@pytest.mark.parametrize("law", [NeoHooke.of(0.05), SOFT, STIFF, Hencky.of(0.3, nu=0.49)], ids=lambda m: m.law)
+def test_a_bar_pulled_and_pressed_has_the_laws_closed_form(name: str, law) -> None:
+    mesh = block((2, 2, 2), (4.0, 4.0, 4.0), wobble=0.2)
+    model = Model.of(mesh, {"layer 0": law}, element(name))
+    nodes = model.space.nodes_mm
+    flat = [np.flatnonzero(np.isclose(nodes[:, k], 0.0)) for k in range(3)]
+    fixed = np.unique(np.concatenate([unknowns(flat[k], k) for k in range(3)]))
+    end = np.flatnonzero(np.isclose(nodes[:, 0], 4.0))
+    if name == "MINI":
+        end = end[end < len(mesh.points_mm)]
+    assembler = Assembler(model, fixed, {0: unknowns(end, 0)})
+    assembler.share({0: unknowns(end, 0)})
+    solver = factors(assembler.indptr, assembler.indices)
+    held = np.array([assembler.own_equations])
+    for stretch in (1.3, 0.75):
+        state = np.zeros(model.unknowns)
+        for part in (0.5, 0.5):
+            found = equilibrium(
+                assembler, solver, state, np.zeros(assembler.size), held, np.array([part * 4.0 * (stretch - 1.0)]),
+                Tolerance(force=1e-8, step_mm=1e-7, iterations=20),
+            )  # fmt: skip
+            assert found is not None
+            state = found.state
+        # exactly: the law with its own compressibility, free at its sides
+        F = np.eye(3) + model.gradients(state)
+        stress = law.stress(F)
+        assert np.abs(stress[:, 1, 1]).max() < 1e-7 * law.bulk_modulus_mpa
+        force = found.forces[unknowns(end, 0)].sum()
+        assert force == pytest.approx(16.0 * stress[:, 0, 0].mean(), rel=1e-6)
+        # and nearly: the incompressible closed form
+        if law.nu > 0.499:
+            assert force == pytest.approx(16.0 * float(law.nominal_stress([stretch])[0]), rel=5e-3)
+
+
+def test_both_libraries_solve_the_same() -> None:
+    model = model_of("P1")
+    left = np.flatnonzero(np.isclose(model.space.nodes_mm[:, 0], 0.0))
+    assembler = Assembler(model, unknowns(left, 0, 1, 2), {})
+    data, right = assembler.tangent(np.zeros(model.unknowns)), np.random.default_rng(0).normal(size=assembler.size)
+    found = []
+    for library in ("pardiso", "superlu"):
+        solver = factors(assembler.indptr, assembler.indices, library=library)
+        solver.factorise(data)
+        found.append(solver.solve(right))
+        solver.factorise(2.0 * data)  # new values, the same pattern
+        assert solver.solve(right) == pytest.approx(0.5 * found[-1], rel=1e-8, abs=1e-10)
+        solver.close()
+    assert found[0] == pytest.approx(found[1], rel=1e-7, abs=1e-9 * np.abs(found[1]).max())
+
+
+def test_superlu_says_when_a_body_is_free_to_move() -> None:
+    model = model_of("P1", layers=1)
+    assembler = Assembler(model, np.empty(0, dtype=int), {})
+    data = np.zeros(len(assembler.indices))
+    with pytest.raises(SingularError, match="cannot be factorised"):
+        factors(assembler.indptr, assembler.indices, library="superlu").factorise(data)

@@ -1,0 +1,163 @@
+"""A plate pressed and sheared against a dome of tissue on fixed bone: balance, tape, symmetry, frame, refusals."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dvc.errors import InputError
+from dvc.kinematics import StrainField
+from dvc.mesh import TetMesh
+from fe.materials import NeoHooke, Ogden
+from fe.plate import Plate
+from fe.simulate import LoadStep, State, simulate
+from tests.blocks import block
+
+FAT, SKIN = Ogden.from_ansys(0.0034, 6.2), NeoHooke.of(0.2)
+LAWS = {"skin": SKIN, "fat": FAT}
+DOWN, ALONG = [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+PRESS = [LoadStep("pressed", 2.0)]
+
+
+def dome(count: tuple[int, int, int] = (4, 6, 6)) -> TetMesh:
+    """20 x 20 mm, 10 mm high toward the plate at x = 0, its middle 1.5 mm lower than its rim; bone at x = 10."""
+    box = block(count, (10.0, 20.0, 20.0), layers=4, wobble=0.15)
+    points = box.points_mm.copy()
+    radius = np.hypot(points[:, 1] - 10.0, points[:, 2] - 10.0) / 10.0
+    points[:, 0] += 1.5 * radius**2 * (1.0 - points[:, 0] / 10.0)
+    fat = np.concatenate([box.regions[f"layer {k}"] for k in (1, 2, 3)])
+    return TetMesh(
+        points,
+        box.cells,
+        {"skin": box.regions["layer 0"], "fat": fat},
+        {"bone": box.facets["x1"], "skin": box.facets["x0"]},
+    )
+
+
+def press(mesh: TetMesh, loads: list[LoadStep], laws=LAWS, **others) -> list[State]:
+    plate = Plate(others.pop("normal", DOWN), others.pop("shear", ALONG), taped=others.pop("taped", True))
+    return simulate(mesh, laws, plate, loads, **others)
+
+
+@pytest.fixture(scope="module")
+def sheared() -> list[State]:
+    return press(dome(), [LoadStep("pressed", 2.0), LoadStep("sheared", 2.0, 1.0), LoadStep("more", 2.0, 2.0)])
+
+
+def test_the_force_is_the_one_asked_for(sheared: list[State]) -> None:
+    for state, force in zip(sheared, ([2, 0, 0], [2, 1, 0], [2, 2, 0]), strict=True):
+        assert state.reached == 1.0
+        assert state.force_n == pytest.approx(force, abs=1e-3 * np.linalg.norm(force))
+        assert state.curve[-1, 3:] == pytest.approx(state.force_n)
+        assert state.curve[-1, :3] == pytest.approx(state.travel_mm)
+
+
+def test_one_path_from_load_to_load(sheared: list[State]) -> None:
+    travel = np.concatenate([state.curve[:, 1] for state in sheared])
+    assert (np.diff(travel[sheared[0].curve.shape[0] - 1 :]) > 0).all()  # sheared ever further
+    assert sheared[1].travel_mm[1] < sheared[2].travel_mm[1]
+    assert sheared[2].holding >= sheared[1].holding >= sheared[0].holding > 4
+
+
+def test_taped_nodes_never_slide_and_lie_on_the_plate(sheared: list[State]) -> None:
+    mesh = dome()
+    bottom = np.unique(mesh.facets["skin"])
+    at = mesh.points_mm + sheared[0].u_mm
+    on_plate = bottom[np.isclose(at[bottom, 0], at[bottom, 0].min(), atol=1e-9)]
+    assert len(on_plate) == sheared[0].holding
+    moved = (sheared[2].u_mm - sheared[0].u_mm)[on_plate]
+    assert np.ptp(moved, axis=0).max() < 1e-9
+    assert moved[0] == pytest.approx(sheared[2].travel_mm - sheared[0].travel_mm, abs=1e-9)
+    assert (at[bottom, 0] > at[on_plate[0], 0] - 1e-9).all()  # nothing is past the plate
+
+
+def test_bone_does_not_move_and_volume_is_kept(sheared: list[State]) -> None:
+    mesh = dome()
+    for state in sheared:
+        assert np.abs(state.u_mm[np.unique(mesh.facets["bone"])]).max() == 0.0
+        J = StrainField.from_gradient(state.gradients).jacobian
+        assert (J * mesh.volumes_mm3).sum() == pytest.approx(mesh.volumes_mm3.sum(), rel=1e-3)
+
+
+def test_another_frame_gives_the_same(sheared: list[State]) -> None:
+    turn = Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix()
+    mesh = dome()
+    moved = TetMesh(mesh.points_mm @ turn.T + [3.0, -50.0, 20.0], mesh.cells, mesh.regions, mesh.facets)
+    again = press(
+        moved, [LoadStep("pressed", 2.0), LoadStep("sheared", 2.0, 1.0)], normal=turn @ DOWN, shear=turn @ ALONG
+    )
+    for state, turned in zip(sheared, again, strict=False):
+        assert np.abs(turned.u_mm @ turn - state.u_mm).max() < 1e-6
+        assert np.abs(turn.T @ turned.gradients @ turn - state.gradients).max() < 1e-6
+
+
+def test_a_mirrored_problem_has_the_mirrored_answer(sheared: list[State]) -> None:
+    mesh = dome()
+    flip = np.array([1.0, -1.0, 1.0])
+    mirrored = TetMesh(mesh.points_mm * flip, mesh.cells[:, [0, 1, 3, 2]], mesh.regions, mesh.facets)
+    again = press(mirrored, [LoadStep("pressed", 2.0), LoadStep("sheared", 2.0, 1.0)], shear=[0.0, -1.0, 0.0])
+    for state, other in zip(sheared, again, strict=False):
+        assert np.abs(other.u_mm * flip - state.u_mm).max() < 1e-6
+
+
+def test_threads_do_not_change_the_digits_that_matter(sheared: list[State]) -> None:
+    again = press(dome(), PRESS, threads=2)
+    assert np.abs(again[0].u_mm - sheared[0].u_mm).max() < 1e-9
+
+
+def test_without_tape_the_surface_slides() -> None:
+    mesh, soft = dome(), {"skin": FAT, "fat": FAT}
+    taped, slid = (press(mesh, PRESS, soft, taped=tape)[0] for tape in (True, False))
+    assert slid.reached == 1.0
+    assert slid.travel_mm[0] > 1.03 * taped.travel_mm[0]  # softer without the tape's hold: 5 % here
+    assert slid.force_n == pytest.approx([2.0, 0.0, 0.0], abs=2e-3)
+    bottom = np.unique(mesh.facets["skin"])
+    at = mesh.points_mm[bottom] + slid.u_mm[bottom]
+    on_plate = np.isclose(at[:, 0], at[:, 0].min(), atol=1e-9)
+    assert np.ptp(slid.u_mm[bottom][on_plate][:, 1]) > 0.1
+
+
+def test_elements_agree_on_a_fine_mesh() -> None:
+    # Linear tetrahedra without a pressure of their own would be several times too stiff here.
+    mesh = dome((6, 12, 12))
+    travel = {name: press(mesh, PRESS, formulation=name)[0].travel_mm[0] for name in ("P1", "MINI", "P2")}
+    assert travel["P1"] == pytest.approx(travel["P2"], rel=0.08)
+    assert travel["MINI"] == pytest.approx(travel["P2"], rel=0.15)
+
+
+def test_a_load_too_large_ends_with_the_last_state_in_balance() -> None:
+    weak = {"skin": NeoHooke.of(2e-5), "fat": NeoHooke.of(2e-5, nu=0.49)}
+    states = press(
+        dome((2, 4, 4)), [LoadStep("pressed", 1.0), LoadStep("far too much", 1.0, 400.0), LoadStep("never", 2.0)], weak
+    )
+    last = states[-1]
+    assert 0.0 <= last.reached < 1.0
+    assert len(states) < 3
+    assert np.isfinite(last.u_mm).all()
+    assert (StrainField.from_gradient(last.gradients).jacobian > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"loads": [LoadStep("pulled", -1.0)]}, "pulled: the normal force must press"),
+        ({"loads": []}, "No load"),
+        ({"laws": {"fat": FAT}}, "Regions without a law: skin"),
+        ({"laws": LAWS | {"bone": FAT}}, "no region 'bone'; it has skin, fat"),
+        ({"facets": {"skin": None}}, "no facets 'bone'"),
+        ({"formulation": "P3"}, "No element 'P3'"),
+        ({"normal": [1.0, 0, 0], "shear": [1.0, 0, 0]}, "parallel"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(change: dict, said: str) -> None:
+    mesh = dome((2, 2, 2))
+    if "facets" in change:
+        mesh = TetMesh(mesh.points_mm, mesh.cells, mesh.regions, {"skin": mesh.facets["skin"]})
+        change = {}
+    loads, laws = change.pop("loads", PRESS), change.pop("laws", LAWS)
+    with pytest.raises(InputError, match=said):
+        press(mesh, loads, laws, **change)
+
+
+def test_a_gap_must_not_be_negative() -> None:
+    with pytest.raises(InputError, match="0 mm or more"):
+        Plate(DOWN, ALONG, gap_mm=-1.0)
