@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 
+from dvc.arrays import FloatArray, IntArray
 from dvc.figures import REGION_COLOURS
-from dvc.sheet import chart, label_axes, png_bytes
+from dvc.kinematics import StrainField
+from dvc.mesh import TetMesh
+from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.fitting import Curve, Fit
+from fe.plate import Plate
+from fe.simulate import State
 
 _POINTS = 200
+_LARGEST = 0.5  # maximal shear at the end of the colour scale
 
 
 def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
@@ -34,4 +44,91 @@ def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
     axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
     label_axes(axes, "stretch", "nominal stress, kPa")
     axes.legend(fontsize=9, frameon=False)
+    return png_bytes(figure)
+
+
+def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate, point_mm: FloatArray) -> bytes:
+    """Maximal shear on the slice through the bone's lowest point, along the plate's normal and the shear's direction.
+
+    Cells are cut in the unloaded configuration and drawn where they are under load; the dashed line is the plate.
+    """
+    rows, columns = (len(states) + 1) // 2, min(len(states), 2)
+    figure = Figure(figsize=(WIDTH_IN, 3.4 * rows + 0.7), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[len(states) :]:
+        axes.set_visible(False)
+    for axes, state in zip(panels, states, strict=False):
+        cells, corners = cut(mesh, state.u_mm, plate.axes, point_mm)
+        shear = StrainField.from_gradient(state.gradients[cells]).max_shear
+        drawn = PolyCollection(
+            corners, array=shear, cmap="viridis", norm=Normalize(0.0, _LARGEST), edgecolors="face", linewidths=0.2
+        )
+        axes.add_collection(drawn)
+        axes.autoscale_view()
+        axes.axhline(
+            float(((mesh.points_mm + state.u_mm) @ plate.axes[:, 0]).min()), color=INK, linewidth=1.0, linestyle="--"
+        )
+        axes.set_aspect("equal")
+        load = state.load
+        axes.set_title(f"{load.name}: {load.normal_n:g} N normal, {load.shear_n:g} N shear", color=INK, **FONT)
+        label_axes(axes, "along the shear, mm", "along the normal force, mm")
+    bar = figure.colorbar(drawn, ax=list(panels[: len(states)]), shrink=0.8, extend="max")
+    bar.set_label("maximal shear", color=INK, **FONT)
+    return png_bytes(figure)
+
+
+def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray) -> tuple[IntArray, list[FloatArray]]:
+    """Cells that the plane of the plate's first two axes cuts, and each one's polygon where it is under load.
+
+    Returns
+    -------
+    cells : (k,)
+    polygons : list of (3 or 4, 2)
+        Along shear and normal force, mm.
+    """
+    height = (mesh.points_mm - point_mm) @ axes[:, 2]
+    height = np.where(height == 0.0, 1e-9, height)
+    now = (mesh.points_mm + u_mm) @ axes[:, [1, 0]]
+    sides = height[mesh.cells] > 0.0
+    cells = np.flatnonzero(sides.any(axis=1) & ~sides.all(axis=1))
+    polygons = []
+    for cell in cells:
+        nodes, side = mesh.cells[cell], sides[cell]
+        above, below = nodes[side], nodes[~side]
+        # around the section: two pairs of edges share a corner, so that the polygon does not cross itself
+        pairs = [(a, b) for a in above for b in below]
+        if len(pairs) == 4:
+            pairs = [pairs[0], pairs[1], pairs[3], pairs[2]]
+        share = [height[a] / (height[a] - height[b]) for a, b in pairs]
+        polygons.append(np.array([(1 - s) * now[a] + s * now[b] for (a, b), s in zip(pairs, share, strict=True)]))
+    return cells, polygons
+
+
+def force_travel(states: Sequence[State]) -> bytes:
+    """Force of the plate over its travel since the first touch, along the normal force (left) and the shear (right)."""
+    figure, panels = chart(2)
+    for axes, axis, name in zip(panels, (0, 1), ("normal", "shear"), strict=True):
+        for number, state in enumerate(states):
+            axes.plot(
+                state.curve[:, axis], state.curve[:, 3 + axis], marker=".", label=state.load.name, linewidth=1.8,
+                color=REGION_COLOURS[number % len(REGION_COLOURS)],
+            )  # fmt: skip
+        label_axes(axes, f"{name} travel, mm", f"{name} force, N")
+    panels[0].legend(fontsize=9, frameon=False)
+    return png_bytes(figure)
+
+
+def mesh_slice(mesh: TetMesh, point_mm: FloatArray, axes: FloatArray) -> bytes:
+    """The mesh on a slice through the bone's lowest point, coloured by tissue."""
+    figure, (panel,) = chart()
+    cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), axes, point_mm)
+    for number, (name, members) in enumerate(mesh.regions.items()):
+        mine = [c for c, inside in zip(corners, np.isin(cells, members), strict=True) if inside]
+        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+        panel.add_collection(PolyCollection(mine, facecolors=colour, edgecolors="white", linewidths=0.3, label=name))
+    panel.autoscale_view()
+    panel.set_aspect("equal")
+    label_axes(panel, "along the shear, mm", "along the normal force, mm")
+    panel.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return png_bytes(figure)

@@ -92,6 +92,8 @@ def simulate(
     *,
     formulation: str = "P1",
     threads: int = 1,
+    keep: Callable[[State], None] = lambda _: None,
+    progress: Callable[[float], None] = lambda _: None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> list[State]:
     """Press and shear soft tissue with a rigid plate.
@@ -108,6 +110,10 @@ def simulate(
         As in `fe.elements`.
     threads : int
         Of the linear algebra.
+    keep : callable
+        Gets each load's state as soon as it is there.
+    progress : callable
+        Gets the share of all loads that is done.
     tell : callable
         Gets a line for each step.
 
@@ -128,11 +134,17 @@ def simulate(
     states: list[State] = []
     try:
         path.approach(loads[0].normal_n)
+        progress(0.3 / len(loads))
         before = path.force.copy()
-        for load in loads:
+        for number, load in enumerate(loads):
+            first = 0.3 if number == 0 else 0.0
             target = np.array([load.normal_n, load.shear_n, 0.0])
             began, counted, known = time.monotonic(), path.iterations if states else 0, len(path.curve) if states else 0
-            reached = path.raise_force(before, target)
+
+            def told(share: float, done: int = number, first: float = first) -> None:
+                progress((done + first + (1.0 - first) * share) / len(loads))
+
+            reached = path.raise_force(before, target, told)
             displacements = 3 * len(model.space.nodes_mm)
             u = path.state[:displacements].reshape(-1, 3)[: len(mesh.points_mm)]
             states.append(
@@ -143,6 +155,7 @@ def simulate(
                     time.monotonic() - began,
                 )
             )  # fmt: skip
+            keep(states[-1])
             if reached < 1.0:
                 break
             before = target
@@ -213,7 +226,7 @@ class _Path:
                 self._restore(kept)
                 step *= _SHRINK
 
-    def raise_force(self, before: FloatArray, target: FloatArray) -> float:
+    def raise_force(self, before: FloatArray, target: FloatArray, progress: Callable[[float], None]) -> float:
         """Raise the force from what it is to the target, in steps as large as converge; the share reached."""
         done, step = 0.0, _FIRST_STEP
         while done < 1.0 and step > _LEAST_STEP:
@@ -222,6 +235,7 @@ class _Path:
             if self._go(before + share * (target - before), [], np.zeros(0)):
                 done, step = share, step * _GROWTH
                 self._told(f"{done:.0%} of the way")
+                progress(done)
             else:
                 self._restore(kept)
                 step *= _SHRINK

@@ -1,0 +1,163 @@
+"""A simulation and its results: a `Deformation`, VTU files for ParaView, tables by region."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import meshio
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.kinematics import StrainField
+from dvc.mesh import TetMesh
+from dvc.onmesh import OnMesh
+from dvc.regions import SHEAR_THRESHOLDS, volume_above
+from dvc.whole import whole_file, write_whole
+from fe.materials import Material
+from fe.simulate import State
+
+CURVE = ("travel_normal_mm", "travel_shear_mm", "travel_third_mm", "force_normal_n", "force_shear_n", "force_third_n")
+
+
+def deformation(mesh: TetMesh, state: State) -> OnMesh:
+    """The simulated deformation at any point of the mesh."""
+    return OnMesh(mesh, state.u_mm)
+
+
+def cauchy_stress(state: State, mesh: TetMesh, laws: Mapping[str, Material]) -> FloatArray:
+    """Cauchy stress of each cell (m, 3, 3), MPa, LPS: the law's deviator, and the mean of the cell's pressures."""
+    F = np.eye(3) + state.gradients
+    stress = np.empty_like(F)
+    for region, law in laws.items():
+        cells = mesh.regions[region]
+        kirchhoff = law.stress(F[cells]) @ F[cells].transpose(0, 2, 1)
+        deviator = kirchhoff - np.trace(kirchhoff, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+        volume = np.linalg.det(F[cells])[:, None, None]
+        stress[cells] = deviator / volume + state.pressure_mpa[cells].mean(axis=1)[:, None, None] * np.eye(3)
+    return stress
+
+
+def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
+    """Volume of the cells around each node over that in the reference configuration: det F of its patch, (n,)."""
+    nodes = mesh.cells.ravel()
+    before = np.bincount(nodes, np.repeat(mesh.volumes_mm3, 4))
+    return np.asarray(np.bincount(nodes, np.repeat(mesh.volumes_mm3 * jacobian, 4)) / before)
+
+
+@dataclass(frozen=True, slots=True)
+class RegionFigures:
+    """A region under a load; percentiles are of volume.
+
+    Attributes
+    ----------
+    load, region : str
+    volume_ml : float
+        In the reference configuration.
+    shear_p50, shear_p90, shear_p99 : float
+        Of the maximal shear (E1 - E3) / 2.
+    above_ml : tuple of float
+        Volume whose maximal shear exceeds 0.2, 0.3, 0.4, 0.5.
+    volume_change : float
+        Of the whole region, as a share of its volume.
+    stable_share : float
+        Share of the volume in which the law is stable (Drucker) at the strain reached.
+    """
+
+    load: str
+    region: str
+    volume_ml: float
+    shear_p50: float
+    shear_p90: float
+    shear_p99: float
+    above_ml: tuple[float, ...]
+    volume_change: float
+    stable_share: float
+
+
+def region_figures(mesh: TetMesh, state: State, laws: Mapping[str, Material]) -> list[RegionFigures]:
+    """Figures of each region under a load."""
+    strain = StrainField.from_gradient(state.gradients)
+    rows = []
+    for region, law in laws.items():
+        cells = mesh.regions[region]
+        volumes = mesh.volumes_mm3[cells]
+        shear = strain.max_shear[cells]
+        p50, p90, p99 = volume_percentiles(shear, volumes, (0.5, 0.9, 0.99))
+        stable = law.is_stable(np.eye(3) + state.gradients[cells])
+        rows.append(
+            RegionFigures(
+                state.load.name, region, float(volumes.sum()) / 1000.0, p50, p90, p99,
+                tuple(volume_above(shear, volumes / 1000.0, SHEAR_THRESHOLDS).tolist()),
+                float(volumes @ strain.jacobian[cells] / volumes.sum()) - 1.0,
+                float(volumes[stable].sum() / volumes.sum()),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def volume_percentiles(values: FloatArray, volumes: FloatArray, shares: Sequence[float]) -> tuple[float, ...]:
+    """Values (n,) below which these shares of the volume lie.
+
+    Examples
+    --------
+    >>> volume_percentiles(np.array([0.1, 0.3, 0.2]), np.array([1.0, 1.0, 2.0]), [0.5])
+    (0.2,)
+    """
+    order = np.argsort(values)
+    below = np.cumsum(volumes[order]) / volumes.sum()
+    at = np.minimum(np.searchsorted(below, shares), len(values) - 1)
+    return tuple(float(v) for v in values[order][at])
+
+
+def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
+    """Write the figures of regions, a row for each load and region."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    above = [f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS]
+    writer.writerow(
+        ["load", "region", "volume_ml", "max_shear_p50", "max_shear_p90", "max_shear_p99", *above, "volume_change",
+         "stable_share"]
+    )  # fmt: skip
+    for row in rows:
+        numbers = (row.volume_ml, row.shear_p50, row.shear_p90, row.shear_p99, *row.above_ml, row.volume_change)
+        writer.writerow([row.load, row.region, *(f"{v:.6g}" for v in numbers), f"{row.stable_share:.6g}"])
+    write_whole(path, text.getvalue())
+
+
+def write_curve_csv(path: Path, states: Sequence[State]) -> None:
+    """Write the force-travel curve: every state of equilibrium, in the plate's axes."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["load", *CURVE])
+    for state in states:
+        writer.writerows([state.load.name, *(f"{v:.8g}" for v in row)] for row in state.curve)
+    write_whole(path, text.getvalue())
+
+
+def write_state(path: Path, mesh: TetMesh, state: State, laws: Mapping[str, Material]) -> None:
+    """Write a load's results as VTU: LPS mm and MPa, on the undeformed mesh (warp by ``displacement_mm``).
+
+    At nodes: displacement, and det F of the patch around each. In cells: number of the region, F, Green-Lagrange
+    strain, its maximal shear, det F, pressure (positive in tension) and Cauchy stress.
+    """
+    strain = StrainField.from_gradient(state.gradients)
+    region = np.zeros(len(mesh.cells), dtype=np.int64)
+    for number, name in enumerate(mesh.regions, start=1):
+        region[mesh.regions[name]] = number
+    cell = {
+        "region": region,
+        "F": (np.eye(3) + state.gradients).reshape(-1, 9),
+        "green_lagrange": strain.green_lagrange.reshape(-1, 9),
+        "max_shear": strain.max_shear,
+        "jacobian": strain.jacobian,
+        "pressure_mpa": state.pressure_mpa.mean(axis=1),
+        "cauchy_stress_mpa": cauchy_stress(state, mesh, laws).reshape(-1, 9),
+    }
+    point = {"displacement_mm": state.u_mm, "patch_jacobian": patch_volumes(mesh, strain.jacobian)}
+    written = meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], point, {name: [v] for name, v in cell.items()})
+    with whole_file(path) as part:
+        meshio.vtu.write(part, written, binary=True)

@@ -1,0 +1,147 @@
+"""Label map to mesh: borders keep volumes, tissues and surfaces keep their names, what cannot be meshed is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.errors import InputError, MrstrainError, OutputError
+from dvc.image import Grid, LabelMap
+from dvc.imagewrite import write_labels
+from dvc.mesh import TetMesh
+from fe.meshing import dihedral_angles_deg, mesh_labels
+from fe.meshstore import read_tet_mesh, write_tet_mesh
+from fe.surfaces import borders_of, labels_at
+from tests.blocks import block
+
+NAMES = {1: "bone", 2: "fat", 3: "skin"}
+
+
+def half_onion(spacing: float = 1.0) -> LabelMap:
+    """Half a ball, cut at z = 0: bone of 6 mm inside fat to 14 mm inside a skin to 17 mm; an oblique grid."""
+    turn = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    grid = Grid((44, 44, 28), (spacing, spacing, spacing), turn @ np.array([-21.5, -21.5, -23.0]), turn)
+    points = grid.points()
+    radius = np.linalg.norm(points, axis=-1)
+    labels = np.select([radius < 6, radius < 14, radius < 17], [1, 2, 3], 0) * (points[..., 2] < 0)
+    return LabelMap(grid, labels, NAMES)
+
+
+@pytest.fixture(scope="module")
+def meshed() -> tuple[TetMesh, object]:
+    return mesh_labels(half_onion(), 4.0)
+
+
+def test_borders_keep_the_volumes_that_smoothing_would_take() -> None:
+    labels = half_onion()
+    borders = borders_of(labels)
+    for number in NAMES:
+        voxels = float((labels.labels == number).sum()) / 1000.0
+        assert borders.volume_ml(number) == pytest.approx(voxels, rel=0.01)  # plain relaxation loses 4 %
+    points = labels.grid.points(labels.labels >= 0)
+    # a voxel's centre may fall on the other side only where a border is: none by more than half a voxel
+    radius = np.linalg.norm(points, axis=-1)
+    sure = (np.abs(radius[:, None] - [6, 14, 17]).min(axis=1) > 1.0) & (np.abs(points[:, 2]) > 1.0)
+    assert np.array_equal(labels_at(borders, points[sure]), labels.labels.reshape(-1)[sure])
+
+
+def test_tissues_have_their_volumes_and_good_cells(meshed) -> None:
+    mesh, quality = meshed
+    assert set(mesh.regions) == {"fat", "skin"}
+    for name, made, given in quality.volumes_ml:
+        assert made == pytest.approx(given, rel=0.02), name
+        assert made == pytest.approx(float(mesh.volumes_mm3[mesh.regions[name]].sum()) / 1000.0)
+    assert quality.least_angle_deg > 10.0
+    assert 2.0 < quality.edge_mm[1] < 5.0
+    counted = np.concatenate(list(mesh.regions.values()))
+    assert len(np.unique(counted)) == len(counted) == len(mesh.cells)
+
+
+def test_surfaces_lie_where_they_should(meshed) -> None:
+    mesh, _ = meshed
+    radius = {name: np.linalg.norm(mesh.points_mm[np.unique(rows)], axis=1) for name, rows in mesh.facets.items()}
+    assert set(radius) == {"bone", "skin", "cut"}
+    assert radius["bone"] == pytest.approx(6.0, abs=0.8)
+    assert np.mean(radius["skin"] < 16.0) < 0.03  # its own section at the cut counts as cut, but for its very rim
+    assert np.abs(mesh.points_mm[np.unique(mesh.facets["cut"]), 2] + 0.5).max() < 0.8
+    whole = np.concatenate(list(mesh.facets.values()))
+    assert len(np.unique(np.sort(whole, axis=1), axis=0)) == len(whole)
+    edges = np.sort(np.concatenate([whole[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)
+    _, times = np.unique(edges, axis=0, return_counts=True)
+    assert (times % 2 == 0).all()  # closed
+
+
+def test_a_finer_skin_is_more_than_one_cell_thick(meshed) -> None:
+    _, coarse = meshed
+    _, fine = mesh_labels(half_onion(), 4.0, finer=("skin", 1.4))
+    assert dict(fine.thin)["skin"] < 0.3 < dict(coarse.thin)["skin"]
+
+
+def test_dihedral_angles_of_known_shapes() -> None:
+    corner = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]])
+    assert sorted(dihedral_angles_deg(corner)[0]) == pytest.approx([np.degrees(np.arccos(3**-0.5))] * 3 + [90.0] * 3)
+    regular = np.array([[[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]])
+    assert dihedral_angles_deg(regular)[0] == pytest.approx(np.degrees(np.arccos(1 / 3)))
+
+
+def test_what_cannot_be_meshed_is_refused() -> None:
+    labels = half_onion()
+    for edge in (0.1, 50.0, float("nan")):
+        with pytest.raises(InputError, match="edge length must lie between"):
+            mesh_labels(labels, edge)
+    with pytest.raises(InputError, match="no region 'calcaneus'; it has bone, fat, skin"):
+        mesh_labels(labels, 4.0, bones=("calcaneus",))
+    with pytest.raises(InputError, match="No soft tissue"):
+        mesh_labels(labels, 4.0, bones=("bone", "fat", "skin"))
+    with pytest.raises(InputError, match="finer edge length"):
+        mesh_labels(labels, 4.0, finer=("skin", 6.0))
+
+
+def test_meshing_that_does_not_end_is_ended() -> None:
+    with pytest.raises(MrstrainError, match=r"given up after 1 s\. Ask for longer edges"):
+        mesh_labels(half_onion(), 0.6, limit_s=1.0)
+
+
+def test_a_mesh_comes_back_with_every_name(tmp_path: Path) -> None:
+    box = block((2, 2, 2), (4.0, 4.0, 4.0), layers=2)
+    mesh = TetMesh(
+        box.points_mm, box.cells, {"fat": box.regions["layer 0"], "skin": box.regions["layer 1"]},
+        {"bone": box.facets["x0"], "skin": box.facets["x1"]},
+    )  # fmt: skip
+    write_tet_mesh(tmp_path / "box.vtu", mesh, {"made": "here"})
+    again = read_tet_mesh(tmp_path / "box.vtu")
+    assert np.array_equal(again.cells, mesh.cells)
+    assert {k: v.tolist() for k, v in again.regions.items()} == {k: v.tolist() for k, v in mesh.regions.items()}
+    assert {k: v.tolist() for k, v in again.facets.items()} == {k: v.tolist() for k, v in mesh.facets.items()}
+    (tmp_path / "box.json").unlink()
+    assert set(read_tet_mesh(tmp_path / "box.vtu").regions) == {"region 1", "region 2"}
+    (tmp_path / "box.json").write_text("{}")
+    with pytest.raises(InputError, match=r"box\.json: no table of regions"):
+        read_tet_mesh(tmp_path / "box.vtu")
+
+
+def test_the_command_writes_mesh_names_and_picture(tmp_path: Path) -> None:
+    from typer.testing import CliRunner
+
+    from mrstrain.cli import app
+
+    write_labels(tmp_path / "map.nii.gz", half_onion())
+    given = ["--edge-mm", "5", "--names", str(tmp_path / "map.csv"), "--out", str(tmp_path / "out" / "onion.vtu")]
+    done = CliRunner().invoke(app, ["mesh", str(tmp_path / "map.nii.gz"), *given])
+    assert done.exit_code == 0, done.output
+    assert "tetrahedra" in done.output
+    assert set(read_tet_mesh(tmp_path / "out" / "onion.vtu").regions) == {"fat", "skin"}
+    told = json.loads((tmp_path / "out" / "onion.json").read_text())
+    assert told["parameters"]["edge_mm"] == 5.0
+    assert told["quality"]["cells"] > 100
+    assert (tmp_path / "out" / "onion.png").stat().st_size > 10_000
+
+
+def test_the_command_replaces_no_input(tmp_path: Path) -> None:
+    from mrstrain.meshing import mesh
+
+    with pytest.raises(InputError, match=r"ends in \.vtu"):
+        mesh("a.nii.gz", out=tmp_path / "mesh.msh")
+    with pytest.raises(OutputError, match="would be replaced"):
+        mesh("a.nii.gz", names=tmp_path / "heel.json", out=tmp_path / "heel.vtu")
