@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dvc.arrays import FloatArray, IntArray
+from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.image import LabelMap
 from dvc.mesh import TetMesh
@@ -23,6 +23,8 @@ BONE, OUTER, CUT = "bone", "skin", "cut"
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
 _SECONDS_PER_TRIANGLE, _SECONDS_PER_CELL = 6e-4, 1e-4  # as measured on one core
 _FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+_ALIGNED = 0.8  # cosine between a face and the plane of a cut that it goes on in
+_RIM_VOXELS = 6.0  # how far the section of a skin may reach
 _REFINED_MM = 2.0  # spacing of the lattice that carries a finer edge length
 
 
@@ -227,21 +229,28 @@ def _rows_in(rows: IntArray, others: IntArray) -> IntArray:
     return np.asarray(np.isin(which[len(others) :], which[: len(others)]))
 
 
-def _rim(points: FloatArray, triangles: IntArray, asked: FloatArray, cut: FloatArray, labels: LabelMap) -> FloatArray:
-    """Faces of the skin that lie in the plane of a cut close by: the skin's own section."""
-    rim = np.zeros(len(triangles), dtype=bool)
+def _rim(points: FloatArray, triangles: IntArray, asked: BoolArray, cut: BoolArray, labels: LabelMap) -> BoolArray:
+    """Faces of the skin that go on in the plane of a cut: the skin's own section."""
     if not cut.any() or not asked.any():
-        return rim
+        return np.zeros(len(triangles), dtype=bool)
     corners = points[triangles]
     centre = corners.mean(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    far = 5.0 * float(labels.grid.spacing_mm.max())
-    distance, nearest = cKDTree(centre[cut]).query(centre[asked])
-    plane = normal[cut][nearest]
-    aligned = np.abs(np.einsum("ij,ij->i", plane, normal[asked])) > 0.9
-    offset = np.abs(np.einsum("ij,ij->i", plane, centre[asked] - centre[cut][nearest]))
-    rim[asked] = aligned & (distance < far) & (offset < 0.25 * far)
+    voxel = float(labels.grid.spacing_mm.max())
+    rim = np.zeros(len(triangles), dtype=bool)
+    tree, planes = cKDTree(centre[cut]), normal[cut]
+    _, nearest = tree.query(centre[asked], k=min(8, len(planes)))
+    # The section's plane: the mean of the nearest faces of the cut, whichever way round they are.
+    nearest = nearest.reshape(int(asked.sum()), -1)
+    around = planes[nearest]
+    around *= np.sign(np.einsum("fki,fi->fk", around, around[:, 0]))[..., None]
+    plane = around.mean(axis=1)
+    plane /= np.linalg.norm(plane, axis=1, keepdims=True)
+    offset = np.einsum("fi,fi->f", plane, centre[asked] - centre[cut][nearest].mean(axis=1))
+    aligned = np.abs(np.einsum("fi,fi->f", plane, normal[asked])) > _ALIGNED
+    close = np.linalg.norm(centre[asked] - centre[cut][nearest[:, 0]], axis=1) < _RIM_VOXELS * voxel
+    rim[asked] = aligned & close & (np.abs(offset) < voxel)
     return rim
 
 
