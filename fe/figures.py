@@ -52,24 +52,25 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate, point_m
 
     Cells are cut in the unloaded configuration and drawn where they are under load; the dashed line is the plate.
     """
+    cuts = [cut(mesh, state.u_mm, plate.axes, point_mm) for state in states]
+    corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
+    low, high = corners.min(axis=0) - 2.0, corners.max(axis=0) + 2.0
     rows, columns = (len(states) + 1) // 2, min(len(states), 2)
-    figure = Figure(figsize=(WIDTH_IN, 3.4 * rows + 0.7), dpi=DPI, facecolor="white", layout="constrained")
+    tall = 0.9 + (WIDTH_IN / columns - 1.0) * float((high[1] - low[1]) / (high[0] - low[0]))
+    figure = Figure(figsize=(WIDTH_IN, rows * tall), dpi=DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in panels[len(states) :]:
         axes.set_visible(False)
-    for axes, state in zip(panels, states, strict=False):
-        cells, corners = cut(mesh, state.u_mm, plate.axes, point_mm)
+    for axes, state, (cells, polygons) in zip(panels, states, cuts, strict=False):
         shear = StrainField.from_gradient(state.gradients[cells]).max_shear
         drawn = PolyCollection(
-            corners, array=shear, cmap="viridis", norm=Normalize(0.0, _LARGEST), edgecolors="face", linewidths=0.2
+            polygons, array=shear, cmap="viridis", norm=Normalize(0.0, _LARGEST), edgecolors="face", linewidths=0.2
         )
         axes.add_collection(drawn)
-        axes.autoscale_view()
-        axes.axhline(
-            float(((mesh.points_mm + state.u_mm) @ plate.axes[:, 0]).min()), color=INK, linewidth=1.0, linestyle="--"
-        )
-        axes.set_aspect("equal")
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        face = float(((mesh.points_mm + state.u_mm) @ plate.axes[:, 0]).min())
+        axes.axhline(face, color=INK, linewidth=1.0, linestyle="--")
         load = state.load
         axes.set_title(f"{load.name}: {load.normal_n:g} N normal, {load.shear_n:g} N shear", color=INK, **FONT)
         label_axes(axes, "along the shear, mm", "along the normal force, mm")

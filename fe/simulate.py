@@ -151,7 +151,7 @@ def simulate(
                 State(
                     load, reached, u @ plate.axes.T, path.state[displacements:][model.space.pressure_cells],
                     plate.axes @ model.gradients(path.state) @ plate.axes.T, path.travel.copy(), path.force.copy(),
-                    int(path.contact.holds.sum()), np.array(path.curve[known:]), path.iterations - counted,
+                    int(path.contact.holds.sum()), np.reshape(path.curve[known:], (-1, 6)), path.iterations - counted,
                     time.monotonic() - began,
                 )
             )  # fmt: skip

@@ -19,6 +19,7 @@ from fe.plate import Plate
 from mrstrain.inputs import make_output
 from mrstrain.provenance import provenance
 
+_FLAT_MM = 0.1
 _INFERIOR, _FORWARD = (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)
 
 
@@ -94,6 +95,7 @@ def mesh(
 
 
 def lowest_point(mesh: TetMesh, plate: Plate) -> np.ndarray:
-    """The node of the bone's surface that lies furthest along the plate's outward normal, LPS mm."""
+    """Where the bone's surface lies furthest along the plate's outward normal, LPS mm; the middle of a flat bone."""
     points = mesh.points_mm[np.unique(mesh.facets[BONE])] if BONE in mesh.facets else mesh.points_mm
-    return np.asarray(points[int(np.argmin(points @ plate.axes[:, 0]))])
+    height = points @ plate.axes[:, 0]
+    return np.asarray(points[height < height.min() + _FLAT_MM].mean(axis=0))

@@ -1,0 +1,144 @@
+"""`mrstrain simulate`: a mesh in; for each set and load a VTU file, tables and pictures out; refusals first."""
+
+import json
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dvc.deformation import Deformation
+from dvc.errors import InputError
+from dvc.kinematics import StrainField
+from fe.meshstore import read_tet_mesh, write_tet_mesh
+from fe.result import cauchy_stress, deformation, patch_volumes, volume_percentiles
+from fe.simulate import LoadStep, simulate
+from mrstrain.cli import app
+from mrstrain.simulating import load_named, paths_of
+from tests.test_simulate import DOWN, FAT, LAWS, PRESS, dome, press
+
+PLATE = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0"]
+MINE = '[mine.fat]\nlaw = "Ogden"\nconvention = "ansys"\nmu_mpa = 0.0034\nalpha = 6.2\nnu = 0.4999\n'
+
+
+@pytest.fixture
+def mesh_file(tmp_path: Path) -> Path:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
+    return tmp_path / "dome.vtu"
+
+
+def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> None:
+    own = tmp_path / "mine.toml"
+    own.write_text(MINE)
+    loads = ["--load", "Load3=2,1", "--load", "Load2=2", "--load", "Load1=4"]
+    given = ["--set", "luboz", "--set", str(own), *loads, *PLATE]
+    done = CliRunner().invoke(app, ["simulate", str(mesh_file), *given, "--out", str(tmp_path / "sim")])
+    assert done.exit_code == 0, done.output
+    assert "mine has no law for skin; fat's is used." in done.output
+    for name in ("luboz", "mine"):
+        folder = tmp_path / "sim" / name
+        told = json.loads((folder / "simulation.json").read_text())
+        assert list(told["outcome"]) == ["Load3", "Load2", "Load1"]
+        assert told["outcome"]["Load3"]["plate_force_n"] == pytest.approx([2, 1, 0], abs=2e-3)
+        assert told["inputs"]["mesh"][0]["name"] == "dome.vtu"
+        assert (folder / "slices.png").stat().st_size > 10_000
+        assert (folder / "force_travel.png").stat().st_size > 5_000
+        regions = np.genfromtxt(folder / "regions.csv", delimiter=",", names=True, dtype=None, encoding=None)
+        assert len(regions) == 6
+        assert (np.abs(regions["volume_change"]) < 0.02).all()
+        curve = np.genfromtxt(folder / "curve.csv", delimiter=",", names=True, dtype=None, encoding=None)
+        assert curve["force_normal_n"].max() == pytest.approx(4.0, abs=0.01)
+        load2, load3 = (meshio.read(folder / f"{load}.vtu") for load in ("Load2", "Load3"))
+        assert load3.point_data["displacement_mm"][:, 1].max() > load2.point_data["displacement_mm"][:, 1].max() + 0.1
+        F = load3.cell_data["F"][0].reshape(-1, 3, 3)
+        strain = StrainField.from_gradient(F - np.eye(3))
+        assert load3.cell_data["max_shear"][0] == pytest.approx(strain.max_shear, abs=1e-12)
+
+
+def test_loads_that_cannot_be_reached_end_with_a_failure_status(mesh_file: Path, tmp_path: Path) -> None:
+    own = tmp_path / "weak.toml"
+    own.write_text('[weak.fat]\nlaw = "neo-Hooke"\nmu_kpa = 0.02\nnu = 0.49\n')
+    given = ["--set", str(own), "--load", "a=1", "--load", "b=1,400", *PLATE, "--out", str(tmp_path / "sim")]
+    done = CliRunner().invoke(app, ["simulate", str(mesh_file), *given])
+    assert done.exit_code == 1, done.output
+    assert "of the load was reached" in done.output
+    assert (tmp_path / "sim" / "weak" / "curve.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--set", "trebi"], "the nearest is 'trebbi'"),
+        (["--set", "luboz", "--set", "luboz"], "each once"),
+        (["--load", "Load1"], "A load is NAME=NORMAL"),
+        (["--load", "../x=3"], "a name of letters"),
+        (["--load", "a=1", "--load", "a=2"], "a name of its own"),
+        (["--load", "a=-1"], "must press"),
+        (["--plate-normal", "0", "0", "0"], "not all zero"),
+    ],
+)
+def test_what_cannot_be_is_refused(mesh_file: Path, tmp_path: Path, given: list[str], said: str) -> None:
+    refused = CliRunner().invoke(app, ["simulate", str(mesh_file), *given, "--out", str(tmp_path / "sim")])
+    assert isinstance(refused.exception, Exception)
+    assert said in str(refused.exception)
+    assert not list(tmp_path.glob("sim/*/*.vtu"))
+
+
+def test_loads_lie_on_paths_by_their_normal_force() -> None:
+    loads = [load_named(text) for text in ("a=15,45", "b=140", "c=15", "d=15,12")]
+    assert [[x.name for x in path] for path in paths_of(loads)] == [["c", "d", "a"], ["b"]]
+    with pytest.raises(InputError, match="a name of its own"):
+        paths_of([])
+
+
+def test_a_simulation_is_a_deformation() -> None:
+    mesh = dome((3, 4, 4))
+    state = press(mesh, PRESS)[0]
+    field = deformation(mesh, state)
+    assert isinstance(field, Deformation)
+    u, H = field.evaluate(mesh.centroids_mm)
+    assert np.abs(u - state.u_mm[mesh.cells].mean(axis=1)).max() < 1e-12
+    assert np.abs(H - state.gradients).max() < 1e-9
+
+
+def test_stress_balances_the_plates_force() -> None:
+    mesh = dome((5, 8, 8))
+    state = press(mesh, PRESS)[0]
+    stress = cauchy_stress(state, mesh, LAWS)
+    assert np.abs(stress - stress.transpose(0, 2, 1)).max() < 1e-9 * np.abs(stress).max()
+    # In balance the mean over a slab, times the slab's area, is the force through it; here close to the bone.
+    x = (mesh.points_mm + state.u_mm)[mesh.cells][:, :, 0]
+    slab = (x.mean(axis=1) > 6.0) & (x.mean(axis=1) < 9.0)
+    volumes = mesh.volumes_mm3 * np.linalg.det(np.eye(3) + state.gradients)
+    force = -(stress[slab, 0, 0] * volumes[slab]).sum() / 3.0
+    assert force == pytest.approx(2.0, rel=0.15)
+
+
+def test_patches_and_percentiles() -> None:
+    mesh = dome((3, 4, 4))
+    assert patch_volumes(mesh, np.full(len(mesh.cells), 1.02)) == pytest.approx(1.02)
+    assert volume_percentiles(np.array([3.0, 1.0, 2.0]), np.array([1.0, 8.0, 1.0]), (0.5, 0.85, 0.99)) == (
+        1.0,
+        2.0,
+        3.0,
+    )
+
+
+def test_the_mesh_may_come_from_elsewhere(tmp_path: Path) -> None:
+    mesh = dome((3, 4, 4))
+    lines = ["*NODE"] + [f"{n}, {x}, {y}, {z}" for n, (x, y, z) in enumerate(mesh.points_mm.tolist(), start=1)]
+    for name, cells in mesh.regions.items():
+        lines += [f"*ELEMENT, TYPE=C3D4H, ELSET={name}"]
+        lines += [f"{c + 1}, " + ", ".join(str(n + 1) for n in mesh.cells[c]) for c in cells]
+    (tmp_path / "dome.inp").write_text("\n".join(lines) + "\n")
+    read = read_tet_mesh(tmp_path / "dome.inp")
+    assert set(read.regions) == {"fat", "skin"}
+    with pytest.raises(InputError, match="no facets 'bone'; it has none"):
+        simulate(read, {"fat": FAT, "skin": FAT}, _plate(), [LoadStep("a", 1.0)])
+
+
+def _plate():
+    from fe.plate import Plate
+
+    return Plate(DOWN, [0.0, 1.0, 0.0])
