@@ -118,6 +118,9 @@ class Assembler:
         for unknowns in shared.values():
             self._may_share[unknowns] = True
         self.indptr, self.indices = self._pattern(shared)
+        self._row_of = np.repeat(np.arange(self.size), np.diff(self.indptr))
+        above = self.indices != self._row_of
+        self._columns = [np.flatnonzero((self.indices == self.own_equations + n) & above) for n in range(len(shared))]
         self._touched = self._may_share[self._cells].any(axis=1)
         pairs = self._cells.shape[1] * (self._cells.shape[1] + 1) // 2
         self._places = np.empty((len(self._cells), pairs), dtype=np.int32)
@@ -164,6 +167,22 @@ class Assembler:
         self._run(state, np.zeros(self.model.unknowns), data)
         data[self.indptr[self.idle]] = 1.0  # the diagonal stands first in its row
         return data
+
+    def held(self, data: FloatArray, right: FloatArray, equations: IntArray, moves: FloatArray) -> FloatArray:
+        """Prescribe how far the unknowns of shared equations move: ``right`` is changed in place, and values returned.
+
+        Their columns go to the right-hand side, their diagonal becomes 1.
+        """
+        kept = data.copy()
+        for equation, move in zip(equations, moves, strict=True):
+            column = self._columns[equation - self.own_equations]
+            right[self._row_of[column]] -= kept[column] * move
+            row = slice(self.indptr[equation], self.indptr[equation + 1])
+            right[self.indices[row][1:]] -= kept[row][1:] * move
+            kept[column], kept[row] = 0.0, 0.0
+            kept[self.indptr[equation]] = 1.0
+        right[equations] = moves
+        return kept
 
     def spread(self, change: FloatArray) -> FloatArray:
         """Change of every unknown from that of every equation; fixed ones do not change."""

@@ -9,13 +9,13 @@ import numpy as np
 
 from dvc.arrays import FloatArray, IntArray
 from fe.assembly import Assembler
-from fe.linear import Factors, SingularError
+from fe.linear import SingularError, Solver
 
 _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at
 _LEAST_VOLUME = 0.02  # det F at a quadrature point below this is on its way to folding
 _MOST_GROWTH = 3.0  # of the residual in one step
-_HELD = 1e12  # put on the diagonal of an equation whose unknown is held
+_INEXACT = 1e-3  # residual of a linear solution that is not exact
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class Converged:
 
 def equilibrium(
     assembler: Assembler,
-    factors: Factors,
+    solver: Solver,
     state: FloatArray,
     outside: FloatArray,
     held: IntArray,
@@ -96,19 +96,17 @@ def equilibrium(
     if not lowest > 0.0:
         return None
     for iteration in range(1, tolerance.iterations + 1):
-        data = assembler.tangent(now)
-        data[assembler.indptr[held]] += _HELD
         right = outside - residual
-        right[held] = _HELD * left
         right[assembler.idle] = 0.0
+        before = _norm(right, held, assembler)
+        data = assembler.held(assembler.tangent(now), right, held, left)
         try:
-            factors.factorise(data)
+            change = assembler.spread(solver.solve(data, right, _INEXACT))
         except SingularError:
             return None
-        change = assembler.spread(factors.solve(right))
         if not np.isfinite(change).all():
             return None
-        before, share = _norm(right, held, assembler), 1.0
+        share = 1.0
         while True:
             tried = now + share * change
             forces, residual, lowest = assembler.residual(tried)

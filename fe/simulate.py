@@ -13,7 +13,7 @@ from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from fe.assembly import Assembler, Model
 from fe.elements import element
-from fe.linear import factors
+from fe.linear import Solver
 from fe.materials import Material
 from fe.newton import Tolerance, equilibrium
 from fe.plate import Contact, Plate
@@ -160,7 +160,7 @@ def simulate(
                 break
             before = target
     finally:
-        path.factors.close()
+        path.solver.close()
     return states
 
 
@@ -206,7 +206,7 @@ class _Path:
         self.contact = Contact(plate, model.space.nodes_mm, touching)
         fixed = (3 * on_bone[:, None] + np.arange(3)).ravel()
         self.assembler = Assembler(model, fixed, self.contact.may_follow)
-        self.factors = factors(self.assembler.indptr, self.assembler.indices, threads=threads)
+        self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
         self.state = np.zeros(model.unknowns)
         self.travel, self.force = np.zeros(3), np.zeros(3)
         self.curve: list[FloatArray] = []
@@ -250,7 +250,7 @@ class _Path:
         self.assembler.share(follows)
         found = equilibrium(
             self.assembler,
-            self.factors,
+            self.solver,
             self.state,
             outside,
             plate[held],

@@ -7,7 +7,7 @@ import pytest
 
 from fe.assembly import Assembler, Model
 from fe.elements import Space, element
-from fe.linear import SingularError, factors
+from fe.linear import SingularError, Solver, factors
 from fe.materials import Hencky, NeoHooke, Ogden, Yeoh
 from fe.newton import Tolerance, equilibrium
 from tests.blocks import block
@@ -107,7 +107,7 @@ def test_patch(name: str) -> None:
         gradient = (np.eye(3) + share * (F - np.eye(3))) - np.eye(3)
         state[unknowns(np.flatnonzero(corners), 0, 1, 2)] = (nodes[corners] @ gradient.T).ravel()
         found = equilibrium(
-            assembler, factors(assembler.indptr, assembler.indices), state, np.zeros(assembler.size),
+            assembler, Solver(assembler.indptr, assembler.indices), state, np.zeros(assembler.size),
             np.empty(0, dtype=int), np.empty(0), Tolerance(force=1e-10, step_mm=1e-9, iterations=20),
         )  # fmt: skip
         assert found is not None
@@ -131,7 +131,7 @@ def test_a_bar_pulled_and_pressed_has_the_laws_closed_form(name: str, law) -> No
         end = end[end < len(mesh.points_mm)]
     assembler = Assembler(model, fixed, {0: unknowns(end, 0)})
     assembler.share({0: unknowns(end, 0)})
-    solver = factors(assembler.indptr, assembler.indices)
+    solver = Solver(assembler.indptr, assembler.indices)
     held = np.array([assembler.own_equations])
     for stretch in (1.3, 0.75):
         state = np.zeros(model.unknowns)
@@ -175,3 +175,24 @@ def test_superlu_says_when_a_body_is_free_to_move() -> None:
     data = np.zeros(len(assembler.indices))
     with pytest.raises(SingularError, match="cannot be factorised"):
         factors(assembler.indptr, assembler.indices, library="superlu").factorise(data)
+
+
+def test_an_old_factorisation_serves_a_matrix_close_to_it() -> None:
+    model = model_of("P1", count=3)
+    nodes = model.space.nodes_mm
+    left = np.flatnonzero(np.isclose(nodes[:, 0], 0.0))
+    assembler = Assembler(model, unknowns(left, 0, 1, 2), {})
+    state, random = np.zeros(model.unknowns), np.random.default_rng(0)
+    solver, exact = (Solver(assembler.indptr, assembler.indices) for _ in range(2))
+    right = random.normal(size=assembler.size)
+    solver.solve(assembler.tangent(state), right, 1e-6)
+    state[: 3 * len(nodes)] = (nodes @ np.diag([0.004, -0.002, -0.002])).ravel()
+    data = assembler.tangent(state)
+    found = solver.solve(data, right, 1e-5)
+    assert (solver.factorisations, exact.factorisations) == (1, 0)
+    assert 1 < solver.steps < 10
+    expected = exact.solve(data, right, 0.0)
+    assert np.linalg.norm(found - expected) < 1e-3 * np.linalg.norm(expected)
+    state[: 3 * len(nodes)] = (nodes @ np.diag([0.9, -0.3, -0.2])).ravel()  # far away: it factorises again
+    solver.solve(assembler.tangent(state), right, 1e-6)
+    assert solver.factorisations == 2
