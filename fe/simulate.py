@@ -62,8 +62,8 @@ class State:
         H = du/dX of each cell, its mean where the element's varies.
     travel_mm, force_n : (3,)
         Displacement of the plate since it first touched, and its force on the tissue, along the plate's axes.
-    holding : int
-        Nodes on the plate.
+    on_plate : (k,)
+        Nodes that hold to the plate.
     curve : (k, 6)
         Travel and force of every state of equilibrium on the way from the load before it, this one last.
     iterations : int
@@ -78,7 +78,7 @@ class State:
     gradients: FloatArray
     travel_mm: FloatArray
     force_n: FloatArray
-    holding: int
+    on_plate: IntArray
     curve: FloatArray
     iterations: int
     seconds: float
@@ -149,12 +149,19 @@ def simulate(
             u = path.state[:displacements].reshape(-1, 3)[: len(mesh.points_mm)]
             states.append(
                 State(
-                    load, reached, u @ plate.axes.T, path.state[displacements:][model.space.pressure_cells],
-                    plate.axes @ model.gradients(path.state) @ plate.axes.T, path.travel.copy(), path.force.copy(),
-                    int(path.contact.holds.sum()), np.reshape(path.curve[known:], (-1, 6)), path.iterations - counted,
-                    time.monotonic() - began,
+                    load=load,
+                    reached=reached,
+                    u_mm=u @ plate.axes.T,
+                    pressure_mpa=path.state[displacements:][model.space.pressure_cells],
+                    gradients=plate.axes @ model.gradients(path.state) @ plate.axes.T,
+                    travel_mm=path.travel.copy(),
+                    force_n=path.force.copy(),
+                    on_plate=path.on_plate[path.on_plate < len(mesh.points_mm)],
+                    curve=np.reshape(path.curve[known:], (-1, 6)),
+                    iterations=path.iterations - counted,
+                    seconds=time.monotonic() - began,
                 )
-            )  # fmt: skip
+            )
             keep(states[-1])
             if reached < 1.0:
                 break
@@ -212,6 +219,11 @@ class _Path:
         self.curve: list[FloatArray] = []
         self.tolerance = Tolerance()
         self.iterations = 0
+
+    @property
+    def on_plate(self) -> IntArray:
+        """Displacement nodes that hold to the plate."""
+        return self.contact.nodes[self.contact.holds]
 
     def approach(self, normal_n: float) -> None:
         """Move the plate from its first touch on, until it presses with a part of the force asked for."""

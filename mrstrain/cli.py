@@ -402,6 +402,7 @@ def simulate(
     slide: Annotated[
         bool, typer.Option("--slide", help="No tape: skin slides along the plate without friction.")
     ] = False,
+    decks: Annotated[bool, typer.Option("--decks", help="Also write each load as a CalculiX deck (C3D10).")] = False,
     mesh_unit: MeshUnit = Unit.MM,
     mesh_frame: MeshFrame = Frame.LPS,
     workers: Annotated[int | None, typer.Option(min=1, help="Simulations at once. Default: one for each core.")] = None,
@@ -420,6 +421,7 @@ def simulate(
             plate_normal=plate_normal or (0.0, 0.0, -1.0),
             shear_direction=shear_direction or (0.0, -1.0, 0.0),
             taped=not slide,
+            decks=decks,
             mesh_unit=mesh_unit.value,
             mesh_frame=mesh_frame.value,
             workers=workers,

@@ -15,6 +15,7 @@ from dvc.mesh import TetMesh
 from dvc.whole import whole_file, write_whole
 from dvc.worker import Worker, each_in_workers, usable_cores
 from fe import figures
+from fe.decks import write_calculix
 from fe.materials import Material
 from fe.meshstore import read_tet_mesh
 from fe.plate import Plate
@@ -107,6 +108,7 @@ def simulate(
     taped: bool = True,
     mesh_unit: str = "mm",
     mesh_frame: str = "LPS",
+    decks: bool = False,
     workers: int | None = None,
     progress: Told | None = None,
 ) -> Simulations:
@@ -128,6 +130,8 @@ def simulate(
         The plate's outward normal, and the direction of the shear force on the tissue, LPS.
     taped : bool
         Whether skin that has touched the plate holds to it; if not, it slides without friction.
+    decks : bool
+        Also write each load as a CalculiX deck (C3D10; see `fe.decks`).
     workers : int
         Simulations at once; by default one for each core.
     progress : callable, optional
@@ -182,12 +186,11 @@ def simulate(
     order = [load.name for load in loads]
     done = []
     for chosen_set in chosen:
-        states = sorted(found[chosen_set.name], key=lambda s: order.index(s.load.name))
+        name = chosen_set.name
+        states = sorted(found[name], key=lambda s: order.index(s.load.name))
         if states:
             record = provenance("simulate", {"mesh": place}, _told(chosen_set, loads, plate))
-            done.append(
-                _written(target / chosen_set.name, chosen_set.name, read, states, *laws[chosen_set.name], plate, record)
-            )
+            done.append(_written(target / name, name, read, states, *laws[name], plate, record, decks))
     if not done:
         raise MrstrainError("No simulation ended. " + " ".join(f"{n}: {r}" for n, r in failures.items()))
     return Simulations(target, tuple(done), failures)
@@ -277,6 +280,7 @@ def _written(
     notes: tuple[str, ...],
     plate: Plate,
     record: dict[str, object],
+    decks: bool,
 ) -> Simulated:
     rows = [row for state in states for row in region_figures(mesh, state, laws)]
     notes += tuple(
@@ -284,6 +288,12 @@ def _written(
         for row in rows
         if row.stable_share < 1.0
     )
+    if decks:
+        try:
+            for state in states:
+                write_calculix(folder / f"{state.load.name}.inp", mesh, laws, state, quadratic=True)
+        except InputError as refused:
+            notes += (f"No deck: {refused}",)
     write_regions_csv(folder / "regions.csv", rows)
     write_curve_csv(folder / "curve.csv", states)
     outcome = {}
@@ -294,7 +304,7 @@ def _written(
             "reached": state.reached,
             "plate_travel_mm": state.travel_mm.tolist(),
             "plate_force_n": state.force_n.tolist(),
-            "nodes_on_plate": state.holding,
+            "nodes_on_plate": len(state.on_plate),
             "iterations": state.iterations,
             "seconds": round(state.seconds, 1),
             "volume_share_with_patch_det_f_off_by_5_percent": float(

@@ -32,7 +32,7 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
     own = tmp_path / "mine.toml"
     own.write_text(MINE)
     loads = ["--load", "Load3=2,1", "--load", "Load2=2", "--load", "Load1=4"]
-    given = ["--set", "luboz", "--set", str(own), *loads, *PLATE]
+    given = ["--set", "luboz", "--set", str(own), *loads, *PLATE, "--decks"]
     done = CliRunner().invoke(app, ["simulate", str(mesh_file), *given, "--out", str(tmp_path / "sim")])
     assert done.exit_code == 0, done.output
     assert "mine has no law for skin; fat's is used." in done.output
@@ -42,6 +42,7 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         assert list(told["outcome"]) == ["Load3", "Load2", "Load1"]
         assert told["outcome"]["Load3"]["plate_force_n"] == pytest.approx([2, 1, 0], abs=2e-3)
         assert told["inputs"]["mesh"][0]["name"] == "dome.vtu"
+        assert "C3D10" in (folder / "Load3.inp").read_text()
         assert (folder / "slices.png").stat().st_size > 10_000
         assert (folder / "force_travel.png").stat().st_size > 5_000
         regions = np.genfromtxt(folder / "regions.csv", delimiter=",", names=True, dtype=None, encoding=None)

@@ -1,0 +1,153 @@
+"""A state of load written for another solver: the same mesh, laws and supports, the plate's nodes where they ended.
+
+A hyperelastic state depends on where its supports are, and not on the way there. So a deck in which bone is fixed and
+the nodes on the plate are moved to where they ended has our state for its solution, and its reactions are the plate's
+forces: contact has not to be found again. CalculiX is the solver written for; Abaqus reads the same keywords.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.errors import InputError
+from dvc.mesh import TetMesh
+from dvc.whole import write_whole
+from fe.elements import EDGES, Space
+from fe.hyperelastic import OGDEN
+from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
+from fe.simulate import BONE, State
+
+_UNUSED = 1e30  # D of a volumetric term that is not wanted: its stiffness is 1 / D
+_PER_LINE = 12
+
+
+def write_calculix(
+    path: Path, mesh: TetMesh, laws: Mapping[str, Material], state: State, *, quadratic: bool = False
+) -> None:
+    """Write a CalculiX deck (.inp) of a state, mm, N and MPa, LPS.
+
+    Parameters
+    ----------
+    path : path
+        Ending in .inp. CalculiX prints displacements of all nodes and the plate's total force to the .dat file.
+    laws : mapping of region to Material
+        Neo-Hooke, Yeoh and Ogden; volume as in `fe.materials`, which is CalculiX' own (D1 = 2 / K).
+    state : State
+    quadratic : bool
+        C3D10 instead of C3D4. Linear tetrahedra without a pressure of their own lock in nearly incompressible tissue:
+        C3D4 is for comparing codes only.
+
+    Raises
+    ------
+    InputError
+        For Hencky's law, which CalculiX does not have.
+    """
+    write_whole(path, "\n".join(_deck(mesh, laws, state, quadratic)) + "\n")
+
+
+def _deck(mesh: TetMesh, laws: Mapping[str, Material], state: State, quadratic: bool) -> Iterator[str]:
+    space = Space.on(mesh, "P2" if quadratic else "P1", np.zeros(len(mesh.cells), dtype=np.int64))
+    yield "*NODE, NSET=NALL"
+    for number, (x, y, z) in enumerate(space.nodes_mm.tolist(), start=1):
+        yield f"{number}, {x:.12g}, {y:.12g}, {z:.12g}"
+    for region in laws:
+        yield f"*ELEMENT, TYPE={'C3D10' if quadratic else 'C3D4'}, ELSET={_short('E', region)}"
+        for cell in mesh.regions[region]:
+            yield f"{cell + 1}, " + ", ".join(str(n + 1) for n in space.cells[cell])
+    for region, law in laws.items():
+        yield f"*MATERIAL, NAME={_short('M', region)}"
+        yield from _law(region, law)
+        yield f"*SOLID SECTION, ELSET={_short('E', region)}, MATERIAL={_short('M', region)}"
+    fixed, on_plate, moved = _supports(mesh, space, state)
+    for name, nodes in (("NBONE", fixed), ("NPLATE", on_plate)):
+        yield f"*NSET, NSET={name}"
+        for start in range(0, len(nodes), _PER_LINE):
+            yield ", ".join(str(n + 1) for n in nodes[start : start + _PER_LINE]) + ","
+    yield "*BOUNDARY"
+    yield "NBONE, 1, 3, 0."
+    yield "*STEP, NLGEOM, INC=200"
+    yield "*STATIC"
+    yield "0.1, 1., 1e-5, 0.25"
+    yield "*BOUNDARY"
+    for node, u in zip(on_plate, moved, strict=True):
+        for axis in range(3):
+            yield f"{node + 1}, {axis + 1}, {axis + 1}, {u[axis]:.12g}"
+    yield "*NODE PRINT, NSET=NALL"
+    yield "U"
+    yield "*NODE PRINT, NSET=NPLATE, TOTALS=ONLY"
+    yield "RF"
+    yield "*NODE FILE"
+    yield "U"
+    yield "*EL FILE"
+    yield "S, E"
+    yield "*END STEP"
+
+
+def _supports(mesh: TetMesh, space: Space, state: State) -> tuple[IntArray, IntArray, FloatArray]:
+    """Nodes that are fixed, nodes on the plate, and how far those move; middles of edges go with their ends."""
+    count = len(mesh.points_mm)
+    bone = np.zeros(count, dtype=bool)
+    bone[mesh.facets[BONE]] = True
+    plate = np.zeros(count, dtype=bool)
+    plate[state.on_plate] = True
+    fixed, on_plate, moved = [np.flatnonzero(bone)], [np.flatnonzero(plate)], [state.u_mm[plate]]
+    if space.cells.shape[1] > 4:
+        for facets, both, nodes in ((mesh.facets[BONE], bone, fixed), (_faces_on(mesh, plate), plate, on_plate)):
+            ends = np.unique(np.sort(np.concatenate([facets[:, e] for e in ([0, 1], [1, 2], [0, 2])]), axis=1), axis=0)
+            ends = ends[both[ends].all(axis=1)]
+            middle = _middles(mesh, space, ends)
+            nodes.append(middle)
+            if nodes is on_plate:
+                moved.append(state.u_mm[ends].mean(axis=1))
+    return np.concatenate(fixed), np.concatenate(on_plate), np.concatenate(moved)
+
+
+def _faces_on(mesh: TetMesh, plate: BoolArray) -> IntArray:
+    every = np.concatenate([rows for name, rows in mesh.facets.items() if name != BONE])
+    return np.asarray(every[plate[every].all(axis=1)])
+
+
+def _middles(mesh: TetMesh, space: Space, ends: IntArray) -> IntArray:
+    """The node in the middle of each edge (k, 2)."""
+    count = len(mesh.points_mm)
+    known = np.sort(np.concatenate([mesh.cells[:, list(edge)] for edge in EDGES]), axis=1)
+    keys, first = np.unique(known[:, 0] * count + known[:, 1], return_index=True)
+    nodes = space.cells[:, 4:].T.ravel()[first]
+    return np.asarray(nodes[np.searchsorted(keys, ends[:, 0] * count + ends[:, 1])])
+
+
+def _law(region: str, law: Material) -> Iterator[str]:
+    d1 = 2.0 / law.bulk_modulus_mpa
+    c10, c20, c30 = law.vector[:3]
+    if isinstance(law, NeoHooke):
+        yield "*HYPERELASTIC, NEO HOOKE"
+        yield f"{c10:.12g}, {d1:.12g}"
+    elif isinstance(law, Yeoh):
+        yield "*HYPERELASTIC, YEOH"
+        yield f"{c10:.12g}, {c20:.12g}, {c30:.12g}, {d1:.12g}, {_UNUSED:g}, {_UNUSED:g}"
+    elif isinstance(law, Ogden):
+        pairs = law.vector[OGDEN:].reshape(-1, 2)
+        if len(pairs) > 3:
+            raise InputError(f"{region}: CalculiX takes Ogden laws of up to three terms; this has {len(pairs)}.")
+        yield f"*HYPERELASTIC, OGDEN, N={len(pairs)}"
+        numbers = [
+            *(f"{mu:.12g}, {alpha:.12g}" for mu, alpha in pairs),
+            f"{d1:.12g}",
+            *[f"{_UNUSED:g}"] * (len(pairs) - 1),
+        ]
+        yield ", ".join(numbers)
+    else:
+        assert isinstance(law, Hencky)
+        raise InputError(
+            f"{region}: CalculiX has no law that is linear in logarithmic strain (its *ELASTIC is Saint Venant-"
+            "Kirchhoff's, which collapses in compression); choose another set for a deck."
+        )
+
+
+def _short(prefix: str, region: str) -> str:
+    """A name that CalculiX takes: letters and digits, under 20 characters."""
+    return prefix + "".join(c for c in region.upper() if c.isalnum())[:18]
