@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -15,6 +15,7 @@ from dvc.figures import REGION_COLOURS
 from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
 from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
+from fe.convergence import Limit
 from fe.fitting import Curve, Fit
 from fe.plate import Plate
 from fe.simulate import State
@@ -132,4 +133,21 @@ def mesh_slice(mesh: TetMesh, point_mm: FloatArray, axes: FloatArray) -> bytes:
     panel.set_aspect("equal")
     label_axes(panel, "along the shear, mm", "along the normal force, mm")
     panel.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return png_bytes(figure)
+
+
+def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[float], Limit]]) -> bytes:
+    """Figures relative to what they tend to, over the size of the cells (cube root of their mean volume).
+
+    A figure that does not depend on the mesh any more lies on the grey line.
+    """
+    figure, (axes,) = chart()
+    for number, (name, (values, limit)) in enumerate(curves.items()):
+        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+        style = "-" if "travel" in name else "--"
+        axes.plot(sizes_mm, np.array(values) / limit.limit, style, marker="o", color=colour, linewidth=1.6, label=name)
+    axes.axhline(1.0, color="#9aa5b1", linewidth=1.0)
+    axes.set_xlim(left=0.0)
+    label_axes(axes, "size of the cells, mm", "figure over its limit")
+    axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)

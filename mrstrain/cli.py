@@ -434,6 +434,44 @@ def simulate(
 
 
 @app.command()
+def converge(
+    labels: Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")],
+    out: Out,
+    edge_mm: Annotated[list[float], typer.Option(help="Length of edges, mm; three or more.")],
+    names: Names = None,
+    bone: Annotated[list[str] | None, typer.Option(help="Region to cut out; repeat for several.")] = None,
+    region: Annotated[str, typer.Option(help="Region whose maximal shear is followed.")] = "fat",
+    set_: Annotated[str, typer.Option("--set", help="Material set.")] = "trebbi",
+    load: Annotated[list[str] | None, typer.Option(help="As in simulate.")] = None,
+    plate_normal: Plate = None,
+    shear_direction: Shear = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Simulations at once. Default: one for each core.")] = None,
+) -> None:
+    """The same loads on meshes of several sizes: percentiles of strain and plate travel, and what they tend to."""
+    from mrstrain.converging import converge as run
+    from mrstrain.progress import live
+    from mrstrain.simulating import LOADS, load_named
+
+    with live() as progress:
+        done = run(
+            labels,
+            edge_mm,
+            out=out,
+            names=names,
+            bones=bone or ("bone",),
+            region=region,
+            material=set_,
+            loads=[load_named(text) for text in load] if load else LOADS,
+            plate_normal=plate_normal or (0.0, 0.0, -1.0),
+            shear_direction=shear_direction or (0.0, -1.0, 0.0),
+            workers=workers,
+            progress=progress,
+        )
+    for line in done.summary():
+        typer.echo(line)
+
+
+@app.command()
 def fit(
     curve: Annotated[
         Path,

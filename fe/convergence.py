@@ -1,0 +1,70 @@
+"""What a figure would be on an endlessly fine mesh, from meshes of several sizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.errors import InputError
+from dvc.mesh import TetMesh
+
+_ORDERS = np.linspace(0.5, 3.0, 251)
+_FEWEST = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A figure's value on an endlessly fine mesh, f(h) = limit + slope h^order.
+
+    Attributes
+    ----------
+    limit, order : float
+        The order is searched from 0.5 to 3.
+    scatter : float
+        Root mean square distance of the figures from the curve; 0 with three sizes, which it goes through if it can.
+    error : float
+        Of the figure on the finest mesh, as a share of the limit.
+    """
+
+    limit: float
+    order: float
+    scatter: float
+    error: float
+
+
+def size_mm(mesh: TetMesh) -> float:
+    """Size of a mesh's cells: the cube root of their mean volume, mm."""
+    return float(np.cbrt(mesh.volumes_mm3.mean()))
+
+
+def extrapolated(sizes_mm: FloatArray, values: FloatArray) -> Limit:
+    """Extrapolate a figure (n,) from meshes of sizes (n,), three or more (Richardson, with the order observed).
+
+    Raises
+    ------
+    InputError
+        If there are fewer than three sizes, or two are the same.
+
+    Examples
+    --------
+    >>> h = np.array([4.0, 2.0, 1.0])
+    >>> found = extrapolated(h, 5.0 + 0.1 * h**2)
+    >>> round(found.limit, 3), round(found.order, 2), round(found.error, 3)
+    (5.0, 2.0, 0.02)
+    """
+    h, f = np.asarray(sizes_mm, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    if len(h) < _FEWEST or len(np.unique(h)) < len(h) or h.shape != f.shape:
+        raise InputError(f"Extrapolation needs {_FEWEST} or more meshes of different size; got sizes {h.tolist()}.")
+    best: tuple[float, float, float] | None = None
+    for order in _ORDERS:
+        columns = np.column_stack([np.ones_like(h), h**order])
+        found, *_ = np.linalg.lstsq(columns, f, rcond=None)
+        cost = float(np.sqrt(np.mean((columns @ found - f) ** 2)))
+        if best is None or cost < best[0] - 1e-15:
+            best = cost, float(order), float(found[0])
+    assert best is not None
+    scatter, order, limit = best
+    finest = float(f[int(np.argmin(h))])
+    return Limit(limit, order, scatter, (finest - limit) / limit if limit != 0.0 else float("nan"))

@@ -1,0 +1,57 @@
+"""Extrapolation gives back a known limit and order; `converge` makes meshes, loads and table, and keeps its meshes."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dvc.errors import InputError
+from dvc.imagewrite import write_labels
+from fe.convergence import extrapolated
+from mrstrain.cli import app
+from tests.test_meshing import half_onion
+
+
+@pytest.mark.parametrize("order", [0.8, 1.0, 2.0])
+def test_a_known_order_and_limit(order: float) -> None:
+    h = np.array([5.0, 3.0, 2.0, 1.5])
+    found = extrapolated(h, 7.0 - 0.2 * h**order)
+    assert found.limit == pytest.approx(7.0, abs=0.01)
+    assert found.order == pytest.approx(order, abs=0.03)
+    assert found.error == pytest.approx(-0.2 * 1.5**order / 7.0, rel=0.05)
+
+
+def test_scatter_tells_figures_that_do_not_follow_a_curve() -> None:
+    h = np.array([5.0, 4.0, 3.0, 2.0])
+    assert extrapolated(h, np.array([1.0, 1.2, 0.9, 1.1])).scatter > 0.05
+    with pytest.raises(InputError, match="3 or more meshes of different size"):
+        extrapolated(h[:2], h[:2])
+
+
+def test_the_command(tmp_path: Path) -> None:
+    write_labels(tmp_path / "map.nii.gz", half_onion())
+    sizes = [text for edge in ("8", "6", "4.5") for text in ("--edge-mm", edge)]
+    given = [*sizes, "--names", str(tmp_path / "map.csv"), "--load", "pressed=3", "--set", "luboz"]
+    out = tmp_path / "study"
+    done = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "tends to" in done.output
+    with (out / "convergence.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximal shear of fat, p50"]
+    assert float(rows[0]["edge_4.5_mm"]) == pytest.approx(float(rows[0]["limit"]), rel=0.3)
+    assert (out / "convergence.png").stat().st_size > 5_000
+    before = (out / "mesh-6.vtu").read_bytes()
+    again = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
+    assert again.exit_code == 0
+    assert (out / "mesh-6.vtu").read_bytes() == before  # the mesher is not deterministic: it was not asked again
+    assert again.output.splitlines()[-6:] == done.output.splitlines()[-6:]
+
+
+def test_two_sizes_are_too_few(tmp_path: Path) -> None:
+    from mrstrain.converging import converge
+
+    with pytest.raises(InputError, match="3 edge lengths or more; got 2"):
+        converge("map.nii.gz", [4.0, 2.0], out=tmp_path)
