@@ -1,0 +1,52 @@
+"""The options that several commands share."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Align(StrEnum):
+    """What is aligned rigidly before the non-rigid registration."""
+
+    BONE = "bone"
+    IMAGE = "image"
+    NONE = "none"
+
+
+class Frame(StrEnum):
+    """Frame of coordinates in a mesh or landmark file."""
+
+    LPS = "LPS"
+    RAS = "RAS"
+
+
+class Unit(StrEnum):
+    """Unit of lengths in a mesh file."""
+
+    MM = "mm"
+    M = "m"
+
+
+Out = Annotated[Path, typer.Option(help="Folder for the results; made where it is missing.")]
+Bone = Annotated[Path | None, typer.Option(help="Mask of the bone to align on, on the unloaded image.")]
+BoneLabel = Annotated[str | None, typer.Option(help="Or: the name of the bone in --labels.")]
+Tissue = Annotated[Path | None, typer.Option(help="Mask of the body; found by a threshold where it is not given.")]
+Labels = Annotated[Path | None, typer.Option(help="Label map of the tissues on the unloaded image.")]
+Names = Annotated[Path | None, typer.Option(help="Names of the labels: ITK-SNAP or Slicer table, or CSV.")]
+Plate = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(
+        help="The plate's outward normal, away from the foot, LPS; default, patient inferior: --plate-normal 0 0 -1."
+    ),
+]
+Shear = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(help="Direction of the shear force, LPS, such as --shear-direction 0 -1 0."),
+]
+MeshFile = Annotated[Path | None, typer.Option(help="Mesh to put displacement and strain on.")]
+MeshUnit = Annotated[Unit, typer.Option(help="Unit of the mesh's coordinates.")]
+MeshFrame = Annotated[Frame, typer.Option(help="Frame of the mesh's coordinates.")]
