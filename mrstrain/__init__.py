@@ -9,19 +9,27 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mrstrain.converging import converge
+    from mrstrain.fitting import fit
     from mrstrain.making import phantom
+    from mrstrain.meshing import mesh
     from mrstrain.registering import register
+    from mrstrain.simulating import simulate
     from mrstrain.straining import strain
     from mrstrain.studying import accuracy
     from mrstrain.twinning import twin
 
 __version__ = "0.1.0"
-__all__ = ["accuracy", "phantom", "register", "strain", "twin"]
+__all__ = ["accuracy", "converge", "fit", "mesh", "phantom", "register", "simulate", "strain", "twin"]
 
 _ROOMS = {
     "accuracy": "studying",
+    "converge": "converging",
+    "fit": "fitting",
+    "mesh": "meshing",
     "phantom": "making",
     "register": "registering",
+    "simulate": "simulating",
     "strain": "straining",
     "twin": "twinning",
 }

@@ -24,6 +24,10 @@ _PACKAGES = (
     "nibabel",
     "pydicom",
     "meshio",
+    "pytetwild",
+    "vtk",
+    "pypardiso",
+    "mkl",
 )
 _BLOCK = 1 << 20
 
