@@ -61,7 +61,7 @@ class State:
     gradients : (m, 3, 3)
         H = du/dX of each cell, its mean where the element's varies.
     travel_mm, force_n : (3,)
-        Displacement of the plate since it first touched, and its force on the tissue, along the plate's axes.
+        Displacement of the plate from its start, and its force on the tissue, along the plate's axes.
     on_plate : (k,)
         Nodes that hold to the plate.
     curve : (k, 6)
@@ -228,6 +228,7 @@ class _Path:
     def approach(self, normal_n: float) -> None:
         """Move the plate from its first touch on, until it presses with a part of the force asked for."""
         self.contact.touch_first(self.state)
+        self.travel[0] = self.contact.plate.gap_mm
         step = _APPROACH_MM
         while self.force[0] < _ENOUGH * normal_n and step > _LEAST_APPROACH_MM:
             kept = self._kept()
