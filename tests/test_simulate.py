@@ -161,7 +161,7 @@ def test_what_cannot_be_simulated_is_refused(change: dict, said: str) -> None:
 def test_the_plate_travels_its_gap_first(sheared: list[State]) -> None:
     plate = Plate(DOWN, ALONG, gap_mm=2.5)
     state = simulate(dome(), LAWS, plate, PRESS)[0]
-    assert state.travel_mm == pytest.approx(sheared[0].travel_mm + [2.5, 0.0, 0.0], abs=1e-9)
+    assert state.travel_mm == pytest.approx(np.add(sheared[0].travel_mm, [2.5, 0.0, 0.0]), abs=1e-9)
     assert np.abs(state.u_mm - sheared[0].u_mm).max() < 1e-9
 
 
