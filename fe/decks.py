@@ -2,13 +2,14 @@
 
 A hyperelastic state depends on where its supports are, and not on the way there. So a deck in which bone is fixed and
 the nodes on the plate are moved to where they ended has our state for its solution, and its reactions are the plate's
-forces: contact has not to be found again. CalculiX is the solver written for; Abaqus reads the same keywords.
+forces: contact has not to be found again. CalculiX reads the one (Abaqus knows the same keywords), FEBio 4 the other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -50,7 +51,7 @@ def write_calculix(
 
 
 def _deck(mesh: TetMesh, laws: Mapping[str, Material], state: State, quadratic: bool) -> Iterator[str]:
-    space = Space.on(mesh, "P2" if quadratic else "P1", np.zeros(len(mesh.cells), dtype=np.int64))
+    space = _space(mesh, quadratic)
     yield "*NODE, NSET=NALL"
     for number, (x, y, z) in enumerate(space.nodes_mm.tolist(), start=1):
         yield f"{number}, {x:.12g}, {y:.12g}, {z:.12g}"
@@ -146,6 +147,101 @@ def _law(region: str, law: Material) -> Iterator[str]:
             f"{region}: CalculiX has no law that is linear in logarithmic strain (its *ELASTIC is Saint Venant-"
             "Kirchhoff's, which collapses in compression); choose another set for a deck."
         )
+
+
+def write_febio(
+    path: Path, mesh: TetMesh, laws: Mapping[str, Material], state: State, *, quadratic: bool = False
+) -> None:
+    """Write an FEBio 4 deck (.feb) of a state, mm, N and MPa, LPS; parameters as `write_calculix`.
+
+    The volume's energy is FEBio's pressure model "Abaqus", K / 2 (J - 1)^2, which is that of `fe.materials`. Written by
+    the format's description and the names in FEBio's sources; FEBio itself has not read it.
+
+    Raises
+    ------
+    InputError
+        For Hencky's law.
+    """
+    space = _space(mesh, quadratic)
+    fixed, on_plate, moved = _supports(mesh, space, state)
+    root = ElementTree.Element("febio_spec", version="4.0")
+    _child(root, "Module", type="solid")
+    control = _child(root, "Control")
+    for name, value in (("analysis", "STATIC"), ("time_steps", "20"), ("step_size", "0.05")):
+        _child(control, name, value)
+    stepper = _child(control, "time_stepper", type="default")
+    for name, value in (("max_retries", "10"), ("opt_iter", "12"), ("dtmin", "1e-4"), ("dtmax", "0.1")):
+        _child(stepper, name, value)
+    solver = _child(control, "solver", type="solid")
+    _child(solver, "symmetric_stiffness", "symmetric")
+    materials = _child(root, "Material")
+    for number, (region, law) in enumerate(laws.items(), start=1):
+        kind, numbers = _febio_law(region, law)
+        material = _child(materials, "material", id=str(number), name=_short("M", region), type=kind)
+        for name, size in (*numbers.items(), ("k", law.bulk_modulus_mpa)):
+            _child(material, name, f"{size:.12g}")
+        _child(material, "pressure_model", "Abaqus")
+    whole = _child(root, "Mesh")
+    nodes = _child(whole, "Nodes", name="all")
+    for number, place in enumerate(space.nodes_mm.tolist(), start=1):
+        _child(nodes, "node", ",".join(f"{v:.12g}" for v in place), id=str(number))
+    for region in laws:
+        elements = _child(whole, "Elements", type="tet10" if quadratic else "tet4", name=_short("E", region))
+        for cell in mesh.regions[region]:
+            _child(elements, "elem", ",".join(str(n + 1) for n in space.cells[cell]), id=str(cell + 1))
+    for name, members in (("bone", fixed), ("plate", on_plate)):
+        _child(whole, "NodeSet", ",".join(str(n + 1) for n in members), name=name)
+    domains = _child(root, "MeshDomains")
+    for region in laws:
+        _child(domains, "SolidDomain", name=_short("E", region), mat=_short("M", region))
+    data = _child(root, "MeshData")
+    boundary = _child(root, "Boundary")
+    still = _child(boundary, "bc", name="bone", type="zero displacement", node_set="bone")
+    for axis in "xyz":
+        _child(still, f"{axis}_dof", "1")
+    for number, axis in enumerate("xyz"):
+        values = _child(data, "NodeData", name=f"u{axis}", node_set="plate", data_type="scalar")
+        for local, u in enumerate(moved[:, number], start=1):
+            _child(values, "node", f"{u:.12g}", lid=str(local))
+        bc = _child(boundary, "bc", name=f"plate {axis}", type="prescribed displacement", node_set="plate")
+        _child(bc, "dof", axis)
+        _child(bc, "value", f"u{axis}", lc="1", type="map")
+        _child(bc, "relative", "0")
+    curve = _child(_child(root, "LoadData"), "load_controller", id="1", type="loadcurve")
+    _child(curve, "interpolate", "LINEAR")
+    points = _child(curve, "points")
+    for point in ("0,0", "1,1"):
+        _child(points, "pt", point)
+    plot = _child(_child(root, "Output"), "plotfile", type="febio")
+    for name in ("displacement", "stress", "Lagrange strain", "reaction forces"):
+        _child(plot, "var", type=name)
+    ElementTree.indent(root)
+    write_whole(
+        path, '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+    )
+
+
+def _child(parent: ElementTree.Element, tag: str, text: str | None = None, /, **attributes: str) -> ElementTree.Element:
+    made = ElementTree.SubElement(parent, tag, attributes)
+    made.text = text
+    return made
+
+
+def _febio_law(region: str, law: Material) -> tuple[str, dict[str, float]]:
+    c10, c20, c30 = law.vector[:3].tolist()
+    if isinstance(law, NeoHooke):
+        return "Mooney-Rivlin", {"c1": c10, "c2": 0.0}
+    if isinstance(law, Yeoh):
+        return "Yeoh", {"c1": c10, "c2": c20, "c3": c30}
+    if isinstance(law, Ogden):  # c = 2 mu0, see Ogden.from_febio
+        pairs = law.vector[OGDEN:].reshape(-1, 2).tolist()
+        numbers = {f"c{n}": 2.0 * mu for n, (mu, _) in enumerate(pairs, start=1)}
+        return "Ogden", numbers | {f"m{n}": alpha for n, (_, alpha) in enumerate(pairs, start=1)}
+    raise InputError(f"{region}: no FEBio deck is written for {law.law}; choose another set.")
+
+
+def _space(mesh: TetMesh, quadratic: bool) -> Space:
+    return Space.on(mesh, "P2" if quadratic else "P1", np.zeros(len(mesh.cells), dtype=np.int64))
 
 
 def _short(prefix: str, region: str) -> str:

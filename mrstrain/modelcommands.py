@@ -58,7 +58,7 @@ def simulate(
     slide: Annotated[
         bool, typer.Option("--slide", help="No tape: skin slides along the plate without friction.")
     ] = False,
-    decks: Annotated[bool, typer.Option("--decks", help="Also write each load as a CalculiX deck (C3D10).")] = False,
+    decks: Annotated[bool, typer.Option("--decks", help="Also write each load for CalculiX and FEBio.")] = False,
     mesh_unit: MeshUnit = Unit.MM,
     mesh_frame: MeshFrame = Frame.LPS,
     workers: Annotated[int | None, typer.Option(min=1, help="Simulations at once. Default: one for each core.")] = None,

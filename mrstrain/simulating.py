@@ -15,7 +15,7 @@ from dvc.mesh import TetMesh
 from dvc.whole import whole_file, write_whole
 from dvc.worker import Worker, each_in_workers, usable_cores
 from fe import figures
-from fe.decks import write_calculix
+from fe.decks import write_calculix, write_febio
 from fe.materials import Material
 from fe.meshstore import read_tet_mesh
 from fe.plate import Plate
@@ -131,7 +131,7 @@ def simulate(
     taped : bool
         Whether skin that has touched the plate holds to it; if not, it slides without friction.
     decks : bool
-        Also write each load as a CalculiX deck (C3D10; see `fe.decks`).
+        Also write each load as decks for CalculiX (C3D10) and FEBio 4 (tet10); see `fe.decks`.
     workers : int
         Simulations at once; by default one for each core.
     progress : callable, optional
@@ -292,6 +292,7 @@ def _written(
         try:
             for state in states:
                 write_calculix(folder / f"{state.load.name}.inp", mesh, laws, state, quadratic=True)
+                write_febio(folder / f"{state.load.name}.feb", mesh, laws, state, quadratic=True)
         except InputError as refused:
             notes += (f"No deck: {refused}",)
     write_regions_csv(folder / "regions.csv", rows)

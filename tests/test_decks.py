@@ -10,7 +10,7 @@ import pytest
 
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
-from fe.decks import write_calculix
+from fe.decks import write_calculix, write_febio
 from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
 from fe.plate import Plate
 from fe.simulate import LoadStep, State, simulate
@@ -86,9 +86,37 @@ def test_a_deck_holds_the_mesh_the_laws_and_the_supports(tmp_path: Path) -> None
     assert len(again.tets.cells) == len(mesh.cells)
 
 
-def test_a_law_that_calculix_does_not_have_is_refused(tmp_path: Path) -> None:
+def test_an_febio_deck_says_the_same(tmp_path: Path) -> None:
+    from xml.etree import ElementTree
+
+    mesh, laws = slab(), {"skin": Yeoh.of(0.265, 1.923), "fat": Ogden.from_ansys(0.0034, 6.2)}
+    state = states_of(mesh, laws, "P1")[0]
+    write_febio(tmp_path / "a.feb", mesh, laws, state, quadratic=True)
+    root = ElementTree.parse(tmp_path / "a.feb").getroot()
+    sections = ["Module", "Control", "Material", "Mesh", "MeshDomains", "MeshData", "Boundary", "LoadData", "Output"]
+    assert [child.tag for child in root] == sections
+    fat = root.find("Material/material[@name='MFAT']")
+    assert fat is not None
+    assert fat.get("type") == "Ogden"
+    numbers = {name: float(fat.findtext(name) or "nan") for name in ("c1", "m1", "k")}
+    assert numbers == pytest.approx({"c1": 2 * 0.01054, "m1": 6.2, "k": laws["fat"].bulk_modulus_mpa})
+    assert Ogden.from_febio(numbers["c1"], numbers["m1"]).shear_modulus_mpa == pytest.approx(0.01054)
+    count = sum(len(e) for e in root.findall("Mesh/Elements"))
+    assert count == len(mesh.cells)
+    assert all(len((e.text or "").split(",")) == 10 for e in root.iterfind("Mesh/Elements/elem"))
+    plate = (root.findtext("Mesh/NodeSet[@name='plate']") or "").split(",")
+    x = [float(n.text or "nan") for n in root.iterfind("MeshData/NodeData[@name='ux']/node")]
+    assert len(x) == len(plate) > len(state.on_plate)
+    assert x == pytest.approx([state.travel_mm[0]] * len(x))
+    domains = {d.get("name"): d.get("mat") for d in root.iterfind("MeshDomains/SolidDomain")}
+    assert domains == {"ESKIN": "MSKIN", "EFAT": "MFAT"}
+
+
+def test_a_law_that_a_solver_does_not_have_is_refused(tmp_path: Path) -> None:
     mesh, laws = slab(), {"skin": NeoHooke.of(0.1), "fat": Hencky.of(0.02, nu=0.49)}
     state = states_of(mesh, laws, "P1")[0]
     with pytest.raises(InputError, match="no law that is linear in logarithmic strain"):
         write_calculix(tmp_path / "a.inp", mesh, laws, state)
-    assert not (tmp_path / "a.inp").exists()
+    with pytest.raises(InputError, match="no FEBio deck is written for linear elastic"):
+        write_febio(tmp_path / "a.feb", mesh, laws, state)
+    assert list(tmp_path.iterdir()) == []
