@@ -12,6 +12,7 @@ from dvc.mesh import TetMesh
 
 _ORDERS = np.linspace(0.5, 3.0, 251)
 _FEWEST = 3
+_APART = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +22,8 @@ class Limit:
     Attributes
     ----------
     limit, order : float
-        The order is searched from 0.5 to 3.
+        The order is searched from 0.5 to 3; both are NaN where the figures show no order between, or do not rise or
+        fall steadily.
     scatter : float
         Root mean square distance of the figures from the curve; 0 with three sizes, which it goes through if it can.
     error : float
@@ -45,7 +47,7 @@ def extrapolated(sizes_mm: FloatArray, values: FloatArray) -> Limit:
     Raises
     ------
     InputError
-        If there are fewer than three sizes, or two are the same.
+        If there are fewer than three sizes, or the coarsest is not 1.5 times the finest or more: nothing could be told.
 
     Examples
     --------
@@ -55,8 +57,12 @@ def extrapolated(sizes_mm: FloatArray, values: FloatArray) -> Limit:
     (5.0, 2.0, 0.02)
     """
     h, f = np.asarray(sizes_mm, dtype=np.float64), np.asarray(values, dtype=np.float64)
-    if len(h) < _FEWEST or len(np.unique(h)) < len(h) or h.shape != f.shape:
-        raise InputError(f"Extrapolation needs {_FEWEST} or more meshes of different size; got sizes {h.tolist()}.")
+    if len(h) < _FEWEST or len(np.unique(h)) < len(h) or h.shape != f.shape or h.max() < _APART * h.min():
+        raise InputError(
+            f"Extrapolation needs {_FEWEST} or more meshes, the coarsest {_APART} times the size of the finest; got "
+            f"cells of {', '.join(f'{s:.2f}' for s in h)} mm. Where borders lie close together they, and not the edge "
+            "length asked for, set the size: ask for shorter edges."
+        )
     best: tuple[float, float, float] | None = None
     for order in _ORDERS:
         columns = np.column_stack([np.ones_like(h), h**order])
@@ -66,5 +72,8 @@ def extrapolated(sizes_mm: FloatArray, values: FloatArray) -> Limit:
             best = cost, float(order), float(found[0])
     assert best is not None
     scatter, order, limit = best
+    steps = np.diff(f[np.argsort(h)])
+    if order in (_ORDERS[0], _ORDERS[-1]) or not (np.all(steps >= 0.0) or np.all(steps <= 0.0)):
+        return Limit(float("nan"), float("nan"), scatter, float("nan"))
     finest = float(f[int(np.argmin(h))])
     return Limit(limit, order, scatter, (finest - limit) / limit if limit != 0.0 else float("nan"))

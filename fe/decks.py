@@ -52,17 +52,18 @@ def write_calculix(
 
 def _deck(mesh: TetMesh, laws: Mapping[str, Material], state: State, quadratic: bool) -> Iterator[str]:
     space = _space(mesh, quadratic)
+    yield from (f"** {line}" for line in _about(state))
     yield "*NODE, NSET=NALL"
     for number, (x, y, z) in enumerate(space.nodes_mm.tolist(), start=1):
         yield f"{number}, {x:.12g}, {y:.12g}, {z:.12g}"
     for region in laws:
-        yield f"*ELEMENT, TYPE={'C3D10' if quadratic else 'C3D4'}, ELSET={_short('E', region)}"
+        yield f"*ELEMENT, TYPE={'C3D10' if quadratic else 'C3D4'}, ELSET={_short('E', region, laws)}"
         for cell in mesh.regions[region]:
             yield f"{cell + 1}, " + ", ".join(str(n + 1) for n in space.cells[cell])
     for region, law in laws.items():
-        yield f"*MATERIAL, NAME={_short('M', region)}"
+        yield f"*MATERIAL, NAME={_short('M', region, laws)}"
         yield from _law(region, law)
-        yield f"*SOLID SECTION, ELSET={_short('E', region)}, MATERIAL={_short('M', region)}"
+        yield f"*SOLID SECTION, ELSET={_short('E', region, laws)}, MATERIAL={_short('M', region, laws)}"
     fixed, on_plate, moved = _supports(mesh, space, state)
     for name, nodes in (("NBONE", fixed), ("NPLATE", on_plate)):
         yield f"*NSET, NSET={name}"
@@ -165,6 +166,7 @@ def write_febio(
     space = _space(mesh, quadratic)
     fixed, on_plate, moved = _supports(mesh, space, state)
     root = ElementTree.Element("febio_spec", version="4.0")
+    root.append(ElementTree.Comment(" " + "\n    ".join(_about(state)) + " "))
     _child(root, "Module", type="solid")
     control = _child(root, "Control")
     for name, value in (("analysis", "STATIC"), ("time_steps", "20"), ("step_size", "0.05")):
@@ -177,7 +179,7 @@ def write_febio(
     materials = _child(root, "Material")
     for number, (region, law) in enumerate(laws.items(), start=1):
         kind, numbers = _febio_law(region, law)
-        material = _child(materials, "material", id=str(number), name=_short("M", region), type=kind)
+        material = _child(materials, "material", id=str(number), name=_short("M", region, laws), type=kind)
         for name, size in (*numbers.items(), ("k", law.bulk_modulus_mpa)):
             _child(material, name, f"{size:.12g}")
         _child(material, "pressure_model", "Abaqus")
@@ -186,14 +188,14 @@ def write_febio(
     for number, place in enumerate(space.nodes_mm.tolist(), start=1):
         _child(nodes, "node", ",".join(f"{v:.12g}" for v in place), id=str(number))
     for region in laws:
-        elements = _child(whole, "Elements", type="tet10" if quadratic else "tet4", name=_short("E", region))
+        elements = _child(whole, "Elements", type="tet10" if quadratic else "tet4", name=_short("E", region, laws))
         for cell in mesh.regions[region]:
             _child(elements, "elem", ",".join(str(n + 1) for n in space.cells[cell]), id=str(cell + 1))
     for name, members in (("bone", fixed), ("plate", on_plate)):
         _child(whole, "NodeSet", ",".join(str(n + 1) for n in members), name=name)
     domains = _child(root, "MeshDomains")
     for region in laws:
-        _child(domains, "SolidDomain", name=_short("E", region), mat=_short("M", region))
+        _child(domains, "SolidDomain", name=_short("E", region, laws), mat=_short("M", region, laws))
     data = _child(root, "MeshData")
     boundary = _child(root, "Boundary")
     still = _child(boundary, "bc", name="bone", type="zero displacement", node_set="bone")
@@ -240,10 +242,20 @@ def _febio_law(region: str, law: Material) -> tuple[str, dict[str, float]]:
     raise InputError(f"{region}: no FEBio deck is written for {law.law}; choose another set.")
 
 
+def _about(state: State) -> tuple[str, ...]:
+    force = ", ".join(f"{f:.4g}" for f in state.force_n)
+    return (
+        f"Written by mrstrain: the state under {state.load.name}, {state.reached:.0%} of it reached. mm, N, MPa; LPS.",
+        "Bone is fixed; nodes on the plate are moved to where they ended; no contact and no force is in this deck.",
+        f"Force on the plate to expect, along the normal force, the shear and their cross product: {force} N,",
+        "less what this element differs from the stabilised linear one that found the state.",
+    )
+
+
 def _space(mesh: TetMesh, quadratic: bool) -> Space:
     return Space.on(mesh, "P2" if quadratic else "P1", np.zeros(len(mesh.cells), dtype=np.int64))
 
 
-def _short(prefix: str, region: str) -> str:
-    """A name that CalculiX takes: letters and digits, under 20 characters."""
-    return prefix + "".join(c for c in region.upper() if c.isalnum())[:18]
+def _short(prefix: str, region: str, laws: Mapping[str, Material]) -> str:
+    """A name of its own that CalculiX takes: letters and digits, under 20 characters."""
+    return f"{prefix}{list(laws).index(region) + 1}" + "".join(c for c in region.upper() if c.isalnum())[:15]

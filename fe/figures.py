@@ -21,7 +21,6 @@ from fe.plate import Plate
 from fe.simulate import State
 
 _POINTS = 200
-_LARGEST = 0.5  # maximal shear at the end of the colour scale
 
 
 def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
@@ -51,11 +50,14 @@ def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
 def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate, point_mm: FloatArray) -> bytes:
     """Maximal shear on the slice through the bone's lowest point, along the plate's normal and the shear's direction.
 
-    Cells are cut in the unloaded configuration and drawn where they are under load; the dashed line is the plate.
+    Cells are cut in the unloaded configuration and drawn where they are under load; the dashed line is the plate. The
+    colours end where a hundredth of the volume is above, over all loads.
     """
     cuts = [cut(mesh, state.u_mm, plate.axes, point_mm) for state in states]
     corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
     low, high = corners.min(axis=0) - 2.0, corners.max(axis=0) + 2.0
+    shears = np.concatenate([StrainField.from_gradient(state.gradients).max_shear for state in states])
+    largest = max(0.05, float(np.ceil(20.0 * np.quantile(shears, 0.99)) / 20.0))
     rows, columns = (len(states) + 1) // 2, min(len(states), 2)
     tall = 0.9 + (WIDTH_IN / columns - 1.0) * float((high[1] - low[1]) / (high[0] - low[0]))
     figure = Figure(figsize=(WIDTH_IN, rows * tall), dpi=DPI, facecolor="white", layout="constrained")
@@ -66,14 +68,16 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate, point_m
     for axes, state, (cells, polygons) in zip(panels, states, cuts, strict=False):
         shear = StrainField.from_gradient(state.gradients[cells]).max_shear
         drawn = PolyCollection(
-            polygons, array=shear, cmap="viridis", norm=Normalize(0.0, _LARGEST), edgecolors="face", linewidths=0.2
+            polygons, array=shear, cmap="viridis", norm=Normalize(0.0, largest), edgecolors="face", linewidths=0.2
         )
         axes.add_collection(drawn)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        face = float(((mesh.points_mm + state.u_mm) @ plate.axes[:, 0]).min())
+        face = float(((mesh.points_mm + state.u_mm)[state.on_plate] @ plate.axes[:, 0]).mean())
         axes.axhline(face, color=INK, linewidth=1.0, linestyle="--")
         load = state.load
-        axes.set_title(f"{load.name}: {load.normal_n:g} N normal, {load.shear_n:g} N shear", color=INK, **FONT)
+        part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%})"
+        told = f"{load.name}: {load.normal_n:g} N normal, {load.shear_n:g} N shear{part}"
+        axes.set_title(told, color=INK, **FONT)
         label_axes(axes, "along the shear, mm", "along the normal force, mm")
     bar = figure.colorbar(drawn, ax=list(panels[: len(states)]), shrink=0.8, extend="max")
     bar.set_label("maximal shear", color=INK, **FONT)
@@ -146,8 +150,11 @@ def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[f
         colour = REGION_COLOURS[number % len(REGION_COLOURS)]
         style = "-" if "travel" in name else "--"
         axes.plot(sizes_mm, np.array(values) / limit.limit, style, marker="o", color=colour, linewidth=1.6, label=name)
+        h = np.linspace(0.0, min(sizes_mm), _POINTS)
+        slope = (values[int(np.argmin(sizes_mm))] - limit.limit) / min(sizes_mm) ** limit.order
+        axes.plot(h, 1.0 + slope * h**limit.order / limit.limit, ":", color=colour, linewidth=1.2)
     axes.axhline(1.0, color="#9aa5b1", linewidth=1.0)
-    axes.set_xlim(left=0.0)
+    axes.set_xlim(0.0, 1.05 * max(sizes_mm))
     label_axes(axes, "size of the cells, mm", "figure over its limit")
     axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)

@@ -16,7 +16,7 @@ from scipy.stats import t as student
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from fe.hyperelastic import HENCKY, OGDEN
-from fe.materials import MODES, Hencky, Material, NeoHooke, Ogden, Yeoh, nominal_stress
+from fe.materials import HIGHEST_NU, MODES, Hencky, Material, NeoHooke, Ogden, Yeoh, nominal_stress
 
 _STRESS = {
     "nominal_stress_kpa": (1e-3, False),
@@ -25,6 +25,7 @@ _STRESS = {
     "true_stress_mpa": (1.0, True),
 }
 _EXPONENTS = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # starts of an Ogden fit
+_MOSTLY = 0.8
 _MOST = 60.0  # an exponent beyond this is not one that a curve can tell
 
 
@@ -156,11 +157,14 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
     except (OSError, UnicodeDecodeError, csv.Error) as failure:
         raise InputError(f"Cannot read the curve {path}: {failure}.") from failure
     stress = [c for c in columns if c in _STRESS]
+    if len(columns) == 1 and ";" in columns[0]:
+        raise InputError(f"{path}: columns are divided by semicolons; write it with commas (and points in numbers).")
     if "stretch" not in columns or len(stress) != 1:
         raise InputError(
             f"{path}: a curve needs a column 'stretch' and one of {', '.join(_STRESS)}, so that unit and kind of "
-            f"stress are said; its columns are {', '.join(columns) or 'none'}."
+            f"stress are said (stretch = 1 + strain); its columns are {', '.join(columns) or 'none'}."
         )
+    mode = None if mode is None else mode.strip().lower()
     if mode is None and "test" not in columns:
         raise InputError(f"{path}: say which test it is: {', '.join(MODES)} (--test, or a column 'test').")
     scale, true = _STRESS[stress[0]]
@@ -173,7 +177,7 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
             raise InputError(f"{path}, line {line}: {failure}.") from failure
         if not (np.isfinite([stretch, value]).all() and stretch > 0.0):
             raise InputError(f"{path}, line {line}: a stretch is positive, and both numbers finite; got {told}.")
-        name = mode or told["test"]
+        name = mode or told["test"].lower()
         if name not in MODES:
             raise InputError(f"{path}, line {line}: no test '{name}'; there are {', '.join(MODES)}.")
         tests.setdefault(name, []).append((stretch, value / stretch if true else value))
@@ -212,12 +216,15 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
 
     Intervals are those of linearised regression with Student's t: they assume independent errors of the same
     standard deviation at every point, and claim nothing of errors that a curve shares, such as a wrong area.
-    Parameters in which the stress is linear start at their best; an Ogden law's exponents from every combination
-    of eight values.
+    Parameters in which the stress is linear start at their best; an Ogden law's exponents from the four best of the
+    combinations of eight values.
     """
-    if law not in LAWS:
+    named = {name.lower(): name for name in LAWS}
+    if law.lower() not in named:
         raise InputError(f"No law '{law}' to fit; there are {', '.join(LAWS)}.")
-    sought = LAWS[law]
+    if not 0.0 <= nu <= HIGHEST_NU:
+        raise InputError(f"Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {nu:g}.")
+    sought = LAWS[named[law.lower()]]
     count = len(sought.names)
     stress = np.concatenate([c.stress_mpa for c in curves]) if curves else np.empty(0)
     stretch = np.concatenate([c.stretch for c in curves]) if curves else np.empty(0)
@@ -226,6 +233,11 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         raise InputError(
             f"{law} has {count} parameters and needs {count + 2} points or more, {count} of them at different "
             f"stretches other than 1; got {len(stress)} points, {apart} such stretches."
+        )
+    if np.mean(stress * (stretch - 1.0) < 0.0) > _MOSTLY:
+        raise InputError(
+            "The stress has the sign opposite to the stretch: it must be above 0 in tension (stretch over 1) and below "
+            "0 in compression (stretch under 1). A column of strain is not one of stretch: stretch = 1 + strain."
         )
     size = float(np.sqrt(np.mean(stress**2)))
     if size == 0.0:

@@ -163,6 +163,11 @@ def _kpa(value_mpa: float) -> str:
     return f"{1000.0 * value_mpa:.4g} kPa"
 
 
+def _check_terms(moduli: FloatArray, exponents: FloatArray) -> None:
+    if moduli.shape != exponents.shape or moduli.ndim != 1 or not len(moduli):
+        raise InputError(f"Ogden: {moduli.size} moduli and {exponents.size} exponents; as many of each are needed.")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NeoHooke(Material):
     """Wbar = mu / 2 (I1bar - 3)."""
@@ -234,8 +239,7 @@ class Ogden(Material):
             If there is not one exponent, other than 0, for each modulus.
         """
         moduli, exponents = np.atleast_1d(shear_modulus_mpa).astype(float), np.atleast_1d(alpha).astype(float)
-        if moduli.shape != exponents.shape or moduli.ndim != 1 or not len(moduli):
-            raise InputError(f"Ogden: {moduli.size} moduli and {exponents.size} exponents; as many of each are needed.")
+        _check_terms(moduli, exponents)
         if not (np.abs(exponents) > 1e-6).all():
             raise InputError("Ogden: an exponent of 0 has no meaning; Hencky's law is the limit.")
         pairs = "; ".join(f"mu0 {_kpa(m)}, alpha {a:g}" for m, a in zip(moduli, exponents, strict=True))
@@ -245,7 +249,9 @@ class Ogden(Material):
     @classmethod
     def from_ansys(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
         """W = sum mu / alpha (sum l^alpha - 3), so mu0 = mu alpha / 2."""
-        return cls.of(0.5 * np.asarray(mu_mpa) * np.asarray(alpha), alpha, nu)
+        numbers, exponents = np.atleast_1d(mu_mpa).astype(float), np.atleast_1d(alpha).astype(float)
+        _check_terms(numbers, exponents)
+        return cls.of(0.5 * numbers * exponents, exponents, nu)
 
     @classmethod
     def from_abaqus(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:

@@ -102,7 +102,8 @@ def equilibrium(
         data = assembler.held(assembler.tangent(now), right, held, left)
         try:
             change = assembler.spread(solver.solve(data, right, _INEXACT))
-        except SingularError:
+        except SingularError as failure:
+            told(f"    {failure}")
             return None
         if not np.isfinite(change).all():
             return None
@@ -124,7 +125,7 @@ def equilibrium(
             continue
         if changed(now, forces):
             forces, residual, lowest = assembler.residual(now)
-        elif balance <= tolerance.force and largest <= tolerance.step_mm:
+        elif share == 1.0 and balance <= tolerance.force and largest <= tolerance.step_mm:
             return Converged(now, forces, iteration)
     return None
 

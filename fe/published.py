@@ -20,7 +20,7 @@ from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
 WHOLE = "all"
 """Name of the tissue in a set that has one law for everything."""
 
-_INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat")}
+_INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,8 @@ class MaterialSet:
     def for_regions(self, regions: Iterable[str]) -> tuple[dict[str, Material], tuple[str, ...]]:
         """The law of each region of a mesh, and a sentence for each region that has none of its own.
 
-        Tendon and aponeurosis take muscle's law, or else fat's; any other region without a law takes fat's.
+        Tendon and aponeurosis without a law take muscle's, or else fat's; muscle takes fat's. No other region takes
+        another's.
 
         Raises
         ------
@@ -81,18 +82,20 @@ class MaterialSet:
         """
         found: dict[str, Material] = {}
         notes = []
+        known = {tissue.casefold(): law for tissue, law in self.laws.items()}
         for region in regions:
             if WHOLE in self.laws:
                 found[region] = self.laws[WHOLE]
                 continue
-            tried = (region, *_INSTEAD.get(region, ("fat",)))
-            name = next((t for t in tried if t in self.laws), None)
+            tried = (region, *_INSTEAD.get(region.casefold(), ()))
+            name = next((t for t in tried if t.casefold() in known), None)
             if name is None:
+                instead = f", nor one for {' or '.join(tried[1:])} to put in its place" if tried[1:] else ""
                 raise InputError(
-                    f"The set {self.name} has no law for the region '{region}', nor one for "
-                    f"{' or '.join(tried[1:])} to put in its place; it has {', '.join(self.laws)}."
+                    f"The set {self.name} has no law for the region '{region}'{instead}; it has "
+                    f"{', '.join(self.laws)}. Add it to the set in a file of your own, or rename the region."
                 )
-            found[region] = self.laws[name]
+            found[region] = known[name.casefold()]
             if name != region:
                 notes.append(f"{self.name} has no law for {region}; {name}'s is used.")
         return found, tuple(notes)

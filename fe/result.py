@@ -54,7 +54,10 @@ class RegionFigures:
 
     Attributes
     ----------
-    load, region : str
+    load : str
+    reached : float
+        Share of the load; below 1 the figures are those of the last state in equilibrium.
+    region : str
     volume_ml : float
         In the reference configuration.
     shear_p50, shear_p90, shear_p99 : float
@@ -68,6 +71,7 @@ class RegionFigures:
     """
 
     load: str
+    reached: float
     region: str
     volume_ml: float
     shear_p50: float
@@ -90,7 +94,7 @@ def region_figures(mesh: TetMesh, state: State, laws: Mapping[str, Material]) ->
         stable = law.is_stable(np.eye(3) + state.gradients[cells])
         rows.append(
             RegionFigures(
-                state.load.name, region, float(volumes.sum()) / 1000.0, p50, p90, p99,
+                state.load.name, state.reached, region, float(volumes.sum()) / 1000.0, p50, p90, p99,
                 tuple(volume_above(shear, volumes / 1000.0, SHEAR_THRESHOLDS).tolist()),
                 float(volumes @ strain.jacobian[cells] / volumes.sum()) - 1.0,
                 float(volumes[stable].sum() / volumes.sum()),
@@ -119,12 +123,14 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
     writer = csv.writer(text, lineterminator="\n")
     above = [f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS]
     writer.writerow(
-        ["load", "region", "volume_ml", "max_shear_p50", "max_shear_p90", "max_shear_p99", *above, "volume_change",
-         "stable_share"]
+        ["load", "reached", "region", "volume_ml", "max_shear_p50", "max_shear_p90", "max_shear_p99", *above,
+         "volume_change", "stable_share"]
     )  # fmt: skip
     for row in rows:
         numbers = (row.volume_ml, row.shear_p50, row.shear_p90, row.shear_p99, *row.above_ml, row.volume_change)
-        writer.writerow([row.load, row.region, *(f"{v:.6g}" for v in numbers), f"{row.stable_share:.6g}"])
+        writer.writerow(
+            [row.load, f"{row.reached:.4g}", row.region, *(f"{v:.6g}" for v in numbers), f"{row.stable_share:.6g}"]
+        )
     write_whole(path, text.getvalue())
 
 

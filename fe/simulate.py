@@ -7,12 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from fe.assembly import Assembler, Model
-from fe.elements import element
+from fe.elements import EDGES, element
 from fe.linear import Solver
 from fe.materials import Material
 from fe.newton import Tolerance, equilibrium
@@ -24,7 +26,7 @@ BONE, SURFACE = "bone", "skin"
 _FIRST_STEP = 0.25
 _LEAST_STEP = 1.0 / 512.0
 _GROWTH, _SHRINK = 1.7, 0.4
-_APPROACH_MM = 0.25
+_APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
 _LEAST_APPROACH_MM = 0.01
 _ENOUGH = 0.2  # share of the normal force up to which the plate is moved, and not yet pushed
 
@@ -53,7 +55,7 @@ class State:
     ----------
     load : LoadStep
     reached : float
-        Share of the way from the load before it; 1 where all of it is there.
+        Share of the force that this load adds to the one before it on its path, all of it being 1.
     u_mm : (n, 3)
         Displacement of the mesh's nodes, mm.
     pressure_mpa : (m, 4)
@@ -65,7 +67,7 @@ class State:
     on_plate : (k,)
         Nodes that hold to the plate.
     curve : (k, 6)
-        Travel and force of every state of equilibrium on the way from the load before it, this one last.
+        Travel and force of every state of equilibrium on the way, from that of the load before it to this one.
     iterations : int
         Newton steps since the load before it, those of steps that failed not counted.
     seconds : float
@@ -127,24 +129,29 @@ def simulate(
     InputError
         If a region has no law or a cell no region, the facets are missing, or the first load does not press.
     """
-    _check(mesh, laws, loads)
+    check(mesh, laws, plate, loads)
     turned = TetMesh(mesh.points_mm @ plate.axes, mesh.cells, mesh.regions, mesh.facets)
     model = Model.of(turned, laws, element(formulation))
     path = _Path(model, turned, plate, threads, tell)
     states: list[State] = []
+    before = np.zeros(3)
     try:
-        path.approach(loads[0].normal_n)
-        progress(0.3 / len(loads))
-        before = path.force.copy()
         for number, load in enumerate(loads):
-            first = 0.3 if number == 0 else 0.0
             target = np.array([load.normal_n, load.shear_n, 0.0])
-            began, counted, known = time.monotonic(), path.iterations if states else 0, len(path.curve) if states else 0
+            began, counted, known = time.monotonic(), path.iterations, len(path.curve)
 
-            def told(share: float, done: int = number, first: float = first) -> None:
-                progress((done + first + (1.0 - first) * share) / len(loads))
+            def told(share: float, done: int = number) -> None:
+                progress((done + share) / len(loads))
 
-            reached = path.raise_force(before, target, told)
+            whole = True
+            if not states:
+                path.approach(load.normal_n)
+                if load.shear_n != 0.0:  # normal first, then shear
+                    whole = path.raise_force(np.array([load.normal_n, 0.0, 0.0]), told)
+            whole = whole and path.raise_force(target, told)
+            reached = (
+                1.0 if whole else float((path.force - before) @ (target - before) / ((target - before) ** 2).sum())
+            )
             displacements = 3 * len(model.space.nodes_mm)
             u = path.state[:displacements].reshape(-1, 3)[: len(mesh.points_mm)]
             states.append(
@@ -157,13 +164,13 @@ def simulate(
                     travel_mm=path.travel.copy(),
                     force_n=path.force.copy(),
                     on_plate=path.on_plate[path.on_plate < len(mesh.points_mm)],
-                    curve=np.reshape(path.curve[known:], (-1, 6)),
+                    curve=np.array(path.curve[known - 1 :]),
                     iterations=path.iterations - counted,
                     seconds=time.monotonic() - began,
                 )
             )
             keep(states[-1])
-            if reached < 1.0:
+            if not whole:
                 break
             before = target
     finally:
@@ -171,7 +178,8 @@ def simulate(
     return states
 
 
-def _check(mesh: TetMesh, laws: Mapping[str, Material], loads: Sequence[LoadStep]) -> None:
+def check(mesh: TetMesh, laws: Mapping[str, Material], plate: Plate, loads: Sequence[LoadStep]) -> None:
+    """Refuse what `simulate` cannot do, before anything is computed; errors as there."""
     for name in (BONE, SURFACE):
         if name not in mesh.facets:
             raise InputError(
@@ -198,6 +206,25 @@ def _check(mesh: TetMesh, laws: Mapping[str, Material], loads: Sequence[LoadStep
                 f"{load.name}: the normal force must press, above 0 N; got {load.normal_n:g} N. The plate's normal "
                 "points away from the tissue."
             )
+        if load.shear_n != 0.0 and not plate.taped:
+            raise InputError(f"{load.name}: a plate without friction carries no shear force; got {load.shear_n:g} N.")
+    _check_held(mesh)
+    on_surface = np.setdiff1d(np.unique(mesh.facets[SURFACE]), np.unique(mesh.facets[BONE]))
+    Contact(plate, mesh.points_mm @ plate.axes, on_surface)
+
+
+def _check_held(mesh: TetMesh) -> None:
+    """Refuse tissue that hangs on no bone: cells whose nodes are joined to none of it."""
+    ends = np.repeat(mesh.cells[:, 0], 3), mesh.cells[:, 1:].ravel()
+    count = len(mesh.points_mm)
+    joined = sparse.csr_matrix((np.ones(len(ends[0]), dtype=np.int8), ends), shape=(count, count))
+    _, part = connected_components(joined, directed=False)
+    loose = ~np.isin(part[mesh.cells[:, 0]], part[np.unique(mesh.facets[BONE])])
+    if loose.any():
+        raise InputError(
+            f"{int(loose.sum())} of {len(loose)} cells are not joined to the bone's surface: tissues are bonded where "
+            "they share nodes. Merge coincident nodes where the mesh was made."
+        )
 
 
 _Kept = tuple[FloatArray, FloatArray, FloatArray, BoolArray, int]
@@ -216,7 +243,8 @@ class _Path:
         self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
         self.state = np.zeros(model.unknowns)
         self.travel, self.force = np.zeros(3), np.zeros(3)
-        self.curve: list[FloatArray] = []
+        self.travel[0] = plate.gap_mm
+        self.curve: list[FloatArray] = [np.concatenate([self.travel, self.force])]
         self.tolerance = Tolerance()
         self.iterations = 0
 
@@ -228,19 +256,20 @@ class _Path:
     def approach(self, normal_n: float) -> None:
         """Move the plate from its first touch on, until it presses with a part of the force asked for."""
         self.contact.touch_first(self.state)
-        self.travel[0] = self.contact.plate.gap_mm
+        deepest = float(np.ptp(self.model.space.nodes_mm[:, 0]))
         step = _APPROACH_MM
-        while self.force[0] < _ENOUGH * normal_n and step > _LEAST_APPROACH_MM:
+        while self.force[0] < _ENOUGH * normal_n and _LEAST_APPROACH_MM < step < deepest - self.travel[0]:
             kept = self._kept()
             if self._go(np.zeros(3), [0], np.array([step])) and self.force[0] < normal_n:
-                step *= _GROWTH
+                step = min(_GROWTH * step, _MOST_APPROACH_MM)
                 self._told("moved")
             else:
                 self._restore(kept)
                 step *= _SHRINK
 
-    def raise_force(self, before: FloatArray, target: FloatArray, progress: Callable[[float], None]) -> float:
-        """Raise the force from what it is to the target, in steps as large as converge; the share reached."""
+    def raise_force(self, target: FloatArray, progress: Callable[[float], None]) -> bool:
+        """Raise the force from what it is to the target, in steps as large as converge; whether it is there."""
+        before = self.force.copy()
         done, step = 0.0, _FIRST_STEP
         while done < 1.0 and step > _LEAST_STEP:
             share = min(1.0, done + step)
@@ -252,10 +281,11 @@ class _Path:
             else:
                 self._restore(kept)
                 step *= _SHRINK
-        return done
+        return done >= 1.0
 
     def _go(self, force: FloatArray, held: list[int], moves: FloatArray) -> bool:
         """Find equilibrium under a force along the axes that are not held, and moves along those that are."""
+        self.contact.begin(self.state)
         follows = self.contact.followers
         plate = self.assembler.own_equations + np.arange(3)
         outside = np.zeros(self.assembler.size)
@@ -274,8 +304,10 @@ class _Path:
         )
         if found is None:
             return False
-        for axis, unknowns in follows.items():
-            self.travel[axis] += found.state[unknowns[0]] - self.state[unknowns[0]]
+        self.travel[0] = self.contact.plate.gap_mm + self.contact.advance_mm(found.state)
+        if self.contact.plate.taped:  # whoever was on the plate still is
+            for axis in (1, 2):
+                self.travel[axis] += (found.state - self.state)[follows[axis][0]]
         self.force = np.array([found.forces[self.contact.followers.get(axis, [])].sum() for axis in range(3)])
         self.state = found.state
         self.iterations += found.iterations
@@ -305,8 +337,6 @@ def _nodes_on(model: Model, mesh: TetMesh, facets: str) -> IntArray:
     corners = np.unique(mesh.facets[facets])
     if model.element.name != "P2":
         return corners
-    from fe.elements import EDGES
-
     faces = mesh.facets[facets]
     ends = np.sort(np.concatenate([faces[:, pair] for pair in ([0, 1], [0, 2], [1, 2])]), axis=1)
     of_cells = np.sort(np.concatenate([mesh.cells[:, list(edge)] for edge in EDGES]), axis=1)

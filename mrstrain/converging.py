@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from dvc.errors import InputError
+from dvc.labels import read_labels
 from dvc.whole import whole_file, write_whole
 from fe import figures
 from fe.convergence import Limit, extrapolated, size_mm
@@ -51,10 +52,10 @@ class Converged:
         lines = ["Size of the cells, mm: " + ", ".join(f"{s:.2f}" for s in self.sizes_mm)]
         for row in self.rows:
             values = ", ".join(f"{v:.4g}" for v in row.values)
-            lines.append(
-                f"{row.load}, {row.figure}: {values}; tends to {row.limit.limit:.4g} (order {row.limit.order:.1f}), "
-                f"the finest is off by {row.limit.error:+.1%}"
-            )
+            limit, tends = row.limit, "no limit can be told"
+            if np.isfinite(limit.limit):
+                tends = f"tends to {limit.limit:.4g} (order {limit.order:.1f}), the finest is off by {limit.error:+.1%}"
+            lines.append(f"{row.load}, {row.figure}: {values}; {tends}")
         return [*lines, f"Results: {self.out}"]
 
 
@@ -102,14 +103,20 @@ def converge(
     refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], list(inputs.values()))
     make_output(target)
     tell = progress or (lambda *_: None)
-    sizes, values = [], []
-    for edge in edges:
-        place = target / f"mesh-{edge:g}.vtu"
+    known = list(read_labels(labels, names).names.values())
+    if region not in known or region in bones:
+        raise InputError(f"No soft tissue '{region}' in the label map to follow; it has {', '.join(known)}.")
+    places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
+    values = []
+    for edge, place in places.items():
         if not _is_of(place, inputs, bones):
             make_mesh(
                 labels, out=place, edge_mm=edge, names=names, bones=bones,
                 watch=lambda share, edge=edge: tell(f"{edge:g} mm", "meshing", share),  # type: ignore[misc]
             )  # fmt: skip
+    sizes = [size_mm(read_tet_mesh(place)) for place in places.values()]
+    extrapolated(np.array(sizes), np.array(sizes))  # refuses sizes that tell nothing, before anything is simulated
+    for edge, place in places.items():
         made = simulate(
             place, out=target / f"simulated-{edge:g}", sets=[material], loads=loads, plate_normal=plate_normal,
             shear_direction=shear_direction, workers=workers,
@@ -117,7 +124,6 @@ def converge(
         )  # fmt: skip
         if not made.complete:
             raise InputError(f"With edges of {edge:g} mm not every load was reached: {' '.join(made.summary()[:-1])}")
-        sizes.append(size_mm(read_tet_mesh(place)))
         found = {}
         for state in made.sets[0].states:
             found[state.load.name, "plate travel, mm"] = float(np.hypot(*state.travel_mm[:2]))
@@ -136,6 +142,13 @@ def converge(
 
 def _limit(sizes: Sequence[float], values: Sequence[float]) -> Limit:
     return extrapolated(np.array(sizes), np.array(values))
+
+
+def _plain(row: dict[str, object]) -> dict[str, object]:
+    """A row with None for what is not known, since JSON has no NaN."""
+    limit = row["limit"]
+    assert isinstance(limit, dict)
+    return row | {"limit": {key: value if np.isfinite(value) else None for key, value in limit.items()}}
 
 
 def _is_of(place: Path, inputs: dict[str, Path], bones: Sequence[str]) -> bool:
@@ -159,9 +172,12 @@ def _write(
     )
     for row in rows:
         numbers = (*row.values, row.limit.limit, row.limit.order, row.limit.scatter, row.limit.error)
-        writer.writerow([row.load, row.figure, *(f"{v:.6g}" for v in numbers)])
+        writer.writerow([row.load, row.figure, *(f"{v:.6g}" if np.isfinite(v) else "" for v in numbers)])
     write_whole(target / "convergence.csv", text.getvalue())
-    curves = {f"{r.load}, {r.figure}": (r.values, r.limit) for r in rows if "p90" in r.figure or "travel" in r.figure}
-    with whole_file(target / "convergence.png") as part:
-        part.write_bytes(figures.convergence(sizes, curves))
-    write_json(target / "convergence.json", {"sizes_mm": list(sizes), "rows": [asdict(r) for r in rows]} | record)
+    curves = {f"{r.load}, {r.figure}": (r.values, r.limit) for r in rows if np.isfinite(r.limit.limit)}
+    if curves:
+        with whole_file(target / "convergence.png") as part:
+            part.write_bytes(figures.convergence(sizes, curves))
+    write_json(
+        target / "convergence.json", {"sizes_mm": list(sizes), "rows": [_plain(asdict(r)) for r in rows]} | record
+    )

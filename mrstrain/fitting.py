@@ -13,6 +13,8 @@ from dvc.whole import whole_file, write_whole
 from fe import figures
 from fe.fitting import Fit, read_curves
 from fe.fitting import fit as fit_law
+from fe.hyperelastic import OGDEN
+from fe.materials import Material, Ogden
 from fe.published import as_toml
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.provenance import provenance, write_json
@@ -42,10 +44,32 @@ class Fitted:
             lines.append(
                 f"{mode}: measured at stretches {low:.3g} to {high:.3g}, stable from {stable[0]:.3g} to {stable[1]:.3g}"
             )
+        lines += _in_programs(found.material)
+        for p in found.parameters:
+            if p.low <= 0.0 <= p.high:
+                lines.append(
+                    f"These curves do not determine {p.name}: its interval holds 0. Take a law with fewer parameters."
+                )
         if not found.stable_where_measured:
             lines.append("NOT stable (Drucker) at every stretch measured: take another law, or simulate less strain.")
         lines += [f"These curves cannot tell it from: {other.told}" for other in found.others]
         return [*lines, f"Results: {self.out}"]
+
+
+def _in_programs(law: Material) -> list[str]:
+    """The numbers of an Ogden law as three programs want them, kPa."""
+    if not isinstance(law, Ogden):
+        return []
+    pairs = law.vector[OGDEN:].reshape(-1, 2).tolist()
+    told = {
+        "ANSYS (mu, alpha)": [(2000.0 * mu / alpha, alpha) for mu, alpha in pairs],
+        "Abaqus, CalculiX (mu, alpha)": [(1000.0 * mu, alpha) for mu, alpha in pairs],
+        "FEBio (c, m)": [(2000.0 * mu, alpha) for mu, alpha in pairs],
+    }
+    return [
+        f"  as {program}: " + "; ".join(f"{first:.4g} kPa, {second:.4g}" for first, second in values)
+        for program, values in told.items()
+    ]
 
 
 def fit(
@@ -87,7 +111,16 @@ def fit(
     given = {"law": law, "test": test, "nu": nu, "tissue": tissue}
     record = provenance("fit", {"curve": path}, given)
     told = asdict(found) | {"material": found.material.told, "others": [o.told for o in found.others]}
-    write_json(target / "fit.json", told | {"stable_where_measured": found.stable_where_measured, "provenance": record})
+    write_json(
+        target / "fit.json",
+        told
+        | {
+            "mu_of_ogden": "initial shear modulus of the term, MPa (Abaqus' convention)",
+            "in_programs": [line.strip() for line in _in_programs(found.material)],
+            "stable_where_measured": found.stable_where_measured,
+            "provenance": record,
+        },
+    )
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["test", "stretch", "nominal_stress_kpa", "fitted_kpa"])

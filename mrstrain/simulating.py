@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from dvc.whole import whole_file, write_whole
 from dvc.worker import Worker, each_in_workers, usable_cores
 from fe import figures
 from fe.decks import write_calculix, write_febio
-from fe.materials import Material
+from fe.materials import MODES, Material
 from fe.meshstore import read_tet_mesh
 from fe.plate import Plate
 from fe.published import MaterialSet, material_set
@@ -28,7 +29,7 @@ from fe.result import (
     write_regions_csv,
     write_state,
 )
-from fe.simulate import LoadStep, State
+from fe.simulate import LoadStep, State, check
 from fe.simulate import simulate as solve
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.meshing import lowest_point
@@ -45,6 +46,7 @@ LOADS = (
 """The published experiment's."""
 
 _FAR = 0.05  # det F of a patch further from 1 than this is counted
+_MUCH = 0.05  # share of the volume above which that is told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,13 +60,16 @@ class Simulated:
         In the order of the loads; the last of a path that could not go on has ``reached`` below 1.
     figures : tuple of RegionFigures
     notes : tuple of str
-        What was assumed.
+        What was assumed, and what is not to be trusted.
+    complete : bool
+        Whether every load was carried, with laws that are stable at the strain reached.
     """
 
     name: str
     states: tuple[State, ...]
     figures: tuple[RegionFigures, ...]
     notes: tuple[str, ...]
+    complete: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,8 +82,8 @@ class Simulations:
 
     @property
     def complete(self) -> bool:
-        """Whether every set carried every load."""
-        return not self.failures and all(s.reached == 1.0 for one in self.sets for s in one.states)
+        """Whether every set carried every load, with laws that are stable at the strain reached."""
+        return not self.failures and all(one.complete for one in self.sets)
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
@@ -87,7 +92,8 @@ class Simulations:
             for state in one.states:
                 fat = [f for f in one.figures if f.load == state.load.name]
                 shear = "; ".join(f"{f.region} {f.shear_p50:.3f} / {f.shear_p90:.3f}" for f in fat)
-                part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached;"
+                force = f"{state.force_n[0]:.1f} N and {state.force_n[1]:.1f} N of shear"
+                part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached ({force});"
                 lines.append(
                     f"{one.name}, {state.load.name}:{part} plate {state.travel_mm[0]:.2f} mm in, "
                     f"{state.travel_mm[1]:.2f} mm along; maximal shear, median / 90th percentile: {shear}"
@@ -151,20 +157,28 @@ def simulate(
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
     paths = paths_of(loads)
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
+    for region_laws, _ in laws.values():
+        check(read, region_laws, plate, loads)
     refuse_touching_inputs(target, names, [place])
     make_output(target)
     for name in names:
         make_output(target / name)
+        _clear(target / name)
+    files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
+    given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped}
     jobs = [(one, path) for one in chosen for path in paths]
     at_once = max(1, min(workers or usable_cores(), len(jobs)))
     threads = max(1, usable_cores() // at_once)
     found: dict[str, list[State]] = {name: [] for name in names}
+    waiting = {name: len(paths) for name in names}
+    done: dict[str, Simulated] = {}
     failures: dict[str, str] = {}
-    tell = progress or (lambda *_: None)
+    tell, writing = progress or (lambda *_: None), threading.Lock()
 
     def one(job: tuple[MaterialSet, tuple[LoadStep, ...]], worker: Worker) -> None:
         chosen_set, path = job
-        case = f"{chosen_set.name}, {' '.join(step.name for step in path)}"
+        name = chosen_set.name
+        case = f"{name}, {' '.join(step.name for step in path)}"
         with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
             share = Path(folder) / "share"
 
@@ -174,30 +188,41 @@ def simulate(
 
             try:
                 states = worker.run(
-                    f"simulating {case}", _simulated, read, laws[chosen_set.name][0], plate, path,
-                    target / chosen_set.name, share, threads, watch=watch,
+                    f"simulating {case}", _simulated, read, laws[name][0], plate, path, target / name, share, threads,
+                    watch=watch,
                 )  # fmt: skip
-                found[chosen_set.name] += states
             except MrstrainError as failure:
-                failures[case] = str(failure)
+                states, failures[case] = [], str(failure)
+        with writing:  # each set's tables as soon as its last path is there
+            found[name] += states
+            waiting[name] -= 1
+            if waiting[name] == 0 and found[name]:
+                ordered = [s for p in paths for load in p for s in found[name] if s.load.name == load.name]
+                record = provenance("simulate", files, given | _told(chosen_set, laws[name][0], paths, plate))
+                done[name] = _written(target / name, name, read, ordered, *laws[name], loads, plate, record, decks)
         tell(case, "simulating", 1.0)
 
     each_in_workers(jobs, one, at_once=at_once, threads=threads)
-    order = [load.name for load in loads]
-    done = []
-    for chosen_set in chosen:
-        name = chosen_set.name
-        states = sorted(found[name], key=lambda s: order.index(s.load.name))
-        if states:
-            record = provenance("simulate", {"mesh": place}, _told(chosen_set, loads, plate))
-            done.append(_written(target / name, name, read, states, *laws[name], plate, record, decks))
     if not done:
         raise MrstrainError("No simulation ended. " + " ".join(f"{n}: {r}" for n, r in failures.items()))
-    return Simulations(target, tuple(done), failures)
+    return Simulations(target, tuple(done[name] for name in names if name in done), failures)
+
+
+def _clear(folder: Path) -> None:
+    """Remove what an earlier simulation left, so that nothing old stands beside what is new."""
+    if (folder / "simulation.json").is_file():
+        for pattern in ("*.vtu", "*.inp", "*.feb", "*.csv", "*.png", "log-*.txt", "simulation.json"):
+            for old in folder.glob(pattern):
+                old.unlink()
+
+
+def _beside(place: Path) -> list[Path]:
+    names = place.with_suffix(".json")
+    return [names] if names.is_file() else []
 
 
 def paths_of(loads: Sequence[LoadStep]) -> list[tuple[LoadStep, ...]]:
-    """Loads by path: those of one normal force in the order of their shear.
+    """Loads by path: those of one normal force, and of shear to the same side, in the order of their shear.
 
     Examples
     --------
@@ -207,8 +232,15 @@ def paths_of(loads: Sequence[LoadStep]) -> list[tuple[LoadStep, ...]]:
     names = [load.name for load in loads]
     if not names or len(set(names)) < len(names):
         raise InputError(f"Loads are needed, each with a name of its own; got {', '.join(names) or 'none'}.")
-    forces = dict.fromkeys(load.normal_n for load in loads)
-    return [tuple(sorted((x for x in loads if x.normal_n == n), key=lambda x: x.shear_n)) for n in forces]
+    both = {load.normal_n for load in loads if load.shear_n > 0.0} & {x.normal_n for x in loads if x.shear_n < 0.0}
+
+    def path(load: LoadStep) -> tuple[float, bool]:
+        return load.normal_n, load.shear_n < 0.0 and load.normal_n in both
+
+    return [
+        tuple(sorted((x for x in loads if path(x) == key), key=lambda x: abs(x.shear_n)))
+        for key in dict.fromkeys(path(load) for load in loads)
+    ]
 
 
 def load_named(text: str) -> LoadStep:
@@ -222,6 +254,8 @@ def load_named(text: str) -> LoadStep:
     name, _, forces = text.partition("=")
     try:
         normal, shear = (float(v) for v in (forces if "," in forces else forces + ",0").split(","))
+        if not np.isfinite([normal, shear]).all():
+            raise ValueError("not finite")
     except ValueError as failure:
         raise InputError(
             f"A load is NAME=NORMAL or NAME=NORMAL,SHEAR in N, such as Load3=15,45; got '{text}'."
@@ -242,10 +276,14 @@ def _simulated(
 ) -> list[State]:
     """Run one path in a worker: each load's file is written as soon as it is there."""
     log: list[str] = []
+
+    def keep(state: State) -> None:
+        if state.reached > 0.0:
+            write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
+
     try:
         return solve(
-            mesh, laws, plate, path, threads=threads, tell=log.append,
-            keep=lambda state: write_state(folder / f"{state.load.name}.vtu", mesh, state, laws),
+            mesh, laws, plate, path, threads=threads, tell=log.append, keep=keep,
             progress=lambda done: _replaced(share, f"{done:.4f}"),
         )  # fmt: skip
     finally:
@@ -258,16 +296,27 @@ def _replaced(path: Path, text: str) -> None:
     part.replace(path)
 
 
-def _told(chosen: MaterialSet, loads: Sequence[LoadStep], plate: Plate) -> dict[str, object]:
+def _told(
+    chosen: MaterialSet, laws: Mapping[str, Material], paths: Sequence[Sequence[LoadStep]], plate: Plate
+) -> dict[str, object]:
     return {
         "set": chosen.name,
         "title": chosen.title,
         "source": chosen.source,
-        "laws": {tissue: law.told for tissue, law in chosen.laws.items()},
-        "loads": [asdict(load) for load in loads],
+        "laws": {
+            region: {
+                "law": law.told,
+                "vector_mpa": law.vector.tolist(),
+                "bulk_modulus_mpa": law.bulk_modulus_mpa,
+                "stable_stretches": {mode: law.stable_range(mode) for mode in MODES},
+            }
+            for region, law in laws.items()
+        },
+        "region_numbers_in_vtu": {number: name for number, name in enumerate(laws, start=1)},
+        "paths": [[asdict(load) for load in path] for path in paths],
         "plate_axes_lps": plate.axes.tolist(),
-        "taped": plate.taped,
-        "element": "P1",
+        "plate": "rigid; moved to the tissue, then force-controlled along all three axes; rotation locked",
+        "element": "P1: stabilised linear tetrahedra, displacement and pressure",
     }
 
 
@@ -278,15 +327,21 @@ def _written(
     states: Sequence[State],
     laws: Mapping[str, Material],
     notes: tuple[str, ...],
+    loads: Sequence[LoadStep],
     plate: Plate,
     record: dict[str, object],
     decks: bool,
 ) -> Simulated:
     rows = [row for state in states for row in region_figures(mesh, state, laws)]
-    notes += tuple(
+    unstable = tuple(
         f"{row.load}: the law of {row.region} is not stable (Drucker) in {1.0 - row.stable_share:.1%} of its volume."
         for row in rows
         if row.stable_share < 1.0
+    )
+    notes += unstable
+    tried = {state.load.name for state in states}
+    notes += tuple(
+        f"{load.name} was not tried: the load before it was not reached." for load in loads if load.name not in tried
     )
     if decks:
         try:
@@ -294,13 +349,19 @@ def _written(
                 write_calculix(folder / f"{state.load.name}.inp", mesh, laws, state, quadratic=True)
                 write_febio(folder / f"{state.load.name}.feb", mesh, laws, state, quadratic=True)
         except InputError as refused:
-            notes += (f"No deck: {refused}",)
+            notes += (f"No decks: {refused}",)
     write_regions_csv(folder / "regions.csv", rows)
     write_curve_csv(folder / "curve.csv", states)
     outcome = {}
     for state in states:
         J = np.linalg.det(np.eye(3) + state.gradients)
         patches = np.abs(patch_volumes(mesh, J) - 1.0)[mesh.cells].mean(axis=1) > _FAR
+        share = float(mesh.volumes_mm3[patches].sum() / mesh.volumes_mm3.sum())
+        if share > _MUCH:
+            notes += (
+                f"{state.load.name}: det F of nodal patches is off by over 5 % in {share:.0%} of the volume; a finer "
+                "mesh keeps volume better.",
+            )
         outcome[state.load.name] = {
             "reached": state.reached,
             "plate_travel_mm": state.travel_mm.tolist(),
@@ -308,9 +369,7 @@ def _written(
             "nodes_on_plate": len(state.on_plate),
             "iterations": state.iterations,
             "seconds": round(state.seconds, 1),
-            "volume_share_with_patch_det_f_off_by_5_percent": float(
-                mesh.volumes_mm3[patches].sum() / mesh.volumes_mm3.sum()
-            ),
+            "volume_share_with_patch_det_f_off_by_5_percent": share,
         }
     write_json(folder / "simulation.json", {"outcome": outcome, "notes": list(notes)} | record)
     pictures = {
@@ -320,4 +379,5 @@ def _written(
     for file, drawn in pictures.items():
         with whole_file(folder / file) as part:
             part.write_bytes(drawn)
-    return Simulated(name, tuple(states), tuple(rows), notes)
+    complete = len(tried) == len(loads) and not unstable and all(state.reached == 1.0 for state in states)
+    return Simulated(name, tuple(states), tuple(rows), notes, complete)

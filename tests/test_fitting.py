@@ -107,6 +107,8 @@ def test_an_unstable_fit_is_reported() -> None:
     [
         ("stretch,stress\n1.1,2\n", "uniaxial", "one of nominal_stress_kpa"),
         ("stretch,nominal_stress_kpa,true_stress_kpa\n", "uniaxial", "a column 'stretch' and one of"),
+        ("stretch;nominal_stress_kpa\n1.1;2\n", "uniaxial", "divided by semicolons"),
+        ("strain,nominal_stress_kpa\n0.1,2\n", "uniaxial", r"stretch = 1 \+ strain"),
         ("stretch,nominal_stress_kpa\n1.1,2\n", None, "say which test it is"),
         ("stretch,nominal_stress_kpa\n1.1,two\n", "uniaxial", r"line 2: could not convert"),
         ("stretch,nominal_stress_kpa\n1.1,2\n-1,2\n", "uniaxial", r"line 3: a stretch is positive"),
@@ -133,7 +135,12 @@ def test_curves_that_tell_nothing_are_refused() -> None:
         fit([curve_of(fat, np.full(20, 1.2))], "Isihara")
     with pytest.raises(InputError, match="0 at every point"):
         fit([Curve("uniaxial", stretch, np.zeros(20))], "neo-Hooke")
-    with pytest.raises(InputError, match="no law to compute with"):
+    with pytest.raises(InputError, match="sign opposite to the stretch"):
         fit([Curve("uniaxial", stretch, -(stretch - 1))], "neo-Hooke")
+    with pytest.raises(InputError, match="Poisson's ratio must lie between 0 and"):
+        fit([curve_of(fat, stretch)], "neo-Hooke", nu=0.5)
+    bent = np.linspace(1.0, 1.5, 20)
+    with pytest.raises(InputError, match="no law to compute with"):
+        fit([Curve("uniaxial", bent, (bent - 1.0) ** 3 - 0.02 * (bent - 1.0))], "Yeoh")
     with pytest.raises(InputError, match="Cannot read the curve nowhere"):
         read_curves("nowhere.csv", "uniaxial")

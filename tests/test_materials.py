@@ -163,6 +163,7 @@ def test_folded_gradients_have_no_stress() -> None:
         (lambda: Yeoh.of(0.0, 1.0), "shear modulus must be positive"),
         (lambda: NeoHooke.of(float("nan")), "finite"),
         (lambda: Ogden.of([0.1, 0.2], [3.0]), "2 moduli and 1 exponents"),
+        (lambda: Ogden.from_ansys(0.01, [6.0, -2.0]), "1 moduli and 2 exponents"),
         (lambda: Ogden.of(0.1, 0.0), "exponent of 0"),
         (lambda: NeoHooke.of(0.1).nominal_stress([1.0], "biaxial"), "No test 'biaxial'"),
         (lambda: NeoHooke.of(0.1).nominal_stress([-1.0]), "positive"),

@@ -67,6 +67,14 @@ def test_a_set_without_fat_refuses_a_region_it_cannot_serve(tmp_path: Path) -> N
     file.write_text('[mine.skin]\nlaw = "neo-Hooke"\nmu_kpa = 100\nnu = 0.49\n')
     with pytest.raises(InputError, match="no law for the region 'tendon', nor one for muscle or fat"):
         material_set(file).for_regions(["skin", "tendon"])
+    with pytest.raises(InputError, match=r"no law for the region 'ligament'; it has skin, fat, muscle\. Add it"):
+        material_set("luboz").for_regions(["skin", "ligament"])
+
+
+def test_regions_are_called_alike_in_any_case() -> None:
+    laws, notes = material_set("luboz").for_regions(["SKIN", "Fat"])
+    assert laws["SKIN"] is material_set("luboz").laws["skin"]
+    assert notes == ()
 
 
 def test_own_sets_in_all_forms(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """A plate pressed and sheared against a dome of tissue on fixed bone: balance, tape, symmetry, frame, refusals."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,6 +18,7 @@ FAT, SKIN = Ogden.from_ansys(0.0034, 6.2), NeoHooke.of(0.2)
 LAWS = {"skin": SKIN, "fat": FAT}
 DOWN, ALONG = [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 PRESS = [LoadStep("pressed", 2.0)]
+SHEARED = LoadStep("sheared", 2.0, 1.0)
 
 
 def dome(count: tuple[int, int, int] = (4, 6, 6)) -> TetMesh:
@@ -52,8 +55,10 @@ def test_the_force_is_the_one_asked_for(sheared: list[State]) -> None:
 
 
 def test_one_path_from_load_to_load(sheared: list[State]) -> None:
-    travel = np.concatenate([state.curve[:, 1] for state in sheared])
-    assert (np.diff(travel[sheared[0].curve.shape[0] - 1 :]) > 0).all()  # sheared ever further
+    assert sheared[0].curve[0].tolist() == [0.0] * 6
+    for before, after in itertools.pairwise(sheared):
+        assert after.curve[0].tolist() == before.curve[-1].tolist()
+        assert (np.diff(after.curve[:, 1]) > 0).all()  # sheared ever further
     assert sheared[1].travel_mm[1] < sheared[2].travel_mm[1]
     assert len(sheared[2].on_plate) >= len(sheared[1].on_plate) >= len(sheared[0].on_plate) > 4
 
@@ -125,15 +130,60 @@ def test_elements_agree_on_a_fine_mesh() -> None:
 
 
 def test_a_load_too_large_ends_with_the_last_state_in_balance() -> None:
-    weak = {"skin": NeoHooke.of(2e-5), "fat": NeoHooke.of(2e-5, nu=0.49)}
-    states = press(
-        dome((2, 4, 4)), [LoadStep("pressed", 1.0), LoadStep("far too much", 1.0, 400.0), LoadStep("never", 2.0)], weak
-    )
+    loads = [LoadStep("pressed", 2.0), LoadStep("far too much", 2.0, 300.0), LoadStep("never", 2.0, 400.0)]
+    weak = {"skin": NeoHooke.of(0.067, nu=0.495), "fat": NeoHooke.of(0.01, nu=0.49)}
+    states = press(dome((3, 4, 4)), loads, weak)
+    assert [state.load.name for state in states] == ["pressed", "far too much"]
     last = states[-1]
-    assert 0.0 <= last.reached < 1.0
-    assert len(states) < 3
-    assert np.isfinite(last.u_mm).all()
-    assert (StrainField.from_gradient(last.gradients).jacobian > 0).all()
+    assert 0.0 < last.reached < 1.0
+    assert last.force_n == pytest.approx([2.0, 300.0 * last.reached, 0.0], abs=1e-3 * last.force_n[1])
+    straight = press(dome((3, 4, 4)), [loads[0], LoadStep("as far", 2.0, float(last.force_n[1]))], weak)[-1]
+    assert straight.reached == 1.0
+    assert np.abs(straight.u_mm - last.u_mm).max() < 0.1 * np.abs(last.u_mm).max()  # steps differ, so does the tape
+
+
+def test_normal_first_then_shear() -> None:
+    alone, after = (press(dome(), loads)[-1] for loads in ([SHEARED], [*PRESS, SHEARED]))
+    assert np.abs(alone.u_mm - after.u_mm).max() < 1e-6
+    assert alone.curve[0].tolist() == [0.0] * 6
+
+
+def test_halved_steps_put_the_tape_in_the_same_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    soft = {"skin": FAT, "fat": FAT}
+    loads = [LoadStep("pressed", 4.0)]
+    plain = press(dome((3, 7, 7)), loads, soft)[0]
+    monkeypatch.setattr("fe.simulate._MOST_APPROACH_MM", 0.1)
+    monkeypatch.setattr("fe.simulate._APPROACH_MM", 0.1)
+    monkeypatch.setattr("fe.simulate._FIRST_STEP", 0.05)
+    monkeypatch.setattr("fe.simulate._GROWTH", 1.0)
+    small = press(dome((3, 7, 7)), loads, soft)[0]
+    assert len(small.curve) > 2 * len(plain.curve)
+    assert plain.travel_mm[0] == pytest.approx(small.travel_mm[0], rel=0.005)
+    assert np.abs(plain.u_mm - small.u_mm).max() < 0.06
+
+
+def test_a_plate_from_the_wrong_side_is_refused() -> None:
+    with pytest.raises(InputError, match=r"would pass through .* mm of tissue that is not its surface"):
+        press(dome(), PRESS, normal=[1.0, 0.0, 0.0])
+
+
+def test_tissue_that_hangs_on_no_bone_is_refused() -> None:
+    mesh = dome((3, 4, 4))
+    skin = mesh.cells[mesh.regions["skin"]]
+    own = np.unique(skin)
+    new = np.full(len(mesh.points_mm), -1)
+    new[own] = len(mesh.points_mm) + np.arange(len(own))
+    cells = mesh.cells.copy()
+    cells[mesh.regions["skin"]] = new[skin]
+    facets = {"bone": mesh.facets["bone"], "skin": new[mesh.facets["skin"]]}
+    apart = TetMesh(np.concatenate([mesh.points_mm, mesh.points_mm[own]]), cells, mesh.regions, facets)
+    with pytest.raises(InputError, match="are not joined to the bone's surface"):
+        press(apart, PRESS)
+
+
+def test_a_plate_without_friction_carries_no_shear() -> None:
+    with pytest.raises(InputError, match="carries no shear force"):
+        press(dome(), [SHEARED], taped=False)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """`mrstrain simulate`: a mesh in; for each set and load a VTU file, tables and pictures out; refusals first."""
 
 import json
+import re
 from pathlib import Path
 
 import meshio
@@ -19,7 +20,18 @@ from mrstrain.simulating import load_named, paths_of
 from tests.test_simulate import DOWN, FAT, LAWS, PRESS, dome, press
 
 PLATE = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0"]
-MINE = '[mine.fat]\nlaw = "Ogden"\nconvention = "ansys"\nmu_mpa = 0.0034\nalpha = 6.2\nnu = 0.4999\n'
+MINE = """
+[mine.fat]
+law = "Ogden"
+convention = "ansys"
+mu_mpa = 0.0034
+alpha = 6.2
+nu = 0.4999
+[mine.Skin]
+law = "neo-Hooke"
+mu_kpa = 200
+nu = 0.4999
+"""
 
 
 @pytest.fixture
@@ -35,13 +47,14 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
     given = ["--set", "luboz", "--set", str(own), *loads, *PLATE, "--decks"]
     done = CliRunner().invoke(app, ["simulate", str(mesh_file), *given, "--out", str(tmp_path / "sim")])
     assert done.exit_code == 0, done.output
-    assert "mine has no law for skin; fat's is used." in done.output
     for name in ("luboz", "mine"):
         folder = tmp_path / "sim" / name
         told = json.loads((folder / "simulation.json").read_text())
-        assert list(told["outcome"]) == ["Load3", "Load2", "Load1"]
+        assert list(told["outcome"]) == ["Load2", "Load3", "Load1"]  # by path
+        assert set(told["parameters"]["laws"]) == {"fat", "skin"}
         assert told["outcome"]["Load3"]["plate_force_n"] == pytest.approx([2, 1, 0], abs=2e-3)
-        assert told["inputs"]["mesh"][0]["name"] == "dome.vtu"
+        assert [file["name"] for file in told["inputs"]["mesh"]] == ["dome.vtu", "dome.json"]
+        assert [file["name"] for file in told["inputs"]["sets"]] == ["mine.toml"]
         assert "C3D10" in (folder / "Load3.inp").read_text()
         assert (folder / "slices.png").stat().st_size > 10_000
         assert (folder / "force_travel.png").stat().st_size > 5_000
@@ -50,6 +63,9 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         assert (np.abs(regions["volume_change"]) < 0.02).all()
         curve = np.genfromtxt(folder / "curve.csv", delimiter=",", names=True, dtype=None, encoding=None)
         assert curve["force_normal_n"].max() == pytest.approx(4.0, abs=0.01)
+        load3 = curve[curve["load"] == "Load3"]
+        assert load3["force_shear_n"][0] == pytest.approx(0.0, abs=1e-3)  # begins where Load2 ended
+        assert load3["force_normal_n"][0] == pytest.approx(2.0, abs=2e-3)
         load2, load3 = (meshio.read(folder / f"{load}.vtu") for load in ("Load2", "Load3"))
         assert load3.point_data["displacement_mm"][:, 1].max() > load2.point_data["displacement_mm"][:, 1].max() + 0.1
         F = load3.cell_data["F"][0].reshape(-1, 3, 3)
@@ -57,14 +73,25 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         assert load3.cell_data["max_shear"][0] == pytest.approx(strain.max_shear, abs=1e-12)
 
 
-def test_loads_that_cannot_be_reached_end_with_a_failure_status(mesh_file: Path, tmp_path: Path) -> None:
-    own = tmp_path / "weak.toml"
-    own.write_text('[weak.fat]\nlaw = "neo-Hooke"\nmu_kpa = 0.02\nnu = 0.49\n')
-    given = ["--set", str(own), "--load", "a=1", "--load", "b=1,400", *PLATE, "--out", str(tmp_path / "sim")]
-    done = CliRunner().invoke(app, ["simulate", str(mesh_file), *given])
+def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, tmp_path: Path) -> None:
+    loads = ["--load", "a=2", "--load", "b=2,300", "--load", "c=2,400"]
+    out = tmp_path / "sim"
+    done = CliRunner().invoke(app, ["simulate", str(mesh_file), "--set", "luboz", *loads, *PLATE, "--out", str(out)])
     assert done.exit_code == 1, done.output
-    assert "of the load was reached" in done.output
-    assert (tmp_path / "sim" / "weak" / "curve.csv").exists()
+    assert re.search(r"luboz, b: ONLY \d+% of the load was reached", done.output)
+    assert "luboz: c was not tried" in done.output
+    told = json.loads((out / "luboz" / "simulation.json").read_text())["outcome"]
+    reached = told["b"]["reached"]
+    assert 0.0 < reached < 1.0
+    assert told["b"]["plate_force_n"][1] == pytest.approx(300.0 * reached, rel=1e-6)
+    rows = (out / "luboz" / "regions.csv").read_text().splitlines()
+    assert [row.split(",")[1] for row in rows if row.startswith("b,")] == [f"{reached:.4g}"] * 2
+    # a second run leaves nothing of the first
+    again = CliRunner().invoke(
+        app, ["simulate", str(mesh_file), "--set", "luboz", "--load", "d=1", *PLATE, "--out", str(out)]
+    )
+    assert again.exit_code == 0, again.output
+    assert [path.name for path in (out / "luboz").glob("*.vtu")] == ["d.vtu"]
 
 
 @pytest.mark.parametrize(
@@ -76,19 +103,24 @@ def test_loads_that_cannot_be_reached_end_with_a_failure_status(mesh_file: Path,
         (["--load", "../x=3"], "a name of letters"),
         (["--load", "a=1", "--load", "a=2"], "a name of its own"),
         (["--load", "a=-1"], "must press"),
+        (["--load", "a=nan"], "A load is NAME=NORMAL"),
         (["--plate-normal", "0", "0", "0"], "not all zero"),
+        (["--slide", "--load", "a=1,1"], "carries no shear force"),
     ],
 )
 def test_what_cannot_be_is_refused(mesh_file: Path, tmp_path: Path, given: list[str], said: str) -> None:
-    refused = CliRunner().invoke(app, ["simulate", str(mesh_file), *given, "--out", str(tmp_path / "sim")])
+    plate = [] if "--plate-normal" in given else PLATE
+    refused = CliRunner().invoke(app, ["simulate", str(mesh_file), *plate, *given, "--out", str(tmp_path / "sim")])
     assert isinstance(refused.exception, Exception)
     assert said in str(refused.exception)
-    assert not list(tmp_path.glob("sim/*/*.vtu"))
+    assert not (tmp_path / "sim").exists()
 
 
 def test_loads_lie_on_paths_by_their_normal_force() -> None:
     loads = [load_named(text) for text in ("a=15,45", "b=140", "c=15", "d=15,12")]
     assert [[x.name for x in path] for path in paths_of(loads)] == [["c", "d", "a"], ["b"]]
+    both_ways = [load_named(text) for text in ("a=15", "b=15,12", "c=15,-12")]
+    assert [[x.name for x in path] for path in paths_of(both_ways)] == [["a", "b"], ["c"]]
     with pytest.raises(InputError, match="a name of its own"):
         paths_of([])
 
