@@ -39,7 +39,7 @@ def test_the_command(tmp_path: Path) -> None:
     onion = half_onion()
     plain = LabelMap(onion.grid, np.where(onion.labels == 3, 2, onion.labels), {1: "bone", 2: "fat"})  # nothing thin
     write_labels(tmp_path / "map.nii.gz", plain)
-    sizes = [text for edge in ("4.5", "2.5", "1.8") for text in ("--edge-mm", edge)]
+    sizes = [text for edge in ("4.5", "2.8", "2") for text in ("--edge-mm", edge)]
     given = [*sizes, "--names", str(tmp_path / "map.csv"), "--load", "pressed=3", "--set", "luboz"]
     out = tmp_path / "study"
     done = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
@@ -48,11 +48,11 @@ def test_the_command(tmp_path: Path) -> None:
     with (out / "convergence.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximal shear of fat, p50"]
-    assert 0.1 < float(rows[0]["edge_1.8_mm"]) < 10.0
-    before = (out / "mesh-2.5.vtu").read_bytes()
+    assert 0.1 < float(rows[0]["edge_2_mm"]) < 10.0
+    before = (out / "mesh-2.8.vtu").read_bytes()
     again = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
     assert again.exit_code == 0
-    assert (out / "mesh-2.5.vtu").read_bytes() == before  # the mesher is not deterministic: it was not asked again
+    assert (out / "mesh-2.8.vtu").read_bytes() == before  # the mesher is not deterministic: it was not asked again
     assert again.output.splitlines()[-6:] == done.output.splitlines()[-6:]
 
 
