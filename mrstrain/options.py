@@ -45,7 +45,7 @@ Plate = Annotated[
 ]
 Shear = Annotated[
     tuple[float, float, float] | None,
-    typer.Option(help="Direction of the shear force, LPS, such as --shear-direction 0 -1 0."),
+    typer.Option(help="Direction of the shear force on the tissue, LPS, such as --shear-direction 0 -1 0 (anterior)."),
 ]
 MeshFile = Annotated[Path | None, typer.Option(help="Mesh to put displacement and strain on.")]
 MeshUnit = Annotated[Unit, typer.Option(help="Unit of the mesh's coordinates.")]
