@@ -22,6 +22,7 @@ BONE, OUTER, CUT = "bone", "skin", "cut"
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
 _SECONDS_PER_TRIANGLE, _SECONDS_PER_CELL = 6e-4, 1e-4  # as measured on one core
+_MOST_LOST = 0.2  # of a tissue's volume
 _FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 _ALIGNED = 0.8  # cosine between a face and the plane of a cut that it goes on in
 _RIM_VOXELS = 6.0  # how far the section of a skin may reach
@@ -88,7 +89,7 @@ def mesh_labels(
     InputError
         If the edge length is out of range, or a region is not in the label map.
     MrstrainError
-        If a tissue vanished, or meshing took too long.
+        If a tissue vanished or lost a fifth of its volume, or meshing took too long.
 
     Notes
     -----
@@ -112,7 +113,14 @@ def mesh_labels(
     points, cells = _limited(borders, edge_mm, _ENVELOPE * spacing, lattice, limit_s, watch)
     found = labels_at(borders, points[cells].mean(axis=1))
     mesh = _named(points, cells, found, soft, [numbers[b] for b in bones], labels)
-    return mesh, _quality(mesh, labels, soft)
+    quality = _quality(mesh, labels, soft)
+    for name, made, given in quality.volumes_ml:
+        if abs(made - given) > _MOST_LOST * given:
+            raise MrstrainError(
+                f"{name} has {made:.2f} mL in the mesh and {given:.2f} mL in the label map: it is finer than the mesh or "
+                "the voxels show. Ask for shorter edges, or give its label to a neighbour."
+            )
+    return mesh, quality
 
 
 def _limited(

@@ -39,7 +39,8 @@ def write_tet_mesh(path: Path, mesh: TetMesh, about: dict[str, object]) -> None:
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:
     """Read a mesh of tetrahedra with its named regions and facets, made here or elsewhere.
 
-    Where a JSON file of the same name tells the names of the numbers in the array ``region``, they are used.
+    Where a JSON file of the same name tells the names of the numbers in the array ``region``, they are used. A set of
+    all cells is left out where others divide them.
 
     Raises
     ------
@@ -58,10 +59,14 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
         except (ValueError, KeyError, AttributeError, TypeError) as damaged:
             raise InputError(f"{_names_of(place)}: no table of regions in it ({damaged}).") from damaged
     mesh = read.tets
+    regions = {names.get(name, name): cells for name, cells in mesh.regions.items()}
+    parts = {name: cells for name, cells in regions.items() if len(cells) < len(mesh.cells)}
+    if parts and len(np.unique(np.concatenate(list(parts.values())))) == len(mesh.cells):
+        regions = parts  # a set of all elements beside those of the tissues
     return TetMesh(
         mesh.points_mm,
         mesh.cells,
-        {names.get(name, name): cells for name, cells in mesh.regions.items()},
+        regions,
         {names.get(name, name): rows for name, rows in mesh.facets.items()},
         mesh.node_ids,
     )

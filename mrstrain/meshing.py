@@ -20,6 +20,7 @@ from mrstrain.inputs import make_output
 from mrstrain.provenance import provenance
 
 _FLAT_MM = 0.1
+_CARE_VOLUME, _CARE_ANGLE_DEG = 0.02, 10.0
 _INFERIOR, _FORWARD = (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)
 
 
@@ -43,7 +44,15 @@ class Meshed:
             "Facets: " + ", ".join(f"{name} {len(rows)}" for name, rows in self.mesh.facets.items()),
         ]
         lines += [
-            f"{share:.0%} of the cells of {name} reach through it: one cell thick there" for name, share in q.thin
+            f"CARE: {name} differs by {made / given - 1.0:+.1%} from its volume in the label map."
+            for name, made, given in q.volumes_ml
+            if abs(made - given) > _CARE_VOLUME * given
+        ]
+        if q.least_angle_deg < _CARE_ANGLE_DEG:
+            lines.append(f"CARE: the least dihedral angle is {q.least_angle_deg:.1f} degrees.")
+        lines += [
+            f"{share:.0%} of the cells of {name} reach through it, one cell thick; --finer makes it thicker."
+            for name, share in q.thin
         ]
         return [*lines, f"Mesh: {self.out}"]
 

@@ -164,11 +164,18 @@ def test_the_mesh_may_come_from_elsewhere(tmp_path: Path) -> None:
     for name, cells in mesh.regions.items():
         lines += [f"*ELEMENT, TYPE=C3D4H, ELSET={name}"]
         lines += [f"{c + 1}, " + ", ".join(str(n + 1) for n in mesh.cells[c]) for c in cells]
+    everything = ", ".join(str(c + 1) for c in range(len(mesh.cells)))
+    lines += ["*ELSET, ELSET=EALL", *_rows(everything)]
     (tmp_path / "dome.inp").write_text("\n".join(lines) + "\n")
-    read = read_tet_mesh(tmp_path / "dome.inp")
+    read = read_tet_mesh(tmp_path / "dome.inp")  # the set of all elements is left out
     assert set(read.regions) == {"fat", "skin"}
     with pytest.raises(InputError, match="no facets 'bone'; it has none"):
         simulate(read, {"fat": FAT, "skin": FAT}, _plate(), [LoadStep("a", 1.0)])
+
+
+def _rows(numbers: str) -> list[str]:
+    each = numbers.split(", ")
+    return [", ".join(each[start : start + 16]) + "," for start in range(0, len(each), 16)]
 
 
 def _plate():
