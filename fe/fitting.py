@@ -226,16 +226,7 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         raise InputError(f"Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {nu:g}.")
     sought = LAWS[named[law.lower()]]
     count = len(sought.names)
-    curves = [
-        Curve(
-            mode,
-            *(
-                np.concatenate([getattr(c, part) for c in curves if c.mode == mode])
-                for part in ("stretch", "stress_mpa")
-            ),
-        )
-        for mode in dict.fromkeys(c.mode for c in curves)
-    ]  # one for each kind of test
+    curves = _by_mode(curves)
     stress = np.concatenate([c.stress_mpa for c in curves]) if curves else np.empty(0)
     stretch = np.concatenate([c.stretch for c in curves]) if curves else np.empty(0)
     apart = len(np.unique(np.round(stretch[np.abs(stretch - 1.0) > 1e-6], 9)))

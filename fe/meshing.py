@@ -117,8 +117,8 @@ def mesh_labels(
     for name, made, given in quality.volumes_ml:
         if abs(made - given) > _MOST_LOST * given:
             raise MrstrainError(
-                f"{name} has {made:.2f} mL in the mesh and {given:.2f} mL in the label map: it is finer than the mesh or "
-                "the voxels show. Ask for shorter edges, or give its label to a neighbour."
+                f"{name} has {made:.2f} mL in the mesh and {given:.2f} mL in the label map: it is finer than the mesh "
+                "or the voxels show. Ask for shorter edges, or give its label to a neighbour."
             )
     return mesh, quality
 
