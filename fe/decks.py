@@ -17,7 +17,7 @@ from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from dvc.whole import write_whole
-from fe.elements import EDGES, Space
+from fe.elements import Space, edges_of
 from fe.hyperelastic import OGDEN
 from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
 from fe.simulate import BONE, State
@@ -99,10 +99,9 @@ def _supports(mesh: TetMesh, space: Space, state: State) -> tuple[IntArray, IntA
     fixed, on_plate, moved = [np.flatnonzero(bone)], [np.flatnonzero(plate)], [state.u_mm[plate]]
     if space.cells.shape[1] > 4:
         for facets, both, nodes in ((mesh.facets[BONE], bone, fixed), (_faces_on(mesh, plate), plate, on_plate)):
-            ends = np.unique(np.sort(np.concatenate([facets[:, e] for e in ([0, 1], [1, 2], [0, 2])]), axis=1), axis=0)
+            ends = edges_of(facets)
             ends = ends[both[ends].all(axis=1)]
-            middle = _middles(mesh, space, ends)
-            nodes.append(middle)
+            nodes.append(space.middles(ends))
             if nodes is on_plate:
                 moved.append(state.u_mm[ends].mean(axis=1))
     return np.concatenate(fixed), np.concatenate(on_plate), np.concatenate(moved)
@@ -111,15 +110,6 @@ def _supports(mesh: TetMesh, space: Space, state: State) -> tuple[IntArray, IntA
 def _faces_on(mesh: TetMesh, plate: BoolArray) -> IntArray:
     every = np.concatenate([rows for name, rows in mesh.facets.items() if name != BONE])
     return np.asarray(every[plate[every].all(axis=1)])
-
-
-def _middles(mesh: TetMesh, space: Space, ends: IntArray) -> IntArray:
-    """The node in the middle of each edge (k, 2)."""
-    count = len(mesh.points_mm)
-    known = np.sort(np.concatenate([mesh.cells[:, list(edge)] for edge in EDGES]), axis=1)
-    keys, first = np.unique(known[:, 0] * count + known[:, 1], return_index=True)
-    nodes = space.cells[:, 4:].T.ravel()[first]
-    return np.asarray(nodes[np.searchsorted(keys, ends[:, 0] * count + ends[:, 1])])
 
 
 def _law(region: str, law: Material) -> Iterator[str]:

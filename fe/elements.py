@@ -159,3 +159,18 @@ class Space:
         pairs = mesh.cells + len(mesh.points_mm) * np.asarray(tissue)[:, None]
         known, numbered = np.unique(pairs, return_inverse=True)
         return cls(points, np.ascontiguousarray(cells), numbered.reshape(pairs.shape), len(known))
+
+    def middles(self, ends: IntArray) -> IntArray:
+        """The node in the middle of each edge (k, 2) of a quadratic mesh, given by its corners."""
+        known = np.sort(np.concatenate([self.cells[:, list(edge)] for edge in EDGES]), axis=1)
+        count = len(self.nodes_mm)
+        keys, first = np.unique(known[:, 0] * count + known[:, 1], return_index=True)
+        wanted = np.sort(ends, axis=1)
+        return np.asarray(
+            self.cells[:, 4:].T.ravel()[first][np.searchsorted(keys, wanted[:, 0] * count + wanted[:, 1])]
+        )
+
+
+def edges_of(faces: IntArray) -> IntArray:
+    """The edges (k, 2) of triangles (n, 3), each once."""
+    return np.unique(np.sort(np.concatenate([faces[:, e] for e in ([0, 1], [1, 2], [0, 2])]), axis=1), axis=0)

@@ -14,7 +14,7 @@ from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from fe.assembly import Assembler, Model
-from fe.elements import EDGES, element
+from fe.elements import edges_of, element
 from fe.linear import Solver
 from fe.materials import Material
 from fe.newton import Tolerance, equilibrium
@@ -337,10 +337,4 @@ def _nodes_on(model: Model, mesh: TetMesh, facets: str) -> IntArray:
     corners = np.unique(mesh.facets[facets])
     if model.element.name != "P2":
         return corners
-    faces = mesh.facets[facets]
-    ends = np.sort(np.concatenate([faces[:, pair] for pair in ([0, 1], [0, 2], [1, 2])]), axis=1)
-    of_cells = np.sort(np.concatenate([mesh.cells[:, list(edge)] for edge in EDGES]), axis=1)
-    middles = model.space.cells[:, 4:].T.ravel()
-    count = len(mesh.points_mm)
-    wanted = np.isin(of_cells[:, 0] * count + of_cells[:, 1], ends[:, 0] * count + ends[:, 1])
-    return np.union1d(corners, middles[wanted])
+    return np.union1d(corners, model.space.middles(edges_of(mesh.facets[facets])))
