@@ -305,6 +305,6 @@ def test_a_run_is_that_of_its_case(worker: Worker) -> None:
     one, two = (measure(case, worker, nullcontext(), lambda _: None) for _ in range(2))
     np.testing.assert_array_equal(one.shear, two.shear)
     assert not one.true_shear.any()
-    assert 0.001 < np.median(one.shear) < 0.1
+    assert 0.001 < np.median(one.shear) < 0.15  # voxels of 2.5 mm; .018 at 0.8 mm
     assert one.estimated_snr == pytest.approx(25.0, rel=0.15)
     assert one.correlation[0] > one.correlation[3]
