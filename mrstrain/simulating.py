@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tempfile
 import threading
@@ -45,6 +46,7 @@ LOADS = (
 )
 """The published experiment's."""
 
+_TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
 _FAR = 0.05  # det F of a patch further from 1 than this is counted
 _MUCH = 0.05  # share of the volume above which that is told
 
@@ -209,11 +211,16 @@ def simulate(
 
 
 def _clear(folder: Path) -> None:
-    """Remove what an earlier simulation left, so that nothing old stands beside what is new."""
-    if (folder / "simulation.json").is_file():
-        for pattern in ("*.vtu", "*.inp", "*.feb", "*.csv", "*.png", "log-*.txt", "simulation.json"):
-            for old in folder.glob(pattern):
-                old.unlink()
+    """Remove what an earlier simulation wrote by its own list, so that nothing old stands beside what is new."""
+    told = folder / "simulation.json"
+    try:
+        loads = list(json.loads(told.read_text(encoding="utf-8"))["outcome"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    of_loads = [f"{load}{ending}" for load in loads for ending in (".vtu", ".inp", ".feb")]
+    logs = [f"log-{load}.txt" for load in loads]
+    for name in (*of_loads, *logs, *_TABLES, told.name):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _beside(place: Path) -> list[Path]:

@@ -92,6 +92,7 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
     )
     assert again.exit_code == 0, again.output
     assert [path.name for path in (out / "luboz").glob("*.vtu")] == ["d.vtu"]
+    assert (out / "luboz" / "mine.csv").read_text() == "kept"  # and takes nothing that it did not write
 
 
 @pytest.mark.parametrize(
