@@ -86,13 +86,14 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
     assert told["b"]["plate_force_n"][1] == pytest.approx(300.0 * reached, rel=1e-6)
     rows = (out / "luboz" / "regions.csv").read_text().splitlines()
     assert [row.split(",")[1] for row in rows if row.startswith("b,")] == [f"{reached:.4g}"] * 2
-    # a second run leaves nothing of the first
+    # a second run leaves nothing of the first, and takes nothing that it did not write
+    (out / "luboz" / "mine.csv").write_text("kept")
     again = CliRunner().invoke(
         app, ["simulate", str(mesh_file), "--set", "luboz", "--load", "d=1", *PLATE, "--out", str(out)]
     )
     assert again.exit_code == 0, again.output
     assert [path.name for path in (out / "luboz").glob("*.vtu")] == ["d.vtu"]
-    assert (out / "luboz" / "mine.csv").read_text() == "kept"  # and takes nothing that it did not write
+    assert (out / "luboz" / "mine.csv").read_text() == "kept"
 
 
 @pytest.mark.parametrize(
