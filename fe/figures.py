@@ -18,9 +18,11 @@ from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.convergence import Limit
 from fe.fitting import Curve, Fit
 from fe.plate import Plate
-from fe.simulate import State
+from fe.result import volume_percentiles
+from fe.simulate import BONE, State
 
 _POINTS = 200
+_FLAT_MM = 0.1
 
 
 def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
@@ -47,17 +49,19 @@ def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
     return png_bytes(figure)
 
 
-def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate, point_mm: FloatArray) -> bytes:
+def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate) -> bytes:
     """Maximal shear on the slice through the bone's lowest point, along the plate's normal and the shear's direction.
 
     Cells are cut in the unloaded configuration and drawn where they are under load; the dashed line is the plate. The
     colours end where a hundredth of the volume is above, over all loads.
     """
-    cuts = [cut(mesh, state.u_mm, plate.axes, point_mm) for state in states]
+    point = _lowest_bone_point(mesh, plate)
+    cuts = [cut(mesh, state.u_mm, plate.axes, point) for state in states]
     corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
     low, high = corners.min(axis=0) - 2.0, corners.max(axis=0) + 2.0
     shears = np.concatenate([StrainField.from_gradient(state.gradients).max_shear for state in states])
-    largest = max(0.05, float(np.ceil(20.0 * np.quantile(shears, 0.99)) / 20.0))
+    (most,) = volume_percentiles(shears, np.tile(mesh.volumes_mm3, len(states)), [0.99])
+    largest = max(0.05, float(np.ceil(20.0 * most) / 20.0))
     rows, columns = (len(states) + 1) // 2, min(len(states), 2)
     tall = 0.9 + (WIDTH_IN / columns - 1.0) * float((high[1] - low[1]) / (high[0] - low[0]))
     figure = Figure(figsize=(WIDTH_IN, rows * tall), dpi=DPI, facecolor="white", layout="constrained")
@@ -84,8 +88,24 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate, point_m
     return png_bytes(figure)
 
 
+def _lowest_bone_point(mesh: TetMesh, plate: Plate) -> FloatArray:
+    """Where the bone's surface lies furthest along the plate's outward normal, LPS mm; the middle of a flat bone."""
+    points = mesh.points_mm[np.unique(mesh.facets[BONE])] if BONE in mesh.facets else mesh.points_mm
+    height = points @ plate.axes[:, 0]
+    return np.asarray(points[height < height.min() + _FLAT_MM].mean(axis=0))
+
+
 def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray) -> tuple[IntArray, list[FloatArray]]:
     """Cells that the plane of the plate's first two axes cuts, and each one's polygon where it is under load.
+
+    Parameters
+    ----------
+    u_mm : (n, 3)
+        Displacement of the mesh's nodes, LPS mm.
+    axes : (3, 3)
+        The plate's, columns, LPS.
+    point_mm : (3,)
+        On the plane, reference configuration, LPS mm.
 
     Returns
     -------
@@ -125,10 +145,10 @@ def force_travel(states: Sequence[State]) -> bytes:
     return png_bytes(figure)
 
 
-def mesh_slice(mesh: TetMesh, point_mm: FloatArray, axes: FloatArray) -> bytes:
+def mesh_slice(mesh: TetMesh, plate: Plate) -> bytes:
     """The mesh on a slice through the bone's lowest point, coloured by tissue."""
     figure, (panel,) = chart()
-    cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), axes, point_mm)
+    cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, _lowest_bone_point(mesh, plate))
     for number, (name, members) in enumerate(mesh.regions.items()):
         mine = [c for c, inside in zip(corners, np.isin(cells, members), strict=True) if inside]
         colour = REGION_COLOURS[number % len(REGION_COLOURS)]

@@ -48,6 +48,13 @@ def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
     return np.asarray(np.bincount(nodes, np.repeat(mesh.volumes_mm3 * jacobian, 4)) / before)
 
 
+def volume_share_off(mesh: TetMesh, state: State, by: float) -> float:
+    """Share of the volume where det F of the nodal patches is further from 1 than ``by``, mean over a cell's nodes."""
+    jacobian = np.linalg.det(np.eye(3) + state.gradients)
+    off = np.abs(patch_volumes(mesh, jacobian) - 1.0)[mesh.cells].mean(axis=1) > by
+    return float(mesh.volumes_mm3[off].sum() / mesh.volumes_mm3.sum())
+
+
 @dataclass(frozen=True, slots=True)
 class RegionFigures:
     """A region under a load; percentiles are of volume.

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.errors import InputError
+from dvc.errors import InputError, MrstrainError
 from dvc.labels import read_labels
 from dvc.whole import whole_file, write_whole
 from fe import figures
 from fe.convergence import Limit, extrapolated, size_mm
 from fe.meshing import BONE
 from fe.meshstore import read_tet_mesh
+from fe.published import material_set
 from fe.simulate import LoadStep
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.meshing import mesh as make_mesh
@@ -93,7 +94,9 @@ def converge(
     Raises
     ------
     InputError
-        If there are fewer than three edge lengths, or a load is not reached on a mesh.
+        If there are fewer than three edge lengths, or the region or the set does not fit; before anything is meshed.
+    MrstrainError
+        If a load is not reached on a mesh.
     """
     edges = sorted(set(edges_mm), reverse=True)
     if len(edges) < _FEWEST:
@@ -106,6 +109,7 @@ def converge(
     known = list(read_labels(labels, names).names.values())
     if region not in known or region in bones:
         raise InputError(f"No soft tissue '{region}' in the label map to follow; it has {', '.join(known)}.")
+    material_set(material).for_regions([name for name in known if name not in bones])  # before hours of meshing
     places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
     values = []
     for edge, place in places.items():
@@ -123,7 +127,9 @@ def converge(
             progress=lambda case, stage, share, edge=edge: tell(f"{edge:g} mm, {case}", stage, share),  # type: ignore[misc]
         )  # fmt: skip
         if not made.complete:
-            raise InputError(f"With edges of {edge:g} mm not every load was reached: {' '.join(made.summary()[:-1])}")
+            raise MrstrainError(
+                f"With edges of {edge:g} mm not every load was reached: {' '.join(made.summary()[:-1])}"
+            )
         found = {}
         for state in made.sets[0].states:
             found[state.load.name, "plate travel, mm"] = float(np.hypot(*state.travel_mm[:2]))
@@ -156,10 +162,13 @@ def _is_of(place: Path, inputs: dict[str, Path], bones: Sequence[str]) -> bool:
     about = place.with_suffix(".json")
     if not (place.is_file() and about.is_file()):
         return False
-    told = json.loads(about.read_text(encoding="utf-8"))
     hashes = {role: [file_hash(path)] for role, path in inputs.items()}
-    known = {role: [f["sha256"] for f in files] for role, files in told["inputs"].items()}
-    return bool(known == hashes and told["parameters"]["bones"] == list(bones))
+    try:
+        told = json.loads(about.read_text(encoding="utf-8"))
+        known = {role: [f["sha256"] for f in files] for role, files in told["inputs"].items()}
+        return bool(known == hashes and told["parameters"]["bones"] == list(bones))
+    except (ValueError, KeyError, TypeError, AttributeError):  # not what `mesh` writes
+        return False
 
 
 def _write(
@@ -175,6 +184,7 @@ def _write(
         writer.writerow([row.load, row.figure, *(f"{v:.6g}" if np.isfinite(v) else "" for v in numbers)])
     write_whole(target / "convergence.csv", text.getvalue())
     curves = {f"{r.load}, {r.figure}": (r.values, r.limit) for r in rows if np.isfinite(r.limit.limit)}
+    (target / "convergence.png").unlink(missing_ok=True)
     if curves:
         with whole_file(target / "convergence.png") as part:
             part.write_bytes(figures.convergence(sizes, curves))

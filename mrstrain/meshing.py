@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
-
 from dvc.errors import InputError, OutputError
 from dvc.labels import read_labels
 from dvc.mesh import TetMesh
@@ -19,7 +17,6 @@ from fe.plate import Plate
 from mrstrain.inputs import make_output
 from mrstrain.provenance import provenance
 
-_FLAT_MM = 0.1
 _CARE_VOLUME, _CARE_ANGLE_DEG = 0.02, 10.0
 _INFERIOR, _FORWARD = (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)
 
@@ -99,12 +96,5 @@ def mesh(
     write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
     plate = Plate(_INFERIOR, _FORWARD)
     with whole_file(target.with_suffix(".png")) as part:
-        part.write_bytes(figures.mesh_slice(made, lowest_point(made, plate), plate.axes))
+        part.write_bytes(figures.mesh_slice(made, plate))
     return Meshed(target, made, quality)
-
-
-def lowest_point(mesh: TetMesh, plate: Plate) -> np.ndarray:
-    """Where the bone's surface lies furthest along the plate's outward normal, LPS mm; the middle of a flat bone."""
-    points = mesh.points_mm[np.unique(mesh.facets[BONE])] if BONE in mesh.facets else mesh.points_mm
-    height = points @ plate.axes[:, 0]
-    return np.asarray(points[height < height.min() + _FLAT_MM].mean(axis=0))

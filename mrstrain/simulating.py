@@ -24,8 +24,8 @@ from fe.plate import Plate
 from fe.published import MaterialSet, material_set
 from fe.result import (
     RegionFigures,
-    patch_volumes,
     region_figures,
+    volume_share_off,
     write_curve_csv,
     write_regions_csv,
     write_state,
@@ -33,7 +33,6 @@ from fe.result import (
 from fe.simulate import LoadStep, State, check
 from fe.simulate import simulate as solve
 from mrstrain.inputs import make_output, refuse_touching_inputs
-from mrstrain.meshing import lowest_point
 from mrstrain.provenance import provenance, write_json
 
 Told = Callable[[str, str, float], None]
@@ -361,9 +360,7 @@ def _written(
     write_curve_csv(folder / "curve.csv", states)
     outcome = {}
     for state in states:
-        J = np.linalg.det(np.eye(3) + state.gradients)
-        patches = np.abs(patch_volumes(mesh, J) - 1.0)[mesh.cells].mean(axis=1) > _FAR
-        share = float(mesh.volumes_mm3[patches].sum() / mesh.volumes_mm3.sum())
+        share = volume_share_off(mesh, state, _FAR)
         if share > _MUCH:
             notes += (
                 f"{state.load.name}: det F of nodal patches is off by over 5 % in {share:.0%} of the volume; a finer "
@@ -380,7 +377,7 @@ def _written(
         }
     write_json(folder / "simulation.json", {"outcome": outcome, "notes": list(notes)} | record)
     pictures = {
-        "slices.png": figures.sagittal_slice(mesh, states, plate, lowest_point(mesh, plate)),
+        "slices.png": figures.sagittal_slice(mesh, states, plate),
         "force_travel.png": figures.force_travel(states),
     }
     for file, drawn in pictures.items():

@@ -56,6 +56,21 @@ def test_the_command(tmp_path: Path) -> None:
     assert again.output.splitlines()[-6:] == done.output.splitlines()[-6:]
 
 
+def test_a_misspelt_set_or_region_is_refused_before_meshing(tmp_path: Path) -> None:
+    from mrstrain.converging import converge
+
+    write_labels(tmp_path / "map.nii.gz", half_onion())
+    for wrong, said in (
+        ({"material": "trebi"}, "the nearest is 'trebbi'"),
+        ({"region": "fatt"}, "No soft tissue 'fatt'"),
+    ):
+        with pytest.raises(InputError, match=said):
+            converge(
+                tmp_path / "map.nii.gz", [6.0, 4.0, 2.0], names=tmp_path / "map.csv", out=tmp_path / "out", **wrong
+            )
+    assert not list((tmp_path / "out").glob("*.vtu"))
+
+
 def test_two_sizes_are_too_few(tmp_path: Path) -> None:
     from mrstrain.converging import converge
 
