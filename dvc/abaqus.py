@@ -7,7 +7,7 @@ make geometry elsewhere in the file is refused: a mesh in the wrong place gives 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,7 +31,8 @@ _SHAPES = {
     "S8": ("quad8", 8), "M3D8": ("quad8", 8), "SFM3D8": ("quad8", 8),
 }  # fmt: skip
 _VARIANTS = set("HRIMTSPEW5")
-_READ = {"NODE", "ELEMENT", "ELSET"}
+_READ = {"NODE", "ELEMENT", "ELSET", "NSET"}
+_SET_OF = {"ELSET": "element set", "NSET": "node set"}
 _ELSEWHERE = {"INCLUDE", "SYSTEM", "NGEN", "NCOPY", "NFILL", "ELGEN", "ELCOPY", "NMAP"}
 
 
@@ -40,13 +41,15 @@ class AbaqusMesh:
     """What one input file says: ``points`` (n, 3) in the file's unit, their ``node_ids`` (n,), blocks, sets.
 
     ``blocks`` are pairs of an element shape, in meshio's names, and node *indices* (m, k); ``sets`` give the
-    indices of the elements of each element set, counted through all blocks.
+    indices of the elements of each element set, counted through all blocks, ``node_sets`` those of the nodes of
+    each node set.
     """
 
     points: FloatArray
     node_ids: IntArray
     blocks: list[tuple[str, IntArray]]
     sets: dict[str, IntArray]
+    node_sets: dict[str, IntArray]
 
 
 @dataclass(slots=True)
@@ -61,7 +64,7 @@ def read_abaqus(path: Path) -> AbaqusMesh:
     """Read the mesh of an Abaqus or CalculiX input file.
 
     Reads ``*NODE`` (any number of blocks), ``*ELEMENT`` (solids incl. hybrid and reduced ones, shells,
-    membranes, surface elements) and ``*ELSET`` (lists, GENERATE, sets of sets). Springs, trusses, connectors
+    membranes, surface elements), ``*ELSET`` and ``*NSET`` (lists, GENERATE, sets of sets). Springs, trusses, connectors
     and the reference points of an assembly carry no tissue: they are left out, and logged.
 
     Raises
@@ -94,7 +97,7 @@ def read_abaqus(path: Path) -> AbaqusMesh:
                 block = _elements(where, keyword)
                 if block is not None:
                     elements.append((keyword, *block))
-            elif keyword.name == "ELSET":
+            elif keyword.name in {"ELSET", "NSET"}:
                 if "GENERATE" in keyword.options:
                     keyword.rows = [[str(i) for i in _generated(row)] for row in keyword.rows]
                 sets.append(keyword)
@@ -199,14 +202,7 @@ def _assembled(
     index_of = {number: index for index, number in enumerate(coordinates)}
     blocks: list[tuple[str, IntArray]] = []
     position: dict[int, int] = {}
-    spelling: dict[str, str] = {}  # names of sets are the same in any case; the first spelling is kept
-    entries: dict[str, list[str]] = {}
-
-    def extend(keyword: _Keyword, more: Iterable[str]) -> None:
-        name = keyword.options["ELSET"].strip('"')
-        spelling.setdefault(name.casefold(), name)
-        entries.setdefault(name.casefold(), []).extend(more)
-
+    element_sets, node_sets = _Sets(path, "ELSET"), _Sets(path, "NSET")
     for keyword, shape, rows in elements:
         for number, *nodes in rows:
             missing = [node for node in nodes if node not in index_of]
@@ -218,32 +214,59 @@ def _assembled(
                 raise ImageFileError(f"{path}: element {number} is defined twice.")
             position[number] = len(position)
         if "ELSET" in keyword.options:
-            extend(keyword, (str(row[0]) for row in rows))
+            element_sets.extend(keyword, (str(row[0]) for row in rows))
         if rows:
             nodes_of = [[index_of[node] for node in row[1:]] for row in rows]
             blocks.append((shape, np.array(nodes_of, dtype=np.int64)))
     for keyword in sets:
-        if "ELSET" not in keyword.options:
-            raise ImageFileError(f"{path}, line {keyword.line}: *ELSET without a name (ELSET=...).")
-        extend(keyword, (x for row in keyword.rows for x in row if x))
-
-    def members(name: str, seen: tuple[str, ...] = ()) -> list[int]:
-        key = name.strip('"').casefold()
-        if key in seen or key not in entries:
-            raise ImageFileError(f"{path}: the element set {name!r} is not defined, or contains itself.")
-        found: list[int] = []
-        for entry in entries[key]:
-            if entry.isdigit():
-                # A set may name elements that were left out, and GENERATE numbers that no element has.
-                found.extend([position[int(entry)]] if int(entry) in position else [])
-            else:
-                found.extend(members(entry, (*seen, key)))
-        return found
-
-    resolved = {spelling[key]: np.unique(np.array(members(key), dtype=np.int64)) for key in entries}
+        chosen = element_sets if keyword.name == "ELSET" else node_sets
+        chosen.extend(keyword, (x for row in keyword.rows for x in row if x))
     return AbaqusMesh(
         np.array(list(coordinates.values()), dtype=np.float64),
         np.array(list(coordinates), dtype=np.int64),
         blocks,
-        {name: index for name, index in resolved.items() if len(index)},
+        element_sets.resolved(position),
+        node_sets.resolved(index_of),
     )
+
+
+class _Sets:
+    """Named sets of elements (ELSET) or nodes (NSET) as the file lists them: by number, or by another set's name."""
+
+    def __init__(self, path: Path, kind: str) -> None:
+        self._path, self._kind = path, kind
+        self._spelling: dict[str, str] = {}  # names are the same in any case; the first spelling is kept
+        self._entries: dict[str, list[str]] = {}
+
+    def extend(self, keyword: _Keyword, more: Iterable[str]) -> None:
+        if self._kind not in keyword.options:
+            raise ImageFileError(f"{self._path}, line {keyword.line}: *{self._kind} without a name ({self._kind}=...).")
+        name = keyword.options[self._kind].strip('"')
+        self._spelling.setdefault(name.casefold(), name)
+        self._entries.setdefault(name.casefold(), []).extend(more)
+
+    def resolved(self, position: Mapping[int, int]) -> dict[str, IntArray]:
+        found = {}
+        for key, name in self._spelling.items():
+            try:
+                found[name] = np.unique(np.array(self._members(key, position), dtype=np.int64))
+            except ImageFileError as error:
+                if self._kind == "ELSET":
+                    raise
+                _log.warning("%s The set is left out.", error)  # nodes of an assembly: no tissue is lost with them
+        return {name: index for name, index in found.items() if len(index)}
+
+    def _members(self, name: str, position: Mapping[int, int], seen: tuple[str, ...] = ()) -> list[int]:
+        key = name.strip('"').casefold()
+        if key in seen or key not in self._entries:
+            raise ImageFileError(
+                f"{self._path}: the {_SET_OF[self._kind]} {name!r} is not defined, or contains itself."
+            )
+        found: list[int] = []
+        for entry in self._entries[key]:
+            if entry.isdigit():
+                # A set may name elements that were left out, and GENERATE numbers that no element has.
+                found.extend([position[int(entry)]] if int(entry) in position else [])
+            else:
+                found.extend(self._members(entry, position, (*seen, key)))
+        return found

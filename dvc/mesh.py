@@ -139,6 +139,13 @@ class TetMesh:
         return np.stack([self.points_mm.min(axis=0), self.points_mm.max(axis=0)])
 
 
+def outer_faces(cells: IntArray) -> IntArray:
+    """Faces (k, 3) of tetrahedra (m, 4) that belong to one of them alone, by their nodes in rising order."""
+    faces = np.sort(np.concatenate([cells[:, face] for face in _FACES]), axis=1)
+    found, times = np.unique(faces, axis=0, return_counts=True)
+    return np.asarray(found[times == 1])
+
+
 def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
     """Nodes as an (n, 3) array of finite numbers.
 

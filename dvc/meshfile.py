@@ -8,7 +8,7 @@ import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -17,10 +17,11 @@ import meshio
 import numpy as np
 
 from dvc.abaqus import read_abaqus
+from dvc.ansys import read_ansys
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.gmsh import gmsh_node_numbers
-from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points
+from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points, outer_faces
 
 _log = logging.getLogger("dvc.meshfile")
 
@@ -102,7 +103,7 @@ class MeshFile:
 
 
 def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
-    """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2 or 4.1) or Abaqus (.inp).
+    """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2 or 4.1), Abaqus (.inp) or ANSYS (.cdb).
 
     Parameters
     ----------
@@ -116,8 +117,9 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     Returns
     -------
     MeshFile
-        With regions from Abaqus element sets, Gmsh physical groups, or, in VTK files, a cell array of whole
-        numbers called region, label, tissue, material or part.
+        With regions from Abaqus element sets, ANSYS components and materials, Gmsh physical groups, or, in VTK files, a
+        cell array of whole numbers called region, label, tissue, material or part. Sets of nodes (Abaqus, ANSYS)
+        become facets: the triangles on the outside of the tetrahedra whose corners are all in the set.
 
     Raises
     ------
@@ -134,7 +136,7 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     if frame not in TO_LPS:
         raise InputError(f"The frame of a mesh is LPS or RAS; got {frame!r}.")
     readers: dict[str, Callable[[Path], _Raw]] = {
-        ".inp": _from_abaqus, ".msh": _from_gmsh, ".vtu": _from_vtk, ".vtk": _from_vtk,
+        ".inp": _from_abaqus, ".cdb": _from_ansys, ".msh": _from_gmsh, ".vtu": _from_vtk, ".vtk": _from_vtk,
     }  # fmt: skip
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: a mesh is a file ending in {', '.join(readers)}; got {path.suffix!r}.")
@@ -154,11 +156,17 @@ class _Raw:
     node_ids: IntArray
     blocks: list[tuple[str, Any]]
     regions: dict[str, IntArray]
+    node_sets: dict[str, IntArray] = field(default_factory=dict)
 
 
 def _from_abaqus(path: Path) -> _Raw:
     mesh = read_abaqus(path)
-    return _Raw(mesh.points, mesh.node_ids, list(mesh.blocks), mesh.sets)
+    return _Raw(mesh.points, mesh.node_ids, list(mesh.blocks), mesh.sets, mesh.node_sets)
+
+
+def _from_ansys(path: Path) -> _Raw:
+    mesh = read_ansys(path)
+    return _Raw(mesh.points, mesh.node_ids, list(mesh.blocks), mesh.sets, mesh.node_sets)
 
 
 def _from_gmsh(path: Path) -> _Raw:
@@ -243,7 +251,7 @@ def _checked(path: Path, unit: str, frame: str, raw: _Raw) -> MeshFile:
     regions = {name: frozen(index, np.int64) for name, index in raw.regions.items() if len(index)}
     tets = None
     if all(block.shape == "tetra" for block in volumes):
-        tets = _tetrahedra(points, raw.node_ids, blocks, regions)
+        tets = _tetrahedra(points, raw.node_ids, blocks, regions, raw.node_sets)
     return MeshFile(
         path=path,
         unit=unit,
@@ -257,7 +265,11 @@ def _checked(path: Path, unit: str, frame: str, raw: _Raw) -> MeshFile:
 
 
 def _tetrahedra(
-    points: FloatArray, node_ids: IntArray, blocks: list[CellBlock], regions: Mapping[str, IntArray]
+    points: FloatArray,
+    node_ids: IntArray,
+    blocks: list[CellBlock],
+    regions: Mapping[str, IntArray],
+    node_sets: Mapping[str, IntArray],
 ) -> TetMesh:
     shape = np.repeat([block.shape for block in blocks], [len(block.nodes) for block in blocks])
 
@@ -275,4 +287,11 @@ def _tetrahedra(
             tissues[name] = tet_row[solid]
         if len(flat):
             surfaces[name] = triangles[triangle_row[flat]]
+    outside = outer_faces(cells) if node_sets else np.empty((0, 3), dtype=np.int64)
+    for name, nodes in node_sets.items():
+        inside = np.zeros(len(points), dtype=bool)
+        inside[nodes] = True
+        faces = outside[inside[outside].all(axis=1)]
+        if len(faces):
+            surfaces.setdefault(name, faces)
     return TetMesh(points, cells, tissues, surfaces, node_ids)

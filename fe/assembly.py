@@ -20,6 +20,9 @@ from fe.elements import Element, Space
 from fe.hyperelastic import principal_response, singular_values
 from fe.materials import Material
 
+CROWDED = 0.4
+"""det F below which a cell resists with an energy of its own, K / 3 ln(CROWDED / J)^3, so that it does not fold."""
+
 _CHUNK = 16384  # cells whose matrices are held at once
 
 
@@ -89,6 +92,13 @@ class Model:
         table = np.einsum("q,qaj->aj", self.element.weights, self.element.gradients)
         u = state[: 3 * len(self.space.nodes_mm)].reshape(-1, 3)[self.space.cells]
         return np.asarray(np.einsum("mai,aj,mjk->mik", u, table, self.inverse))
+
+    def pressures(self, state: FloatArray) -> FloatArray:
+        """Pressure at each cell's corners (m, 4), MPa: the field's, and the part that acts in the cell on its own."""
+        volume = np.linalg.det(np.eye(3) + self.gradients(state))
+        crowded = np.log(CROWDED / np.clip(volume, 1e-12, CROWDED)) ** 2 / volume
+        own = self.element.own_volume * self.shear_mpa[self.law] * (volume - 1.0) - self.bulk_mpa[self.law] * crowded
+        return np.asarray(state[3 * len(self.space.nodes_mm) :][self.space.pressure_cells] + own[:, None])
 
 
 FIXED = -1
@@ -207,7 +217,8 @@ class Assembler:
             part = slice(start, min(start + _CHUNK, len(self._cells)))
             _elements(
                 space.cells[part], space.pressure_cells[part], m.volumes_mm3[part], m.inverse[part], m.law[part],
-                m.vectors, m.shear_mpa, m.bulk_mpa, element.weights, element.gradients, element.pressure,
+                m.vectors, m.shear_mpa, m.bulk_mpa, element.own_volume * m.shear_mpa,
+                element.weights, element.gradients, element.pressure,
                 element.stabilisation, u, p, data is not None, local_forces, local, volumes,
             )  # fmt: skip
             count = part.stop - part.start
@@ -296,6 +307,7 @@ def _elements(
     vectors: FloatArray,
     shear: FloatArray,
     bulk: FloatArray,
+    own: FloatArray,
     weights: FloatArray,
     tables: FloatArray,
     pressure: FloatArray,
@@ -341,7 +353,13 @@ def _elements(
             if not J > 0.0:
                 f[:] = np.nan
                 break
-            principal_response(vectors[which], s, J, pq, stress, direct, swapped)
+            pq += own[which] * (J - 1.0)
+            rise = own[which]
+            if J < CROWDED:
+                depth = np.log(CROWDED / J)
+                pq -= bulk[which] * depth**2 / J
+                rise += bulk[which] * (2.0 + depth) * depth / J**2
+            principal_response(vectors[which], s, J, pq, rise, stress, direct, swapped)
             for a in range(nodes):  # gradients in the principal frame
                 for j in range(3):
                     h[a, j] = g[a, 0] * V[0, j] + g[a, 1] * V[1, j] + g[a, 2] * V[2, j]
@@ -387,7 +405,7 @@ def _elements(
         for c in range(4):
             for d in range(4):
                 mass = volumes[n] / 20.0 * (2.0 if c == d else 1.0)
-                value = mass / bulk[which] + tau / shear[which] * (mass - volumes[n] / 16.0)
+                value = mass / (bulk[which] - own[which]) + tau / shear[which] * (mass - volumes[n] / 16.0)
                 f[3 * nodes + c] -= value * p[pressure_cells[n, d]]
                 K[3 * nodes + c, 3 * nodes + d] -= value
         for i in range(width):

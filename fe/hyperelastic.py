@@ -148,9 +148,18 @@ def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) 
 
 @njit(cache=True)
 def principal_response(
-    law: FloatArray, s: FloatArray, J: float, p: float, stress: FloatArray, direct: FloatArray, swapped: FloatArray
+    law: FloatArray,
+    s: FloatArray,
+    J: float,
+    p: float,
+    bulk: float,
+    stress: FloatArray,
+    direct: FloatArray,
+    swapped: FloatArray,
 ) -> float:
     """W(F, p) in MPa at principal stretches ``s`` (3,), with its stress and tangent in the principal frame.
+
+    ``bulk`` is dp/dJ (MPa), 0 for a pressure that is a field of its own.
 
     Written: ``stress`` (3,) = W_i; ``direct`` (3, 3) with A_ijij, A_iiii on its diagonal; ``swapped`` (3, 3, 2) with
     A_iijj first and A_ijji second, i != j.
@@ -161,10 +170,10 @@ def principal_response(
     energy = isochoric(law, e, slope, curvature) + p * (J - 1.0)
     for i in range(3):
         stress[i] = (slope[i] + p * J) / s[i]
-        direct[i, i] = (curvature[i, i] - slope[i]) / s[i] ** 2
+        direct[i, i] = (curvature[i, i] - slope[i] + bulk * J * J) / s[i] ** 2
     for i in range(3):
         for j in range(i + 1, 3):
-            mixed = (curvature[i, j] + p * J) / (s[i] * s[j])
+            mixed = (curvature[i, j] + p * J + bulk * J * J) / (s[i] * s[j])
             if abs(s[i] - s[j]) > _EQUAL * (s[i] + s[j]):
                 together = (stress[i] - stress[j]) / (s[i] - s[j])
             else:
@@ -195,14 +204,7 @@ def stress_and_tangent(
             energy[n], stress[n], tangent[n] = np.nan, np.nan, np.nan
             continue
         p = bulk * (J - 1.0)
-        energy[n] = principal_response(law, s, J, p, principal, direct, swapped) - 0.5 * p * (J - 1.0)
-        for i in range(3):
-            for j in range(3):  # the pressure follows the volume: dp/ds_j = bulk J / s_j
-                added = bulk * J * J / (s[i] * s[j])
-                if i == j:
-                    direct[i, i] += added
-                else:
-                    swapped[i, j, 0] += added
+        energy[n] = principal_response(law, s, J, p, bulk, principal, direct, swapped) - 0.5 * p * (J - 1.0)
         stress[n] = 0.0
         tangent[n] = 0.0
         for i in range(3):

@@ -15,6 +15,8 @@ _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at
 _LEAST_VOLUME = 0.02  # det F at a quadrature point below this is on its way to folding
 _MOST_GROWTH = 3.0  # of the residual in one step
+_WANDERED = 2  # steps in a row that hardly lowered the residual, after which a step is measured before it is made
+_SHARES = (1.0, 0.5, 0.25)
 _INEXACT = 1e-3  # residual of a linear solution that is not exact
 
 
@@ -34,7 +36,7 @@ class Tolerance:
 
     force: float = 1e-4
     step_mm: float = 1e-3
-    iterations: int = 25
+    iterations: int = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +97,7 @@ def equilibrium(
     forces, residual, lowest = assembler.residual(now)
     if not lowest > 0.0:
         return None
+    wandering = 0
     for iteration in range(1, tolerance.iterations + 1):
         right = outside - residual
         right[assembler.idle] = 0.0
@@ -108,11 +111,14 @@ def equilibrium(
         if not np.isfinite(change).all():
             return None
         share = 1.0
+        if wandering >= _WANDERED:
+            share = _best_share(assembler, now, change, outside, held)
+        bound = np.inf if left.any() or iteration == 1 else _MOST_GROWTH * before
         while True:
             tried = now + share * change
             forces, residual, lowest = assembler.residual(tried)
             after = _norm(outside - residual, held, assembler)
-            if lowest > _LEAST_VOLUME and (left.any() or after <= _MOST_GROWTH * before or iteration == 1):
+            if lowest > _LEAST_VOLUME and after <= bound:
                 break
             share *= 0.5
             if share < _LEAST_SHARE:
@@ -120,6 +126,7 @@ def equilibrium(
         now, left = tried, (1.0 - share) * left
         largest = share * float(np.abs(change[:displacements]).max())
         balance = after / max(_reaction(assembler, forces), 1e-9)
+        wandering = wandering + 1 if after > 0.5 * before and balance > tolerance.force else 0
         told(f"    {iteration}: out of balance {balance:.1e}, step {largest:.1e} mm, least det F {lowest:.3f}")
         if left.any() or balance > _NEAR:
             continue
@@ -128,6 +135,17 @@ def equilibrium(
         elif share == 1.0 and balance <= tolerance.force and largest <= tolerance.step_mm:
             return Converged(now, forces, iteration)
     return None
+
+
+def _best_share(
+    assembler: Assembler, now: FloatArray, change: FloatArray, outside: FloatArray, held: IntArray
+) -> float:
+    """The share of a step, of a few, that leaves the least out of balance."""
+    left = {}
+    for share in _SHARES:
+        _, residual, lowest = assembler.residual(now + share * change)
+        left[share] = _norm(outside - residual, held, assembler) if lowest > _LEAST_VOLUME else np.inf
+    return min(_SHARES, key=lambda share: left[share])
 
 
 def _norm(residual: FloatArray, held: IntArray, assembler: Assembler) -> float:

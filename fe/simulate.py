@@ -24,7 +24,7 @@ BONE, SURFACE = "bone", "skin"
 """Names of the facets that are fixed, and of those that the plate may touch."""
 
 _FIRST_STEP = 0.25
-_LEAST_STEP = 1.0 / 512.0
+_LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
 _LEAST_APPROACH_MM = 0.01
@@ -92,6 +92,7 @@ def simulate(
     plate: Plate,
     loads: Sequence[LoadStep],
     *,
+    fixed: Sequence[str] = (BONE,),
     formulation: str = "P1",
     threads: int = 1,
     keep: Callable[[State], None] = lambda _: None,
@@ -103,11 +104,13 @@ def simulate(
     Parameters
     ----------
     mesh : TetMesh
-        With facets "bone", which do not move, and "skin", which the plate may touch; every cell in one region.
+        With facets "skin", which the plate may touch, and those that are fixed; every cell in one region.
     laws : mapping of region to Material
     plate : Plate
     loads : sequence of LoadStep
         Reached one from the other. The first must press.
+    fixed : sequence of str
+        Facets that do not move.
     formulation : {"P1", "MINI", "P2"}
         As in `fe.elements`.
     threads : int
@@ -129,10 +132,10 @@ def simulate(
     InputError
         If a region has no law or a cell no region, the facets are missing, or the first load does not press.
     """
-    check(mesh, laws, plate, loads)
+    check(mesh, laws, plate, loads, fixed)
     turned = TetMesh(mesh.points_mm @ plate.axes, mesh.cells, mesh.regions, mesh.facets)
     model = Model.of(turned, laws, element(formulation))
-    path = _Path(model, turned, plate, threads, tell)
+    path = _Path(model, turned, plate, fixed, threads, tell)
     states: list[State] = []
     before = np.zeros(3)
     try:
@@ -159,7 +162,7 @@ def simulate(
                     load=load,
                     reached=reached,
                     u_mm=u @ plate.axes.T,
-                    pressure_mpa=path.state[displacements:][model.space.pressure_cells],
+                    pressure_mpa=model.pressures(path.state),
                     gradients=plate.axes @ model.gradients(path.state) @ plate.axes.T,
                     travel_mm=path.travel.copy(),
                     force_n=path.force.copy(),
@@ -178,9 +181,17 @@ def simulate(
     return states
 
 
-def check(mesh: TetMesh, laws: Mapping[str, Material], plate: Plate, loads: Sequence[LoadStep]) -> None:
+def check(
+    mesh: TetMesh,
+    laws: Mapping[str, Material],
+    plate: Plate,
+    loads: Sequence[LoadStep],
+    fixed: Sequence[str] = (BONE,),
+) -> None:
     """Refuse what `simulate` cannot do, before anything is computed; errors as there."""
-    for name in (BONE, SURFACE):
+    if not fixed:
+        raise InputError("No facets are fixed: tissue that nothing holds cannot be pressed.")
+    for name in (*fixed, SURFACE):
         if name not in mesh.facets:
             raise InputError(
                 f"The mesh has no facets '{name}'; it has {', '.join(mesh.facets) or 'none'}. The bone's interface is "
@@ -208,22 +219,26 @@ def check(mesh: TetMesh, laws: Mapping[str, Material], plate: Plate, loads: Sequ
             )
         if load.shear_n != 0.0 and not plate.taped:
             raise InputError(f"{load.name}: a plate without friction carries no shear force; got {load.shear_n:g} N.")
-    _check_held(mesh)
-    on_surface = np.setdiff1d(np.unique(mesh.facets[SURFACE]), np.unique(mesh.facets[BONE]))
+    _check_held(mesh, fixed)
+    on_surface = np.setdiff1d(np.unique(mesh.facets[SURFACE]), _nodes_of(mesh, fixed))
     Contact(plate, mesh.points_mm @ plate.axes, on_surface)
 
 
-def _check_held(mesh: TetMesh) -> None:
-    """Refuse tissue that hangs on no bone: cells whose nodes are joined to none of it."""
+def _nodes_of(mesh: TetMesh, facets: Sequence[str]) -> IntArray:
+    return np.unique(np.concatenate([mesh.facets[name].ravel() for name in facets]))
+
+
+def _check_held(mesh: TetMesh, fixed: Sequence[str]) -> None:
+    """Refuse tissue that hangs on nothing: cells whose nodes are joined to no fixed one."""
     ends = np.repeat(mesh.cells[:, 0], 3), mesh.cells[:, 1:].ravel()
     count = len(mesh.points_mm)
     joined = sparse.csr_matrix((np.ones(len(ends[0]), dtype=np.int8), ends), shape=(count, count))
     _, part = connected_components(joined, directed=False)
-    loose = ~np.isin(part[mesh.cells[:, 0]], part[np.unique(mesh.facets[BONE])])
+    loose = ~np.isin(part[mesh.cells[:, 0]], part[_nodes_of(mesh, fixed)])
     if loose.any():
         raise InputError(
-            f"{int(loose.sum())} of {len(loose)} cells are not joined to the bone's surface: tissues are bonded where "
-            "they share nodes. Merge coincident nodes where the mesh was made."
+            f"{int(loose.sum())} of {len(loose)} cells are not joined to what is fixed ({', '.join(fixed)}): tissues "
+            "are bonded where they share nodes. Merge coincident nodes where the mesh was made."
         )
 
 
@@ -233,15 +248,23 @@ _Kept = tuple[FloatArray, FloatArray, FloatArray, BoolArray, int]
 class _Path:
     """The state on its way, and what moves it."""
 
-    def __init__(self, model: Model, mesh: TetMesh, plate: Plate, threads: int, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        model: Model,
+        mesh: TetMesh,
+        plate: Plate,
+        fixed: Sequence[str],
+        threads: int,
+        tell: Callable[[str], None],
+    ) -> None:
         self.model, self.tell = model, tell
-        on_bone, on_surface = (_nodes_on(model, mesh, name) for name in (BONE, SURFACE))
-        touching = np.setdiff1d(on_surface, on_bone)
+        held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in fixed]))
+        touching = np.setdiff1d(_nodes_on(model, mesh, SURFACE), held)
         self.contact = Contact(plate, model.space.nodes_mm, touching)
-        fixed = (3 * on_bone[:, None] + np.arange(3)).ravel()
-        self.assembler = Assembler(model, fixed, self.contact.may_follow)
+        self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), self.contact.may_follow)
         self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
         self.state = np.zeros(model.unknowns)
+        self.extent_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
         self.travel, self.force = np.zeros(3), np.zeros(3)
         self.travel[0] = plate.gap_mm
         self.curve: list[FloatArray] = [np.concatenate([self.travel, self.force])]
@@ -256,32 +279,48 @@ class _Path:
     def approach(self, normal_n: float) -> None:
         """Move the plate from its first touch on, until it presses with a part of the force asked for."""
         self.contact.touch_first(self.state)
-        deepest = float(np.ptp(self.model.space.nodes_mm[:, 0]))
-        step = _APPROACH_MM
-        while self.force[0] < _ENOUGH * normal_n and _LEAST_APPROACH_MM < step < deepest - self.travel[0]:
+        self._push(0, _ENOUGH * normal_n, normal_n)
+
+    def raise_force(self, target: FloatArray, progress: Callable[[float], None]) -> bool:
+        """Raise the force from what it is to the target, in steps as large as converge; whether it is there.
+
+        Where tissue gives way too much for that, the plate is moved along the force for a while, and then pushed again.
+        It is given up where the plate has moved as far as the body is large.
+        """
+        before, way = self.force.copy(), target - self.force
+        axis = int(np.argmax(np.abs(way)))
+        done, step, pushed = 0.0, _FIRST_STEP, False
+        while done < 1.0 and step > _LEAST_STEP:
+            share = min(1.0, done + step)
             kept = self._kept()
-            if self._go(np.zeros(3), [0], np.array([step])) and self.force[0] < normal_n:
+            if self._go(before + share * way, [], np.zeros(0)):
+                done, step, pushed = share, step * _GROWTH, False
+                self._told(f"{done:.0%} of the way")
+                progress(done)
+                continue
+            self._restore(kept)
+            step *= _SHRINK
+            if step < _SOFT_STEP and not pushed:
+                pushed = True
+                self._push(axis, before[axis] + min(1.0, done + _FIRST_STEP) * way[axis], target[axis])
+                done, step = float((self.force - before) @ way / (way @ way)), _FIRST_STEP
+        return done >= 1.0
+
+    def _push(self, axis: int, enough_n: float, most_n: float) -> None:
+        """Move the plate along an axis until its force there is enough, or no more can be had; never past the most."""
+        sign = 1.0 if most_n >= self.force[axis] else -1.0
+        farthest = self.travel[axis] + sign * float(np.ptp(self.model.space.nodes_mm[:, 0]))
+        step = _APPROACH_MM
+        while sign * (enough_n - self.force[axis]) > 0.0 and step > _LEAST_APPROACH_MM:
+            if sign * (farthest - self.travel[axis]) < step:
+                break
+            kept = self._kept()
+            if self._go(self.force, [axis], np.array([sign * step])) and sign * (most_n - self.force[axis]) > 0.0:
                 step = min(_GROWTH * step, _MOST_APPROACH_MM)
                 self._told("moved")
             else:
                 self._restore(kept)
                 step *= _SHRINK
-
-    def raise_force(self, target: FloatArray, progress: Callable[[float], None]) -> bool:
-        """Raise the force from what it is to the target, in steps as large as converge; whether it is there."""
-        before = self.force.copy()
-        done, step = 0.0, _FIRST_STEP
-        while done < 1.0 and step > _LEAST_STEP:
-            share = min(1.0, done + step)
-            kept = self._kept()
-            if self._go(before + share * (target - before), [], np.zeros(0)):
-                done, step = share, step * _GROWTH
-                self._told(f"{done:.0%} of the way")
-                progress(done)
-            else:
-                self._restore(kept)
-                step *= _SHRINK
-        return done >= 1.0
 
     def _go(self, force: FloatArray, held: list[int], moves: FloatArray) -> bool:
         """Find equilibrium under a force along the axes that are not held, and moves along those that are."""
@@ -308,6 +347,9 @@ class _Path:
         if self.contact.plate.taped:  # whoever was on the plate still is
             for axis in (1, 2):
                 self.travel[axis] += (found.state - self.state)[follows[axis][0]]
+        if np.abs(self.travel).max() > self.extent_mm:
+            self.tell("the plate would have moved farther than the body is large")
+            return False
         self.force = np.array([found.forces[self.contact.followers.get(axis, [])].sum() for axis in range(3)])
         self.state = found.state
         self.iterations += found.iterations

@@ -58,6 +58,9 @@ def simulate(
     slide: Annotated[
         bool, typer.Option("--slide", help="No tape: skin slides along the plate without friction.")
     ] = False,
+    gap_mm: Annotated[float, typer.Option(min=0.0, help="Distance of the plate from the skin at the start, mm.")] = 0.0,
+    fix: Annotated[list[str] | None, typer.Option(help="Facets that do not move; repeat. Default: bone.")] = None,
+    element: Annotated[str, typer.Option(help="P1 (fast), MINI, or P2 (quadratic: more exact, slow).")] = "P1",
     decks: Annotated[bool, typer.Option("--decks", help="Also write each load for CalculiX and FEBio.")] = False,
     mesh_unit: MeshUnit = Unit.MM,
     mesh_frame: MeshFrame = Frame.LPS,
@@ -77,6 +80,9 @@ def simulate(
             plate_normal=plate_normal or (0.0, 0.0, -1.0),
             shear_direction=shear_direction or (0.0, -1.0, 0.0),
             taped=not slide,
+            gap_mm=gap_mm,
+            fixed=fix or ("bone",),
+            element=element,
             decks=decks,
             mesh_unit=mesh_unit.value,
             mesh_frame=mesh_frame.value,

@@ -18,6 +18,8 @@ from dvc.whole import whole_file, write_whole
 from dvc.worker import Worker, each_in_workers, usable_cores
 from fe import figures
 from fe.decks import write_calculix, write_febio
+from fe.elements import TOLD
+from fe.elements import element as formulation
 from fe.materials import MODES, Material
 from fe.meshstore import read_tet_mesh
 from fe.plate import Plate
@@ -30,7 +32,7 @@ from fe.result import (
     write_regions_csv,
     write_state,
 )
-from fe.simulate import LoadStep, State, check
+from fe.simulate import BONE, LoadStep, State, check
 from fe.simulate import simulate as solve
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.provenance import provenance, write_json
@@ -113,6 +115,9 @@ def simulate(
     plate_normal: Sequence[float] = (0.0, 0.0, -1.0),
     shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
     taped: bool = True,
+    gap_mm: float = 0.0,
+    fixed: Sequence[str] = (BONE,),
+    element: str = "P1",
     mesh_unit: str = "mm",
     mesh_frame: str = "LPS",
     decks: bool = False,
@@ -124,7 +129,7 @@ def simulate(
     Parameters
     ----------
     mesh : path
-        As `mesh` writes it, or made elsewhere; with facets "bone" and "skin".
+        As `mesh` writes it, or made elsewhere; with facets "skin" and those that are fixed.
     out : path
         Gets a folder for each set: a VTU file for each load, ``curve.csv`` (force and travel of the plate),
         ``regions.csv``, ``simulation.json`` and pictures.
@@ -137,6 +142,12 @@ def simulate(
         The plate's outward normal, and the direction of the shear force on the tissue, LPS.
     taped : bool
         Whether skin that has touched the plate holds to it; if not, it slides without friction.
+    gap_mm : float
+        Distance of the plate from the skin at the start, which its travel begins with.
+    fixed : sequence of str
+        Facets that do not move.
+    element : {"P1", "MINI", "P2"}
+        As in `fe.elements`.
     decks : bool
         Also write each load as decks for CalculiX (C3D10) and FEBio 4 (tet10); see `fe.decks`.
     workers : int
@@ -150,7 +161,8 @@ def simulate(
         If the mesh, a set or a load cannot be used; before anything is computed.
     """
     place, target = Path(mesh), Path(out)
-    plate = Plate(plate_normal, shear_direction, taped=taped)
+    plate = Plate(plate_normal, shear_direction, gap_mm, taped)
+    formulation(element)
     read = read_tet_mesh(place, unit=mesh_unit, frame=mesh_frame)
     chosen = [material_set(name) for name in sets]
     names = [one.name for one in chosen]
@@ -159,14 +171,14 @@ def simulate(
     paths = paths_of(loads)
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
-        check(read, region_laws, plate, loads)
+        check(read, region_laws, plate, loads, fixed)
     refuse_touching_inputs(target, names, [place])
     make_output(target)
     for name in names:
         make_output(target / name)
         _clear(target / name)
     files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
-    given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped}
+    given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(fixed)}
     jobs = [(one, path) for one in chosen for path in paths]
     at_once = max(1, min(workers or usable_cores(), len(jobs)))
     threads = max(1, usable_cores() // at_once)
@@ -189,8 +201,8 @@ def simulate(
 
             try:
                 states = worker.run(
-                    f"simulating {case}", _simulated, read, laws[name][0], plate, path, target / name, share, threads,
-                    watch=watch,
+                    f"simulating {case}", _simulated, read, laws[name][0], plate, path, fixed, element,
+                    target / name, share, threads,                     watch=watch,
                 )  # fmt: skip
             except MrstrainError as failure:
                 states, failures[case] = [], str(failure)
@@ -199,7 +211,7 @@ def simulate(
             waiting[name] -= 1
             if waiting[name] == 0 and found[name]:
                 ordered = [s for p in paths for load in p for s in found[name] if s.load.name == load.name]
-                record = provenance("simulate", files, given | _told(chosen_set, laws[name][0], paths, plate))
+                record = provenance("simulate", files, given | _told(chosen_set, laws[name][0], paths, plate, element))
                 done[name] = _written(target / name, name, read, ordered, *laws[name], loads, plate, record, decks)
         tell(case, "simulating", 1.0)
 
@@ -276,6 +288,8 @@ def _simulated(
     laws: Mapping[str, Material],
     plate: Plate,
     path: Sequence[LoadStep],
+    fixed: Sequence[str],
+    element: str,
     folder: Path,
     share: Path,
     threads: int,
@@ -289,7 +303,7 @@ def _simulated(
 
     try:
         return solve(
-            mesh, laws, plate, path, threads=threads, tell=log.append, keep=keep,
+            mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=log.append, keep=keep,
             progress=lambda done: _replaced(share, f"{done:.4f}"),
         )  # fmt: skip
     finally:
@@ -303,7 +317,7 @@ def _replaced(path: Path, text: str) -> None:
 
 
 def _told(
-    chosen: MaterialSet, laws: Mapping[str, Material], paths: Sequence[Sequence[LoadStep]], plate: Plate
+    chosen: MaterialSet, laws: Mapping[str, Material], paths: Sequence[Sequence[LoadStep]], plate: Plate, element: str
 ) -> dict[str, object]:
     return {
         "set": chosen.name,
@@ -322,7 +336,7 @@ def _told(
         "paths": [[asdict(load) for load in path] for path in paths],
         "plate_axes_lps": plate.axes.tolist(),
         "plate": "rigid; moved to the tissue, then force-controlled along all three axes; rotation locked",
-        "element": "P1: stabilised linear tetrahedra, displacement and pressure",
+        "element": f"{element}: {TOLD[element]}",
     }
 
 

@@ -69,7 +69,8 @@ def test_pressure_jumps_between_tissues_and_nowhere_else() -> None:
 
 
 @pytest.mark.parametrize("name", ELEMENTS)
-def test_tangent_is_the_derivative_of_the_residual(name: str) -> None:
+@pytest.mark.parametrize("pressed", [0.0, 0.7], ids=["plain", "nearly flat"])
+def test_tangent_is_the_derivative_of_the_residual(name: str, pressed: float) -> None:
     model = model_of(name)
     nodes = model.space.nodes_mm
     left, right = (np.flatnonzero(np.isclose(nodes[:, 0], x)) for x in (0.0, 8.0))
@@ -77,7 +78,9 @@ def test_tangent_is_the_derivative_of_the_residual(name: str) -> None:
     random = np.random.default_rng(0)
     state = np.zeros(model.unknowns)
     corner = np.unique(model.space.cells[:, :4])
-    state[unknowns(corner, 0, 1, 2)] = 0.05 * random.normal(size=3 * len(corner))
+    state[unknowns(corner, 0, 1, 2)] = (0.05, 0.02)[pressed > 0.0] * random.normal(size=3 * len(corner))
+    linear = np.arange(len(nodes)) if name == "P2" else corner
+    state[unknowns(linear, 0)] -= pressed * nodes[linear, 0]
     state[3 * len(nodes) :] = 0.01 * random.normal(size=model.space.pressures)
     for followers in ({}, {k: unknowns(right[::2], k) for k in range(3)}):
         assembler.share(followers)
@@ -92,7 +95,7 @@ def test_tangent_is_the_derivative_of_the_residual(name: str) -> None:
             upper[row, assembler.indices[at]] = data[at]
         whole = upper + np.triu(upper, 1).T
         expected = (ahead - behind) / (2 * h)
-        assert np.abs(whole @ change - expected).max() < 1e-8 * np.abs(expected).max()
+        assert np.abs(whole @ change - expected).max() < (1e-8, 1e-6)[pressed > 0.0] * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("name", ELEMENTS)
@@ -118,8 +121,7 @@ def test_patch(name: str) -> None:
         state = found.state.copy()
     gradients = model.gradients(state)
     assert np.abs(gradients - (F - np.eye(3))).max() < 1e-9
-    pressure = state[3 * len(nodes) :]
-    assert pressure == pytest.approx(SOFT.bulk_modulus_mpa * 2e-4, rel=1e-5)
+    assert model.pressures(state) == pytest.approx(SOFT.bulk_modulus_mpa * 2e-4, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ELEMENTS)

@@ -108,6 +108,37 @@ def write_abaqus(path: Path, points: np.ndarray, cells: np.ndarray, kind: str = 
     path.write_text("\n".join(lines) + "\n")
 
 
+def write_ansys(path: Path, points: np.ndarray, cells: np.ndarray, top: np.ndarray | None = None) -> None:
+    """As CDWRITE writes it: shells and solids in one block, components as runs of numbers, a component of nodes."""
+    lines = [
+        "/COM,ANSYS RELEASE 2024 R1",
+        "/PREP7",
+        "ET,1,285",
+        "ET,2,181",
+        f"NBLOCK,6,SOLID,{TAGS.max():9d},{len(TAGS):9d}",
+    ]
+    lines += ["(3i9,6e21.13e3)"]
+    lines += [f"{TAGS[n]:9d}{0:9d}{0:9d}" + "".join(f"{x:21.13E}" for x in points[n]) for n in range(len(TAGS))]
+    lines += ["N,R5.3,LOC,       -1,", f"EBLOCK,19,SOLID,{950:9d},{50:9d}", "(19i9)"]
+
+    def row(number: int, kind: int, material: int, nodes: list[int]) -> str:
+        return "".join(f"{v:9d}" for v in [material, kind, 1, 1, 0, 0, 0, 0, len(nodes), 0, number, *nodes])
+
+    lines += [row(901 + i, 2, 7, [*TAGS[face], TAGS[face[-1]]]) for i, face in enumerate(skin(cells))]
+    lines += [row(1 + i, 1, 1 if i < 20 else 2, list(TAGS[cell])) for i, cell in enumerate(cells)]
+    lines += [f"{-1:9d}"]
+
+    def component(name: str, kind: str, numbers: list[int]) -> list[str]:
+        rows = ["".join(f"{n:10d}" for n in numbers[i : i + 8]) for i in range(0, len(numbers), 8)]
+        return [f"CMBLOCK,{name:<8},{kind},{len(numbers):8d}  ! users element component definition", "(8i10)", *rows]
+
+    lines += component("SOLE", "ELEM", [901, 902])
+    lines += component("FAT", "ELEM", [1, -20]) + component("SKIN", "ELEM", [21, -48])
+    if top is not None:
+        lines += component("TOP", "NODE", sorted(TAGS[top].tolist()))
+    path.write_text("\n".join([*lines, "/GO", "FINISH"]) + "\n")
+
+
 def write_vtk(path: Path, points: np.ndarray, cells: np.ndarray) -> None:
     tissue = [np.array([7, 7]), np.where(np.arange(48) < 20, 1, 2)]
     blocks = [("triangle", skin(cells)), ("tetra", cells)]
@@ -120,6 +151,8 @@ def written(folder: Path, kind: str, scale: float = 1.0, signs: tuple[int, int, 
     path = folder / f"heel.{kind[:3]}"
     if kind == "inp":
         write_abaqus(path, points, cells)
+    elif kind == "cdb":
+        write_ansys(path, points, cells)
     elif kind == "msh-22":
         write_gmsh22(path, points, cells)
     elif kind.startswith("msh"):
@@ -129,7 +162,7 @@ def written(folder: Path, kind: str, scale: float = 1.0, signs: tuple[int, int, 
     return path
 
 
-KINDS = ["vtu", "vtk", "msh-22", "msh-41", "msh-41-binary", "inp"]
+KINDS = ["vtu", "vtk", "msh-22", "msh-41", "msh-41-binary", "inp", "cdb"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -143,15 +176,63 @@ def test_every_format_unit_and_frame_gives_the_same_mesh(
     np.testing.assert_allclose(mesh.points_mm, points, atol=1e-9)
     assert mesh.tets is not None
     np.testing.assert_array_equal(mesh.tets.cells, cells)
-    named = kind in {"inp"} or kind.startswith("msh")
+    named = kind in {"inp", "cdb"} or kind.startswith("msh")
     fat, dermis, sole = ("fat", "skin", "sole") if named else ("tissue 1", "tissue 2", "tissue 7")
     regions = {name.casefold(): index for name, index in mesh.tets.regions.items()}
     np.testing.assert_array_equal(regions[fat], np.arange(20))
     np.testing.assert_array_equal(regions[dermis], np.arange(20, 48))
-    np.testing.assert_array_equal(mesh.tets.facets[sole], skin(cells))
+    facets = {name.casefold(): faces for name, faces in mesh.tets.facets.items()}
+    np.testing.assert_array_equal(facets[sole], skin(cells))
     np.testing.assert_array_equal(mesh.node_ids, TAGS if named else np.arange(27))
     assert mesh.cell_count == 50
     np.testing.assert_allclose(mesh.centroids_mm[2:], mesh.tets.centroids_mm, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["inp", "cdb"])
+def test_a_set_of_nodes_names_the_outer_triangles_between_them(tmp_path: Path, kind: str) -> None:
+    points, cells = block()
+    top = np.flatnonzero(points[:, 2] == points[:, 2].max())
+    path = tmp_path / f"heel.{kind}"
+    if kind == "cdb":
+        write_ansys(path, points, cells, top)
+    else:
+        write_abaqus(path, points, cells)
+        middle = len(top) // 2
+        sets = ["*NSET, NSET=half", ", ".join(str(TAGS[n]) for n in top[:middle]), "*NSET, NSET=Top", "HALF,"]
+        strange = ["*NSET, NSET=elsewhere", "Part-1.5"]
+        path.write_text(
+            path.read_text() + "\n".join([*sets, ", ".join(str(TAGS[n]) for n in top[middle:]), *strange]) + "\n"
+        )
+    mesh = read_mesh(path).tets
+    assert mesh is not None
+    found = mesh.facets["TOP" if kind == "cdb" else "Top"]
+    assert len(found) == 8  # two for each of the four squares
+    assert np.unique(found).tolist() == top.tolist()
+    assert "elsewhere" not in mesh.facets
+
+
+@pytest.mark.parametrize(("nodes", "kind"), [(4, "tetra"), (10, "tetra10")])
+def test_bricks_that_are_tetrahedra_are_read_as_such(tmp_path: Path, nodes: int, kind: str) -> None:
+    path = tmp_path / "heel.cdb"
+    points = np.array([[0, 0, 0], [6, 0, 0], [0, 6, 0], [0, 0, 6]], dtype=float)
+    edges = [(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)]
+    points = np.concatenate([points, [points[list(e)].mean(axis=0) for e in edges]])[:nodes]
+    i, j, k, m, *mid = range(1, nodes + 1)
+    brick = [i, j, k, k, m, m, m, m]
+    if mid:
+        q, r, t, y, z, a = mid
+        brick += [q, r, k, t, m, m, m, m, y, z, a, a]
+    head = [1, 1, 1, 1, 0, 0, 0, 0, len(brick), 0, 1]
+    lines = [f"ET,1,{186 if mid else 185}", f"NBLOCK,6,SOLID,{nodes},{nodes}", "(3i9,6e21.13e3)"]
+    lines += [f"{n:9d}{0:9d}{0:9d}" + "".join(f"{x:21.13E}" for x in p) for n, p in enumerate(points, start=1)]
+    lines += ["-1", "EBLOCK,19,SOLID,1,1", "(19i9)", "".join(f"{v:9d}" for v in head + brick[:8])]
+    lines += ["".join(f"{v:9d}" for v in brick[8:])] if mid else []
+    path.write_text("\n".join([*lines, "       -1"]) + "\n")
+    mesh = read_mesh(path)
+    assert [(b.kind, b.nodes.tolist()) for b in mesh.blocks] == [(kind, [list(range(nodes))])]
+    path.write_text(path.read_text().replace("ET,1,185", "ET,1,170").replace("ET,1,186", "ET,1,170"))
+    with pytest.raises(ImageFileError, match="no volume cells"):
+        read_mesh(path)
 
 
 def test_gmsh_22_binary_numbers_are_read(tmp_path: Path) -> None:
@@ -213,7 +294,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path: Path, kind: str) -> None:
 
 
 def test_what_cannot_be_a_mesh_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"\.inp, \.msh, \.vtu, \.vtk; got '\.stl'"):
+    with pytest.raises(InputError, match=r"\.inp, \.cdb, \.msh, \.vtu, \.vtk; got '\.stl'"):
         read_mesh(tmp_path / "heel.stl")
     with pytest.raises(ImageFileError, match="no such file"):
         read_mesh(tmp_path / "heel.vtu")

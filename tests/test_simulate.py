@@ -125,7 +125,7 @@ def test_elements_agree_on_a_fine_mesh() -> None:
     # Linear tetrahedra without a pressure of their own would be several times too stiff here.
     mesh = dome((6, 12, 12))
     travel = {name: press(mesh, PRESS, formulation=name)[0].travel_mm[0] for name in ("P1", "MINI", "P2")}
-    assert travel["P1"] == pytest.approx(travel["P2"], rel=0.08)
+    assert travel["P1"] == pytest.approx(travel["P2"], rel=0.1)
     assert travel["MINI"] == pytest.approx(travel["P2"], rel=0.15)
 
 
@@ -177,7 +177,7 @@ def test_tissue_that_hangs_on_no_bone_is_refused() -> None:
     cells[mesh.regions["skin"]] = new[skin]
     facets = {"bone": mesh.facets["bone"], "skin": new[mesh.facets["skin"]]}
     apart = TetMesh(np.concatenate([mesh.points_mm, mesh.points_mm[own]]), cells, mesh.regions, facets)
-    with pytest.raises(InputError, match="are not joined to the bone's surface"):
+    with pytest.raises(InputError, match="are not joined to what is fixed"):
         press(apart, PRESS)
 
 
