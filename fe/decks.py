@@ -7,7 +7,7 @@ forces: contact has not to be found again. CalculiX reads the one (Abaqus knows 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -27,7 +27,13 @@ _PER_LINE = 12
 
 
 def write_calculix(
-    path: Path, mesh: TetMesh, laws: Mapping[str, Material], state: State, *, quadratic: bool = False
+    path: Path,
+    mesh: TetMesh,
+    laws: Mapping[str, Material],
+    state: State,
+    *,
+    fixed: Sequence[str] = (BONE,),
+    quadratic: bool = False,
 ) -> None:
     """Write a CalculiX deck (.inp) of a state, mm, N and MPa, LPS.
 
@@ -38,6 +44,8 @@ def write_calculix(
     laws : mapping of region to Material
         Neo-Hooke, Yeoh and Ogden; volume as in `fe.materials`, which is CalculiX' own (D1 = 2 / K).
     state : State
+    fixed : sequence of str
+        Facets that do not move.
     quadratic : bool
         C3D10 instead of C3D4. Linear tetrahedra without a pressure of their own lock in nearly incompressible tissue:
         C3D4 is for comparing codes only.
@@ -47,10 +55,12 @@ def write_calculix(
     InputError
         For Hencky's law, which CalculiX does not have.
     """
-    write_whole(path, "\n".join(_deck(mesh, laws, state, quadratic)) + "\n")
+    write_whole(path, "\n".join(_deck(mesh, laws, state, fixed, quadratic)) + "\n")
 
 
-def _deck(mesh: TetMesh, laws: Mapping[str, Material], state: State, quadratic: bool) -> Iterator[str]:
+def _deck(
+    mesh: TetMesh, laws: Mapping[str, Material], state: State, fixed: Sequence[str], quadratic: bool
+) -> Iterator[str]:
     space = _space(mesh, quadratic)
     yield from (f"** {line}" for line in _about(state))
     yield "*NODE, NSET=NALL"
@@ -64,8 +74,8 @@ def _deck(mesh: TetMesh, laws: Mapping[str, Material], state: State, quadratic: 
         yield f"*MATERIAL, NAME={_short('M', region, laws)}"
         yield from _law(region, law)
         yield f"*SOLID SECTION, ELSET={_short('E', region, laws)}, MATERIAL={_short('M', region, laws)}"
-    fixed, on_plate, moved = _supports(mesh, space, state)
-    for name, nodes in (("NBONE", fixed), ("NPLATE", on_plate)):
+    held, on_plate, moved = _supports(mesh, space, state, fixed)
+    for name, nodes in (("NBONE", held), ("NPLATE", on_plate)):
         yield f"*NSET, NSET={name}"
         for start in range(0, len(nodes), _PER_LINE):
             yield ", ".join(str(n + 1) for n in nodes[start : start + _PER_LINE]) + ","
@@ -89,26 +99,27 @@ def _deck(mesh: TetMesh, laws: Mapping[str, Material], state: State, quadratic: 
     yield "*END STEP"
 
 
-def _supports(mesh: TetMesh, space: Space, state: State) -> tuple[IntArray, IntArray, FloatArray]:
+def _supports(mesh: TetMesh, space: Space, state: State, fixed: Sequence[str]) -> tuple[IntArray, IntArray, FloatArray]:
     """Nodes that are fixed, nodes on the plate, and how far those move; middles of edges go with their ends."""
     count = len(mesh.points_mm)
     bone = np.zeros(count, dtype=bool)
-    bone[mesh.facets[BONE]] = True
+    held = np.concatenate([mesh.facets[name] for name in fixed])
+    bone[held] = True
     plate = np.zeros(count, dtype=bool)
     plate[state.on_plate] = True
-    fixed, on_plate, moved = [np.flatnonzero(bone)], [np.flatnonzero(plate)], [state.u_mm[plate]]
+    still, on_plate, moved = [np.flatnonzero(bone)], [np.flatnonzero(plate)], [state.u_mm[plate]]
     if space.cells.shape[1] > 4:
-        for facets, both, nodes in ((mesh.facets[BONE], bone, fixed), (_faces_on(mesh, plate), plate, on_plate)):
+        for facets, both, nodes in ((held, bone, still), (_faces_on(mesh, plate, fixed), plate, on_plate)):
             ends = edges_of(facets)
             ends = ends[both[ends].all(axis=1)]
             nodes.append(space.middles(ends))
             if nodes is on_plate:
                 moved.append(state.u_mm[ends].mean(axis=1))
-    return np.concatenate(fixed), np.concatenate(on_plate), np.concatenate(moved)
+    return np.concatenate(still), np.concatenate(on_plate), np.concatenate(moved)
 
 
-def _faces_on(mesh: TetMesh, plate: BoolArray) -> IntArray:
-    every = np.concatenate([rows for name, rows in mesh.facets.items() if name != BONE])
+def _faces_on(mesh: TetMesh, plate: BoolArray, fixed: Sequence[str]) -> IntArray:
+    every = np.concatenate([rows for name, rows in mesh.facets.items() if name not in fixed])
     return np.asarray(every[plate[every].all(axis=1)])
 
 
@@ -141,7 +152,13 @@ def _law(region: str, law: Material) -> Iterator[str]:
 
 
 def write_febio(
-    path: Path, mesh: TetMesh, laws: Mapping[str, Material], state: State, *, quadratic: bool = False
+    path: Path,
+    mesh: TetMesh,
+    laws: Mapping[str, Material],
+    state: State,
+    *,
+    fixed: Sequence[str] = (BONE,),
+    quadratic: bool = False,
 ) -> None:
     """Write an FEBio 4 deck (.feb) of a state, mm, N and MPa, LPS; parameters as `write_calculix`.
 
@@ -154,7 +171,7 @@ def write_febio(
         For Hencky's law.
     """
     space = _space(mesh, quadratic)
-    fixed, on_plate, moved = _supports(mesh, space, state)
+    held, on_plate, moved = _supports(mesh, space, state, fixed)
     root = ElementTree.Element("febio_spec", version="4.0")
     root.append(ElementTree.Comment(" " + "\n    ".join(_about(state)) + " "))
     _child(root, "Module", type="solid")
@@ -181,7 +198,7 @@ def write_febio(
         elements = _child(whole, "Elements", type="tet10" if quadratic else "tet4", name=_short("E", region, laws))
         for cell in mesh.regions[region]:
             _child(elements, "elem", ",".join(str(n + 1) for n in space.cells[cell]), id=str(cell + 1))
-    for name, members in (("bone", fixed), ("plate", on_plate)):
+    for name, members in (("bone", held), ("plate", on_plate)):
         _child(whole, "NodeSet", ",".join(str(n + 1) for n in members), name=name)
     domains = _child(root, "MeshDomains")
     for region in laws:

@@ -212,7 +212,9 @@ def simulate(
             if waiting[name] == 0 and found[name]:
                 ordered = [s for p in paths for load in p for s in found[name] if s.load.name == load.name]
                 record = provenance("simulate", files, given | _told(chosen_set, laws[name][0], paths, plate, element))
-                done[name] = _written(target / name, name, read, ordered, *laws[name], loads, plate, record, decks)
+                done[name] = _written(
+                    target / name, name, read, ordered, *laws[name], loads, plate, record, fixed if decks else None
+                )
         tell(case, "simulating", 1.0)
 
     each_in_workers(jobs, one, at_once=at_once, threads=threads)
@@ -350,7 +352,7 @@ def _written(
     loads: Sequence[LoadStep],
     plate: Plate,
     record: dict[str, object],
-    decks: bool,
+    decks_fixed: Sequence[str] | None,
 ) -> Simulated:
     rows = [row for state in states for row in region_figures(mesh, state, laws)]
     unstable = tuple(
@@ -363,11 +365,11 @@ def _written(
     notes += tuple(
         f"{load.name} was not tried: the load before it was not reached." for load in loads if load.name not in tried
     )
-    if decks:
+    if decks_fixed is not None:
         try:
             for state in states:
-                write_calculix(folder / f"{state.load.name}.inp", mesh, laws, state, quadratic=True)
-                write_febio(folder / f"{state.load.name}.feb", mesh, laws, state, quadratic=True)
+                write_calculix(folder / f"{state.load.name}.inp", mesh, laws, state, fixed=decks_fixed, quadratic=True)
+                write_febio(folder / f"{state.load.name}.feb", mesh, laws, state, fixed=decks_fixed, quadratic=True)
         except InputError as refused:
             notes += (f"No decks: {refused}",)
     write_regions_csv(folder / "regions.csv", rows)
