@@ -20,6 +20,7 @@ from dvc.abaqus import read_abaqus
 from dvc.ansys import read_ansys
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
+from dvc.frd import read_frd
 from dvc.gmsh import gmsh_node_numbers
 from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points, outer_faces
 
@@ -103,7 +104,7 @@ class MeshFile:
 
 
 def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
-    """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2 or 4.1), Abaqus (.inp) or ANSYS (.cdb).
+    """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2, 4.1), Abaqus (.inp), ANSYS (.cdb), CalculiX (.frd).
 
     Parameters
     ----------
@@ -136,7 +137,8 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     if frame not in TO_LPS:
         raise InputError(f"The frame of a mesh is LPS or RAS; got {frame!r}.")
     readers: dict[str, Callable[[Path], _Raw]] = {
-        ".inp": _from_abaqus, ".cdb": _from_ansys, ".msh": _from_gmsh, ".vtu": _from_vtk, ".vtk": _from_vtk,
+        ".inp": _from_abaqus, ".cdb": _from_ansys, ".frd": _from_frd,
+        ".msh": _from_gmsh, ".vtu": _from_vtk, ".vtk": _from_vtk,
     }  # fmt: skip
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: a mesh is a file ending in {', '.join(readers)}; got {path.suffix!r}.")
@@ -167,6 +169,11 @@ def _from_abaqus(path: Path) -> _Raw:
 def _from_ansys(path: Path) -> _Raw:
     mesh = read_ansys(path)
     return _Raw(mesh.points, mesh.node_ids, list(mesh.blocks), mesh.sets, mesh.node_sets)
+
+
+def _from_frd(path: Path) -> _Raw:
+    found = read_frd(path)
+    return _Raw(found.points, found.node_ids, list(found.blocks), found.materials)
 
 
 def _from_gmsh(path: Path) -> _Raw:

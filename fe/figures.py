@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
@@ -23,6 +25,7 @@ from fe.simulate import BONE, State
 
 _POINTS = 200
 _FLAT_MM = 0.1
+_UNKNOWN = "#c9ced6"
 
 
 def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
@@ -55,35 +58,74 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate) -> byte
     Cells are cut in the unloaded configuration and drawn where they are under load; the dashed line is the plate. The
     colours end where a hundredth of the volume is above, over all loads.
     """
-    point = _lowest_bone_point(mesh, plate)
-    cuts = [cut(mesh, state.u_mm, plate.axes, point) for state in states]
-    corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
-    low, high = corners.min(axis=0) - 2.0, corners.max(axis=0) + 2.0
-    shears = np.concatenate([StrainField.from_gradient(state.gradients).max_shear for state in states])
-    (most,) = volume_percentiles(shears, np.tile(mesh.volumes_mm3, len(states)), [0.99])
-    largest = max(0.05, float(np.ceil(20.0 * most) / 20.0))
-    rows, columns = (len(states) + 1) // 2, min(len(states), 2)
-    tall = 0.9 + (WIDTH_IN / columns - 1.0) * float((high[1] - low[1]) / (high[0] - low[0]))
-    figure = Figure(figsize=(WIDTH_IN, rows * tall), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in panels[len(states) :]:
-        axes.set_visible(False)
-    for axes, state, (cells, polygons) in zip(panels, states, cuts, strict=False):
-        shear = StrainField.from_gradient(state.gradients[cells]).max_shear
-        drawn = PolyCollection(
-            polygons, array=shear, cmap="viridis", norm=Normalize(0.0, largest), edgecolors="face", linewidths=0.2
-        )
-        axes.add_collection(drawn)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        face = float(((mesh.points_mm + state.u_mm)[state.on_plate] @ plate.axes[:, 0]).mean())
-        axes.axhline(face, color=INK, linewidth=1.0, linestyle="--")
+    panels = []
+    for state in states:
         load = state.load
         part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%})"
         told = f"{load.name}: {load.normal_n:g} N normal, {load.shear_n:g} N shear{part}"
-        axes.set_title(told, color=INK, **FONT)
-        label_axes(axes, "along the shear, mm", "along the normal force, mm")
-    bar = figure.colorbar(drawn, ax=list(panels[: len(states)]), shrink=0.8, extend="max")
+        face = float(((mesh.points_mm + state.u_mm)[state.on_plate] @ plate.axes[:, 0]).mean())
+        panels.append(Slice(told, state.u_mm, StrainField.from_gradient(state.gradients).max_shear, face))
+    return slice_sheet(mesh, panels, plate.axes, _lowest_bone_point(mesh, plate))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slice:
+    """A field on a mesh, to be drawn on a slice.
+
+    Attributes
+    ----------
+    title : str
+    u_mm : (n, 3)
+        Displacement of the mesh's nodes, LPS mm: cells are drawn where it puts them.
+    max_shear : (m,)
+        Of the cells; where it is NaN, a cell is drawn grey.
+    face_mm : float, optional
+        Height of a plate along the normal force, drawn as a dashed line.
+    """
+
+    title: str
+    u_mm: FloatArray
+    max_shear: FloatArray
+    face_mm: float | None = None
+
+
+def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> bytes:
+    """Fields on one slice, in one colour scale that ends where a hundredth of the volume is above.
+
+    Parameters
+    ----------
+    axes : (3, 3)
+        The plate's: columns are the directions of the normal force, of shear, and their cross product, LPS.
+    point_mm : (3,)
+        On the slice, reference configuration, LPS mm.
+    """
+    cuts = [cut(mesh, panel.u_mm, axes, point_mm) for panel in panels]
+    corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
+    low, high = corners.min(axis=0) - 2.0, corners.max(axis=0) + 2.0
+    shears = np.concatenate([panel.max_shear for panel in panels])
+    known = np.isfinite(shears)
+    (most,) = volume_percentiles(shears[known], np.tile(mesh.volumes_mm3, len(panels))[known], [0.99])
+    largest = max(0.05, float(np.ceil(20.0 * most) / 20.0))
+    rows, columns = (len(panels) + 1) // 2, min(len(panels), 2)
+    tall = 0.9 + (WIDTH_IN / columns - 1.0) * float((high[1] - low[1]) / (high[0] - low[0]))
+    figure = Figure(figsize=(WIDTH_IN, rows * tall), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    spots = figure.subplots(rows, columns, squeeze=False).ravel()
+    for spot in spots[len(panels) :]:
+        spot.set_visible(False)
+    shades = colormaps["viridis"].with_extremes(bad=_UNKNOWN)
+    for spot, panel, (cells, polygons) in zip(spots, panels, cuts, strict=False):
+        drawn = PolyCollection(
+            polygons, array=np.ma.masked_invalid(panel.max_shear[cells]), cmap=shades, norm=Normalize(0.0, largest),
+            edgecolors="face", linewidths=0.2,
+        )  # fmt: skip
+        spot.add_collection(drawn)
+        spot.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        if panel.face_mm is not None:
+            spot.axhline(panel.face_mm, color=INK, linewidth=1.0, linestyle="--")
+        spot.set_title(panel.title, color=INK, **FONT)
+        label_axes(spot, "along the shear, mm", "along the normal force, mm")
+    bar = figure.colorbar(drawn, ax=list(spots[: len(panels)]), shrink=0.8, extend="max")
     bar.set_label("maximal shear", color=INK, **FONT)
     return png_bytes(figure)
 

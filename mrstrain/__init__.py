@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mrstrain.comparing import compare
     from mrstrain.converging import converge
     from mrstrain.fitting import fit
     from mrstrain.making import phantom
@@ -20,10 +21,11 @@ if TYPE_CHECKING:
     from mrstrain.twinning import twin
 
 __version__ = "0.1.0"
-__all__ = ["accuracy", "converge", "fit", "mesh", "phantom", "register", "simulate", "strain", "twin"]
+__all__ = ["accuracy", "compare", "converge", "fit", "mesh", "phantom", "register", "simulate", "strain", "twin"]
 
 _ROOMS = {
     "accuracy": "studying",
+    "compare": "comparing",
     "converge": "converging",
     "fit": "fitting",
     "mesh": "meshing",

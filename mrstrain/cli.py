@@ -326,7 +326,13 @@ def accuracy(
         raise typer.Exit(1)
 
 
-for _command in (modelcommands.mesh, modelcommands.simulate, modelcommands.converge, modelcommands.fit):
+for _command in (
+    modelcommands.mesh,
+    modelcommands.simulate,
+    modelcommands.compare,
+    modelcommands.converge,
+    modelcommands.fit,
+):
     app.command()(_command)
 
 

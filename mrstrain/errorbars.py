@@ -7,7 +7,7 @@ import hashlib
 import io
 import re
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,10 +51,13 @@ class ErrorBars:
     uncertainty : Uncertainty or None
     told : str
         Where the figures come from, or the reason why there are none.
+    model : ErrorModel or None
+        With the one table that was used.
     """
 
     uncertainty: Uncertainty | None
     told: str
+    model: ErrorModel | None = None
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
@@ -65,9 +68,11 @@ class ErrorBars:
         return {"known": True, "source": self.told, "voxel_mm": voxel, "snr": round(table.snr, 1)}
 
     def write(self, folder: Path, maps: StrainMaps) -> None:
-        """Write ``sigma_max_shear.nii.gz`` and ``intervals.csv``, where the errors are known."""
+        """Write ``sigma_max_shear.nii.gz``, ``intervals.csv`` and the ``error_model.json`` used, if there are any."""
         if self.uncertainty is None:
             return
+        if self.model is not None:
+            self.model.write(folder / "error_model.json")
         write_image(folder / "sigma_max_shear.nii.gz", Image(maps.grid, self.uncertainty.sigma))
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
@@ -119,7 +124,7 @@ def error_bars(found: Registration, subject: Subject, maps: StrainMaps, model: E
         f"{chosen.source}. Tissues with figures of their own: {known or 'none'}; others take those of soft tissue "
         f"together. {_held(table)} All this is for tissue that is strained and imaged like those phantoms."
     )
-    return ErrorBars(sure, told)
+    return ErrorBars(sure, told, replace(chosen, tables=(table,)))
 
 
 def _held(table: ErrorTable) -> str:

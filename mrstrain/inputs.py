@@ -121,6 +121,23 @@ def _unit(name: str, vector: Sequence[float]) -> FloatArray:
     return direction / length
 
 
+def read_matrix(path: Path) -> FloatArray:
+    """Read a 4 x 4 matrix from a text file of four rows.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    try:
+        matrix = np.loadtxt(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: no matrix of four rows of four numbers ({error}).") from error
+    if matrix.shape != (4, 4):
+        raise InputError(f"{path}: a matrix of shape {matrix.shape}; 4 x 4 is needed.")
+    return np.asarray(matrix, dtype=np.float64)
+
+
 def case_names(loads: Sequence[Path]) -> list[str]:
     """Names of the result folders, from the files' names.
 

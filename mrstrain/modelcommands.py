@@ -95,6 +95,62 @@ def simulate(
         raise typer.Exit(1)
 
 
+def compare(
+    dvc: Annotated[Path, typer.Argument(help="Results of register: a folder for each load, or one of these.")],
+    models: Annotated[
+        list[Path],
+        typer.Argument(help="For each model a folder with a file for each load (Load1.vtu, .frd, .csv ...)."),
+    ],
+    labels: Annotated[Path, typer.Option(help="Label map of the unloaded image.")],
+    out: Out,
+    names: Names = None,
+    bone: Annotated[list[str] | None, typer.Option(help="Label of bone; repeat. Default: bone.")] = None,
+    mesh: Annotated[Path | None, typer.Option(help="Where to compare. Default: the first model's mesh.")] = None,
+    model_mesh: Annotated[Path | None, typer.Option(help="Mesh of nodal displacements in .csv files.")] = None,
+    model_unit: MeshUnit = Unit.MM,
+    model_frame: MeshFrame = Frame.LPS,
+    to_image: Annotated[
+        Path | None, typer.Option(help="Text file: 4 x 4 map of the models' frame to the image's, LPS mm.")
+    ] = None,
+    plate_normal: Plate = None,
+    shear_direction: Shear = None,
+    strains: Annotated[tuple[float, float], typer.Option(help="Range of maximal shear of the areas.")] = (0.2, 0.5),
+    thresholds: Annotated[Path | None, typer.Option(help="CSV: max_shear, source. Levels for clusters.")] = None,
+    least_ml: Annotated[float, typer.Option(help="Volume of the smallest cluster that counts, mL.")] = 0.1,
+    on_image: Annotated[
+        bool, typer.Option("--on-image", help="Also each model's strain on the image's voxels.")
+    ] = False,
+) -> None:
+    """Finite-element models of any code against a measurement: curves, areas, location, agreement, and a report."""
+    from mrstrain.comparing import compare as run
+    from mrstrain.inputs import read_matrix
+    from mrstrain.progress import live
+
+    with live() as progress:
+        done = run(
+            dvc,
+            models,
+            labels=labels,
+            out=out,
+            names=names,
+            bones=bone or ("bone",),
+            mesh=mesh,
+            model_mesh=model_mesh,
+            model_unit=model_unit.value,
+            model_frame=model_frame.value,
+            to_image=None if to_image is None else read_matrix(to_image),
+            plate_normal=plate_normal or (0.0, 0.0, -1.0),
+            shear_direction=shear_direction or (0.0, -1.0, 0.0),
+            strains=strains,
+            thresholds=thresholds,
+            least_ml=least_ml,
+            on_image=on_image,
+            progress=progress,
+        )
+    for line in done.summary():
+        typer.echo(line)
+
+
 def converge(
     labels: Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")],
     out: Out,

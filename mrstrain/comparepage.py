@@ -1,0 +1,215 @@
+"""The report of a comparison: verdict first, then the table of models and loads, curves, slices and agreement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.deformation import Deformation
+from dvc.image import LabelMap
+from dvc.report import Cell, Picture, Section, Table, write_report
+from dvc.verdict import Verdict
+from mrstrain.page import flat, said
+from validate import figures
+from validate.comparison import ALL, Comparison
+from validate.location import Threshold
+from validate.sources import FeResult
+
+_PANELS = 2  # tissues whose curves are drawn, all soft tissue first
+_TITLES = {
+    "curves": ("Volume above a strain", figures.volume_strain),
+    "slices": ("Where the strain lies", figures.slices),
+    "agreement": ("Cell by cell", figures.scatter),
+}
+_CLOSING = Section(
+    "How to read this",
+    paragraphs=(
+        "All fields are compared at the centroids of the same cells of one mesh, with the cells' volumes as weights, "
+        "in the reference (unloaded) configuration; cells in which the measurement or a model is not defined are left "
+        "out for all. Strain is Green-Lagrange, maximal shear (E1 - E3)/2. Displacement is that of tissue relative "
+        "to its bone, LPS mm.",
+        "The area between two volume-strain curves is the integral of the difference of volumes above a strain over "
+        "the range of strain, in mL; its share is divided by the tissue's volume and the width of the range. Curves "
+        "carry no place: two fields may have one curve and differ everywhere. Overlap (Dice), distances of centroids, "
+        "the Hausdorff distance (95th percentile) and the agreement cell by cell tell where.",
+        "Intervals and the grey band come from the error model of the registration: truths are drawn that could lie "
+        "behind the measured field, and the model's area to each is taken. Where an interval does not hold the area "
+        "as found, noise and smoothing have moved the measured curve. Two models are told apart where the area of one "
+        "is the smaller in 97.5 % of the draws, widened as the intervals are.",
+        "A measurement smears strain that jumps at a border of tissues over about 4 mm, and noise lifts small shears; "
+        "a model does neither. What the measurement cannot see, no comparison can: scanner distortion, creep during "
+        "a scan, tissue that slides along a smooth skin or inside a uniform region. Levels of strain are no "
+        "thresholds of injury unless the table of thresholds says so and why.",
+    ),
+)  # fmt: skip
+
+
+class Judged(Protocol):
+    """A measurement with the verdict on its registration."""
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """None where it has none."""
+        ...
+
+
+def pictures_of(
+    one: Comparison,
+    measured: Deformation,
+    results: Sequence[FeResult],
+    labels: LabelMap,
+    bones: Sequence[str],
+    axes: FloatArray,
+    strains: tuple[float, float],
+) -> dict[str, bytes]:
+    """Draw a load's figures; by the stem of their files."""
+    found = one.found
+    displacements = {r.name: _at_nodes(r, found.mesh.points_mm) for r in results}
+    drawn = {"curves": figures.volume_strain(found, one.bands, strains, (ALL, *found.tissues)[:_PANELS])}
+    point = lowest_bone_point(labels, bones, axes)
+    across = (found.mesh.points_mm - point) @ axes[:, 2]
+    if not across.min() < 0.0 < across.max():  # the bone lies beside the mesh
+        point = found.mesh.bounds_mm.mean(axis=0)
+    drawn["slices"] = figures.slices(found, measured, displacements, axes, point)
+    drawn["agreement"] = figures.scatter(found)
+    return drawn
+
+
+def lowest_bone_point(labels: LabelMap, bones: Sequence[str], axes: FloatArray) -> FloatArray:
+    """Where the bone lies furthest along the plate's outward normal, LPS mm; the middle of a flat one."""
+    bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
+    points = labels.grid.points(bone)
+    height = points @ axes[:, 0]
+    return np.asarray(points[height < height.min() + 0.5 * labels.grid.spacing_mm.min()].mean(axis=0))
+
+
+def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
+    """A model's displacement at the nodes of the compared mesh; its own nodes' where that is its mesh."""
+    if result.mesh.points_mm.shape == points_mm.shape and np.array_equal(result.mesh.points_mm, points_mm):
+        return result.deformation.u_mm
+    u = result.deformation.displacement(points_mm)
+    missing = ~np.isfinite(u).all(axis=1)
+    if missing.any():
+        from scipy.spatial import cKDTree
+
+        _, nearest = cKDTree(result.mesh.points_mm).query(points_mm[missing])
+        u[missing] = result.deformation.u_mm[nearest]
+    return u
+
+
+def write_page(
+    path: Path,
+    shown: Sequence[tuple[Comparison, Judged, Mapping[str, bytes]]],
+    totals: Mapping[str, float],
+    noise: Sequence[str],
+    notes: Sequence[str],
+    strains: tuple[float, float],
+    thresholds: Sequence[Threshold],
+    record: Mapping[str, object],
+) -> None:
+    """Write the report, one self-contained page."""
+    done = [one for one, _, _ in shown]
+    sections = [Section("Models and loads", None, (_areas(done, totals, strains),), (), (*noise, *notes))]
+    for one, measurement, drawn in shown:
+        verdict = measurement.verdict
+        pictures = {stem: Picture(title, said(draw), drawn[stem]) for stem, (title, draw) in _TITLES.items()}
+        covered = one.found.coverage()
+        told = (
+            f"Compared: {covered['common']:.1f} mL of the mesh's {covered['mesh']:.1f} mL of soft tissue; the "
+            f"measurement is defined in {covered['measured']:.1f} mL."
+        )
+        judged = () if verdict is None else (f"Its registration is judged: {verdict.words}.",)
+        doubtful = verdict if verdict is not None and verdict.level != "trust" else None
+        first = tuple(pictures[stem] for stem in ("curves", "slices"))
+        sections.append(
+            Section(one.load, doubtful, (_tissues(one), _location(one), _travel(one)), first, (told, *judged))
+        )
+        sections.append(Section(f"{one.load}, cell by cell", None, (_agreement(one),), (pictures["agreement"],)))
+    sources = Section(
+        "Levels of strain",
+        None,
+        (Table("Thresholds", ("maximal shear", "source"), tuple((t.max_shear, t.source) for t in thresholds)),),
+    )
+    write_report(path, "Models against the measurement", None, sections, [_CLOSING, sources], flat(record))
+
+
+def _areas(done: Sequence[Comparison], totals: Mapping[str, float], strains: tuple[float, float]) -> Table:
+    areas = {(a.model, a.load): a for one in done for a in one.areas if a.tissue == ALL}
+    names = [*totals, *dict.fromkeys(model for model, _ in areas if model not in totals)]
+    rows = []
+    for name in names:
+        cells: list[Cell] = [name]
+        for one in done:
+            area = areas.get((name, one.load))
+            if area is None:
+                cells.append("–")
+            elif np.isnan(area.low_ml):
+                cells.append(f"{area.ml:.2f}")
+            else:
+                cells.append(f"{area.ml:.2f} ({area.low_ml:.2f} to {area.high_ml:.2f})")
+        rows.append((*cells, f"{totals[name]:.2f}" if name in totals else "–"))
+    return Table(
+        f"Area between the volume-strain curves of soft tissue, strains {strains[0]:g} to {strains[1]:g}, mL",
+        ("model", *(one.load for one in done), "all loads"),
+        tuple(rows),
+        "The nearest model first. In brackets the 95 % interval that the measurement's own error leaves.",
+    )
+
+
+def _tissues(one: Comparison) -> Table:
+    rows = tuple((a.model, a.tissue, a.ml, 100.0 * a.share, a.low_ml, a.high_ml) for a in one.areas)
+    return Table(
+        "Area between the curves, by tissue",
+        ("model", "tissue", "area, mL", "share, %", "95 % from", "to"),
+        rows,
+    )
+
+
+def _location(one: Comparison) -> Table:
+    rows = tuple(
+        (o.model, o.threshold, o.measured_ml, o.model_ml, o.measured_clusters, o.model_clusters, o.dice, o.centroids_mm,
+         o.largest_mm, o.hausdorff95_mm)
+        for o in one.overlaps
+    )  # fmt: skip
+    return Table(
+        "Tissue above a strain: how much, and where",
+        ("model", "above", "measured, mL", "model, mL", "clusters", "model's", "Dice", "centroids apart, mm",
+         "largest clusters apart, mm", "Hausdorff 95, mm"),
+        rows,
+    )  # fmt: skip
+
+
+def _agreement(one: Comparison) -> Table:
+    rows = tuple(
+        (a.model, {"max_shear": "maximal shear", "u_mm": "displacement, mm"}[a.quantity], a.part, a.measured_mean,
+         a.model_mean, a.slope, a.intercept, a.r2, a.rmse, a.concordance, a.bias, a.lower, a.upper)
+        for a in one.agreements
+        if a.part == ALL or a.part in one.found.tissues
+    )  # fmt: skip
+    return Table(
+        "Agreement cell by cell",
+        ("model", "quantity", "tissue", "measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias",
+         "limits from", "to"),
+        rows,
+        "Means, regression of the model on the measurement, Lin's concordance, and Bland and Altman's limits of "
+        "agreement; by distance to bone in agreement.csv.",
+    )  # fmt: skip
+
+
+def _travel(one: Comparison) -> Table:
+    rows = tuple(
+        (t.model, t.nodes, t.measured_mm, t.model_mm, t.measured_along_mm, t.model_along_mm,
+         100.0 * t.measured_volume_change, 100.0 * t.model_volume_change)
+        for t in one.travels
+    )  # fmt: skip
+    return Table(
+        "Skin under the plate, and volume of the fat",
+        ("model", "nodes", "in, measured, mm", "in, model", "along, measured", "along, model", "volume, measured, %",
+         "volume, model, %"),
+        rows,
+        "Mean displacement of the skin on the model's plate, 1 mm inside the skin for the measurement; mean det F - 1.",
+    )  # fmt: skip

@@ -1,0 +1,377 @@
+"""`compare`: finite-element models of any code against a measurement, load by load."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.deformation import Deformation, evaluate_on_grid
+from dvc.displacementfile import read_displacement
+from dvc.errors import InputError
+from dvc.image import Image, LabelMap
+from dvc.imagewrite import write_image
+from dvc.kinematics import StrainField, plate_axes
+from dvc.labels import read_labels
+from dvc.regions import volume_above
+from dvc.uncertainty import ErrorTable, read_error_model
+from dvc.verdict import Verdict
+from dvc.whole import whole_file, whole_folder, write_whole
+from fe.meshstore import read_tet_mesh
+from mrstrain.comparepage import pictures_of, write_page
+from mrstrain.inputs import make_output, refuse_touching_inputs
+from mrstrain.provenance import provenance, write_json
+from validate.agreement import Agreement, Travel
+from validate.comparison import ALL, Comparison
+from validate.comparison import compare as compare_load
+from validate.curves import RANGE, Area, Band
+from validate.location import LEAST_ML, Overlap, read_thresholds
+from validate.sources import FeResult, check_overlap, read_result
+
+Told = Callable[[str, str, float], None]
+
+_FIELD = "displacement.nii.gz"
+_ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".csv")
+_STEP = 0.005  # of the curves that are written
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """One load as it was measured.
+
+    Attributes
+    ----------
+    load : str
+    folder : Path
+    table : ErrorTable or None
+        Error of the maximal shear, where it is known.
+    verdict : Verdict or None
+        On the registration.
+    """
+
+    load: str
+    folder: Path
+    table: ErrorTable | None
+    verdict: Verdict | None
+
+    def deformation(self) -> Deformation:
+        """Displacement of tissue relative to its bone."""
+        return read_displacement(self.folder / _FIELD)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """What `compare` gave."""
+
+    out: Path
+    comparisons: tuple[Comparison, ...]
+    totals: Mapping[str, float]
+    noise: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        lines = []
+        for one in self.comparisons:
+            told = ", ".join(f"{a.model} {a.ml:.2f}{_interval(a)}" for a in one.ranked())
+            lines.append(f"{one.load}: area between the curves, mL, the nearest first: {told}")
+        if self.totals:
+            told = ", ".join(f"{name} {ml:.2f}" for name, ml in self.totals.items())
+            lines.append(f"All loads: {told}")
+        return [*lines, *self.noise, *self.notes, f"Report: {self.out / 'report.html'}"]
+
+
+def compare(
+    dvc: Path | str,
+    models: Sequence[Path | str],
+    *,
+    labels: Path | str,
+    out: Path | str,
+    names: Path | str | None = None,
+    bones: Sequence[str] = ("bone",),
+    mesh: Path | str | None = None,
+    model_mesh: Path | str | None = None,
+    model_unit: str = "mm",
+    model_frame: str = "LPS",
+    to_image: FloatArray | None = None,
+    plate_normal: Sequence[float] = (0.0, 0.0, -1.0),
+    shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
+    strains: tuple[float, float] = RANGE,
+    thresholds: Path | str | None = None,
+    least_ml: float = LEAST_ML,
+    on_image: bool = False,
+    progress: Told | None = None,
+) -> Compared:
+    """Compare finite-element models with a measurement.
+
+    Parameters
+    ----------
+    dvc : path
+        Results of `register` or `strain`: a folder for each load, or one of these.
+    models : sequence of path
+        For each model a folder whose files are called as the loads (Load1.vtu, .vtk, .msh, .frd, or .csv with
+        ``model_mesh``), or a file, where there is one load.
+    labels, names : path
+        Label map of the unloaded image and its names: tissues, and distance to bone.
+    out : path
+        Gets ``report.html``, tables, and a folder for each load.
+    bones : sequence of str
+        Labels of bone.
+    mesh : path, optional
+        Where fields are compared; the first model's mesh by default.
+    model_mesh, model_unit, model_frame, to_image
+        As in `validate.sources.read_result`.
+    plate_normal, shear_direction : (3,)
+        The plate's outward normal and the direction of shear, LPS.
+    strains : (low, high)
+        Range of maximal shear over which curves are compared.
+    thresholds : path, optional
+        Table of strains above which clusters are looked at, with where each comes from.
+    least_ml : float
+        Volume of the smallest cluster that counts.
+    on_image : bool
+        Also write each model's maximal shear on the measurement's voxels.
+    progress : callable, optional
+        ``progress(case, stage, fraction)``.
+
+    Raises
+    ------
+    InputError
+        If measurement and models have no load in common, or as in `validate.comparison.compare`.
+    """
+    target, tell = Path(out), progress or (lambda *_: None)
+    if not 0.0 <= strains[0] < strains[1]:
+        raise InputError(f"The range of strain must rise from 0 or more; got {strains[0]:g} to {strains[1]:g}.")
+    axes = plate_axes(-np.asarray(plate_normal, dtype=np.float64), shear_direction)
+    levels = read_thresholds(None if thresholds is None else Path(thresholds))
+    tissues = read_labels(labels, names)
+    measurements = _measurements(Path(dvc))
+    files, notes = _files(measurements, [Path(m) for m in models])
+    given = [*(f for by in files.values() for f in by.values()), *([Path(model_mesh)] if model_mesh else [])]
+    refuse_touching_inputs(target, list(files), [*given, *(m.folder / _FIELD for m in measurements), Path(labels)])
+    make_output(target)
+    common = None if mesh is None else read_tet_mesh(mesh)
+    record = provenance(
+        "compare",
+        {
+            "measured": [m.folder / _FIELD for m in measurements], "models": given, "labels": Path(labels),
+            "names": [] if names is None else [Path(names)], "mesh": [] if mesh is None else [Path(mesh)],
+            "error_models": [f for m in measurements if (f := m.folder / "error_model.json").is_file()],
+        },
+        {
+            "bones": list(bones), "plate_axes_lps": axes.tolist(), "strains": list(strains),
+            "least_cluster_ml": least_ml,
+            "thresholds": [[t.max_shear, t.source] for t in levels],
+            "model_unit": model_unit, "model_frame": model_frame,
+            "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": 1,
+        },
+    )  # fmt: skip
+    done: list[Comparison] = []
+    shown: list[tuple[Comparison, Measurement, dict[str, bytes]]] = []
+    for number, measurement in enumerate(m for m in measurements if m.load in files):
+        load = measurement.load
+        tell("compare", load, number / len(files))
+        results = []
+        for name, file in files[load].items():
+            result = read_result(name, file, mesh=model_mesh, unit=model_unit, frame=model_frame, to_image=to_image)
+            check_overlap(result, tissues.grid)
+            results.append(result)
+        measured = measurement.deformation()
+        one = compare_load(
+            load, measured, results, tissues, bones=bones, normal=-axes[:, 0], mesh=common, table=measurement.table,
+            strains=strains, thresholds=levels, least_ml=least_ml,
+        )  # fmt: skip
+        drawn = pictures_of(one, measured, results, tissues, bones, axes, strains)
+        with whole_folder(target / load) as folder:
+            _write_fields(folder / "fields.vtu", one)
+            for stem, png in drawn.items():
+                (folder / f"{stem}.png").write_bytes(png)
+            if on_image:
+                _write_on_image(folder, results, tissues)
+            write_json(folder / "provenance.json", record)
+        done.append(one)
+        shown.append((one, measurement, drawn))
+    notes += [
+        f"{m.load}: the measurement's error is not known (no error_model.json beside it): no difference counts as seen."
+        for m in measurements
+        if m.load in files and m.table is None
+    ]
+    totals, noise = _ranking(done)
+    _write_tables(target, done, strains)
+    write_json(
+        target / "comparison.json",
+        {
+            "total_area_ml": totals, "told_apart": list(noise), "notes": notes,
+            "coverage_ml": {one.load: one.found.coverage() for one in done},
+        } | record,
+    )  # fmt: skip
+    write_page(target / "report.html", shown, totals, noise, notes, strains, levels, record)
+    tell("compare", "done", 1.0)
+    return Compared(target, tuple(done), totals, noise, tuple(notes))
+
+
+def _measurements(place: Path) -> list[Measurement]:
+    folders = [place] if (place / _FIELD).is_file() else sorted(p.parent for p in place.glob(f"*/{_FIELD}"))
+    if not folders:
+        raise InputError(f"{place}: no results of `register` or `strain` here (LOAD/{_FIELD}).")
+    found = []
+    for folder in folders:
+        model = folder / "error_model.json"
+        table = read_error_model(model).tables[0] if model.is_file() else None
+        verdict = None
+        if (folder / "quality.json").is_file():
+            told = json.loads((folder / "quality.json").read_text(encoding="utf-8"))["verdict"]
+            verdict = Verdict(told["level"], tuple(told["reasons"]))
+        found.append(Measurement(folder.resolve().name, folder, table, verdict))
+    return found
+
+
+def _files(measurements: Sequence[Measurement], models: Sequence[Path]) -> tuple[dict[str, dict[str, Path]], list[str]]:
+    """For each load each model's file, and what is missing."""
+    if not models:
+        raise InputError("No model is given: a folder with a file for each load, or a file.")
+    loads = [m.load for m in measurements]
+    files: dict[str, dict[str, Path]] = {load: {} for load in loads}
+    notes: list[str] = []
+    taken: set[str] = set()
+    for place in models:
+        if place.is_file():
+            if len(loads) > 1 and place.stem not in loads:
+                raise InputError(
+                    f"{place}: which load is it of? Measured are {', '.join(loads)}: call the file so, or give one "
+                    "load's folder as the measurement."
+                )
+            name, of = (place.parent.resolve().name, place.stem) if place.stem in loads else (place.stem, loads[0])
+            chosen = {of: place}
+        elif place.is_dir():
+            name = place.resolve().name
+            chosen = {
+                load: file
+                for load in loads
+                for ending in reversed(_ENDINGS)
+                if (file := place / (load + ending)).is_file()
+            }
+        else:
+            raise InputError(f"{place}: there is no such model.")
+        if name in taken:
+            raise InputError(f"Two models are called '{name}': give their folders names of their own.")
+        if not chosen:
+            raise InputError(
+                f"{place} has no file of a measured load ({', '.join(loads)}), ending in {', '.join(_ENDINGS)}."
+            )
+        taken.add(name)
+        reached = _reached(place)
+        for load in loads:
+            if load not in chosen:
+                notes.append(f"{name} has no result for {load}.")
+            elif reached.get(load, 1.0) < 1.0:
+                notes.append(f"{name} reached only {reached[load]:.0%} of {load}, which is not compared.")
+            else:
+                files[load][name] = chosen[load]
+    files = {load: by for load, by in files.items() if by}
+    if not files:
+        raise InputError("No model has a whole result for a measured load. " + " ".join(notes))
+    return files, notes
+
+
+def _reached(place: Path) -> dict[str, float]:
+    """Share of each load that a simulation of ours reached."""
+    folder = place if place.is_dir() else place.parent
+    try:
+        outcome = json.loads((folder / "simulation.json").read_text(encoding="utf-8"))["outcome"]
+        return {load: float(told["reached"]) for load, told in outcome.items()}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _ranking(done: Sequence[Comparison]) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Total area of each model that has every load, the smallest first; and which of them can be told apart."""
+    everywhere = [name for name in done[0].found.models if all(name in one.found.models for one in done)]
+    area = {(a.load, a.model): a.ml for one in done for a in one.areas if a.tissue == ALL}
+    totals = {name: sum(area[one.load, name] for one in done) for name in everywhere}
+    totals = dict(sorted(totals.items(), key=lambda item: item[1]))
+    told = []
+    if len(totals) > 1 and all(ALL in one.bands for one in done):
+        parts = [one.bands[ALL] for one in done]
+        areas = {name: np.sum([band.areas_ml[name] for band in parts], axis=0) for name in totals}
+        whole = Band(parts[0].strains, parts[0].low_ml, parts[0].high_ml, areas, max(b.widening for b in parts))
+        first, *others = totals
+        near = [name for name in others if not whole.surely_below(first, name)]
+        told.append(
+            f"Nearest over all loads: {first}. "
+            + (
+                f"Not told apart from it by this measurement: {', '.join(near)}."
+                if near
+                else "It is told apart from all others."
+            )
+        )
+    return totals, tuple(told)
+
+
+def _interval(area: Area) -> str:
+    return "" if np.isnan(area.low_ml) else f" ({area.low_ml:.2f} to {area.high_ml:.2f})"
+
+
+def _write_fields(path: Path, one: Comparison) -> None:
+    """Measured and simulated maximal shear and displacement in the compared cells, for ParaView."""
+    found = one.found
+    arrays: dict[str, FloatArray] = {
+        "measured_max_shear": found.measured.max_shear,
+        "measured_u_mm": found.measured.u_mm,
+    }
+    for name, field in found.models.items():
+        arrays |= {f"{name}_max_shear": field.max_shear, f"{name}_u_mm": field.u_mm}
+    arrays["to_bone_mm"] = found.to_bone_mm
+    arrays["compared"] = found.common.astype(np.float64)
+    mesh = meshio.Mesh(
+        found.mesh.points_mm, [("tetra", found.mesh.cells)], cell_data={n: [a] for n, a in arrays.items()}
+    )
+    with whole_file(path) as part:
+        meshio.vtu.write(part, mesh, binary=True)
+
+
+def _write_on_image(folder: Path, results: Sequence[FeResult], labels: LabelMap) -> None:
+    inside = labels.labels > 0
+    for result in results:
+        values = np.full(labels.grid.shape, np.nan, dtype=np.float32)
+        values[inside] = StrainField.from_gradient(
+            evaluate_on_grid(result.deformation, labels.grid, inside)[1]
+        ).max_shear
+        write_image(folder / f"{result.name}_max_shear.nii.gz", Image(labels.grid, values))
+
+
+def _write_tables(target: Path, done: Sequence[Comparison], strains: tuple[float, float]) -> None:
+    _rows(target / "areas.csv", Area, [a for one in done for a in one.areas])
+    _rows(target / "location.csv", Overlap, [o for one in done for o in one.overlaps])
+    _rows(target / "agreement.csv", Agreement, [a for one in done for a in one.agreements])
+    _rows(target / "travel.csv", Travel, [t for one in done for t in one.travels])
+    at = np.arange(0.0, 1.5 * strains[1] + _STEP / 2, _STEP)
+    curves: list[tuple[object, ...]] = []
+    for one in done:
+        found = one.found
+        for tissue in (ALL, *found.tissues):
+            where = found.common & ((found.tissue == tissue) | (tissue == ALL))
+            for name, field in {"measured": found.measured, **found.models}.items():
+                above = volume_above(field.max_shear[where], found.volumes_ml[where], at)
+                curves += [(one.load, tissue, name, s, v) for s, v in zip(at.tolist(), above.tolist(), strict=True)]
+    write_whole(target / "curves.csv", _table(["load", "tissue", "field", "max_shear", "volume_above_ml"], curves))
+
+
+def _rows(path: Path, kind: type[Any], rows: Sequence[Any]) -> None:
+    write_whole(path, _table([f.name for f in fields(kind)], [astuple(row) for row in rows]))
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in rows)
+    return text.getvalue()

@@ -1,0 +1,178 @@
+"""`compare` from files to report: loads matched by name, partial ones left out, one self-contained page."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dvc.errors import GeometryError, InputError
+from dvc.imagewrite import write_labels
+from dvc.outputs import write_displacement
+from mrstrain.cli import app
+from mrstrain.comparing import compare
+from tests.test_validate import cube, error_table, labels, sheared
+
+LOADS = {"Load1": 0.8, "Load2": 0.4}
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """Measured shear of two loads, and the models "right" (the same) and "half"; a label map and its names."""
+    tissues = labels()
+    write_labels(tmp_path / "tissues.nii.gz", tissues)
+    (tmp_path / "tissues.csv").write_text("label,name\n1,fat\n2,skin\n3,bone\n")
+    mesh = cube(6)
+    points = tissues.grid.points().reshape(*tissues.grid.shape, 3)
+    for load, gamma in LOADS.items():
+        folder = tmp_path / "measured" / load
+        folder.mkdir(parents=True)
+        u = sheared(gamma).displacement(points.reshape(-1, 3)).reshape(points.shape)
+        write_displacement(folder, tissues.grid, u.astype(np.float32))
+        for model, factor in (("right", 1.0), ("half", 0.5)):
+            place = tmp_path / model / f"{load}.vtu"
+            place.parent.mkdir(exist_ok=True)
+            moved = sheared(factor * gamma).displacement(mesh.points_mm)
+            meshio.write(place, meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"displacement": moved}))
+    return tmp_path
+
+
+def given(study: Path) -> dict[str, object]:
+    plate = {"plate_normal": (1.0, 0.0, 0.0), "shear_direction": (0.0, 1.0, 0.0)}
+    return {"labels": study / "tissues.nii.gz", "names": study / "tissues.csv", "out": study / "out"} | plate
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def with_errors(study: Path, bias: float, sd: float) -> None:
+    from dvc.uncertainty import ErrorModel
+
+    for load in LOADS:
+        ErrorModel("heel-mr", "0", (error_table(bias, sd),), "test").write(
+            study / "measured" / load / "error_model.json"
+        )
+
+
+def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
+    with_errors(study, 0.0, 0.02)
+    done = compare(study / "measured", [study / "half", study / "right"], on_image=True, **given(study))
+    assert list(done.totals) == ["right", "half"]
+    assert done.totals["right"] == pytest.approx(0.0, abs=1e-3)
+    assert "Nearest over all loads: right. It is told apart from all others." in done.noise
+    areas = {(r["model"], r["load"], r["tissue"]): r for r in rows(study / "out" / "areas.csv")}
+    # all 8 mL are above 0.2 to 0.43 by the measurement, and to 0.204 by the model, minus what lies at the border
+    volume = json.loads((study / "out" / "comparison.json").read_text())["coverage_ml"]["Load1"]["common"]
+    expected = volume * (np.hypot(0.8, 0.32) - np.hypot(0.4, 0.08)) / 2.0
+    found = areas["half", "Load1", "soft tissue"]
+    assert float(found["ml"]) == pytest.approx(expected, rel=1e-3)
+    assert float(found["low_ml"]) < expected < float(found["high_ml"])
+    assert float(areas["half", "Load1", "fat"]["ml"]) == pytest.approx(expected / 2.0, rel=0.05)
+    travel = {(r["model"], r["load"]): r for r in rows(study / "out" / "travel.csv")}
+    assert float(travel["right", "Load1"]["model_along_mm"]) >= 0.0
+    for load, gamma in LOADS.items():
+        names = {p.name for p in (study / "out" / load).iterdir()}
+        assert names >= {
+            "fields.vtu",
+            "curves.png",
+            "slices.png",
+            "agreement.png",
+            "right_max_shear.nii.gz",
+            "provenance.json",
+        }
+        fields = meshio.read(study / "out" / load / "fields.vtu").cell_data
+        inside = fields["compared"][0] == 1.0
+        assert fields["half_max_shear"][0][inside] == pytest.approx(0.5 * np.hypot(gamma / 2, gamma**2 / 8))
+    curves = [
+        r
+        for r in rows(study / "out" / "curves.csv")
+        if (r["load"], r["tissue"], r["field"]) == ("Load2", "fat", "half")
+    ]
+    above = {float(r["max_shear"]): float(r["volume_above_ml"]) for r in curves}
+    assert above[0.1] == pytest.approx(volume / 2.0, rel=0.05)
+    assert above[0.105] == 0.0
+    assert {r["quantity"] for r in rows(study / "out" / "agreement.csv")} == {"max_shear", "u_mm"}
+    assert {float(r["threshold"]) for r in rows(study / "out" / "location.csv")} == {0.2, 0.3, 0.5}
+
+
+def test_the_report_needs_nothing_else_and_says_what_it_rests_on(study: Path) -> None:
+    compare(study / "measured", [study / "right", study / "half"], **given(study))
+    page = (study / "out" / "report.html").read_text()
+
+    class Fetched(HTMLParser):
+        def __init__(self) -> None:
+            super().__init__()
+            self.found: list[str] = []
+
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            self.found += [
+                v or "" for k, v in attrs if k in ("src", "href") and not (v or "").startswith(("data:", "#"))
+            ]
+
+    parser = Fetched()
+    parser.feed(page)
+    assert parser.found == []
+    assert "<script" not in page
+    assert len(re.findall("<figure>", page)) == 3 * len(LOADS)
+    text = re.sub(r"\s+", " ", page)
+    assert "measurement&#39;s error is not known" in text
+    assert text.index("Models and loads") < text.index("Volume above a strain")
+
+
+def test_without_an_error_no_difference_counts_as_seen(study: Path) -> None:
+    done = compare(study / "measured", [study / "right", study / "half"], **given(study))
+    assert done.noise == ()
+    assert all(one.within_noise("right", "half") for one in done.comparisons)
+    with_errors(study, 0.0, 5.0)  # a measurement that knows nothing
+    done = compare(study / "measured", [study / "right", study / "half"], **given(study))
+    assert "Not told apart from it by this measurement: half." in done.noise[0]
+
+
+def test_a_load_that_a_model_did_not_carry_is_not_compared(study: Path) -> None:
+    outcome = {"outcome": {"Load1": {"reached": 0.42}, "Load2": {"reached": 1.0}}, "parameters": {}}
+    (study / "half" / "simulation.json").write_text(json.dumps(outcome))
+    done = compare(study / "measured", [study / "right", study / "half"], **given(study))
+    assert "half reached only 42% of Load1, which is not compared." in done.notes
+    assert list(done.totals) == ["right"]
+    assert [sorted(one.found.models) for one in done.comparisons] == [["right"], ["half", "right"]]
+
+
+def test_the_command_takes_one_load_and_one_file(study: Path) -> None:
+    out = study / "one"
+    argv = ["compare", study / "measured" / "Load1", study / "half" / "Load1.vtu", "--labels", study / "tissues.nii.gz"]
+    argv += ["--names", study / "tissues.csv", "--out", out, "--strains", "0.1", "0.4"]
+    ran = CliRunner().invoke(app, [str(a) for a in argv])
+    assert ran.exit_code == 0, ran.output
+    assert "Load1: area between the curves, mL, the nearest first: half" in ran.output
+    assert (out / "report.html").is_file()
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_written(study: Path) -> None:
+    right = study / "right"
+    for measured, models, error, message in (
+        (study, [right], InputError, "no results of `register`"),
+        (study / "measured", [], InputError, "No model is given"),
+        (study / "measured", [study / "nobody"], InputError, "no such model"),
+        (study / "measured", [right, right / "Load1.vtu"], InputError, "Two models are called 'right'"),
+        (study / "measured", [study / "measured"], InputError, "no file of a measured load"),
+    ):
+        with pytest.raises(error, match=message):
+            compare(measured, models, **given(study))
+    for more, error, message in (
+        ({"bones": ["calcaneus"]}, InputError, "no 'calcaneus'"),
+        ({"strains": (0.5, 0.2)}, InputError, "must rise"),
+        ({"model_unit": "m"}, (GeometryError, InputError), "no body part is that large"),
+        ({"model_frame": "RAS"}, GeometryError, "the other of LPS and RAS"),
+    ):
+        with pytest.raises(error, match=message):
+            compare(study / "measured", [right], **(given(study) | more))
+    assert not list((study / "out").glob("*/*")) if (study / "out").exists() else True

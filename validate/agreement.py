@@ -1,0 +1,178 @@
+"""Agreement of a simulated with a measured field, cell by cell; every figure is weighted by volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.deformation import Deformation
+from dvc.mesh import outer_faces
+from dvc.onmesh import OnMesh
+from validate.mapping import Mapped
+
+TO_BONE_MM = (0.0, 3.0, 6.0, 12.0)
+"""Lower ends of the bins of distance to bone, mm."""
+
+_LEAST = 10  # cells below which nothing is told
+_COPLANAR_MM = 0.3
+_INWARD_MM = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """Agreement of one quantity in one part of the tissue.
+
+    Attributes
+    ----------
+    model, load, quantity, part : str
+        The quantity is "max_shear" or "u_mm", the length of the displacement.
+    cells : int
+    volume_ml : float
+    measured_mean, model_mean : float
+    slope, intercept : float
+        Least squares of the model on the measurement.
+    r2 : float
+        Square of the correlation.
+    rmse : float
+        Root mean square of model minus measurement; for the displacement of the difference vector's length, mm.
+    concordance : float
+        Lin's coefficient (1989, doi:10.2307/2532051): 1 where both are equal.
+    bias, lower, upper : float
+        Mean of model minus measurement, and that -+ 1.96 standard deviations (Bland and Altman 1986,
+        doi:10.1016/S0140-6736(86)90837-8).
+    """
+
+    model: str
+    load: str
+    quantity: str
+    part: str
+    cells: int
+    volume_ml: float
+    measured_mean: float
+    model_mean: float
+    slope: float
+    intercept: float
+    r2: float
+    rmse: float
+    concordance: float
+    bias: float
+    lower: float
+    upper: float
+
+
+def agreement(
+    model: str,
+    load: str,
+    quantity: str,
+    part: str,
+    measured: FloatArray,
+    simulated: FloatArray,
+    volumes_ml: FloatArray,
+    rmse: float | None = None,
+) -> Agreement | None:
+    """Agreement of two fields (n,) without gaps; None for fewer than ten cells.
+
+    Examples
+    --------
+    >>> x = np.linspace(0.0, 1.0, 20)
+    >>> found = agreement("a", "Load1", "max_shear", "fat", x, 2.0 * x + 0.1, np.ones(20))
+    >>> round(found.slope, 9), round(found.intercept, 9), round(found.r2, 9), round(found.bias, 9)
+    (2.0, 0.1, 1.0, 0.6)
+    """
+    if len(measured) < _LEAST:
+        return None
+    weight = volumes_ml / volumes_ml.sum()
+    x0, y0 = float(weight @ measured), float(weight @ simulated)
+    x, y = measured - x0, simulated - y0
+    xx, yy, xy = float(weight @ x**2), float(weight @ y**2), float(weight @ (x * y))
+    slope = xy / xx if xx > 0.0 else float("nan")
+    spread = float(np.sqrt(weight @ (y - x) ** 2))
+    bias = y0 - x0
+    return Agreement(
+        model, load, quantity, part, len(measured), float(volumes_ml.sum()), x0, y0, slope, y0 - slope * x0,
+        xy**2 / (xx * yy) if xx * yy > 0.0 else float("nan"),
+        float(np.hypot(bias, spread)) if rmse is None else rmse,
+        2.0 * xy / (xx + yy + bias**2) if xx + yy + bias**2 > 0.0 else float("nan"),
+        bias, bias - 1.96 * spread, bias + 1.96 * spread,
+    )  # fmt: skip
+
+
+def agreements(found: Mapped, model: str, load: str) -> list[Agreement]:
+    """Agreement of maximal shear and displacement in all soft tissue, each tissue, and by distance to bone."""
+    common, field = found.common, found.models[model]
+    parts: dict[str, BoolArray] = {"soft tissue": common}
+    parts |= {tissue: common & (found.tissue == tissue) for tissue in found.tissues}
+    ends = (*TO_BONE_MM[1:], np.inf)
+    for low, high in zip(TO_BONE_MM, ends, strict=True):
+        told = f"{low:g} to {high:g} mm from bone" if np.isfinite(high) else f"over {low:g} mm from bone"
+        parts[told] = common & (found.to_bone_mm >= low) & (found.to_bone_mm < high)
+    rows = []
+    for part, where in parts.items():
+        volumes = found.volumes_ml[where]
+        u, v = found.measured.u_mm[where], field.u_mm[where]
+        apart = float(np.sqrt(volumes @ ((v - u) ** 2).sum(axis=1) / volumes.sum())) if where.any() else 0.0
+        rows.append(
+            agreement(model, load, "max_shear", part, found.measured.max_shear[where], field.max_shear[where], volumes)
+        )
+        lengths = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
+        rows.append(agreement(model, load, "u_mm", part, *lengths, volumes, apart))
+    return [row for row in rows if row is not None]
+
+
+@dataclass(frozen=True, slots=True)
+class Travel:
+    """Displacement of the skin under the plate, and change of the tissues' volume.
+
+    Attributes
+    ----------
+    model, load : str
+    nodes : int
+        Of the skin under the model's plate at which the measurement is defined.
+    measured_mm, model_mm : float
+        Mean displacement along the plate's normal force (towards the foot).
+    measured_along_mm, model_along_mm : float
+        Mean displacement across it, length.
+    measured_volume_change, model_volume_change : float
+        Mean of det F - 1 over the fat, or over all tissue where none is called fat.
+    """
+
+    model: str
+    load: str
+    nodes: int
+    measured_mm: float
+    model_mm: float
+    measured_along_mm: float
+    model_along_mm: float
+    measured_volume_change: float
+    model_volume_change: float
+
+
+def sole_under_plate(model: OnMesh, normal: FloatArray) -> IntArray:
+    """Nodes on the outside of a model that lie on one plane at its end along ``normal``, once it is deformed."""
+    outside = np.unique(outer_faces(model.mesh.cells))
+    height = (model.mesh.points_mm + model.u_mm)[outside] @ normal
+    return np.asarray(outside[height > height.max() - _COPLANAR_MM])
+
+
+def travel(found: Mapped, name: str, load: str, model: OnMesh, measured: Deformation, normal: FloatArray) -> Travel:
+    """Compare how far the plate went in, by the skin on it; the measurement is read 1 mm inside the skin.
+
+    Parameters
+    ----------
+    normal : (3,)
+        The plate's outward unit normal, LPS.
+    """
+    nodes = sole_under_plate(model, normal)
+    u = measured.displacement(model.mesh.points_mm[nodes] - _INWARD_MM * normal)
+    known = np.isfinite(u).all(axis=1)
+    moved = [u[known], model.u_mm[nodes][known]]
+    mean = [m.mean(axis=0) if known.any() else np.full(3, np.nan) for m in moved]
+    fat = np.char.lower(found.tissue) == "fat"
+    where = found.common & (fat if fat.any() else True)
+    volumes = found.volumes_ml[where] / max(found.volumes_ml[where].sum(), 1e-12)
+    change = [float(volumes @ field.jacobian[where]) - 1.0 for field in (found.measured, found.models[name])]
+    along = [float(-m @ normal) for m in mean]
+    across = [float(np.linalg.norm(m - (m @ normal) * normal)) for m in mean]
+    return Travel(name, load, int(known.sum()), along[0], along[1], across[0], across[1], change[0], change[1])

@@ -1,0 +1,109 @@
+"""Figures of a comparison, each as PNG bytes; what a figure's docstring says is its caption."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
+
+from dvc.arrays import FloatArray
+from dvc.deformation import Deformation
+from dvc.figures import REGION_COLOURS
+from dvc.regions import volume_above
+from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
+from fe.figures import Slice, slice_sheet
+from validate.curves import Band
+from validate.mapping import Mapped
+
+_POINTS = 601
+_COLUMNS = 3
+_BAND = "#b8bfc9"
+_BINS = 60
+
+
+def volume_strain(
+    found: Mapped, bands: Mapping[str, Band], strains: tuple[float, float], tissues: Sequence[str]
+) -> bytes:
+    """Volume of tissue whose maximal shear exceeds a value: measured (black) and models, on the same cells.
+
+    The grey band holds the true curve in 95 % of cases, by the measurement's error model; areas are
+    taken between the dotted lines.
+    """
+    figure, panels = chart(len(tissues))
+    at = np.linspace(0.0, 1.5 * strains[1], _POINTS)
+    for axes, tissue in zip(panels, tissues, strict=True):
+        where = found.common & ((found.tissue == tissue) | (tissue == "soft tissue"))
+        volumes = found.volumes_ml[where]
+        if tissue in bands:
+            band = bands[tissue]
+            axes.fill_between(band.strains, band.low_ml, band.high_ml, color=_BAND, linewidth=0, label="95 % of truths")
+        axes.plot(
+            at,
+            volume_above(found.measured.max_shear[where], volumes, at),
+            color="black",
+            linewidth=2.2,
+            label="measured",
+        )
+        for number, (name, field) in enumerate(found.models.items()):
+            colour = REGION_COLOURS[number % (len(REGION_COLOURS) - 1)]
+            axes.plot(at, volume_above(field.max_shear[where], volumes, at), color=colour, linewidth=1.5, label=name)
+        for edge in strains:
+            axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
+        axes.set_title(tissue, color=INK, **FONT)
+        axes.set_xlim(0.0, at[-1])
+        axes.set_ylim(0.0, None)
+        label_axes(axes, "maximal shear", "volume above, mL")
+    panels[0].legend(fontsize=9, frameon=False)
+    return png_bytes(figure)
+
+
+def slices(
+    found: Mapped,
+    measured: Deformation,
+    displacements: Mapping[str, FloatArray],
+    axes: FloatArray,
+    point_mm: FloatArray,
+) -> bytes:
+    """Maximal shear on the slice through the bone's lowest point, measured and simulated, where tissue is under load.
+
+    The slice holds the plate's normal and the direction of shear; the same cells in one colour scale. Grey is not
+    defined. Where the measurement does not reach a node, it is drawn with the displacement of the nearest one.
+    """
+    u = measured.displacement(found.mesh.points_mm)
+    known = np.isfinite(u).all(axis=1)
+    _, nearest = cKDTree(found.mesh.points_mm[known]).query(found.mesh.points_mm[~known])
+    u[~known] = u[known][nearest]
+    panels = [Slice("measured", u, found.measured.max_shear)]
+    panels += [Slice(name, displacements[name], field.max_shear) for name, field in found.models.items()]
+    return slice_sheet(found.mesh, panels, axes, point_mm)
+
+
+def scatter(found: Mapped) -> bytes:
+    """Simulated over measured maximal shear, cell by cell: how much volume lies where (darker is more, logarithmic).
+
+    On the line both agree.
+    """
+    names = list(found.models)
+    rows, columns = -(-len(names) // _COLUMNS), min(len(names), _COLUMNS)
+    width = WIDTH_IN if columns > 1 else 0.62 * WIDTH_IN
+    figure = Figure(figsize=(width, rows * (width / columns)), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    where = found.common
+    x, volumes = found.measured.max_shear[where], found.volumes_ml[where]
+    most = max(0.1, *(float(np.quantile(f.max_shear[where], 0.995)) for f in (found.measured, *found.models.values())))
+    spots = figure.subplots(rows, columns, squeeze=False).ravel()
+    for spot in spots[len(names) :]:
+        spot.set_visible(False)
+    for spot, name in zip(spots, names, strict=False):
+        spot.hist2d(
+            x, found.models[name].max_shear[where], bins=_BINS, range=((0.0, most), (0.0, most)), weights=volumes,
+            norm="log", cmap="Blues",
+        )  # fmt: skip
+        spot.plot([0.0, most], [0.0, most], color=INK, linewidth=0.9)
+        spot.set_title(name, color=INK, **FONT)
+        spot.set_aspect("equal")
+        label_axes(spot, "measured", "simulated")
+    return png_bytes(figure)

@@ -1,0 +1,177 @@
+"""Strain location: connected tissue above a strain, measured and simulated, and how far apart the two lie."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.errors import InputError
+from dvc.mesh import TetMesh
+
+LEAST_ML = 0.1
+"""Volume under which a cluster is not told, by default."""
+
+_FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """A maximal shear above which tissue is looked at, and where the number comes from."""
+
+    max_shear: float
+    source: str
+
+
+def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
+    """Thresholds of a table with columns max_shear and source; by default that which comes with the package.
+
+    Raises
+    ------
+    InputError
+        If there is no such table, or a value is none of a strain.
+    """
+    place = path if path is not None else files("validate") / "thresholds.csv"
+    try:
+        rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines()))
+        found = tuple(Threshold(float(row["max_shear"]), row["source"].strip()) for row in rows)
+    except (OSError, KeyError, ValueError, AttributeError) as error:
+        raise InputError(f"{place}: a table of thresholds has the columns max_shear and source ({error}).") from error
+    if not found or not all(0.0 < t.max_shear < 10.0 for t in found):
+        raise InputError(f"{place}: thresholds are maximal shears above 0; it has {[t.max_shear for t in found]}.")
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cluster:
+    """Connected cells above a threshold.
+
+    Attributes
+    ----------
+    cells : (k,)
+    volume_ml, mean_shear : float
+    centroid_mm : (3,)
+        Reference configuration, LPS.
+    """
+
+    cells: IntArray
+    volume_ml: float
+    mean_shear: float
+    centroid_mm: FloatArray
+
+
+def neighbours(mesh: TetMesh) -> sparse.csr_matrix:
+    """Which cells share a face, (m, m)."""
+    count = len(mesh.cells)
+    faces = np.sort(np.concatenate([mesh.cells[:, face] for face in _FACES]), axis=1)
+    order = np.lexsort(faces.T)
+    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
+    first, second = order[:-1][same] % count, order[1:][same] % count
+    return sparse.csr_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
+
+
+def clusters(
+    above: BoolArray,
+    shear: FloatArray,
+    volumes_ml: FloatArray,
+    points_mm: FloatArray,
+    touching: sparse.csr_matrix,
+    least_ml: float = LEAST_ML,
+) -> list[Cluster]:
+    """Clusters of cells ``above`` (n,), connected through faces, of at least a volume; the largest first."""
+    cells = np.flatnonzero(above)
+    if not len(cells):
+        return []
+    _, number = connected_components(touching[cells][:, cells], directed=False)
+    found = []
+    for n in range(number.max() + 1):
+        members = cells[number == n]
+        volume = volumes_ml[members]
+        if volume.sum() >= least_ml:
+            share = volume / volume.sum()
+            found.append(
+                Cluster(members, float(volume.sum()), float(share @ shear[members]), share @ points_mm[members])
+            )
+    return sorted(found, key=lambda c: -c.volume_ml)
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """Where a model and the measurement put tissue above a threshold.
+
+    Attributes
+    ----------
+    model, load : str
+    threshold : float
+        Maximal shear.
+    measured_ml, model_ml : float
+        Volume above it.
+    measured_clusters, model_clusters : int
+        Connected parts of at least the least volume.
+    dice : float
+        Twice the common volume over the sum of both.
+    centroids_mm : float
+        Distance of the centroids of all that lies above.
+    largest_mm : float
+        The same of the largest cluster of each.
+    hausdorff95_mm : float
+        95th percentile, by volume, of the distance of either to the other; the larger of the two.
+    """
+
+    model: str
+    load: str
+    threshold: float
+    measured_ml: float
+    model_ml: float
+    measured_clusters: int
+    model_clusters: int
+    dice: float
+    centroids_mm: float
+    largest_mm: float
+    hausdorff95_mm: float
+
+
+def overlap(
+    model: str,
+    load: str,
+    threshold: float,
+    measured: FloatArray,
+    simulated: FloatArray,
+    volumes_ml: FloatArray,
+    points_mm: FloatArray,
+    touching: sparse.csr_matrix,
+    least_ml: float = LEAST_ML,
+) -> Overlap:
+    """Compare what lies above a threshold in two fields (n,) on the same cells; figures without a meaning are NaN."""
+    masks = measured > threshold, simulated > threshold
+    found = [
+        clusters(m, s, volumes_ml, points_mm, touching, least_ml)
+        for m, s in zip(masks, (measured, simulated), strict=True)
+    ]
+    volume = [float(volumes_ml[m].sum()) for m in masks]
+    both = float(volumes_ml[masks[0] & masks[1]].sum())
+    dice = 2.0 * both / sum(volume) if sum(volume) > 0.0 else float("nan")
+    apart = largest = far = float("nan")
+    if all(m.any() for m in masks):
+        centre = [volumes_ml[m] @ points_mm[m] / volumes_ml[m].sum() for m in masks]
+        apart = float(np.linalg.norm(centre[0] - centre[1]))
+        far = max(_distance95(a, b, points_mm, volumes_ml) for a, b in (masks, masks[::-1]))
+    if all(found):
+        largest = float(np.linalg.norm(found[0][0].centroid_mm - found[1][0].centroid_mm))
+    return Overlap(
+        model, load, threshold, volume[0], volume[1], len(found[0]), len(found[1]), dice, apart, largest, far
+    )
+
+
+def _distance95(first: BoolArray, second: BoolArray, points: FloatArray, volumes: FloatArray) -> float:
+    distance, _ = cKDTree(points[second]).query(points[first])
+    order = np.argsort(distance)
+    share = np.cumsum(volumes[first][order]) / volumes[first].sum()
+    return float(distance[order][min(int(np.searchsorted(share, 0.95)), len(order) - 1)])

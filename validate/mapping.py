@@ -1,0 +1,168 @@
+"""A measured and several simulated deformations at the same points, with the same volumes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.deformation import Deformation
+from dvc.errors import InputError
+from dvc.image import LabelMap
+from dvc.kinematics import StrainField
+from dvc.mesh import TetMesh
+
+OTHER = "unnamed"
+"""Tissue of cells that neither the mesh nor the label map names."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Field:
+    """A deformation at the points of a comparison.
+
+    Attributes
+    ----------
+    u_mm : (n, 3)
+        Displacement, LPS mm; NaN where not defined, as below.
+    max_shear, jacobian : (n,)
+        (E1 - E3) / 2 of the Green-Lagrange strain, and det F.
+    """
+
+    u_mm: FloatArray
+    max_shear: FloatArray
+    jacobian: FloatArray
+
+    @property
+    def defined(self) -> BoolArray:
+        """Where there is a value."""
+        return np.isfinite(self.max_shear)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapped:
+    """One load, measured and simulated, at the centroids of a mesh's cells; reference configuration, LPS mm.
+
+    Attributes
+    ----------
+    mesh : TetMesh
+    points_mm : (n, 3)
+    volumes_ml : (n,)
+        Of the cells.
+    tissue : (n,) str
+    to_bone_mm : (n,)
+        Distance to the nearest voxel of bone.
+    measured : Field
+    models : mapping of str to Field
+    """
+
+    mesh: TetMesh
+    points_mm: FloatArray
+    volumes_ml: FloatArray
+    tissue: np.ndarray
+    to_bone_mm: FloatArray
+    measured: Field
+    models: Mapping[str, Field]
+
+    @property
+    def common(self) -> BoolArray:
+        """Cells in which the measurement and every model are defined: all are scored on the same tissue."""
+        kept = self.measured.defined.copy()
+        for field in self.models.values():
+            kept &= field.defined
+        return kept
+
+    @property
+    def tissues(self) -> list[str]:
+        """Names, the largest first."""
+        names = np.unique(self.tissue)
+        return sorted((str(n) for n in names), key=lambda n: -self.volumes_ml[self.tissue == n].sum())
+
+    def coverage(self) -> dict[str, float]:
+        """Volume (mL) of the mesh, of what each field defines of it, and of what is common to all."""
+        told = {"mesh": float(self.volumes_ml.sum()), "measured": float(self.volumes_ml[self.measured.defined].sum())}
+        told |= {name: float(self.volumes_ml[field.defined].sum()) for name, field in self.models.items()}
+        return told | {"common": float(self.volumes_ml[self.common].sum())}
+
+
+def sampled(deformation: Deformation, points_mm: FloatArray) -> Field:
+    """A deformation at points (n, 3)."""
+    u, H = deformation.evaluate(points_mm)
+    strain = StrainField.from_gradient(H)
+    return Field(u, strain.max_shear, strain.jacobian)
+
+
+def mapped(
+    mesh: TetMesh,
+    labels: LabelMap,
+    bones: Sequence[str],
+    measured: Deformation,
+    models: Mapping[str, Deformation],
+) -> Mapped:
+    """Evaluate a measured and simulated deformations at the centroids of a mesh's cells.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+        Reference configuration, LPS mm. Its regions give the tissues where they are called as those of the label map.
+    labels : LabelMap
+        Of the unloaded image.
+    bones : sequence of str
+        Labels of bone; no cell whose centroid is there is compared.
+    measured, models
+        u and grad u in the reference configuration, LPS mm.
+
+    Raises
+    ------
+    InputError
+        If a bone is not in the label map, or measurement and models have no tissue in common.
+    """
+    for name in bones:
+        if name not in labels.names.values():
+            raise InputError(f"The label map has no '{name}'; it has {', '.join(labels.names.values())}.")
+    points = mesh.centroids_mm
+    tissue = _tissues(mesh, labels, points)
+    soft = ~np.isin(tissue, list(bones))
+    bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
+    distance, _ = cKDTree(labels.grid.points(bone)).query(points[soft])
+    kept = np.flatnonzero(soft)
+    if len(kept) < len(points):
+        mesh = _part(mesh, kept)
+    found = Mapped(
+        mesh,
+        points[kept],
+        mesh.volumes_mm3 / 1000.0,
+        tissue[kept],
+        distance,
+        sampled(measured, points[kept]),
+        {name: sampled(model, points[kept]) for name, model in models.items()},
+    )
+    if not found.common.any():
+        told = "; ".join(f"{name} {volume:.1f} mL" for name, volume in found.coverage().items())
+        raise InputError(f"Measurement and models are defined nowhere together ({told}). Do they share a frame?")
+    return found
+
+
+def _tissues(mesh: TetMesh, labels: LabelMap, points: FloatArray) -> np.ndarray:
+    names = set(labels.names.values())
+    of_mesh = {name: cells for name, cells in mesh.regions.items() if name in names}
+    width = max(len(n) for n in (*names, OTHER))
+    tissue = np.full(len(points), OTHER, dtype=f"<U{width}")
+    nearest = np.rint(labels.grid.indices_of(points)).astype(np.int64)
+    inside = ((nearest >= 0) & (nearest < np.array(labels.grid.shape))).all(axis=1)
+    number = np.zeros(len(points), dtype=np.int64)
+    number[inside] = labels.labels[tuple(nearest[inside].T)]
+    for value, name in labels.names.items():
+        tissue[number == value] = name
+    for name, cells in of_mesh.items():
+        tissue[cells] = name
+    return tissue
+
+
+def _part(mesh: TetMesh, kept: IntArray) -> TetMesh:
+    place = np.full(len(mesh.cells), -1)
+    place[kept] = np.arange(len(kept))
+    regions = {name: place[cells][place[cells] >= 0] for name, cells in mesh.regions.items()}
+    return TetMesh(mesh.points_mm, mesh.cells[kept], {n: c for n, c in regions.items() if len(c)})
