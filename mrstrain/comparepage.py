@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -20,7 +20,7 @@ from validate.location import Threshold
 from validate.sources import FeResult
 
 _PANELS = 2  # tissues whose curves are drawn, all soft tissue first
-_TITLES = {
+_TITLES: dict[str, tuple[str, Callable[..., bytes]]] = {
     "curves": ("Volume above a strain", figures.volume_strain),
     "slices": ("Where the strain lies", figures.slices),
     "agreement": ("Cell by cell", figures.scatter),

@@ -178,7 +178,7 @@ def compare(
     shown: list[tuple[Comparison, Measurement, dict[str, bytes]]] = []
     for number, measurement in enumerate(m for m in measurements if m.load in files):
         load = measurement.load
-        tell("compare", load, number / len(files))
+        tell("compare", "comparing", number / len(files))
         results = []
         for name, file in files[load].items():
             result = read_result(name, file, mesh=model_mesh, unit=model_unit, frame=model_frame, to_image=to_image)
@@ -214,7 +214,7 @@ def compare(
         } | record,
     )  # fmt: skip
     write_page(target / "report.html", shown, totals, noise, notes, strains, levels, record)
-    tell("compare", "done", 1.0)
+    tell("compare", "comparing", 1.0)
     return Compared(target, tuple(done), totals, noise, tuple(notes))
 
 
@@ -299,21 +299,25 @@ def _ranking(done: Sequence[Comparison]) -> tuple[dict[str, float], tuple[str, .
     totals = {name: sum(area[one.load, name] for one in done) for name in everywhere}
     totals = dict(sorted(totals.items(), key=lambda item: item[1]))
     told = []
-    if len(totals) > 1 and all(ALL in one.bands for one in done):
+    for one in done:
+        if ALL in one.bands and len(one.found.models) > 1:
+            told.append(_nearest(f"under {one.load}", [a.model for a in one.ranked()], one.bands[ALL]))
+    if len(done) > 1 and len(totals) > 1 and all(ALL in one.bands for one in done):
         parts = [one.bands[ALL] for one in done]
         areas = {name: np.sum([band.areas_ml[name] for band in parts], axis=0) for name in totals}
         whole = Band(parts[0].strains, parts[0].low_ml, parts[0].high_ml, areas, max(b.widening for b in parts))
-        first, *others = totals
-        near = [name for name in others if not whole.surely_below(first, name)]
-        told.append(
-            f"Nearest over all loads: {first}. "
-            + (
-                f"Not told apart from it by this measurement: {', '.join(near)}."
-                if near
-                else "It is told apart from all others."
-            )
-        )
+        told.insert(0, _nearest("over all loads", list(totals), whole))
     return totals, tuple(told)
+
+
+def _nearest(where: str, ranked: Sequence[str], band: Band) -> str:
+    first, *others = ranked
+    near = [name for name in others if not band.surely_below(first, name)]
+    return f"Nearest {where}: {first}. " + (
+        f"Not told apart from it by this measurement: {', '.join(near)}."
+        if near
+        else "It is told apart from all others."
+    )
 
 
 def _interval(area: Area) -> str:
