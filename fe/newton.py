@@ -17,7 +17,7 @@ _LEAST_VOLUME = 0.02  # det F at a quadrature point below this is on its way to 
 _MOST_GROWTH = 3.0  # of the residual in one step
 _WANDERED = 2  # steps in a row that hardly lowered the residual, after which a step is measured before it is made
 _SHARES = (1.0, 0.5, 0.25)
-_INEXACT = 0.05  # residual of a linear solution that is not exact; smaller costs more steps and saves none of Newton's
+_ROUGH, _INEXACT = 0.05, 1e-3  # residual of a linear solution that is not exact, far from equilibrium and near it
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,14 +97,14 @@ def equilibrium(
     forces, residual, lowest = assembler.residual(now)
     if not lowest > 0.0:
         return None
-    wandering = 0
+    wandering, balance = 0, 0.0
     for iteration in range(1, tolerance.iterations + 1):
         right = outside - residual
         right[assembler.idle] = 0.0
         before = _norm(right, held, assembler)
         data = assembler.held(assembler.tangent(now), right, held, left)
         try:
-            change = assembler.spread(solver.solve(data, right, _INEXACT))
+            change = assembler.spread(solver.solve(data, right, _ROUGH if balance > _NEAR else _INEXACT))
         except SingularError as failure:
             told(f"    {failure}")
             return None
