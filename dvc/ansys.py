@@ -83,6 +83,8 @@ def read_ansys(path: Path) -> AnsysMesh:
         try:
             if word == "ET" and len(fields) > 2:
                 types[fields[1]] = re.sub(r"\D", "", fields[2])
+            elif word == "ETBLOCK":
+                _types(lines, types)
             elif word == "NBLOCK":
                 _nodes(lines, nodes)
             elif word == "EBLOCK":
@@ -92,7 +94,7 @@ def read_ansys(path: Path) -> AnsysMesh:
                     _log.warning("%s: a block of contact elements is left out.", path)
             elif word == "CMBLOCK":
                 components[fields[1].upper(), fields[2][:4].upper()] = _members(lines, int(fields[3]))
-        except (ValueError, IndexError, AttributeError) as error:
+        except (ValueError, IndexError, AttributeError, KeyError) as error:
             if isinstance(error, ImageFileError):
                 raise
             raise ImageFileError(
@@ -109,6 +111,17 @@ def read_ansys(path: Path) -> AnsysMesh:
 def _columns(line: str, width: int, count: int | None = None) -> list[int]:
     whole = len(line.rstrip()) // width if count is None else count
     return [int(line[i * width : (i + 1) * width]) for i in range(whole)]
+
+
+def _types(lines: _Lines, types: dict[str, str]) -> None:
+    form = lines.next("ETBLOCK")
+    width = int(_WORD.search(form).group(2))  # type: ignore[union-attr]
+    while True:
+        line = lines.next("ETBLOCK")
+        if line.strip() == "-1":
+            return
+        number, kind = _columns(line, width, 2)
+        types[str(number)] = str(kind)
 
 
 def _nodes(lines: _Lines, nodes: dict[int, list[float]]) -> None:
@@ -139,6 +152,8 @@ def _elements(lines: _Lines, types: dict[str, str], elements: dict[int, tuple[st
         found = numbers[_HEAD:]
         while len(found) < count:
             found += _columns(lines.next("EBLOCK"), width)
+        if str(numbers[1]) not in types:
+            raise ValueError(f"element {numbers[10]} has type {numbers[1]}, which no ET defines")
         elements[numbers[10]] = types[str(numbers[1])], numbers[0], found[:count]
 
 
@@ -161,7 +176,7 @@ def _shape(kind: str, nodes: list[int]) -> tuple[str, list[int]] | None:
         return (name, nodes) if len(nodes) == count and 0 not in nodes else ("tetra", nodes[:4])
     if kind in _SHELLS:
         corners = list(dict.fromkeys(nodes[:4]))
-        return {3: "triangle", 4: "quad"}[len(corners)], corners
+        return ({3: "triangle", 4: "quad"}[len(corners)], corners) if len(corners) >= 3 else None
     if kind not in _BRICKS:
         return None
     if len(set(nodes[4:8])) == 1:

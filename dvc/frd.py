@@ -15,6 +15,11 @@ _SHAPES = {
     1: ("hexahedron", 8), 2: ("wedge", 6), 3: ("tetra", 4), 4: ("hexahedron20", 20), 5: ("wedge15", 15),
     6: ("tetra10", 10), 7: ("triangle", 3), 8: ("triangle6", 6), 9: ("quad", 4), 10: ("quad8", 8),
 }  # fmt: skip
+# CalculiX writes the middles of the upright edges before those of the top.
+_ORDER = {
+    "hexahedron20": [*range(12), *range(16, 20), *range(12, 16)],
+    "wedge15": [*range(9), *range(12, 15), *range(9, 12)],
+}
 _NODE, _VALUE = 10, 12  # columns of a number of a node, and of a value
 
 
@@ -94,6 +99,8 @@ def read_frd(path: Path) -> FrdResult:
         if missing:
             raise ImageFileError(f"{path}: an element uses node {missing[0]}, which the file does not define.")
         members = np.array([[index_of[n] for n in row] for row in cells[shape, material]], dtype=np.int64)
+        if shape in _ORDER:
+            members = members[:, _ORDER[shape]]
         blocks.append((shape, members))
         name = f"material {material}"
         here = np.arange(known, known + len(members))

@@ -77,6 +77,11 @@ class Model:
         )
 
     @property
+    def own_bulk_mpa(self) -> FloatArray:
+        """The part of each law's bulk modulus (k,) that acts in each cell on its own; at most half of it."""
+        return np.minimum(self.element.own_volume * self.shear_mpa, 0.5 * self.bulk_mpa)
+
+    @property
     def unknowns(self) -> int:
         """Displacements and pressures."""
         return 3 * len(self.space.nodes_mm) + self.space.pressures
@@ -97,7 +102,7 @@ class Model:
         """Pressure at each cell's corners (m, 4), MPa: the field's, and the part that acts in the cell on its own."""
         volume = np.linalg.det(np.eye(3) + self.gradients(state))
         crowded = np.log(CROWDED / np.clip(volume, 1e-12, CROWDED)) ** 2 / volume
-        own = self.element.own_volume * self.shear_mpa[self.law] * (volume - 1.0) - self.bulk_mpa[self.law] * crowded
+        own = self.own_bulk_mpa[self.law] * (volume - 1.0) - self.bulk_mpa[self.law] * crowded
         return np.asarray(state[3 * len(self.space.nodes_mm) :][self.space.pressure_cells] + own[:, None])
 
 
@@ -217,7 +222,7 @@ class Assembler:
             part = slice(start, min(start + _CHUNK, len(self._cells)))
             _elements(
                 space.cells[part], space.pressure_cells[part], m.volumes_mm3[part], m.inverse[part], m.law[part],
-                m.vectors, m.shear_mpa, m.bulk_mpa, element.own_volume * m.shear_mpa,
+                m.vectors, m.shear_mpa, m.bulk_mpa, self.model.own_bulk_mpa,
                 element.weights, element.gradients, element.pressure,
                 element.stabilisation, u, p, data is not None, local_forces, local, volumes,
             )  # fmt: skip

@@ -347,7 +347,7 @@ class _Path:
         if self.contact.plate.taped:  # whoever was on the plate still is
             for axis in (1, 2):
                 self.travel[axis] += (found.state - self.state)[follows[axis][0]]
-        if np.abs(self.travel).max() > self.extent_mm:
+        if np.abs(self.travel - [self.contact.plate.gap_mm, 0.0, 0.0]).max() > self.extent_mm:
             self.tell("the plate would have moved farther than the body is large")
             return False
         self.force = np.array([found.forces[self.contact.followers.get(axis, [])].sum() for axis in range(3)])

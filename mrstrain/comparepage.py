@@ -15,11 +15,13 @@ from dvc.report import Cell, Picture, Section, Table, write_report
 from dvc.verdict import Verdict
 from mrstrain.page import flat, said
 from validate import figures
-from validate.comparison import ALL, Comparison
+from validate.comparison import Comparison
+from validate.curves import Area
 from validate.location import Threshold
+from validate.mapping import ALL
 from validate.sources import FeResult
 
-_PANELS = 2  # tissues whose curves are drawn, all soft tissue first
+_PANELS = 4  # tissues whose curves are drawn, all soft tissue first
 _TITLES: dict[str, tuple[str, Callable[..., bytes]]] = {
     "curves": ("Volume above a strain", figures.volume_strain),
     "slices": ("Where the strain lies", figures.slices),
@@ -69,7 +71,8 @@ def pictures_of(
     """Draw a load's figures; by the stem of their files."""
     found = one.found
     displacements = {r.name: _at_nodes(r, found.mesh.points_mm) for r in results}
-    drawn = {"curves": figures.volume_strain(found, one.bands, strains, (ALL, *found.tissues)[:_PANELS])}
+    told = [name for name in found.tissues if any(a.tissue == name for a in one.areas)]
+    drawn = {"curves": figures.volume_strain(found, one.bands, strains, (ALL, *told)[:_PANELS])}
     point = lowest_bone_point(labels, bones, axes)
     across = (found.mesh.points_mm - point) @ axes[:, 2]
     if not across.min() < 0.0 < across.max():  # the bone lies beside the mesh
@@ -104,7 +107,7 @@ def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
 def write_page(
     path: Path,
     shown: Sequence[tuple[Comparison, Judged, Mapping[str, bytes]]],
-    totals: Mapping[str, float],
+    totals: Sequence[Area],
     noise: Sequence[str],
     notes: Sequence[str],
     strains: tuple[float, float],
@@ -137,35 +140,42 @@ def write_page(
     write_report(path, "Models against the measurement", None, sections, [_CLOSING, sources], flat(record))
 
 
-def _areas(done: Sequence[Comparison], totals: Mapping[str, float], strains: tuple[float, float]) -> Table:
+def shown(area: Area) -> str:
+    """An area as people read it: with the interval that the measurement's error leaves, where that is known."""
+    known = not np.isnan(area.low_ml)
+    return f"{area.best_ml:.2f}" + (f" ({area.low_ml:.2f} to {area.high_ml:.2f})" if known else "")
+
+
+def _areas(done: Sequence[Comparison], totals: Sequence[Area], strains: tuple[float, float]) -> Table:
     areas = {(a.model, a.load): a for one in done for a in one.areas if a.tissue == ALL}
-    names = [*totals, *dict.fromkeys(model for model, _ in areas if model not in totals)]
+    sums = {a.model: a for a in totals}
+    names = [*sums, *dict.fromkeys(model for model, _ in areas if model not in sums)]
     rows = []
     for name in names:
         cells: list[Cell] = [name]
         for one in done:
             area = areas.get((name, one.load))
-            if area is None:
-                cells.append("–")
-            elif np.isnan(area.low_ml):
-                cells.append(f"{area.ml:.2f}")
-            else:
-                cells.append(f"{area.ml:.2f} ({area.low_ml:.2f} to {area.high_ml:.2f})")
-        rows.append((*cells, f"{totals[name]:.2f}" if name in totals else "–"))
+            cells.append("–" if area is None else shown(area))
+        rows.append((*cells, shown(sums[name]) if name in sums else "–"))
     return Table(
         f"Area between the volume-strain curves of soft tissue, strains {strains[0]:g} to {strains[1]:g}, mL",
         ("model", *(one.load for one in done), "all loads"),
         tuple(rows),
-        "The nearest model first. In brackets the 95 % interval that the measurement's own error leaves.",
+        "The nearest model first. Where the measurement's error is known, the area is the median over truths that "
+        "could lie behind it, with a 95 % interval; areas as found, and by tissue, stand below and in areas.csv.",
     )
 
 
 def _tissues(one: Comparison) -> Table:
-    rows = tuple((a.model, a.tissue, a.ml, 100.0 * a.share, a.low_ml, a.high_ml) for a in one.areas)
+    rows = tuple(
+        (a.model, a.tissue, a.ml, 100.0 * a.share, a.estimate_ml, a.low_ml, a.high_ml, a.floor_ml) for a in one.areas
+    )
     return Table(
         "Area between the curves, by tissue",
-        ("model", "tissue", "area, mL", "share, %", "95 % from", "to"),
+        ("model", "tissue", "as found, mL", "share, %", "estimate, mL", "95 % from", "to", "a perfect model's"),
         rows,
+        "As found: with the measurement's noise and smoothing. Estimate and interval: these taken out. A perfect "
+        "model's: what noise alone would give; an interval that reaches it begins at 0.",
     )
 
 

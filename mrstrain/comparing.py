@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -26,14 +26,15 @@ from dvc.uncertainty import ErrorTable, read_error_model
 from dvc.verdict import Verdict
 from dvc.whole import whole_file, whole_folder, write_whole
 from fe.meshstore import read_tet_mesh
-from mrstrain.comparepage import pictures_of, write_page
+from mrstrain.comparepage import pictures_of, shown, write_page
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.provenance import provenance, write_json
 from validate.agreement import Agreement, Travel
-from validate.comparison import ALL, Comparison
+from validate.comparison import Comparison, total
 from validate.comparison import compare as compare_load
-from validate.curves import RANGE, Area, Band
+from validate.curves import RANGE, Area
 from validate.location import LEAST_ML, Overlap, read_thresholds
+from validate.mapping import ALL
 from validate.sources import FeResult, check_overlap, read_result
 
 Told = Callable[[str, str, float], None]
@@ -55,12 +56,15 @@ class Measurement:
         Error of the maximal shear, where it is known.
     verdict : Verdict or None
         On the registration.
+    aligned_on : str
+        "bone", "image" or "none"; empty where it is not told.
     """
 
     load: str
     folder: Path
     table: ErrorTable | None
     verdict: Verdict | None
+    aligned_on: str = ""
 
     def deformation(self) -> Deformation:
         """Displacement of tissue relative to its bone."""
@@ -73,7 +77,7 @@ class Compared:
 
     out: Path
     comparisons: tuple[Comparison, ...]
-    totals: Mapping[str, float]
+    totals: tuple[Area, ...]
     noise: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -81,11 +85,10 @@ class Compared:
         """A few lines for a person."""
         lines = []
         for one in self.comparisons:
-            told = ", ".join(f"{a.model} {a.ml:.2f}{_interval(a)}" for a in one.ranked())
+            told = ", ".join(f"{a.model} {shown(a)}" for a in one.ranked())
             lines.append(f"{one.load}: area between the curves, mL, the nearest first: {told}")
-        if self.totals:
-            told = ", ".join(f"{name} {ml:.2f}" for name, ml in self.totals.items())
-            lines.append(f"All loads: {told}")
+        if len(self.comparisons) > 1 and self.totals:
+            lines.append("All loads: " + ", ".join(f"{a.model} {shown(a)}" for a in self.totals))
         return [*lines, *self.noise, *self.notes, f"Report: {self.out / 'report.html'}"]
 
 
@@ -175,7 +178,7 @@ def compare(
         },
     )  # fmt: skip
     done: list[Comparison] = []
-    shown: list[tuple[Comparison, Measurement, dict[str, bytes]]] = []
+    told: list[tuple[Comparison, Measurement, dict[str, bytes]]] = []
     for number, measurement in enumerate(m for m in measurements if m.load in files):
         load = measurement.load
         tell("compare", "comparing", number / len(files))
@@ -198,22 +201,32 @@ def compare(
                 _write_on_image(folder, results, tissues)
             write_json(folder / "provenance.json", record)
         done.append(one)
-        shown.append((one, measurement, drawn))
+        told.append((one, measurement, drawn))
+    notes += [
+        f"{m.load}: the bone's motion was not taken out of this measurement: displacements are not the tissue's alone."
+        for m in measurements
+        if m.load in files and m.aligned_on == "none"
+    ]
+    notes += [
+        f"{m.load}: how often its intervals hold is not known (an error model of one heel): they are as drawn."
+        for m in measurements
+        if m.load in files and m.table is not None and np.isnan(m.table.widening)
+    ]
     notes += [
         f"{m.load}: the measurement's error is not known (no error_model.json beside it): no difference counts as seen."
         for m in measurements
         if m.load in files and m.table is None
     ]
-    totals, noise = _ranking(done)
+    totals, noise = total(done)
     _write_tables(target, done, strains)
     write_json(
         target / "comparison.json",
         {
-            "total_area_ml": totals, "told_apart": list(noise), "notes": notes,
+            "total_area_ml": {a.model: a.best_ml for a in totals}, "told_apart": list(noise), "notes": notes,
             "coverage_ml": {one.load: one.found.coverage() for one in done},
         } | record,
     )  # fmt: skip
-    write_page(target / "report.html", shown, totals, noise, notes, strains, levels, record)
+    write_page(target / "report.html", told, totals, noise, notes, strains, levels, record)
     tell("compare", "comparing", 1.0)
     return Compared(target, tuple(done), totals, noise, tuple(notes))
 
@@ -226,11 +239,12 @@ def _measurements(place: Path) -> list[Measurement]:
     for folder in folders:
         model = folder / "error_model.json"
         table = read_error_model(model).tables[0] if model.is_file() else None
-        verdict = None
+        verdict, aligned_on = None, ""
         if (folder / "quality.json").is_file():
-            told = json.loads((folder / "quality.json").read_text(encoding="utf-8"))["verdict"]
-            verdict = Verdict(told["level"], tuple(told["reasons"]))
-        found.append(Measurement(folder.resolve().name, folder, table, verdict))
+            told = json.loads((folder / "quality.json").read_text(encoding="utf-8"))
+            verdict = Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"]))
+            aligned_on = str(told.get("alignment", {}).get("on", ""))
+        found.append(Measurement(folder.resolve().name, folder, table, verdict, aligned_on))
     return found
 
 
@@ -250,6 +264,8 @@ def _files(measurements: Sequence[Measurement], models: Sequence[Path]) -> tuple
                     "load's folder as the measurement."
                 )
             name, of = (place.parent.resolve().name, place.stem) if place.stem in loads else (place.stem, loads[0])
+            if place.stem not in loads and place.stem in _reached(place):
+                raise InputError(f"{place} is a simulation of {place.stem}, and {of} was measured.")
             chosen = {of: place}
         elif place.is_dir():
             name = place.resolve().name
@@ -292,38 +308,6 @@ def _reached(place: Path) -> dict[str, float]:
         return {}
 
 
-def _ranking(done: Sequence[Comparison]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Total area of each model that has every load, the smallest first; and which of them can be told apart."""
-    everywhere = [name for name in done[0].found.models if all(name in one.found.models for one in done)]
-    area = {(a.load, a.model): a.ml for one in done for a in one.areas if a.tissue == ALL}
-    totals = {name: sum(area[one.load, name] for one in done) for name in everywhere}
-    totals = dict(sorted(totals.items(), key=lambda item: item[1]))
-    told = []
-    for one in done:
-        if ALL in one.bands and len(one.found.models) > 1:
-            told.append(_nearest(f"under {one.load}", [a.model for a in one.ranked()], one.bands[ALL]))
-    if len(done) > 1 and len(totals) > 1 and all(ALL in one.bands for one in done):
-        parts = [one.bands[ALL] for one in done]
-        areas = {name: np.sum([band.areas_ml[name] for band in parts], axis=0) for name in totals}
-        whole = Band(parts[0].strains, parts[0].low_ml, parts[0].high_ml, areas, max(b.widening for b in parts))
-        told.insert(0, _nearest("over all loads", list(totals), whole))
-    return totals, tuple(told)
-
-
-def _nearest(where: str, ranked: Sequence[str], band: Band) -> str:
-    first, *others = ranked
-    near = [name for name in others if not band.surely_below(first, name)]
-    return f"Nearest {where}: {first}. " + (
-        f"Not told apart from it by this measurement: {', '.join(near)}."
-        if near
-        else "It is told apart from all others."
-    )
-
-
-def _interval(area: Area) -> str:
-    return "" if np.isnan(area.low_ml) else f" ({area.low_ml:.2f} to {area.high_ml:.2f})"
-
-
 def _write_fields(path: Path, one: Comparison) -> None:
     """Measured and simulated maximal shear and displacement in the compared cells, for ParaView."""
     found = one.found
@@ -353,7 +337,7 @@ def _write_on_image(folder: Path, results: Sequence[FeResult], labels: LabelMap)
 
 
 def _write_tables(target: Path, done: Sequence[Comparison], strains: tuple[float, float]) -> None:
-    _rows(target / "areas.csv", Area, [a for one in done for a in one.areas])
+    _rows(target / "areas.csv", Area, [*(a for one in done for a in one.areas), *total(done)[0]])
     _rows(target / "location.csv", Overlap, [o for one in done for o in one.overlaps])
     _rows(target / "agreement.csv", Agreement, [a for one in done for a in one.agreements])
     _rows(target / "travel.csv", Travel, [t for one in done for t in one.travels])
@@ -363,6 +347,13 @@ def _write_tables(target: Path, done: Sequence[Comparison], strains: tuple[float
         found = one.found
         for tissue in (ALL, *found.tissues):
             where = found.common & ((found.tissue == tissue) | (tissue == ALL))
+            if tissue in one.bands:
+                band = one.bands[tissue]
+                for name, edge in (("measured, low", band.low_ml), ("measured, high", band.high_ml)):
+                    curves += [
+                        (one.load, tissue, name, s, v)
+                        for s, v in zip(at.tolist(), np.interp(at, band.strains, edge).tolist(), strict=True)
+                    ]
             for name, field in {"measured": found.measured, **found.models}.items():
                 above = volume_above(field.max_shear[where], found.volumes_ml[where], at)
                 curves += [(one.load, tissue, name, s, v) for s, v in zip(at.tolist(), above.tolist(), strict=True)]

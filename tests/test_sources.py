@@ -12,8 +12,10 @@ import pytest
 
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.image import Grid
+from dvc.mesh import outer_faces
 from dvc.meshfile import read_mesh
 from tests.test_meshfile import TAGS, block, write_abaqus, write_ansys, write_gmsh22
+from validate.location import clusters, neighbours
 from validate.sources import check_overlap, read_result
 from validate.split import linear_tetrahedra
 
@@ -107,7 +109,7 @@ def test_a_map_to_the_image_turns_points_and_displacements(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("kind", "children"), [("tetra10", 8), ("hexahedron", 6), ("hexahedron20", 6), ("wedge", 3), ("pyramid", 2)]
+    ("kind", "children"), [("tetra10", 8), ("hexahedron", 12), ("hexahedron20", 12), ("wedge", 8), ("pyramid", 6)]
 )
 def test_cells_of_any_kind_carry_a_linear_field_exactly(tmp_path: Path, kind: str, children: int) -> None:
     corners = {
@@ -152,14 +154,35 @@ def test_cells_of_any_kind_carry_a_linear_field_exactly(tmp_path: Path, kind: st
             read_result("one", path)
 
 
+def test_neighbours_of_any_numbering_fit(tmp_path: Path) -> None:
+    axis = np.linspace(0.0, 12.0, 4)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    corner = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+    turns = [[0, 1, 2, 3, 4, 5, 6, 7], [1, 2, 3, 0, 5, 6, 7, 4], [0, 4, 5, 1, 3, 7, 6, 2], [6, 5, 4, 7, 2, 1, 0, 3]]
+    cells = np.array([(np.array(c) + corner) @ [16, 4, 1] for c in np.ndindex(3, 3, 3)])
+    random = np.random.default_rng(0)
+    cells = np.array([cell[turns[random.integers(4)]] for cell in cells])
+    number = random.permutation(len(points))
+    shuffled = np.empty_like(points)
+    shuffled[number] = points
+    path = tmp_path / "Load1.vtu"
+    meshio.write(path, meshio.Mesh(shuffled, [("hexahedron", number[cells])], {"displacement": moved(shuffled)}))
+    mesh = read_result("bricks", path).mesh
+    whole = clusters(np.ones(len(mesh.cells), dtype=bool), np.ones(len(mesh.cells)), mesh.volumes_mm3 / 1000.0,
+                     mesh.centroids_mm, neighbours(mesh))  # fmt: skip
+    assert [c.volume_ml for c in whole] == [pytest.approx(1.728)]
+    on_a_side = ((mesh.points_mm == 0.0) | (mesh.points_mm == 12.0)).any(axis=1)
+    assert on_a_side[outer_faces(mesh.cells)].all()
+
+
 def test_surfaces_and_regions_come_along(tmp_path: Path) -> None:
     points, cells = block()
     top = np.flatnonzero(points[:, 2] == points[:, 2].max())
     write_ansys(tmp_path / "heel.cdb", points, cells, top)
-    mesh, of_file = linear_tetrahedra(read_mesh(tmp_path / "heel.cdb"))
+    mesh, carry = linear_tetrahedra(read_mesh(tmp_path / "heel.cdb"))
     assert len(mesh.regions["FAT"]) == 20
     assert len(mesh.facets["TOP"]) == 8
-    assert np.array_equal(np.unique(of_file[mesh.facets["TOP"]]), top)
+    assert np.array_equal(np.unique(carry[np.unique(mesh.facets["TOP"])].indices), top)
 
 
 def test_what_does_not_lie_in_the_image_is_refused_with_what_would(tmp_path: Path) -> None:
@@ -186,6 +209,7 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
         read_result("heel", files["path"])
     for rows, head, message in (
         (TAGS, "node,a,b,c", "column 'node' and three"),
+        (TAGS, "node,x,y,z", "column 'node' and three"),
         (TAGS + 1, "node,ux,uy,uz", "does not have"),
         (np.full(27, TAGS[0]), "node,ux,uy,uz", "a node twice"),
         (TAGS[:20], "Node Label,U1,U2,U3", "7 of 27 nodes have no displacement"),
@@ -202,6 +226,17 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
         whole.write_text(text[:end])
         with pytest.raises((ImageFileError, InputError)):
             read_result("heel", whole)
+
+
+def test_a_gmsh_file_whose_nodes_stand_in_another_order_is_refused(tmp_path: Path) -> None:
+    mesh = tmp_path / "Load2.msh"
+    mesh.write_text(
+        "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n4\n2 6 0 0\n1 0 0 0\n3 0 6 0\n4 0 0 6\n$EndNodes\n"
+        "$Elements\n1\n1 4 2 1 1 1 2 3 4\n$EndElements\n"
+        '$NodeData\n1\n"u"\n1\n0.0\n3\n0\n3\n4\n1 0 0 0\n2 0 0 0\n3 0 0 0\n4 1 0 0\n$EndNodeData\n'
+    )
+    with pytest.raises(InputError, match="order of their numbers"):
+        read_result("heel", mesh)
 
 
 @pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX (ccx) is not installed")

@@ -13,10 +13,10 @@ from dvc.onmesh import OnMesh
 from dvc.uncertainty import POOLED, ErrorTable, TruthDraws
 from tests.blocks import block
 from validate.agreement import agreement, sole_under_plate
-from validate.comparison import ALL, compare
+from validate.comparison import compare
 from validate.curves import area_between, bands
 from validate.location import Threshold, clusters, neighbours, overlap, read_thresholds
-from validate.mapping import mapped
+from validate.mapping import ALL, mapped
 from validate.sources import FeResult
 
 SIDE = 20.0
@@ -133,7 +133,7 @@ def test_fields_are_compared_at_the_same_points_by_tissue_and_distance() -> None
     assert found.models["half"].max_shear == pytest.approx(max_shear(0.2))
     assert found.volumes_ml.sum() == pytest.approx(8.0)
     assert found.volumes_ml[found.tissue == "fat"].sum() == pytest.approx(4.0)
-    assert found.to_bone_mm == pytest.approx(found.points_mm[:, 0] + 0.5, abs=0.75)  # voxels' centres lie at -0.5
+    assert found.to_bone_mm == pytest.approx(found.points_mm[:, 0], abs=0.75)
     # what a model does not reach is left out for all, and counted
     part = TetMesh(mesh.points_mm, mesh.cells[mesh.centroids_mm[:, 1] < 10.0])
     small = OnMesh(part, sheared(0.2).displacement(part.points_mm))
@@ -192,7 +192,8 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
     truth = 0.2 + 0.4 * points[:, 0] / SIDE
     models = {"near": truth + 0.02, "as near": truth - 0.021, "far": truth + 0.1}
     true_area = {name: area_between(truth, field, volumes) for name, field in models.items()}
-    held, told = [], []
+    held, told, held_by_equal = [], [], []
+    models["equal"] = truth
     for seed in range(40):
         tissue, distance = ["fat"] * len(points), np.ones(len(points))
         # found = truth + bias + noise; draws take bias and noise away again
@@ -204,12 +205,14 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
         )
         draws = TruthDraws(points, truth + 0.01 + noise, tissue, distance, error_table(0.01, 0.04), seed)
         band = bands(draws, models, volumes, everywhere, 1.3)[ALL]
-        low, high = band.interval("far")
+        _, low, high, _ = band.interval("far")
+        held_by_equal.append(band.interval("equal")[1] == 0.0)
         held.append(low <= true_area["far"] <= high)
         told.append(
             (band.surely_below("near", "far"), band.surely_below("near", "as near"), band.surely_below("far", "near"))
         )
     assert np.mean(held) > 0.85
+    assert np.mean(held_by_equal) > 0.9  # a perfect model's interval begins at 0
     seen, noisy, wrong = np.mean(told, axis=0)
     assert seen > 0.9
     assert noisy < 0.2
@@ -228,6 +231,21 @@ def test_the_skin_on_the_plate_is_found_from_the_deformed_shape() -> None:
     nodes = sole_under_plate(OnMesh(shaped, u), np.array([1.0, 0.0, 0.0]))
     assert set(np.flatnonzero(over & (points[:, 0] == SIDE))) <= set(nodes)
     assert (shaped.points_mm + u)[nodes, 0].min() > 20.2
+
+
+def test_a_biased_measurement_ranks_by_what_lies_behind_it() -> None:
+    mesh = cube(8)
+    volumes = mesh.volumes_mm3 / 1000.0
+    truth = 0.2 + 0.4 * mesh.centroids_mm[:, 0] / SIDE
+    # found .07 below the truth: a model that copies what was found is nearer to it, and further from the truth
+    draws = TruthDraws(
+        mesh.centroids_mm, truth - 0.07, ["fat"] * len(truth), np.ones(len(truth)), error_table(-0.07, 0.02)
+    )
+    models = {"copy": truth - 0.07, "right": truth}
+    band = bands(draws, models, volumes, {ALL: np.ones(len(truth), dtype=bool)}, 1.0)[ALL]
+    assert area_between(truth - 0.07, models["copy"], volumes) < area_between(truth - 0.07, truth, volumes)
+    assert band.interval("right")[0] < band.interval("copy")[0]
+    assert band.surely_below("right", "copy")
 
 
 def test_thresholds_are_a_table_with_sources(tmp_path) -> None:

@@ -10,11 +10,12 @@ from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.deformation import Deformation
 from dvc.mesh import outer_faces
 from dvc.onmesh import OnMesh
-from validate.mapping import Mapped
+from validate.mapping import ALL, Mapped
 
 TO_BONE_MM = (0.0, 3.0, 6.0, 12.0)
 """Lower ends of the bins of distance to bone, mm."""
 
+_FLAT = 1e-12  # variance over mean square
 _LEAST = 10  # cells below which nothing is told
 _COPLANAR_MM = 0.3
 _INWARD_MM = 1.0
@@ -87,14 +88,16 @@ def agreement(
     x0, y0 = float(weight @ measured), float(weight @ simulated)
     x, y = measured - x0, simulated - y0
     xx, yy, xy = float(weight @ x**2), float(weight @ y**2), float(weight @ (x * y))
-    slope = xy / xx if xx > 0.0 else float("nan")
+    if min(xx, yy) <= _FLAT * max(x0**2, y0**2):  # a uniform field: only rounding varies
+        xx = yy = xy = float("nan")
+    slope = xy / xx
     spread = float(np.sqrt(weight @ (y - x) ** 2))
     bias = y0 - x0
     return Agreement(
         model, load, quantity, part, len(measured), float(volumes_ml.sum()), x0, y0, slope, y0 - slope * x0,
-        xy**2 / (xx * yy) if xx * yy > 0.0 else float("nan"),
+        xy**2 / (xx * yy),
         float(np.hypot(bias, spread)) if rmse is None else rmse,
-        2.0 * xy / (xx + yy + bias**2) if xx + yy + bias**2 > 0.0 else float("nan"),
+        2.0 * xy / (xx + yy + bias**2),
         bias, bias - 1.96 * spread, bias + 1.96 * spread,
     )  # fmt: skip
 
@@ -102,7 +105,7 @@ def agreement(
 def agreements(found: Mapped, model: str, load: str) -> list[Agreement]:
     """Agreement of maximal shear and displacement in all soft tissue, each tissue, and by distance to bone."""
     common, field = found.common, found.models[model]
-    parts: dict[str, BoolArray] = {"soft tissue": common}
+    parts: dict[str, BoolArray] = {ALL: common}
     parts |= {tissue: common & (found.tissue == tissue) for tissue in found.tissues}
     ends = (*TO_BONE_MM[1:], np.inf)
     for low, high in zip(TO_BONE_MM, ends, strict=True):
@@ -129,13 +132,13 @@ class Travel:
     ----------
     model, load : str
     nodes : int
-        Of the skin under the model's plate at which the measurement is defined.
+        Of the skin under the model's plate at which both are defined.
     measured_mm, model_mm : float
         Mean displacement along the plate's normal force (towards the foot).
     measured_along_mm, model_along_mm : float
         Mean displacement across it, length.
     measured_volume_change, model_volume_change : float
-        Mean of det F - 1 over the fat, or over all tissue where none is called fat.
+        Mean of det F - 1 over the fat, or over all tissue where no fat is compared.
     """
 
     model: str
@@ -150,14 +153,20 @@ class Travel:
 
 
 def sole_under_plate(model: OnMesh, normal: FloatArray) -> IntArray:
-    """Nodes on the outside of a model that lie on one plane at its end along ``normal``, once it is deformed."""
+    """Nodes on the outside of a model that lie on one plane across ``normal`` once it is deformed.
+
+    The plane with most nodes, in the half of the model towards the plate: tissue may bulge past a small plate.
+    """
     outside = np.unique(outer_faces(model.mesh.cells))
     height = (model.mesh.points_mm + model.u_mm)[outside] @ normal
-    return np.asarray(outside[height > height.max() - _COPLANAR_MM])
+    rising = np.sort(height[height > 0.5 * (height.min() + height.max())])
+    within = np.searchsorted(rising, rising + _COPLANAR_MM, side="right") - np.arange(len(rising))
+    low = rising[len(rising) - 1 - int(np.argmax(within[::-1]))]
+    return np.asarray(outside[(height >= low) & (height <= low + _COPLANAR_MM)])
 
 
 def travel(found: Mapped, name: str, load: str, model: OnMesh, measured: Deformation, normal: FloatArray) -> Travel:
-    """Compare how far the plate went in, by the skin on it; the measurement is read 1 mm inside the skin.
+    """Compare how far the plate took the skin on it, by the mean displacement 1 mm inside the skin.
 
     Parameters
     ----------
@@ -165,13 +174,14 @@ def travel(found: Mapped, name: str, load: str, model: OnMesh, measured: Deforma
         The plate's outward unit normal, LPS.
     """
     nodes = sole_under_plate(model, normal)
-    u = measured.displacement(model.mesh.points_mm[nodes] - _INWARD_MM * normal)
-    known = np.isfinite(u).all(axis=1)
-    moved = [u[known], model.u_mm[nodes][known]]
+    inside = model.mesh.points_mm[nodes] - _INWARD_MM * normal
+    both = measured.displacement(inside), model.displacement(inside)
+    known = np.isfinite(both[0]).all(axis=1) & np.isfinite(both[1]).all(axis=1)
+    moved = [u[known] for u in both]
     mean = [m.mean(axis=0) if known.any() else np.full(3, np.nan) for m in moved]
     fat = np.char.lower(found.tissue) == "fat"
-    where = found.common & (fat if fat.any() else True)
-    volumes = found.volumes_ml[where] / max(found.volumes_ml[where].sum(), 1e-12)
+    where = found.common & (fat if (found.common & fat).any() else True)
+    volumes = found.volumes_ml[where] / found.volumes_ml[where].sum()
     change = [float(volumes @ field.jacobian[where]) - 1.0 for field in (found.measured, found.models[name])]
     along = [float(-m @ normal) for m in mean]
     across = [float(np.linalg.norm(m - (m @ normal) * normal)) for m in mean]

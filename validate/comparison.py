@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -15,11 +16,8 @@ from dvc.uncertainty import ErrorTable, TruthDraws
 from validate.agreement import Agreement, Travel, agreements, travel
 from validate.curves import RANGE, Area, Band, area_between, bands
 from validate.location import LEAST_ML, Overlap, Threshold, neighbours, overlap
-from validate.mapping import Mapped, mapped
+from validate.mapping import ALL, Mapped, mapped
 from validate.sources import FeResult
-
-ALL = "soft tissue"
-"""All tissue that is compared, together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,8 +46,8 @@ class Comparison:
     bands: Mapping[str, Band]
 
     def ranked(self, tissue: str = ALL) -> list[Area]:
-        """Areas of a tissue, the smallest first."""
-        return sorted((a for a in self.areas if a.tissue == tissue), key=lambda a: a.ml)
+        """Areas of a tissue, the smallest first: as estimated from the truths drawn, where the error is known."""
+        return sorted((a for a in self.areas if a.tissue == tissue), key=lambda a: a.best_ml)
 
     def within_noise(self, model: str, other: str, tissue: str = ALL) -> bool:
         """Whether the measurement cannot tell which of two models is nearer; also where its error is not known."""
@@ -99,7 +97,7 @@ def compare(
     least_ml : float
         Volume of the smallest cluster that counts.
     seed : int
-        Of the truths drawn.
+        Of the truths drawn; those of different loads are independent.
 
     Raises
     ------
@@ -113,14 +111,15 @@ def compare(
     tissues |= {
         name: common & (found.tissue == name) for name in found.tissues if (common & (found.tissue == name)).any()
     }
-    told = _bands(found, tissues, table, strains, seed)
+    told = _bands(found, tissues, table, strains, zlib.crc32(load.encode()) + seed)
     areas = []
     for name, field in found.models.items():
         for tissue, where in tissues.items():
             volumes = found.volumes_ml[where]
             area = area_between(found.measured.max_shear[where], field.max_shear[where], volumes, strains)
-            low, high = told[tissue].interval(name) if tissue in told else (np.nan, np.nan)
-            areas.append(Area(name, load, tissue, area, area / volumes.sum() / (strains[1] - strains[0]), low, high))
+            share = area / volumes.sum() / (strains[1] - strains[0])
+            estimated = told[tissue].interval(name) if tissue in told else ()
+            areas.append(Area(name, load, tissue, area, share, *estimated))
     touching = neighbours(found.mesh)
     measured_shear = np.where(common, found.measured.max_shear, -1.0)
     overlaps = [
@@ -134,6 +133,45 @@ def compare(
     rows = [row for name in models for row in agreements(found, name, load)]
     travels = [travel(found, r.name, load, r.deformation, measured, normal) for r in results]
     return Comparison(load, found, tuple(areas), tuple(overlaps), tuple(rows), tuple(travels), told)
+
+
+def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], tuple[str, ...]]:
+    """Areas over all loads of the models that have every one, the nearest first; and sentences on what can be told.
+
+    Loads are measured one by one, so their errors are taken as independent. The share is the mean of the loads' shares.
+    """
+    everywhere = [name for name in done[0].found.models if all(name in one.found.models for one in done)]
+    bands_of = [one.bands[ALL] for one in done if ALL in one.bands]
+    whole: Band | None = None
+    if everywhere and len(bands_of) == len(done):
+        areas = {name: np.sum([band.areas_ml[name] for band in bands_of], axis=0) for name in everywhere}
+        floor = float(sum(band.floor_ml for band in bands_of))
+        first = bands_of[0]
+        whole = Band(first.strains, first.low_ml, first.high_ml, areas, floor, max(b.widening for b in bands_of))
+    rows = []
+    for name in everywhere:
+        parts = [a for one in done for a in one.areas if a.tissue == ALL and a.model == name]
+        estimated = whole.interval(name) if whole is not None else ()
+        share = float(np.mean([a.share for a in parts]))
+        rows.append(Area(name, "all loads", ALL, sum(a.ml for a in parts), share, *estimated))
+    rows.sort(key=lambda a: a.best_ml)
+    told = [_told(f"under {one.load}", one.ranked(), one.bands[ALL]) for one in done if ALL in one.bands]
+    if len(done) > 1 and whole is not None:
+        told.insert(0, _told("over all loads", rows, whole))
+    return tuple(rows), tuple(sentence for sentence in told if sentence)
+
+
+def _told(where: str, ranked: Sequence[Area], band: Band) -> str:
+    """Which model is nearest, and which others the measurement cannot tell from it; nothing for one model."""
+    if len(ranked) < 2:
+        return ""
+    first, *others = (a.model for a in ranked)
+    near = [name for name in others if not band.surely_below(first, name)]
+    return f"Nearest {where}: {first}. " + (
+        f"Not told apart from it by this measurement: {', '.join(near)}."
+        if near
+        else "It is told apart from all others."
+    )
 
 
 def _bands(

@@ -55,8 +55,13 @@ class Area:
         As found.
     share : float
         Divided by the tissue's volume and the width of the range.
+    estimate_ml : float
+        Median of the areas to the truths drawn: the measurement's bias taken out. NaN, as those below, where the error
+        is not known.
     low_ml, high_ml : float
-        95 % interval from the measurement's uncertainty; NaN where that is not known.
+        95 % interval from the measurement's uncertainty.
+    floor_ml : float
+        What a perfect model would be given: the median area between two truths drawn.
     """
 
     model: str
@@ -64,8 +69,15 @@ class Area:
     tissue: str
     ml: float
     share: float
+    estimate_ml: float = float("nan")
     low_ml: float = float("nan")
     high_ml: float = float("nan")
+    floor_ml: float = float("nan")
+
+    @property
+    def best_ml(self) -> float:
+        """The estimate, where there is one, else the area as found."""
+        return self.ml if np.isnan(self.estimate_ml) else self.estimate_ml
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +91,8 @@ class Band:
         95 % band of the true V.
     areas_ml : mapping of model to (draws,)
         Area to each truth drawn.
+    floor_ml : float
+        Median area between one truth drawn and the next.
     widening : float
         By which intervals of draws are widened; see `dvc.uncertainty.ErrorTable`.
     """
@@ -87,12 +101,16 @@ class Band:
     low_ml: FloatArray
     high_ml: FloatArray
     areas_ml: Mapping[str, FloatArray]
+    floor_ml: float
     widening: float
 
-    def interval(self, model: str) -> tuple[float, float]:
-        """95 % interval of a model's area, mL."""
-        low, _, high = widened(self.areas_ml[model][:, None], self.widening)
-        return float(low[0]), float(high[0])
+    def interval(self, model: str) -> tuple[float, float, float, float]:
+        """Estimate of a model's area, its 95 % interval, and the floor, mL.
+
+        An area cannot be below zero, and noise alone makes it larger: an interval that reaches the floor begins at 0.
+        """
+        low, middle, high = (float(v[0]) for v in widened(self.areas_ml[model][:, None], self.widening))
+        return middle, 0.0 if low <= self.floor_ml else low, high, self.floor_ml
 
     def surely_below(self, model: str, other: str) -> bool:
         """Whether a model's area is below another's by more than the measurement's uncertainty."""
@@ -136,16 +154,27 @@ def bands(
     }
     drawn = {name: np.empty((count, len(outer))) for name in tissues}
     areas = {name: {model: np.empty(count) for model in models} for name in tissues}
+    last: dict[str, FloatArray] = {}
+    floors: dict[str, list[float]] = {name: [] for name in tissues}
     for n in range(count):
         truth = draws.drawn()
         for name, inside in tissues.items():
             both = volume_above(truth[inside], volumes_ml[inside], np.concatenate([outer, inner]))
             drawn[name][n], curve = both[: len(outer)], both[len(outer) :]
             for model, found in curves[name].items():
-                difference = np.abs(found - curve)
-                areas[name][model][n] = step * (difference.sum() - 0.5 * (difference[0] + difference[-1]))
+                areas[name][model][n] = np.trapezoid(np.abs(found - curve), dx=step)
+            if name in last:
+                floors[name].append(float(np.trapezoid(np.abs(last[name] - curve), dx=step)))
+            last[name] = curve
     result = {}
     for name, inside in tissues.items():
         least, _, most = widened(drawn[name], widening)
-        result[name] = Band(outer, least, np.minimum(most, volumes_ml[inside].sum()), areas[name], widening)
+        result[name] = Band(
+            outer,
+            least,
+            np.minimum(most, volumes_ml[inside].sum()),
+            areas[name],
+            float(np.median(floors[name])),
+            widening,
+        )
     return result

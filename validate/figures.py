@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
@@ -13,7 +14,7 @@ from dvc.arrays import FloatArray
 from dvc.deformation import Deformation
 from dvc.figures import REGION_COLOURS
 from dvc.regions import volume_above
-from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
+from dvc.sheet import DPI, FONT, INK, WIDTH_IN, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet
 from validate.curves import Band
 from validate.mapping import Mapped
@@ -32,10 +33,10 @@ def volume_strain(
     The grey band holds the true curve in 95 % of cases, by the measurement's error model; areas are
     taken between the dotted lines.
     """
-    figure, panels = chart(len(tissues))
+    figure, panels = _panels(len(tissues))
     at = np.linspace(0.0, 1.5 * strains[1], _POINTS)
     for axes, tissue in zip(panels, tissues, strict=True):
-        where = found.common & ((found.tissue == tissue) | (tissue == "soft tissue"))
+        where = found.common & ((found.tissue == tissue) | (tissue not in found.tissues))
         volumes = found.volumes_ml[where]
         if tissue in bands:
             band = bands[tissue]
@@ -58,6 +59,16 @@ def volume_strain(
         label_axes(axes, "maximal shear", "volume above, mL")
     panels[0].legend(fontsize=9, frameon=False)
     return png_bytes(figure)
+
+
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    rows, columns = -(-count // 2), min(count, 2)
+    figure = Figure(figsize=(WIDTH_IN, 3.4 * rows), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    spots = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for spot in spots[count:]:
+        spot.set_visible(False)
+    return figure, spots[:count]
 
 
 def slices(

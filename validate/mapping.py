@@ -15,6 +15,9 @@ from dvc.image import LabelMap
 from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
 
+ALL = "all soft tissue"
+"""All tissue that is compared, together."""
+
 OTHER = "unnamed"
 """Tissue of cells that neither the mesh nor the label map names."""
 
@@ -53,7 +56,7 @@ class Mapped:
         Of the cells.
     tissue : (n,) str
     to_bone_mm : (n,)
-        Distance to the nearest voxel of bone.
+        Distance to the surface of bone.
     measured : Field
     models : mapping of str to Field
     """
@@ -127,6 +130,7 @@ def mapped(
     soft = ~np.isin(tissue, list(bones))
     bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
     distance, _ = cKDTree(labels.grid.points(bone)).query(points[soft])
+    distance = np.maximum(distance - 0.5 * labels.grid.spacing_mm.min(), 0.0)  # from voxels' centres to the surface
     kept = np.flatnonzero(soft)
     if len(kept) < len(points):
         mesh = _part(mesh, kept)

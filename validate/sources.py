@@ -27,11 +27,11 @@ from dvc.onmesh import OnMesh
 from validate.split import linear_tetrahedra
 
 _NAMES = ("displacement_mm", "displacement", "displacements", "disp", "u")
-_NODE_COLUMNS = ("node", "node_id", "node number", "nodeid", "id", "node label", "label")
+_NODE_COLUMNS = ("node", "node label", "node number", "node_id", "nodeid", "id")
 _COMPONENTS = (
     ("ux_mm", "uy_mm", "uz_mm"),
     ("ux", "uy", "uz"), ("u1", "u2", "u3"), ("u-u1", "u-u2", "u-u3"),
-    ("u_x", "u_y", "u_z"), ("dx", "dy", "dz"), ("x", "y", "z"),
+    ("u_x", "u_y", "u_z"), ("u.x", "u.y", "u.z"), ("disp_x", "disp_y", "disp_z"), ("dx", "dy", "dz"),
 )  # fmt: skip
 _SCALES = {1.0: "this unit", 1e3: "metres", 1e-3: "units a thousand times smaller"}
 _TURNS = {(1.0, 1.0, 1.0): "this frame", (-1.0, -1.0, 1.0): "the other of LPS and RAS"}
@@ -105,18 +105,19 @@ def read_result(
         source = read_mesh(place, unit=unit, frame=frame)
         values = _beside_mesh(place, source)
     u = values * MM_PER_UNIT[unit] * TO_LPS[frame]
-    tets, of_file = linear_tetrahedra(source)
+    tets, carry = linear_tetrahedra(source)
     names = _names_of_regions(place)
     regions = {names.get(region, region): cells for region, cells in tets.regions.items()}
     tets = TetMesh(tets.points_mm, tets.cells, regions, tets.facets, tets.node_ids)
-    moved = u[of_file]
-    missing = ~np.isfinite(moved).all(axis=1)
+    used = np.unique(carry.indices)
+    missing = ~np.isfinite(u[used]).all(axis=1)
     if missing.any():
-        first = source.node_ids[of_file[int(np.argmax(missing))]]
+        first = source.node_ids[used[int(np.argmax(missing))]]
         raise InputError(
             f"{place}: {np.count_nonzero(missing)} of {len(missing)} nodes have no displacement, first node {first}. "
             "Export all nodes of the tissue."
         )
+    moved = np.asarray(carry @ np.nan_to_num(u))
     if to_image is not None:
         rigid = _rigid(to_image)
         tets = TetMesh(rigid.apply(tets.points_mm), tets.cells, tets.regions, tets.facets, tets.node_ids)
@@ -161,6 +162,11 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
         return found
     if place.suffix.lower() in (".inp", ".cdb"):
         raise InputError(f"{place} holds a mesh and no result; give the table of its nodal displacements (.csv).")
+    if place.suffix.lower() == ".msh" and (np.diff(source.node_ids) <= 0).any():
+        raise InputError(
+            f"{place}: its nodes do not stand in the order of their numbers, so that displacements may "
+            "belong to others. Write it as VTU."
+        )
     with silenced(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         data = meshio.read(place).point_data
