@@ -207,12 +207,13 @@ def check_extent(points_mm: FloatArray) -> None:
     if extent < _SMALLEST_EXTENT_MM:
         raise GeometryError(
             f"The mesh is {extent:.3g} mm across, and a mesh in mm is not that small: its coordinates are "
-            "probably in metres. If so, say unit='m' (--mesh-unit m)."
+            "probably in metres. If so, say unit='m' (--mesh-unit m; compare: --model-unit m)."
         )
     if extent > _LARGEST_EXTENT_MM:
         raise GeometryError(
             f"The mesh is {extent / 1000:.4g} m across, and no body part is that large: its coordinates are "
-            "probably in mm and not in metres, or finer. Say unit='mm' (--mesh-unit mm), or scale them to mm."
+            "probably in mm and not in metres, or finer. Say unit='mm' (--mesh-unit mm; compare: --model-unit mm), "
+            "or scale them to mm."
         )
 
 

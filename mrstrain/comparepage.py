@@ -67,12 +67,13 @@ def pictures_of(
     bones: Sequence[str],
     axes: FloatArray,
     strains: tuple[float, float],
+    colours: Sequence[str],
 ) -> dict[str, bytes]:
-    """Draw a load's figures; by the stem of their files."""
+    """Draw a load's figures, by the stem of their files; ``colours`` names the models in the order of their colours."""
     found = one.found
     displacements = {r.name: _at_nodes(r, found.mesh.points_mm) for r in results}
     told = [name for name in found.tissues if any(a.tissue == name for a in one.areas)]
-    drawn = {"curves": figures.volume_strain(found, one.bands, strains, (ALL, *told)[:_PANELS])}
+    drawn = {"curves": figures.volume_strain(found, one.bands, strains, (ALL, *told)[:_PANELS], colours)}
     point = lowest_bone_point(labels, bones, axes)
     across = (found.mesh.points_mm - point) @ axes[:, 2]
     if not across.min() < 0.0 < across.max():  # the bone lies beside the mesh
@@ -187,9 +188,10 @@ def _location(one: Comparison) -> Table:
     )  # fmt: skip
     return Table(
         "Tissue above a strain: how much, and where",
-        ("model", "above", "measured, mL", "model, mL", "clusters", "model's", "Dice", "centroids apart, mm",
-         "largest clusters apart, mm", "Hausdorff 95, mm"),
+        ("model", "above", "measured, mL", "model, mL", "clusters measured", "of the model", "Dice", "centroids, mm",
+         "largest, mm", "Hausdorff 95, mm"),
         rows,
+        "Clusters are connected parts; distances of the centroids of all that lies above, and of the largest clusters.",
     )  # fmt: skip
 
 
@@ -205,8 +207,9 @@ def _agreement(one: Comparison) -> Table:
         ("model", "quantity", "tissue", "measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias",
          "limits from", "to"),
         rows,
-        "Means, regression of the model on the measurement, Lin's concordance, and Bland and Altman's limits of "
-        "agreement; by distance to bone in agreement.csv.",
+        "Means, regression of the model on the measurement, Lin's concordance, Bland and Altman's limits. Of "
+        "displacements: lengths, but for regression and concordance (the three components together) and RMSE (of the "
+        "difference). By distance to bone in agreement.csv.",
     )  # fmt: skip
 
 
@@ -218,8 +221,9 @@ def _travel(one: Comparison) -> Table:
     )  # fmt: skip
     return Table(
         "Skin under the plate, and volume of the fat",
-        ("model", "nodes", "in, measured, mm", "in, model", "along, measured", "along, model", "volume, measured, %",
-         "volume, model, %"),
+        ("model", "nodes", "inward, measured, mm", "model, mm", "across, measured, mm", "model, mm",
+         "fat's volume, measured, %", "model, %"),
         rows,
-        "Mean displacement of the skin on the model's plate, 1 mm inside the skin for the measurement; mean det F - 1.",
+        "Mean displacement 1 mm inside the skin on the model's plate, against the plate's outward normal and across "
+        "it; mean det F - 1.",
     )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -28,6 +29,7 @@ from dvc.whole import whole_file, whole_folder, write_whole
 from fe.meshstore import read_tet_mesh
 from mrstrain.comparepage import pictures_of, shown, write_page
 from mrstrain.inputs import make_output, refuse_touching_inputs
+from mrstrain.modelfiles import Reading, model_files
 from mrstrain.provenance import provenance, write_json
 from validate.agreement import Agreement, Travel
 from validate.comparison import Comparison, total
@@ -35,12 +37,15 @@ from validate.comparison import compare as compare_load
 from validate.curves import RANGE, Area
 from validate.location import LEAST_ML, Overlap, read_thresholds
 from validate.mapping import ALL
+from validate.misfit import misfits
 from validate.sources import FeResult, check_overlap, read_result
 
 Told = Callable[[str, str, float], None]
 
 _FIELD = "displacement.nii.gz"
-_ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".csv")
+_TABLES = ("areas.csv", "location.csv", "agreement.csv", "travel.csv", "curves.csv")
+_WHOLE = 0.9  # share of the mesh under which a model's cover is told
+_MOST_STRAIN = 3.0
 _STEP = 0.005  # of the curves that are written
 
 
@@ -151,16 +156,40 @@ def compare(
         If measurement and models have no load in common, or as in `validate.comparison.compare`.
     """
     target, tell = Path(out), progress or (lambda *_: None)
-    if not 0.0 <= strains[0] < strains[1]:
-        raise InputError(f"The range of strain must rise from 0 or more; got {strains[0]:g} to {strains[1]:g}.")
+    if not 0.0 <= strains[0] < strains[1] <= _MOST_STRAIN or least_ml < 0.0:
+        raise InputError(
+            f"The range of strain must rise from 0 or more to {_MOST_STRAIN:g} or less (no percent), and a volume be "
+            f"0 or more; got {strains[0]:g} to {strains[1]:g}, {least_ml:g} mL."
+        )
     axes = plate_axes(-np.asarray(plate_normal, dtype=np.float64), shear_direction)
     levels = read_thresholds(None if thresholds is None else Path(thresholds))
     tissues = read_labels(labels, names)
     measurements = _measurements(Path(dvc))
-    files, notes = _files(measurements, [Path(m) for m in models])
-    given = [*(f for by in files.values() for f in by.values()), *([Path(model_mesh)] if model_mesh else [])]
+    usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame, to_image)
+    places = [Path(m) for m in models]
+    files, notes = model_files([m.load for m in measurements], places, usual)
+    every = [file for of in files.values() for file in of]
+    given = [
+        *(file.path for file in every),
+        *dict.fromkeys(f.reading.mesh for f in every if f.reading.mesh is not None),
+    ]
     refuse_touching_inputs(target, list(files), [*given, *(m.folder / _FIELD for m in measurements), Path(labels)])
+    for place in (Path(dvc), *(m.folder for m in measurements), *(p for p in places if p.is_dir())):
+        if target.resolve() == place.resolve():
+            raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
+    results: dict[str, list[FeResult]] = {}
+    for load, of in files.items():
+        results[load] = []
+        for file in of:
+            how = file.reading
+            read = read_result(
+                file.name, file.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image
+            )
+            check_overlap(read, tissues.grid)
+            notes += [f"{load}: {sentence}" for sentence in misfits(read, tissues, bones)]
+            results[load].append(read)
     make_output(target)
+    _clear(target, list(files))
     common = None if mesh is None else read_tet_mesh(mesh)
     record = provenance(
         "compare",
@@ -175,30 +204,27 @@ def compare(
             "thresholds": [[t.max_shear, t.source] for t in levels],
             "model_unit": model_unit, "model_frame": model_frame,
             "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": 1,
+            "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
         },
     )  # fmt: skip
+    colours = list(dict.fromkeys(file.name for file in every))
     done: list[Comparison] = []
     told: list[tuple[Comparison, Measurement, dict[str, bytes]]] = []
     for number, measurement in enumerate(m for m in measurements if m.load in files):
         load = measurement.load
         tell("compare", "comparing", number / len(files))
-        results = []
-        for name, file in files[load].items():
-            result = read_result(name, file, mesh=model_mesh, unit=model_unit, frame=model_frame, to_image=to_image)
-            check_overlap(result, tissues.grid)
-            results.append(result)
         measured = measurement.deformation()
         one = compare_load(
-            load, measured, results, tissues, bones=bones, normal=-axes[:, 0], mesh=common, table=measurement.table,
-            strains=strains, thresholds=levels, least_ml=least_ml,
+            load, measured, results[load], tissues, bones=bones, normal=-axes[:, 0], mesh=common,
+            table=measurement.table, strains=strains, thresholds=levels, least_ml=least_ml,
         )  # fmt: skip
-        drawn = pictures_of(one, measured, results, tissues, bones, axes, strains)
+        drawn = pictures_of(one, measured, results[load], tissues, bones, axes, strains, colours)
         with whole_folder(target / load) as folder:
             _write_fields(folder / "fields.vtu", one)
             for stem, png in drawn.items():
                 (folder / f"{stem}.png").write_bytes(png)
             if on_image:
-                _write_on_image(folder, results, tissues)
+                _write_on_image(folder, results[load], tissues)
             write_json(folder / "provenance.json", record)
         done.append(one)
         told.append((one, measurement, drawn))
@@ -212,11 +238,13 @@ def compare(
         for m in measurements
         if m.load in files and m.table is not None and np.isnan(m.table.widening)
     ]
-    notes += [
-        f"{m.load}: the measurement's error is not known (no error_model.json beside it): no difference counts as seen."
-        for m in measurements
-        if m.load in files and m.table is None
-    ]
+    unknown = [m.load for m in measurements if m.load in files and m.table is None]
+    if unknown:
+        notes.append(
+            f"{', '.join(unknown)}: the measurement's error is not known (no error_model.json beside it): no "
+            "difference counts as seen."
+        )
+    notes += _covered(done)
     totals, noise = total(done)
     _write_tables(target, done, strains)
     write_json(
@@ -234,7 +262,9 @@ def compare(
 def _measurements(place: Path) -> list[Measurement]:
     folders = [place] if (place / _FIELD).is_file() else sorted(p.parent for p in place.glob(f"*/{_FIELD}"))
     if not folders:
-        raise InputError(f"{place}: no results of `register` or `strain` here (LOAD/{_FIELD}).")
+        raise InputError(
+            f"{place}: no results of `register` or `strain` here (LOAD/{_FIELD}). Give the folder they wrote."
+        )
     found = []
     for folder in folders:
         model = folder / "error_model.json"
@@ -248,64 +278,32 @@ def _measurements(place: Path) -> list[Measurement]:
     return found
 
 
-def _files(measurements: Sequence[Measurement], models: Sequence[Path]) -> tuple[dict[str, dict[str, Path]], list[str]]:
-    """For each load each model's file, and what is missing."""
-    if not models:
-        raise InputError("No model is given: a folder with a file for each load, or a file.")
-    loads = [m.load for m in measurements]
-    files: dict[str, dict[str, Path]] = {load: {} for load in loads}
-    notes: list[str] = []
-    taken: set[str] = set()
-    for place in models:
-        if place.is_file():
-            if len(loads) > 1 and place.stem not in loads:
-                raise InputError(
-                    f"{place}: which load is it of? Measured are {', '.join(loads)}: call the file so, or give one "
-                    "load's folder as the measurement."
-                )
-            name, of = (place.parent.resolve().name, place.stem) if place.stem in loads else (place.stem, loads[0])
-            if place.stem not in loads and place.stem in _reached(place):
-                raise InputError(f"{place} is a simulation of {place.stem}, and {of} was measured.")
-            chosen = {of: place}
-        elif place.is_dir():
-            name = place.resolve().name
-            chosen = {
-                load: file
-                for load in loads
-                for ending in reversed(_ENDINGS)
-                if (file := place / (load + ending)).is_file()
-            }
-        else:
-            raise InputError(f"{place}: there is no such model.")
-        if name in taken:
-            raise InputError(f"Two models are called '{name}': give their folders names of their own.")
-        if not chosen:
-            raise InputError(
-                f"{place} has no file of a measured load ({', '.join(loads)}), ending in {', '.join(_ENDINGS)}."
-            )
-        taken.add(name)
-        reached = _reached(place)
-        for load in loads:
-            if load not in chosen:
-                notes.append(f"{name} has no result for {load}.")
-            elif reached.get(load, 1.0) < 1.0:
-                notes.append(f"{name} reached only {reached[load]:.0%} of {load}, which is not compared.")
-            else:
-                files[load][name] = chosen[load]
-    files = {load: by for load, by in files.items() if by}
-    if not files:
-        raise InputError("No model has a whole result for a measured load. " + " ".join(notes))
-    return files, notes
-
-
-def _reached(place: Path) -> dict[str, float]:
-    """Share of each load that a simulation of ours reached."""
-    folder = place if place.is_dir() else place.parent
+def _clear(target: Path, loads: Sequence[str]) -> None:
+    """Remove what an earlier comparison wrote by its own list, but for the folders of loads that are made anew."""
+    told = target / "comparison.json"
     try:
-        outcome = json.loads((folder / "simulation.json").read_text(encoding="utf-8"))["outcome"]
-        return {load: float(told["reached"]) for load, told in outcome.items()}
+        old = list(json.loads(told.read_text(encoding="utf-8"))["coverage_ml"])
     except (OSError, ValueError, KeyError, TypeError):
-        return {}
+        return
+    for name in (*_TABLES, told.name, "report.html"):
+        (target / name).unlink(missing_ok=True)
+    for load in old:
+        if load not in loads and (target / load / "fields.vtu").is_file():
+            shutil.rmtree(target / load)
+
+
+def _covered(done: Sequence[Comparison]) -> list[str]:
+    """Which model leaves much of the mesh out: all are scored where every one is defined."""
+    notes = []
+    for one in done:
+        volumes = one.found.coverage()
+        for name in one.found.models:
+            if volumes[name] < _WHOLE * volumes["mesh"]:
+                notes.append(
+                    f"{one.load}: {name} covers {volumes[name] / volumes['mesh']:.0%} of the mesh, and all models "
+                    "are scored on the tissue that every one covers."
+                )
+    return notes
 
 
 def _write_fields(path: Path, one: Comparison) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dvc.errors import GeometryError, InputError
+from dvc.errors import GeometryError, InputError, OutputError
 from dvc.imagewrite import write_labels
 from dvc.outputs import write_displacement
 from mrstrain.cli import app
@@ -68,7 +68,7 @@ def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
     done = compare(study / "measured", [study / "half", study / "right"], on_image=True, **given(study))
     assert [a.model for a in done.totals] == ["right", "half"]
     assert done.totals[0].ml == pytest.approx(0.0, abs=1e-3)
-    assert "Nearest over all loads: right. It is told apart from all others." in done.noise
+    assert "Nearest over all loads, by the area: right. It is told apart from all others." in done.noise
     areas = {(r["model"], r["load"], r["tissue"]): r for r in rows(study / "out" / "areas.csv")}
     # all 8 mL are above 0.2 to 0.43 by the measurement, and to 0.204 by the model, minus what lies at the border
     volume = json.loads((study / "out" / "comparison.json").read_text())["coverage_ml"]["Load1"]["common"]
@@ -135,7 +135,7 @@ def test_without_an_error_no_difference_counts_as_seen(study: Path) -> None:
     assert all(one.within_noise("right", "half") for one in done.comparisons)
     with_errors(study, 0.0, 5.0)  # a measurement that knows nothing
     done = compare(study / "measured", [study / "right", study / "half"], **given(study))
-    assert "Not told apart from it by this measurement: half." in done.noise[0]
+    assert "The measurement does not tell these apart from it by the area: half." in done.noise[0]
 
 
 def test_a_load_that_a_model_did_not_carry_is_not_compared(study: Path) -> None:
@@ -145,6 +145,65 @@ def test_a_load_that_a_model_did_not_carry_is_not_compared(study: Path) -> None:
     assert "half reached only 42% of Load1, which is not compared." in done.notes
     assert [a.model for a in done.totals] == ["right"]
     assert [sorted(one.found.models) for one in done.comparisons] == [["right"], ["half", "right"]]
+
+
+def test_a_model_that_lies_elsewhere_or_is_strange_is_refused_or_told(study: Path) -> None:
+    mesh = cube(6)
+
+    def written(name: str, points: np.ndarray, u: np.ndarray) -> Path:
+        (study / name).mkdir()
+        for load in LOADS:
+            meshio.write(
+                study / name / f"{load}.vtu", meshio.Mesh(points, [("tetra", mesh.cells)], {"displacement": u})
+            )
+        return study / name
+
+    u = sheared(0.4).displacement(mesh.points_mm)
+    off = written("off", mesh.points_mm - [6.0, 0.0, 0.0], u)  # a third of it in the bone
+    with pytest.raises(GeometryError, match=r"only \d+% of the model lies in the labelled soft tissue"):
+        compare(study / "measured", [off], **given(study))
+    assert not (study / "out").exists()
+    a_bit = written("a bit", mesh.points_mm - [2.0, 0.0, 0.0], u)
+    moving = written("moving", mesh.points_mm, u + np.array([3.0, 0.0, 0.0]))
+    swollen = written("swollen", mesh.points_mm, 0.1 * mesh.points_mm)
+    done = compare(study / "measured", [a_bit, moving, swollen], **given(study))
+    for name, words in (
+        ("a bit", "is its frame right"),
+        ("moving", "mm at the bone"),
+        ("swollen", "change their volume by 33%"),
+    ):
+        assert any(name in note and words in note for note in done.notes), (name, done.notes)
+
+
+def test_each_model_may_have_a_unit_frame_and_mesh_of_its_own(study: Path) -> None:
+    from tests.test_sources import table
+
+    mesh = cube(6)
+    (study / "ansys").mkdir()
+    turned = 1e-3 * mesh.points_mm * [-1.0, -1.0, 1.0]
+    meshio.write(study / "ansys" / "heel.vtu", meshio.Mesh(turned, [("tetra", mesh.cells)]))
+    for load, gamma in LOADS.items():
+        u = 1e-3 * sheared(gamma).displacement(mesh.points_mm) * [-1.0, -1.0, 1.0]
+        table(study / "ansys" / f"{load}.csv", np.arange(len(turned)), u)
+    settings = study / "ansys" / "model.toml"
+    settings.write_text('mesh = "heel.vtu"\nunit = "m"\nframe = "RAS"\n')
+    done = compare(study / "measured", [study / "half", study / "ansys"], **given(study))
+    assert done.totals[0].model == "ansys"
+    assert done.totals[0].ml == pytest.approx(0.0, abs=1e-3)
+    settings.write_text('units = "m"\n')
+    with pytest.raises(InputError, match="'units' is none of mesh, unit, frame, to_image"):
+        compare(study / "measured", [study / "ansys"], **given(study))
+
+
+def test_nothing_old_stands_beside_what_is_new(study: Path) -> None:
+    compare(study / "measured", [study / "right"], **given(study))
+    (study / "out" / "notes.txt").write_text("mine")
+    compare(study / "measured" / "Load1", [study / "half"], **given(study))
+    assert {p.name for p in (study / "out").iterdir() if p.is_dir()} == {"Load1"}
+    assert (study / "out" / "notes.txt").is_file()
+    for place in (study / "measured", study / "half"):
+        with pytest.raises((InputError, OutputError), match="hoose another --out"):
+            compare(study / "measured", [study / "half"], **(given(study) | {"out": place}))
 
 
 def test_the_command_takes_one_load_and_one_file(study: Path) -> None:
@@ -171,6 +230,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(study: Path) ->
     for more, error, message in (
         ({"bones": ["calcaneus"]}, InputError, "no 'calcaneus'"),
         ({"strains": (0.5, 0.2)}, InputError, "must rise"),
+        ({"strains": (20, 50)}, InputError, "no percent"),
         ({"model_unit": "m"}, (GeometryError, InputError), "no body part is that large"),
         ({"model_frame": "RAS"}, GeometryError, "the other of LPS and RAS"),
     ):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +28,8 @@ class Agreement:
     Attributes
     ----------
     model, load, quantity, part : str
-        The quantity is "max_shear" or "u_mm", the length of the displacement.
+        The quantity is "max_shear" or "u_mm": means, bias and limits of the displacement's length; regression and
+        concordance of its three components together, so that a wrong direction shows.
     cells : int
     volume_ml : float
     measured_mean, model_mean : float
@@ -119,8 +120,20 @@ def agreements(found: Mapped, model: str, load: str) -> list[Agreement]:
         rows.append(
             agreement(model, load, "max_shear", part, found.measured.max_shear[where], field.max_shear[where], volumes)
         )
-        lengths = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
-        rows.append(agreement(model, load, "u_mm", part, *lengths, volumes, apart))
+        lengths = agreement(
+            model, load, "u_mm", part, np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1), volumes, apart
+        )
+        vectors = agreement(model, load, "u_mm", part, u.ravel(), v.ravel(), np.repeat(volumes, 3))
+        if lengths is not None and vectors is not None:
+            rows.append(
+                replace(
+                    lengths,
+                    slope=vectors.slope,
+                    intercept=vectors.intercept,
+                    r2=vectors.r2,
+                    concordance=vectors.concordance,
+                )
+            )
     return [row for row in rows if row is not None]
 
 

@@ -19,6 +19,8 @@ from validate.location import LEAST_ML, Overlap, Threshold, neighbours, overlap
 from validate.mapping import ALL, Mapped, mapped
 from validate.sources import FeResult
 
+_STRAINED = 0.01
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
@@ -35,6 +37,8 @@ class Comparison:
     travels : tuple of Travel
     bands : mapping of tissue to Band
         Empty where the measurement's error is not known.
+    strains : (low, high)
+        Range of the areas.
     """
 
     load: str
@@ -44,6 +48,15 @@ class Comparison:
     agreements: tuple[Agreement, ...]
     travels: tuple[Travel, ...]
     bands: Mapping[str, Band]
+    strains: tuple[float, float] = RANGE
+
+    @property
+    def hardly_strained(self) -> bool:
+        """Whether under a hundredth of the tissue is measured above the lower end of the range."""
+        where = self.found.common
+        volumes = self.found.volumes_ml[where]
+        above = volumes[self.found.measured.max_shear[where] > self.strains[0]].sum()
+        return bool(above < _STRAINED * volumes.sum())
 
     def ranked(self, tissue: str = ALL) -> list[Area]:
         """Areas of a tissue, the smallest first: as estimated from the truths drawn, where the error is known."""
@@ -132,7 +145,7 @@ def compare(
     ]  # fmt: skip
     rows = [row for name in models for row in agreements(found, name, load)]
     travels = [travel(found, r.name, load, r.deformation, measured, normal) for r in results]
-    return Comparison(load, found, tuple(areas), tuple(overlaps), tuple(rows), tuple(travels), told)
+    return Comparison(load, found, tuple(areas), tuple(overlaps), tuple(rows), tuple(travels), told, strains)
 
 
 def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], tuple[str, ...]]:
@@ -155,7 +168,14 @@ def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], tuple[str, ...]
         share = float(np.mean([a.share for a in parts]))
         rows.append(Area(name, "all loads", ALL, sum(a.ml for a in parts), share, *estimated))
     rows.sort(key=lambda a: a.best_ml)
-    told = [_told(f"under {one.load}", one.ranked(), one.bands[ALL]) for one in done if ALL in one.bands]
+    told = []
+    for one in done:
+        if one.hardly_strained:
+            told.append(
+                f"Under {one.load} hardly any tissue is measured above the range's lower end: areas do not judge."
+            )
+        elif ALL in one.bands:
+            told.append(_told(f"under {one.load}", one.ranked(), one.bands[ALL]))
     if len(done) > 1 and whole is not None:
         told.insert(0, _told("over all loads", rows, whole))
     return tuple(rows), tuple(sentence for sentence in told if sentence)
@@ -167,8 +187,8 @@ def _told(where: str, ranked: Sequence[Area], band: Band) -> str:
         return ""
     first, *others = (a.model for a in ranked)
     near = [name for name in others if not band.surely_below(first, name)]
-    return f"Nearest {where}: {first}. " + (
-        f"Not told apart from it by this measurement: {', '.join(near)}."
+    return f"Nearest {where}, by the area: {first}. " + (
+        f"The measurement does not tell these apart from it by the area: {', '.join(near)}."
         if near
         else "It is told apart from all others."
     )

@@ -26,7 +26,11 @@ _BINS = 60
 
 
 def volume_strain(
-    found: Mapped, bands: Mapping[str, Band], strains: tuple[float, float], tissues: Sequence[str]
+    found: Mapped,
+    bands: Mapping[str, Band],
+    strains: tuple[float, float],
+    tissues: Sequence[str],
+    colours: Sequence[str],
 ) -> bytes:
     """Volume of tissue whose maximal shear exceeds a value: measured (black) and models, on the same cells.
 
@@ -48,8 +52,8 @@ def volume_strain(
             linewidth=2.2,
             label="measured",
         )
-        for number, (name, field) in enumerate(found.models.items()):
-            colour = REGION_COLOURS[number % (len(REGION_COLOURS) - 1)]
+        for name, field in found.models.items():
+            colour = REGION_COLOURS[colours.index(name) % (len(REGION_COLOURS) - 1)]
             axes.plot(at, volume_above(field.max_shear[where], volumes, at), color=colour, linewidth=1.5, label=name)
         for edge in strains:
             axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")

@@ -40,12 +40,17 @@ def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
     """
     place = path if path is not None else files("validate") / "thresholds.csv"
     try:
-        rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines()))
+        rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines(), restval=""))
         found = tuple(Threshold(float(row["max_shear"]), row["source"].strip()) for row in rows)
-    except (OSError, KeyError, ValueError, AttributeError) as error:
+    except OSError as error:
+        raise InputError(f"{place} cannot be read as thresholds: {error.strerror}.") from error
+    except (KeyError, ValueError, AttributeError) as error:
         raise InputError(f"{place}: a table of thresholds has the columns max_shear and source ({error}).") from error
-    if not found or not all(0.0 < t.max_shear < 10.0 for t in found):
-        raise InputError(f"{place}: thresholds are maximal shears above 0; it has {[t.max_shear for t in found]}.")
+    if not found or not all(0.0 < t.max_shear < 3.0 for t in found):
+        raise InputError(
+            f"{place}: thresholds are maximal shears between 0 and 3 (no percent); it has "
+            f"{[t.max_shear for t in found]}."
+        )
     return found
 
 

@@ -124,9 +124,12 @@ def mapped(
     """
     for name in bones:
         if name not in labels.names.values():
-            raise InputError(f"The label map has no '{name}'; it has {', '.join(labels.names.values())}.")
+            raise InputError(
+                f"The label map has no '{name}'; it has {', '.join(labels.names.values())}. Bones are named with "
+                "--bone, labels by the table --names."
+            )
     points = mesh.centroids_mm
-    tissue = _tissues(mesh, labels, points)
+    tissue = tissues_of(mesh, labels, points)
     soft = ~np.isin(tissue, list(bones))
     bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
     distance, _ = cKDTree(labels.grid.points(bone)).query(points[soft])
@@ -149,9 +152,10 @@ def mapped(
     return found
 
 
-def _tissues(mesh: TetMesh, labels: LabelMap, points: FloatArray) -> np.ndarray:
+def tissues_of(mesh: TetMesh, labels: LabelMap, points: FloatArray, *, by_mesh: bool = True) -> np.ndarray:
+    """Tissue of each cell (m,) str: the mesh's region where it is called as a label, else the label at its centroid."""
     names = set(labels.names.values())
-    of_mesh = {name: cells for name, cells in mesh.regions.items() if name in names}
+    of_mesh = {name: cells for name, cells in mesh.regions.items() if by_mesh and name in names}
     width = max(len(n) for n in (*names, OTHER))
     tissue = np.full(len(points), OTHER, dtype=f"<U{width}")
     nearest = np.rint(labels.grid.indices_of(points)).astype(np.int64)

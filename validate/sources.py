@@ -31,10 +31,11 @@ _NODE_COLUMNS = ("node", "node label", "node number", "node_id", "nodeid", "id")
 _COMPONENTS = (
     ("ux_mm", "uy_mm", "uz_mm"),
     ("ux", "uy", "uz"), ("u1", "u2", "u3"), ("u-u1", "u-u2", "u-u3"),
-    ("u_x", "u_y", "u_z"), ("u.x", "u.y", "u.z"), ("disp_x", "disp_y", "disp_z"), ("dx", "dy", "dz"),
+    ("u_x", "u_y", "u_z"), ("u.x", "u.y", "u.z"), ("u.u1", "u.u2", "u.u3"), ("disp_x", "disp_y", "disp_z"),
+    ("dx", "dy", "dz"),
 )  # fmt: skip
-_SCALES = {1.0: "this unit", 1e3: "metres", 1e-3: "units a thousand times smaller"}
-_TURNS = {(1.0, 1.0, 1.0): "this frame", (-1.0, -1.0, 1.0): "the other of LPS and RAS"}
+_SCALES = {1.0: "this unit", 1e3: "metres (--model-unit m)"}
+_TURNS = {(1.0, 1.0, 1.0): "this frame", (-1.0, -1.0, 1.0): "the other of LPS and RAS (--model-frame)"}
 _INSIDE = 0.5  # share of a mesh's nodes that has to lie in the image
 _MOST_MM = 200.0
 
@@ -98,7 +99,9 @@ def read_result(
     place = Path(path)
     if place.suffix.lower() == ".csv":
         if mesh is None:
-            raise InputError(f"{place}: a table of displacements needs the mesh that its nodes belong to.")
+            raise InputError(
+                f"{place}: a table of displacements needs the mesh that its nodes belong to (--model-mesh)."
+            )
         source = read_mesh(mesh, unit=unit, frame=frame)
         values = _from_table(place, source)
     else:
@@ -148,7 +151,8 @@ def _names_of_regions(place: Path) -> dict[str, str]:
 def _rigid(matrix: FloatArray) -> Affine:
     given = np.asarray(matrix, dtype=np.float64)
     turn = given[:3, :3] if given.shape == (4, 4) else np.zeros((3, 3))
-    if not (np.abs(turn.T @ turn - np.eye(3)).max() < 1e-4 and np.allclose(given[3], [0.0, 0.0, 0.0, 1.0])):
+    proper = np.abs(turn.T @ turn - np.eye(3)).max() < 1e-4 and np.linalg.det(turn) > 0.0
+    if not (proper and np.allclose(given[3], [0.0, 0.0, 0.0, 1.0])):
         raise InputError("The map to the image must be a 4 x 4 matrix of a rotation and a translation in mm.")
     return Affine(turn, given[:3, 3])
 
@@ -186,16 +190,16 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
 def _from_table(place: Path, source: MeshFile) -> FloatArray:
     try:
         with place.open(newline="", encoding="utf-8-sig") as file:
-            head, *rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
+            head, *rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)] or [[]]
     except (OSError, ValueError) as error:
         raise InputError(f"{place}: no readable table ({error}).") from error
-    named = [cell.strip().casefold() for cell in head]
+    named = [cell.strip(" '\"").casefold() for cell in head]
     node = next((n for n in _NODE_COLUMNS if n in named), None)
     parts = next((c for c in _COMPONENTS if set(c) <= set(named)), None)
     if node is None or parts is None:
         raise InputError(
-            f"{place}: a table of displacements has a column 'node' and three such as ux, uy, uz; it has "
-            f"{', '.join(head)}."
+            f"{place}: a table of displacements has a column 'node' and three such as ux, uy, uz, with commas "
+            f"between; it has {', '.join(head)}."
         )
     columns = [named.index(node), *(named.index(c) for c in parts)]
     try:
@@ -232,7 +236,7 @@ def check_overlap(result: FeResult, grid: Grid) -> None:
     raise GeometryError(
         f"{result.path} does not lie in the image. Model: {_box(points.min(axis=0), points.max(axis=0))}; image: "
         f"{_box(low, high)} (LPS mm). "
-        + (f"It would with {fitting[0]}." if fitting else "Give the map to the image's frame as a matrix.")
+        + (f"It would with {fitting[0]}." if fitting else "Give the map to the image's frame (--to-image).")
     )
 
 

@@ -1,0 +1,128 @@
+"""Which file is whose: the models and loads of a comparison, and what a model's folder says of its unit and frame."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.errors import InputError
+from mrstrain.inputs import read_matrix
+
+ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".csv")
+SETTINGS = "model.toml"
+"""In a model's folder: mesh, unit, frame and to_image of this model alone."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """How a model's files are read; as in `validate.sources.read_result`."""
+
+    mesh: Path | None = None
+    unit: str = "mm"
+    frame: str = "LPS"
+    to_image: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelFile:
+    """A model's result for one load."""
+
+    name: str
+    path: Path
+    reading: Reading
+
+
+def model_files(
+    loads: Sequence[str], models: Sequence[Path], usual: Reading
+) -> tuple[dict[str, list[ModelFile]], list[str]]:
+    """For each load the models' files, in the order given; and in sentences what is missing.
+
+    Raises
+    ------
+    InputError
+        If a model is not there, has no file of a measured load, or two have one name.
+    """
+    if not models:
+        raise InputError("No model is given: a folder with a file for each load, or a file.")
+    files: dict[str, list[ModelFile]] = {load: [] for load in loads}
+    notes: list[str] = []
+    taken: set[str] = set()
+    for place in models:
+        name, chosen = _chosen(place, loads)
+        if name in taken:
+            raise InputError(f"Two models are called '{name}': give their folders names of their own.")
+        if not chosen:
+            raise InputError(
+                f"{place} has no file of a measured load ({', '.join(loads)}), ending in {', '.join(ENDINGS)}."
+            )
+        taken.add(name)
+        reached = _reached(place)
+        reading = _reading(place, usual)
+        for load in loads:
+            if load not in chosen:
+                notes.append(f"{name} has no result for {load}.")
+            elif reached.get(load, 1.0) < 1.0:
+                notes.append(f"{name} reached only {reached[load]:.0%} of {load}, which is not compared.")
+            else:
+                files[load].append(ModelFile(name, chosen[load], reading))
+    files = {load: of for load, of in files.items() if of}
+    if not files:
+        raise InputError("No model has a whole result for a measured load. " + " ".join(notes))
+    return files, notes
+
+
+def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
+    if place.is_dir():
+        found = {
+            load: file for load in loads for ending in reversed(ENDINGS) if (file := place / (load + ending)).is_file()
+        }
+        return place.resolve().name, found
+    if not place.is_file():
+        raise InputError(f"{place}: there is no such model.")
+    if place.stem in loads:
+        return place.parent.resolve().name, {place.stem: place}
+    if len(loads) > 1:
+        raise InputError(
+            f"{place}: which load is it of? Measured are {', '.join(loads)}: call the file so, or give one load's "
+            "folder as the measurement."
+        )
+    if place.stem in _reached(place):
+        raise InputError(f"{place} is a simulation of {place.stem}, and {loads[0]} was measured.")
+    return place.stem, {loads[0]: place}
+
+
+def _reached(place: Path) -> dict[str, float]:
+    """Share of each load that a simulation of ours reached."""
+    folder = place if place.is_dir() else place.parent
+    try:
+        outcome = json.loads((folder / "simulation.json").read_text(encoding="utf-8"))["outcome"]
+        return {load: float(told["reached"]) for load, told in outcome.items()}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _reading(place: Path, usual: Reading) -> Reading:
+    settings = (place if place.is_dir() else place.parent) / SETTINGS
+    if not settings.is_file():
+        return usual
+    try:
+        told = tomllib.loads(settings.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{settings} is no TOML file ({error}).") from error
+    unknown = sorted(set(told) - {"mesh", "unit", "frame", "to_image"})
+    if unknown:
+        raise InputError(f"{settings}: '{unknown[0]}' is none of mesh, unit, frame, to_image.")
+    made = replace(usual, unit=str(told.get("unit", usual.unit)), frame=str(told.get("frame", usual.frame)))
+    if "mesh" in told:
+        made = replace(made, mesh=settings.parent / str(told["mesh"]))
+    if isinstance(told.get("to_image"), str):
+        made = replace(made, to_image=read_matrix(settings.parent / told["to_image"]))
+    elif "to_image" in told:
+        made = replace(made, to_image=np.asarray(told["to_image"], dtype=np.float64))
+    return made
