@@ -197,18 +197,7 @@ def check(
                 f"The mesh has no facets '{name}'; it has {', '.join(mesh.facets) or 'none'}. The bone's interface is "
                 f"called '{BONE}' and is fixed, the surface that the plate touches '{SURFACE}'."
             )
-    times = np.zeros(len(mesh.cells), dtype=int)
-    for region in laws:
-        if region not in mesh.regions:
-            raise InputError(f"The mesh has no region '{region}'; it has {', '.join(mesh.regions) or 'none'}.")
-        times[mesh.regions[region]] += 1
-    if (times != 1).any():
-        bare, twice = int((times == 0).sum()), int((times > 1).sum())
-        without = ", ".join(name for name in mesh.regions if name not in laws)
-        raise InputError(
-            f"Every cell needs one law: {bare} have none and {twice} more than one. Regions without a law: "
-            f"{without or 'none'}."
-        )
+    check_laws(mesh, laws)
     if not loads:
         raise InputError("No load is given.")
     for load in loads:
@@ -222,6 +211,22 @@ def check(
     _check_held(mesh, fixed)
     on_surface = np.setdiff1d(np.unique(mesh.facets[SURFACE]), _nodes_of(mesh, fixed))
     Contact(plate, mesh.points_mm @ plate.axes, on_surface)
+
+
+def check_laws(mesh: TetMesh, laws: Mapping[str, Material]) -> None:
+    """Refuse a mesh of which a cell has no law, or more than one."""
+    times = np.zeros(len(mesh.cells), dtype=int)
+    for region in laws:
+        if region not in mesh.regions:
+            raise InputError(f"The mesh has no region '{region}'; it has {', '.join(mesh.regions) or 'none'}.")
+        times[mesh.regions[region]] += 1
+    if (times != 1).any():
+        bare, twice = int((times == 0).sum()), int((times > 1).sum())
+        without = ", ".join(name for name in mesh.regions if name not in laws)
+        raise InputError(
+            f"Every cell needs one law: {bare} have none and {twice} more than one. Regions without a law: "
+            f"{without or 'none'}."
+        )
 
 
 def _nodes_of(mesh: TetMesh, facets: Sequence[str]) -> IntArray:

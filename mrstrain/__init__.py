@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mrstrain.comparing import compare
     from mrstrain.converging import converge
+    from mrstrain.driving import drive
     from mrstrain.fitting import fit
     from mrstrain.making import phantom
     from mrstrain.meshing import mesh
@@ -21,12 +22,25 @@ if TYPE_CHECKING:
     from mrstrain.twinning import twin
 
 __version__ = "0.1.0"
-__all__ = ["accuracy", "compare", "converge", "fit", "mesh", "phantom", "register", "simulate", "strain", "twin"]
+__all__ = [
+    "accuracy",
+    "compare",
+    "converge",
+    "drive",
+    "fit",
+    "mesh",
+    "phantom",
+    "register",
+    "simulate",
+    "strain",
+    "twin",
+]
 
 _ROOMS = {
     "accuracy": "studying",
     "compare": "comparing",
     "converge": "converging",
+    "drive": "driving",
     "fit": "fitting",
     "mesh": "meshing",
     "phantom": "making",

@@ -330,6 +330,7 @@ for _command in (
     modelcommands.mesh,
     modelcommands.simulate,
     modelcommands.compare,
+    modelcommands.drive,
     modelcommands.converge,
     modelcommands.fit,
 ):

@@ -164,7 +164,7 @@ def compare(
     axes = plate_axes(-np.asarray(plate_normal, dtype=np.float64), shear_direction)
     levels = read_thresholds(None if thresholds is None else Path(thresholds))
     tissues = read_labels(labels, names)
-    measurements = _measurements(Path(dvc))
+    measurements = measurements_in(Path(dvc))
     usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame, to_image)
     places = [Path(m) for m in models]
     files, notes = model_files([m.load for m in measurements], places, usual)
@@ -259,7 +259,8 @@ def compare(
     return Compared(target, tuple(done), totals, noise, tuple(notes))
 
 
-def _measurements(place: Path) -> list[Measurement]:
+def measurements_in(place: Path) -> list[Measurement]:
+    """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is."""
     folders = [place] if (place / _FIELD).is_file() else sorted(p.parent for p in place.glob(f"*/{_FIELD}"))
     if not folders:
         raise InputError(

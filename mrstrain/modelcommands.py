@@ -151,6 +151,37 @@ def compare(
         typer.echo(line)
 
 
+def drive(
+    mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra; facets 'bone' do not move.")],
+    dvc: Annotated[Path, typer.Argument(help="Results of register: a folder for each load, or one of these.")],
+    out: Out,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Published material set, or a file of your own (.toml); repeat for several."),
+    ] = None,
+    mesh_unit: MeshUnit = Unit.MM,
+    mesh_frame: MeshFrame = Frame.LPS,
+) -> None:
+    """A model whose outside goes where the measurement puts it: laws are judged apart from the plate."""
+    from mrstrain.driving import drive as run
+    from mrstrain.progress import live
+
+    with live() as progress:
+        done = run(
+            mesh,
+            dvc,
+            out=out,
+            sets=set_ or ("trebbi",),
+            mesh_unit=mesh_unit.value,
+            mesh_frame=mesh_frame.value,
+            progress=progress,
+        )
+    for line in done.summary():
+        typer.echo(line)
+    if not done.complete:
+        raise typer.Exit(1)
+
+
 def converge(
     labels: Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")],
     out: Out,

@@ -1,0 +1,125 @@
+"""`drive`: a model whose outside goes where the measurement puts it, so that laws are judged apart from the plate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvc.errors import InputError, MrstrainError
+from dvc.whole import write_whole
+from dvc.worker import usable_cores
+from fe.meshstore import read_tet_mesh
+from fe.published import material_set
+from fe.result import region_figures, write_regions_csv, write_state
+from fe.simulate import check_laws
+from mrstrain.comparing import measurements_in
+from mrstrain.inputs import make_output, refuse_touching_inputs
+from mrstrain.provenance import provenance, write_json
+from validate.driven import driven, outside, write_boundary
+
+BOUNDARY = "boundary"
+"""Folder of the boundary conditions for other codes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Driven:
+    """What `drive` gave."""
+
+    out: Path
+    complete: bool
+    lines: tuple[str, ...]
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        return [*self.lines, f"Results: {self.out}"]
+
+
+def drive(
+    mesh: Path | str,
+    dvc: Path | str,
+    *,
+    out: Path | str,
+    sets: Sequence[str] = ("trebbi",),
+    mesh_unit: str = "mm",
+    mesh_frame: str = "LPS",
+    progress: Callable[[str, str, float], None] | None = None,
+) -> Driven:
+    """Drive a mesh by measured displacements of its outside.
+
+    Parameters
+    ----------
+    mesh : path
+        As in `simulate`; facets "bone" do not move.
+    dvc : path
+        Results of `register` or `strain`: a folder for each load, or one of these.
+    out : path
+        Gets a folder for each set with ``LOAD.vtu``, as `simulate` writes them and `compare` takes them, and a folder
+        ``boundary`` with the displacements of the outside for ANSYS, Abaqus and FEBio, by the mesh's node numbers.
+    sets : sequence of str
+        Names of published sets, or files of your own (.toml).
+    progress : callable, optional
+        ``progress(case, stage, fraction)``.
+
+    Raises
+    ------
+    InputError
+        If mesh, sets or measurement cannot be used; before anything is computed.
+    """
+    target, place, tell = Path(out), Path(mesh), progress or (lambda *_: None)
+    read = read_tet_mesh(place, unit=mesh_unit, frame=mesh_frame)
+    chosen = [material_set(name) for name in sets]
+    if not chosen or len({one.name for one in chosen}) < len(chosen):
+        raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
+    laws = {one.name: one.for_regions(read.regions) for one in chosen}
+    for region_laws, _ in laws.values():
+        check_laws(read, region_laws)
+    measured = {m.load: m.deformation() for m in measurements_in(Path(dvc))}
+    edges = {load: outside(read, field) for load, field in measured.items()}
+    refuse_touching_inputs(target, [BOUNDARY, *laws], [place, Path(dvc)])
+    make_output(target)
+    for name in (BOUNDARY, *laws):
+        make_output(target / name)
+    fields = [m.folder / "displacement.nii.gz" for m in measurements_in(Path(dvc))]
+    record = provenance(
+        "drive", {"mesh": [place], "measured": fields}, {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame}
+    )
+    lines: list[str] = []
+    complete = True
+    for load, (nodes, u) in edges.items():
+        write_boundary(target / BOUNDARY / load, read, nodes, u)
+    total = len(chosen) * len(measured)
+    for number, one in enumerate(chosen):
+        region_laws, notes = laws[one.name]
+        rows, outcome, log = [], {}, list[str]()
+        for at, (load, field) in enumerate(measured.items()):
+            tell("drive", "simulating", (number * len(measured) + at) / total)
+            try:
+                state = driven(read, region_laws, field, load, threads=usable_cores(), tell=log.append)
+            except InputError:
+                raise
+            except MrstrainError as failure:
+                complete = False
+                lines.append(f"{one.name}: {failure}")
+                continue
+            write_state(target / one.name / f"{load}.vtu", read, state, region_laws)
+            outcome[load] = {
+                "reached": state.reached,
+                "iterations": state.iterations,
+                "seconds": round(state.seconds, 1),
+            }
+            complete = complete and state.reached == 1.0
+            rows += region_figures(read, state, region_laws)
+            told = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p90:.3f}" for r in rows if r.load == load)
+            part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the displacement was reached;"
+            lines.append(f"{one.name}, {load}:{part} maximal shear, median / 90th percentile: {told}")
+        write_regions_csv(target / one.name / "regions.csv", rows)
+        write_whole(target / one.name / "log.txt", "\n".join(log) + "\n")
+        regions = {str(n): name for n, name in enumerate(read.regions, start=1)}
+        write_json(
+            target / one.name / "simulation.json",
+            {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": one.name,
+             "laws": {region: law.told for region, law in region_laws.items()}} | record,
+        )  # fmt: skip
+    tell("drive", "simulating", 1.0)
+    return Driven(target, complete, tuple(lines))
