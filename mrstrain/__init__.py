@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from mrstrain.converging import converge
     from mrstrain.driving import drive
     from mrstrain.fitting import fit
+    from mrstrain.levelling import level
     from mrstrain.making import phantom
     from mrstrain.meshing import mesh
     from mrstrain.registering import register
@@ -28,6 +29,7 @@ __all__ = [
     "converge",
     "drive",
     "fit",
+    "level",
     "mesh",
     "phantom",
     "register",
@@ -42,6 +44,7 @@ _ROOMS = {
     "converge": "converging",
     "drive": "driving",
     "fit": "fitting",
+    "level": "levelling",
     "mesh": "meshing",
     "phantom": "making",
     "register": "registering",

@@ -331,6 +331,7 @@ for _command in (
     modelcommands.simulate,
     modelcommands.compare,
     modelcommands.drive,
+    modelcommands.level,
     modelcommands.converge,
     modelcommands.fit,
 ):

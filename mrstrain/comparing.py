@@ -35,6 +35,7 @@ from validate.agreement import Agreement, Travel
 from validate.comparison import Comparison, total
 from validate.comparison import compare as compare_load
 from validate.curves import RANGE, Area
+from validate.levelled import LEVELLED
 from validate.location import LEAST_ML, Overlap, read_thresholds
 from validate.mapping import ALL
 from validate.misfit import misfits
@@ -92,6 +93,13 @@ class Compared:
         for one in self.comparisons:
             told = ", ".join(f"{a.model} {shown(a)}" for a in one.ranked())
             lines.append(f"{one.load}: area between the curves, mL, the nearest first: {told}")
+            level = [a for a in one.areas if a.tissue == ALL and a.model.endswith(LEVELLED)]
+            found = {a.model: a.ml for a in one.areas if a.tissue == ALL}
+            lines += [
+                f"{one.load}: {a.model} {a.ml:.2f} as found, {found.get(a.model.removesuffix(LEVELLED), np.nan):.2f} "
+                "before levelling"
+                for a in level
+            ]
         if len(self.comparisons) > 1 and self.totals:
             lines.append("All loads: " + ", ".join(f"{a.model} {shown(a)}" for a in self.totals))
         return [*lines, *self.noise, *self.notes, f"Report: {self.out / 'report.html'}"]

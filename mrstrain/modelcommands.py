@@ -182,6 +182,52 @@ def drive(
         raise typer.Exit(1)
 
 
+def level(
+    load0: Annotated[Path, typer.Argument(help="The unloaded image.")],
+    model: Annotated[Path, typer.Argument(help="Folder of a model, with a file for each load, as in compare.")],
+    out: Out,
+    bone: Annotated[Path | None, typer.Option(help="Mask of the bone on the unloaded image.")] = None,
+    bone_label: Annotated[str | None, typer.Option(help="Or its label in --labels.")] = None,
+    tissue: Annotated[Path | None, typer.Option(help="Mask of the body, as in register.")] = None,
+    labels: Annotated[Path | None, typer.Option(help="Label map, as in register.")] = None,
+    names: Names = None,
+    load: Annotated[list[str] | None, typer.Option(help="Name of a load; repeat. Default: all of the model's.")] = None,
+    preset: Annotated[str, typer.Option(help="That of the measurement.")] = "heel-mr",
+    model_mesh: Annotated[Path | None, typer.Option(help="Mesh of nodal displacements in .csv files.")] = None,
+    model_unit: MeshUnit = Unit.MM,
+    model_frame: MeshFrame = Frame.LPS,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Registrations at once. Default: one for each core.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of noise and registration.")] = 1,
+) -> None:
+    """A model sent through the measurement itself (it moves the image, which is registered): like against like."""
+    from mrstrain.levelling import level as run
+    from mrstrain.progress import live
+
+    with live() as progress:
+        done = run(
+            load0,
+            model,
+            out=out,
+            bone=bone,
+            bone_label=bone_label,
+            tissue=tissue,
+            labels=labels,
+            names=names,
+            loads=load or (),
+            preset=preset,
+            model_mesh=model_mesh,
+            model_unit=model_unit.value,
+            model_frame=model_frame.value,
+            workers=workers,
+            seed=seed,
+            progress=progress,
+        )
+    for line in done.summary():
+        typer.echo(line)
+
+
 def converge(
     labels: Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")],
     out: Out,

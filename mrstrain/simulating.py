@@ -376,11 +376,11 @@ def _written(
     write_curve_csv(folder / "curve.csv", states)
     outcome = {}
     for state in states:
-        share = volume_share_off(mesh, state, _FAR)
+        share = volume_share_off(mesh, state, laws, _FAR)
         if share > _MUCH:
             notes += (
-                f"{state.load.name}: det F of nodal patches is off by over 5 % in {share:.0%} of the volume; a finer "
-                "mesh keeps volume better.",
+                f"{state.load.name}: det F of nodal patches is over 5 % off what the law asks for in {share:.0%} of "
+                "the volume; a finer mesh keeps volume better.",
             )
         outcome[state.load.name] = {
             "reached": state.reached,

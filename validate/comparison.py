@@ -15,6 +15,7 @@ from dvc.mesh import TetMesh
 from dvc.uncertainty import ErrorTable, TruthDraws
 from validate.agreement import Agreement, Travel, agreements, travel
 from validate.curves import RANGE, Area, Band, area_between, bands
+from validate.levelled import LEVELLED
 from validate.location import LEAST_ML, Overlap, Threshold, neighbours, overlap
 from validate.mapping import ALL, Mapped, mapped
 from validate.sources import FeResult
@@ -59,8 +60,12 @@ class Comparison:
         return bool(above < _STRAINED * volumes.sum())
 
     def ranked(self, tissue: str = ALL) -> list[Area]:
-        """Areas of a tissue, the smallest first: as estimated from the truths drawn, where the error is known."""
-        return sorted((a for a in self.areas if a.tissue == tissue), key=lambda a: a.best_ml)
+        """Areas of a tissue, the smallest first: as estimated from the truths drawn, where the error is known.
+
+        Levelled models are left out: their areas are those as found, and of another kind.
+        """
+        models = (a for a in self.areas if a.tissue == tissue and not a.model.endswith(LEVELLED))
+        return sorted(models, key=lambda a: a.best_ml)
 
     def within_noise(self, model: str, other: str, tissue: str = ALL) -> bool:
         """Whether the measurement cannot tell which of two models is nearer; also where its error is not known."""
@@ -131,7 +136,8 @@ def compare(
             volumes = found.volumes_ml[where]
             area = area_between(found.measured.max_shear[where], field.max_shear[where], volumes, strains)
             share = area / volumes.sum() / (strains[1] - strains[0])
-            estimated = told[tissue].interval(name) if tissue in told else ()
+            # what was measured itself carries the measurement's bias as well: as found, like is compared with like
+            estimated = told[tissue].interval(name) if tissue in told and not name.endswith(LEVELLED) else ()
             areas.append(Area(name, load, tissue, area, share, *estimated))
     touching = neighbours(found.mesh)
     measured_shear = np.where(common, found.measured.max_shear, -1.0)
@@ -164,7 +170,7 @@ def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], tuple[str, ...]
     rows = []
     for name in everywhere:
         parts = [a for one in done for a in one.areas if a.tissue == ALL and a.model == name]
-        estimated = whole.interval(name) if whole is not None else ()
+        estimated = whole.interval(name) if whole is not None and not name.endswith(LEVELLED) else ()
         share = float(np.mean([a.share for a in parts]))
         rows.append(Area(name, "all loads", ALL, sum(a.ml for a in parts), share, *estimated))
     rows.sort(key=lambda a: a.best_ml)
@@ -177,7 +183,7 @@ def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], tuple[str, ...]
         elif ALL in one.bands:
             told.append(_told(f"under {one.load}", one.ranked(), one.bands[ALL]))
     if len(done) > 1 and whole is not None:
-        told.insert(0, _told("over all loads", rows, whole))
+        told.insert(0, _told("over all loads", [a for a in rows if not a.model.endswith(LEVELLED)], whole))
     return tuple(rows), tuple(sentence for sentence in told if sentence)
 
 

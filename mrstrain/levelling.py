@@ -1,0 +1,155 @@
+"""`level`: models sent through the measurement itself, so that like is compared with like."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import meshio
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dvc.displacementfile import read_displacement
+from dvc.errors import InputError
+from dvc.imagewrite import write_image
+from dvc.tissue import tissue_mask
+from dvc.whole import whole_file, write_whole
+from mrstrain.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.modelfiles import ENDINGS, Reading, model_files
+from mrstrain.registering import register
+from phantoms.twin import loaded_twin
+from validate.levelled import LEVELLED, carried_on
+from validate.sources import FeResult, check_overlap, read_result
+
+_APART_MM, _FEW = 0.1, 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Levelled:
+    """What `level` gave."""
+
+    folder: Path
+    lines: tuple[str, ...]
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        return [*self.lines, f"Levelled model, for compare: {self.folder}"]
+
+
+def level(
+    load0: Path | str,
+    model: Path | str,
+    *,
+    out: Path | str,
+    bone: Path | str | None = None,
+    bone_label: str | None = None,
+    tissue: Path | str | None = None,
+    labels: Path | str | None = None,
+    names: Path | str | None = None,
+    loads: Sequence[str] = (),
+    preset: str = "heel-mr",
+    model_mesh: Path | str | None = None,
+    model_unit: str = "mm",
+    model_frame: str = "LPS",
+    workers: int | None = None,
+    seed: int = 1,
+    progress: Callable[[str, str, float], None] | None = None,
+) -> Levelled:
+    """Send a model's deformations through the measurement.
+
+    Parameters
+    ----------
+    load0 : path
+        The unloaded image.
+    model : path
+        A folder with a file for each load, as in `compare`.
+    out : path
+        Gets the images that the model would have given, their registration in the layout of `register`, and a folder
+        called as the model and "-levelled", which `compare` takes beside the model itself.
+    bone, bone_label, tissue, labels, names
+        As in `register`; the bone is needed.
+    loads : sequence of str
+        Names of the loads; all of the model's files by default.
+    preset : str
+        That of the measurement.
+    model_mesh, model_unit, model_frame
+        As in `compare`.
+    workers : int
+        Registrations at once.
+    seed : int
+        Of the noise that is drawn anew, and of the registration.
+    progress : callable, optional
+        ``progress(case, stage, fraction)``.
+
+    Raises
+    ------
+    InputError
+        If image, bone or model cannot be used, or the model folds; before anything is registered.
+    """
+    target, place = Path(out), Path(model)
+    if not place.is_dir():
+        raise InputError(f"{place} is no folder with a model's results, a file for each load.")
+    subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
+    if subject.bone is None:
+        raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is at rest.")
+    wanted = list(loads) or sorted({p.stem for p in place.iterdir() if p.suffix.lower() in ENDINGS})
+    usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame)
+    files, notes = model_files(wanted, [place], usual)
+    name = place.resolve().name + LEVELLED
+    refuse_touching_inputs(
+        target, [name, "images", "registered"], [Path(load0), *(f.path for of in files.values() for f in of)]
+    )
+    results: dict[str, FeResult] = {}
+    body = subject.tissue or tissue_mask(subject.reference)
+    made = {}
+    for load, (file,) in files.items():
+        how = file.reading
+        result = read_result(file.name, file.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image)
+        check_overlap(result, subject.reference.grid)
+        field = carried_on(result.deformation, subject.reference.grid, subject.bone.inside)
+        middles = result.mesh.centroids_mm
+        apart = field.displacement(middles) - result.deformation.displacement(middles)
+        share = float(np.mean(np.linalg.norm(apart, axis=1) > _APART_MM))
+        if share > _FEW:
+            notes.append(
+                f"{load}: where the model's cells are nearly flat it was smoothed before it moved the image, by over "
+                f"{_APART_MM:g} mm in {share:.0%} of its cells."
+            )
+        made[load] = loaded_twin(subject.reference, body, field, seed=seed)
+        results[load] = result
+    make_output(target)
+    make_output(target / "images")
+    for load, twin in made.items():
+        write_image(target / "images" / f"{load}.nii.gz", twin.image)
+    series = register(
+        load0, [target / "images" / f"{load}.nii.gz" for load in results], out=target / "registered", bone=bone,
+        bone_label=bone_label, tissue=tissue, labels=labels, names=names, preset=preset, workers=workers, seed=seed,
+        progress=progress,
+    )  # fmt: skip
+    make_output(target / name)
+    for load, result in results.items():
+        found = target / "registered" / load / "displacement.nii.gz"
+        if found.is_file():
+            _write(target / name / f"{load}.vtu", result, found)
+        else:
+            notes.append(f"{load} was not registered: {series.failures.get(load, 'see the registration')}")
+    return Levelled(target / name, tuple(notes))
+
+
+def _write(path: Path, result: FeResult, field: Path) -> None:
+    """The measured displacement at the nodes of the model's mesh; where it is not defined, that of the nearest node."""
+    mesh = result.mesh
+    u = read_displacement(field).displacement(mesh.points_mm)
+    known = np.isfinite(u).all(axis=1)
+    _, nearest = cKDTree(mesh.points_mm[known]).query(mesh.points_mm[~known])
+    u[~known] = u[known][nearest]
+    region = np.zeros(len(mesh.cells), dtype=np.int64)
+    for number, cells in enumerate(mesh.regions.values(), start=1):
+        region[cells] = number
+    written = meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"displacement_mm": u}, {"region": [region]})
+    with whole_file(path) as part:
+        meshio.vtu.write(part, written, binary=True)
+    names = {str(number): name for number, name in enumerate(mesh.regions, start=1)}
+    write_whole(path.with_suffix(".json"), json.dumps({"regions": names}) + "\n")
