@@ -13,6 +13,7 @@ import numpy as np
 
 from dvc.errors import InputError
 from dvc.verdict import Verdict
+from dvc.viewer import Viewer, script
 from dvc.whole import write_whole
 
 Cell = str | float | int | None
@@ -89,6 +90,7 @@ class Section:
     tables: tuple[Table, ...] = ()
     pictures: tuple[Picture, ...] = ()
     paragraphs: tuple[str, ...] = ()
+    viewers: tuple[Viewer, ...] = ()
 
 
 def shown(value: Cell) -> str:
@@ -116,8 +118,8 @@ def write_report(
 ) -> None:
     """Write a report: verdict first, if there is one, then the sections, the closing ones, and where it all came from.
 
-    One HTML file without scripts and without anything to fetch; all text is escaped. A list of the sections
-    with their verdicts stands at the top where there are two or more.
+    One HTML file without anything to fetch, and without scripts but for a section's viewer; all text is escaped. A list
+    of the sections with their verdicts stands at the top where there are two or more.
 
     Raises
     ------
@@ -135,5 +137,6 @@ def write_report(
         sections=list(sections),
         closing=list(closing),
         provenance=dict(provenance),
+        script=script() if any(section.viewers for section in sections) else "",
     )
     write_whole(path, page)

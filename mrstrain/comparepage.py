@@ -9,10 +9,13 @@ from typing import Protocol
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.deformation import Deformation
-from dvc.image import LabelMap
+from dvc.deformation import Deformation, evaluate_on_grid
+from dvc.image import LabelMap, Mask
+from dvc.imagefile import read_image
+from dvc.kinematics import StrainField
 from dvc.report import Cell, Picture, Section, Table, write_report
 from dvc.verdict import Verdict
+from dvc.viewer import Viewer, Volume
 from mrstrain.page import flat, said
 from validate import figures
 from validate.comparison import Comparison
@@ -21,6 +24,7 @@ from validate.location import Threshold
 from validate.mapping import ALL
 from validate.sources import FeResult
 
+_AROUND = 4  # voxels around the tissue in the viewer
 _PANELS = 4  # tissues whose curves are drawn, all soft tissue first
 _TITLES: dict[str, tuple[str, Callable[..., bytes]]] = {
     "curves": ("Volume above a strain", figures.volume_strain),
@@ -105,9 +109,47 @@ def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
     return u
 
 
+def viewer_of(
+    one: Comparison,
+    measured: Deformation,
+    results: Sequence[FeResult],
+    labels: LabelMap,
+    bones: Sequence[str],
+    folder: Path,
+) -> Viewer:
+    """The measured strain and that of the nearest model over the image, on the label map's voxels.
+
+    The image is the loaded one as registered, which lies on the unloaded anatomy, where the measurement has it.
+    """
+    box = Mask(labels.grid, labels.labels > 0).box(_AROUND)
+    soft = [number for number, name in labels.names.items() if name not in bones]
+    grid, inside = labels.grid.part(box), np.isin(labels.labels[box], soft)
+    names = [a.model for a in one.ranked()] or list(one.found.models)
+    model = next(r for r in results if r.name == names[0])
+    shear = []
+    for field in (measured, model.deformation):
+        values = np.full(grid.shape, np.nan)
+        values[inside] = StrainField.from_gradient(evaluate_on_grid(field, grid, inside)[1]).max_shear
+        shear.append(values)
+    scanned = folder / "registered.nii.gz"
+    image = read_image(scanned, allow_missing=True) if scanned.is_file() else None
+    if image is not None and image.grid.same_as(labels.grid):
+        shown = np.nan_to_num(image.values[box])
+    else:
+        shown = labels.labels[box].astype(np.float64)
+    most = max(0.05, float(np.ceil(20.0 * np.nanquantile(shear[0], 0.99)) / 20.0))
+    return Viewer(
+        "To turn and to scroll",
+        f"Maximal shear, 0 to {most:g}, in the unloaded configuration: measured, and by {model.name}. Drag to move "
+        "through the slices, with the right button to turn; both follow. Needs WebGL 2.",
+        Volume.of("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
+        (Volume.of("measured", grid, shear[0], most), Volume.of(model.name, grid, shear[1], most)),
+    )
+
+
 def write_page(
     path: Path,
-    shown: Sequence[tuple[Comparison, Judged, Mapping[str, bytes]]],
+    shown: Sequence[tuple[Comparison, Judged, Mapping[str, bytes], Viewer]],
     totals: Sequence[Area],
     noise: Sequence[str],
     notes: Sequence[str],
@@ -116,9 +158,9 @@ def write_page(
     record: Mapping[str, object],
 ) -> None:
     """Write the report, one self-contained page."""
-    done = [one for one, _, _ in shown]
+    done = [one for one, _, _, _ in shown]
     sections = [Section("Models and loads", None, (_areas(done, totals, strains),), (), (*noise, *notes))]
-    for one, measurement, drawn in shown:
+    for one, measurement, drawn, viewer in shown:
         verdict = measurement.verdict
         pictures = {stem: Picture(title, said(draw), drawn[stem]) for stem, (title, draw) in _TITLES.items()}
         covered = one.found.coverage()
@@ -130,7 +172,9 @@ def write_page(
         doubtful = verdict if verdict is not None and verdict.level != "trust" else None
         first = tuple(pictures[stem] for stem in ("curves", "slices"))
         sections.append(
-            Section(one.load, doubtful, (_tissues(one), _location(one), _travel(one)), first, (told, *judged))
+            Section(
+                one.load, doubtful, (_tissues(one), _location(one), _travel(one)), first, (told, *judged), (viewer,)
+            )
         )
         sections.append(Section(f"{one.load}, cell by cell", None, (_agreement(one),), (pictures["agreement"],)))
     sources = Section(

@@ -25,9 +25,10 @@ from dvc.labels import read_labels
 from dvc.regions import volume_above
 from dvc.uncertainty import ErrorTable, read_error_model
 from dvc.verdict import Verdict
+from dvc.viewer import Viewer
 from dvc.whole import whole_file, whole_folder, write_whole
 from fe.meshstore import read_tet_mesh
-from mrstrain.comparepage import pictures_of, shown, write_page
+from mrstrain.comparepage import pictures_of, shown, viewer_of, write_page
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.provenance import provenance, write_json
@@ -217,7 +218,7 @@ def compare(
     )  # fmt: skip
     colours = list(dict.fromkeys(file.name for file in every))
     done: list[Comparison] = []
-    told: list[tuple[Comparison, Measurement, dict[str, bytes]]] = []
+    told: list[tuple[Comparison, Measurement, dict[str, bytes], Viewer]] = []
     for number, measurement in enumerate(m for m in measurements if m.load in files):
         load = measurement.load
         tell("compare", "comparing", number / len(files))
@@ -235,7 +236,9 @@ def compare(
                 _write_on_image(folder, results[load], tissues)
             write_json(folder / "provenance.json", record)
         done.append(one)
-        told.append((one, measurement, drawn))
+        told.append(
+            (one, measurement, drawn, viewer_of(one, measured, results[load], tissues, bones, measurement.folder))
+        )
     notes += [
         f"{m.load}: the bone's motion was not taken out of this measurement: displacements are not the tissue's alone."
         for m in measurements

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import base64
 import csv
+import gzip
 import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
 
 import meshio
+import nibabel
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -121,8 +124,21 @@ def test_the_report_needs_nothing_else_and_says_what_it_rests_on(study: Path) ->
     parser = Fetched()
     parser.feed(page)
     assert parser.found == []
-    assert "<script" not in page
     assert len(re.findall("<figure>", page)) == 3 * len(LOADS)
+    assert len(re.findall('<figure class="viewer">', page)) == len(LOADS)
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
+    assert policy is not None
+    assert "default-src 'none'" in policy[1]
+    assert "http" not in policy[1]
+    held = {name: text for name, text in re.findall(r'class="overlay" data-title="([^"]*)"[^>]*>([^<]*)<', page)}
+    right, measured = (
+        nibabel.Nifti1Image.from_bytes(gzip.decompress(base64.b64decode(held[n]))) for n in ("right", "measured")
+    )
+    middle = right.get_fdata()[tuple(n // 2 for n in right.shape)]
+    assert middle == pytest.approx(0.5 * np.hypot(0.4, 0.08), abs=0.005)  # the last of the loads, "Load2"
+    assert measured.get_fdata()[tuple(n // 2 for n in right.shape)] == pytest.approx(middle, abs=0.005)
+    corner = right.affine @ [4, 4, 4, 1]  # RAS of the first labelled voxel
+    assert corner[:3].tolist() == [3.5, 3.5, -3.5]
     text = re.sub(r"\s+", " ", page)
     assert "measurement&#39;s error is not known" in text
     assert text.index("Models and loads") < text.index("Volume above a strain")
