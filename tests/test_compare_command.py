@@ -137,8 +137,8 @@ def test_the_report_needs_nothing_else_and_says_what_it_rests_on(study: Path) ->
     middle = right.get_fdata()[tuple(n // 2 for n in right.shape)]
     assert middle == pytest.approx(0.5 * np.hypot(0.4, 0.08), abs=0.005)  # the last of the loads, "Load2"
     assert measured.get_fdata()[tuple(n // 2 for n in right.shape)] == pytest.approx(middle, abs=0.005)
-    corner = right.affine @ [4, 4, 4, 1]  # RAS of the first labelled voxel
-    assert corner[:3].tolist() == [3.5, 3.5, -3.5]
+    corner = right.affine @ [4, 4, 4, 1]  # RAS: x and y turn their sign
+    assert corner[:3].tolist() == [-0.5, -0.5, 0.5]
     text = re.sub(r"\s+", " ", page)
     assert "measurement&#39;s error is not known" in text
     assert text.index("Models and loads") < text.index("Volume above a strain")
