@@ -207,7 +207,8 @@ def _areas(done: Sequence[Comparison], totals: Sequence[Area], strains: tuple[fl
         ("model", *(one.load for one in done), "all loads"),
         tuple(rows),
         "The nearest model first. Where the measurement's error is known, the area is the median over truths that "
-        "could lie behind it, with a 95 % interval; areas as found, and by tissue, stand below and in areas.csv.",
+        "could lie behind it, with a 95 % interval; areas as found, and by tissue, stand below and in areas.csv. "
+        "Levelled models come last, with their area as found.",
     )
 
 

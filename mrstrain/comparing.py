@@ -44,7 +44,7 @@ from validate.sources import FeResult, check_overlap, read_result
 
 Told = Callable[[str, str, float], None]
 
-_FIELD = "displacement.nii.gz"
+_FIELD, _REPEAT = "displacement.nii.gz", "repeat"  # a repeat scan is no load
 _TABLES = ("areas.csv", "location.csv", "agreement.csv", "travel.csv", "curves.csv")
 _WHOLE = 0.9  # share of the mesh under which a model's cover is told
 _MOST_STRAIN = 3.0
@@ -273,6 +273,7 @@ def compare(
 def measurements_in(place: Path) -> list[Measurement]:
     """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is."""
     folders = [place] if (place / _FIELD).is_file() else sorted(p.parent for p in place.glob(f"*/{_FIELD}"))
+    folders = [f for f in folders if f == place or f.name != _REPEAT]
     if not folders:
         raise InputError(
             f"{place}: no results of `register` or `strain` here (LOAD/{_FIELD}). Give the folder they wrote."

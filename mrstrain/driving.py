@@ -15,11 +15,13 @@ from fe.result import region_figures, write_regions_csv, write_state
 from fe.simulate import check_laws
 from mrstrain.comparing import measurements_in
 from mrstrain.inputs import make_output, refuse_touching_inputs
+from mrstrain.modelfiles import IN_IMAGE, SETTINGS
 from mrstrain.provenance import provenance, write_json
+from mrstrain.simulating import clear
 from validate.driven import driven, outside, write_boundary
 
-BOUNDARY = "boundary"
-"""Folder of the boundary conditions for other codes."""
+BOUNDARY, ENDING = "boundary", "-driven"
+"""Folder of the boundary conditions for other codes; ending of a set's folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +56,8 @@ def drive(
     dvc : path
         Results of `register` or `strain`: a folder for each load, or one of these.
     out : path
-        Gets a folder for each set with ``LOAD.vtu``, as `simulate` writes them and `compare` takes them, and a folder
-        ``boundary`` with the displacements of the outside for ANSYS, Abaqus and FEBio, by the mesh's node numbers.
+        Gets a folder for each set (SET-driven) with ``LOAD.vtu``, as `simulate` writes them and `compare` takes them,
+        and a folder ``boundary`` with the displacements of the outside for ANSYS, Abaqus and FEBio, by the mesh's node numbers.
     sets : sequence of str
         Names of published sets, or files of your own (.toml).
     progress : callable, optional
@@ -74,20 +76,31 @@ def drive(
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
         check_laws(read, region_laws)
-    measured = {m.load: m.deformation() for m in measurements_in(Path(dvc))}
+    found = measurements_in(Path(dvc))
+    loose = [m.load for m in found if m.aligned_on == "none"]
+    if loose:
+        raise InputError(
+            f"{', '.join(loose)}: the bone's motion was not taken out of this measurement, and the model's bone stays "
+            "where it is. Register with a bone."
+        )
+    measured = {m.load: m.deformation() for m in found}
     edges = {load: outside(read, field) for load, field in measured.items()}
-    refuse_touching_inputs(target, [BOUNDARY, *laws], [place, Path(dvc)])
+    folders = {name: target / (name + ENDING) for name in laws}
+    refuse_touching_inputs(target, [BOUNDARY, *(f.name for f in folders.values())], [place, Path(dvc)])
     make_output(target)
-    for name in (BOUNDARY, *laws):
-        make_output(target / name)
-    fields = [m.folder / "displacement.nii.gz" for m in measurements_in(Path(dvc))]
+    for folder in (target / BOUNDARY, *folders.values()):
+        make_output(folder)
+        clear(folder)
+    fields = [m.folder / "displacement.nii.gz" for m in found]
     record = provenance(
         "drive", {"mesh": [place], "measured": fields}, {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame}
     )
-    lines: list[str] = []
+    lines = [
+        f"{m.load}: the measurement is judged: {m.verdict.words}" for m in found if m.verdict and m.verdict.reasons
+    ]
     complete = True
     for load, (nodes, u) in edges.items():
-        write_boundary(target / BOUNDARY / load, read, nodes, u)
+        write_boundary(target / BOUNDARY / load, read, nodes, u, unit=mesh_unit, frame=mesh_frame)
     total = len(chosen) * len(measured)
     for number, one in enumerate(chosen):
         region_laws, notes = laws[one.name]
@@ -102,7 +115,7 @@ def drive(
                 complete = False
                 lines.append(f"{one.name}: {failure}")
                 continue
-            write_state(target / one.name / f"{load}.vtu", read, state, region_laws)
+            write_state(folders[one.name] / f"{load}.vtu", read, state, region_laws)
             outcome[load] = {
                 "reached": state.reached,
                 "iterations": state.iterations,
@@ -113,11 +126,12 @@ def drive(
             told = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p90:.3f}" for r in rows if r.load == load)
             part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the displacement was reached;"
             lines.append(f"{one.name}, {load}:{part} maximal shear, median / 90th percentile: {told}")
-        write_regions_csv(target / one.name / "regions.csv", rows)
-        write_whole(target / one.name / "log.txt", "\n".join(log) + "\n")
+        write_regions_csv(folders[one.name] / "regions.csv", rows)
+        write_whole(folders[one.name] / SETTINGS, IN_IMAGE)
+        write_whole(folders[one.name] / "log.txt", "\n".join(log) + "\n")
         regions = {str(n): name for n, name in enumerate(read.regions, start=1)}
         write_json(
-            target / one.name / "simulation.json",
+            folders[one.name] / "simulation.json",
             {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": one.name,
              "laws": {region: law.told for region, law in region_laws.items()}} | record,
         )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from dvc.imagewrite import write_image
 from dvc.tissue import tissue_mask
 from dvc.whole import whole_file, write_whole
 from mrstrain.inputs import make_output, read_subject, refuse_touching_inputs
-from mrstrain.modelfiles import ENDINGS, Reading, model_files
+from mrstrain.modelfiles import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.registering import register
 from phantoms.twin import loaded_twin
 from validate.levelled import LEVELLED, carried_on
@@ -66,8 +67,8 @@ def level(
     model : path
         A folder with a file for each load, as in `compare`.
     out : path
-        Gets the images that the model would have given, their registration in the layout of `register`, and a folder
-        called as the model and "-levelled", which `compare` takes beside the model itself.
+        Gets a folder called as the model and "-levelled", which `compare` takes beside the model itself, and one ending
+        in "-work" with the images that the model would have given and their registration.
     bone, bone_label, tissue, labels, names
         As in `register`; the bone is needed.
     loads : sequence of str
@@ -94,13 +95,13 @@ def level(
     subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
     if subject.bone is None:
         raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is at rest.")
-    wanted = list(loads) or sorted({p.stem for p in place.iterdir() if p.suffix.lower() in ENDINGS})
+    wanted = list(loads) or loads_of(place, model_mesh is not None)
     usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame)
     files, notes = model_files(wanted, [place], usual)
     name = place.resolve().name + LEVELLED
-    refuse_touching_inputs(
-        target, [name, "images", "registered"], [Path(load0), *(f.path for of in files.values() for f in of)]
-    )
+    work = name + "-work"
+    given = [Path(p) for p in (load0, bone, tissue, labels, names, model_mesh) if p is not None]
+    refuse_touching_inputs(target, [name, work], [*given, *(f.path for of in files.values() for f in of)])
     results: dict[str, FeResult] = {}
     body = subject.tissue or tissue_mask(subject.reference)
     made = {}
@@ -108,6 +109,8 @@ def level(
         how = file.reading
         result = read_result(file.name, file.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image)
         check_overlap(result, subject.reference.grid)
+        results[load] = result
+    for load, result in results.items():
         field = carried_on(result.deformation, subject.reference.grid, subject.bone.inside)
         middles = result.mesh.centroids_mm
         apart = field.displacement(middles) - result.deformation.displacement(middles)
@@ -118,20 +121,23 @@ def level(
                 f"{_APART_MM:g} mm in {share:.0%} of its cells."
             )
         made[load] = loaded_twin(subject.reference, body, field, seed=seed)
-        results[load] = result
     make_output(target)
-    make_output(target / "images")
+    for folder in (target / name, target / work):  # of an earlier run
+        shutil.rmtree(folder, ignore_errors=True)
+        make_output(folder)
+    make_output(target / work / "images")
     for load, twin in made.items():
-        write_image(target / "images" / f"{load}.nii.gz", twin.image)
+        write_image(target / work / "images" / f"{load}.nii.gz", twin.image)
     series = register(
-        load0, [target / "images" / f"{load}.nii.gz" for load in results], out=target / "registered", bone=bone,
+        load0, [target / work / "images" / f"{load}.nii.gz" for load in results],
+        out=target / work / "registered", bone=bone,
         bone_label=bone_label, tissue=tissue, labels=labels, names=names, preset=preset, workers=workers, seed=seed,
         progress=progress,
     )  # fmt: skip
-    make_output(target / name)
+    write_whole(target / name / SETTINGS, IN_IMAGE)
     for load, result in results.items():
-        found = target / "registered" / load / "displacement.nii.gz"
-        if found.is_file():
+        found = target / work / "registered" / load / "displacement.nii.gz"
+        if load not in series.failures and found.is_file():
             _write(target / name / f"{load}.vtu", result, found)
         else:
             notes.append(f"{load} was not registered: {series.failures.get(load, 'see the registration')}")

@@ -18,6 +18,9 @@ ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".csv")
 SETTINGS = "model.toml"
 """In a model's folder: mesh, unit, frame and to_image of this model alone."""
 
+IN_IMAGE = 'unit = "mm"\nframe = "LPS"\nto_image = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n'
+"""Settings of results that lie in the image already."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
@@ -67,8 +70,8 @@ def model_files(
         for load in loads:
             if load not in chosen:
                 notes.append(f"{name} has no result for {load}.")
-            elif reached.get(load, 1.0) < 1.0:
-                notes.append(f"{name} reached only {reached[load]:.0%} of {load}, which is not compared.")
+            elif reached.get(load, 0.0 if reached else 1.0) < 1.0:
+                notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}, which is not compared.")
             else:
                 files[load].append(ModelFile(name, chosen[load], reading))
     files = {load: of for load, of in files.items() if of}
@@ -95,6 +98,16 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
     if place.stem in _reached(place):
         raise InputError(f"{place} is a simulation of {place.stem}, and {loads[0]} was measured.")
     return place.stem, {loads[0]: place}
+
+
+def loads_of(place: Path, has_mesh: bool) -> list[str]:
+    """Loads for which a model's folder has a file: those that a simulation of ours tells, else by the files' names."""
+    told = _reached(place)
+    if told:
+        return [load for load in told if any((place / (load + ending)).is_file() for ending in ENDINGS)]
+    kept = [ending for ending in ENDINGS if ending != ".csv" or has_mesh or (place / SETTINGS).is_file()]
+    own = _reading(place, Reading()).mesh
+    return sorted({p.stem for p in place.iterdir() if p.suffix.lower() in kept and p != own})
 
 
 def _reached(place: Path) -> dict[str, float]:

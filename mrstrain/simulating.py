@@ -176,7 +176,7 @@ def simulate(
     make_output(target)
     for name in names:
         make_output(target / name)
-        _clear(target / name)
+        clear(target / name)
     files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
     given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(fixed)}
     jobs = [(one, path) for one in chosen for path in paths]
@@ -223,7 +223,7 @@ def simulate(
     return Simulations(target, tuple(done[name] for name in names if name in done), failures)
 
 
-def _clear(folder: Path) -> None:
+def clear(folder: Path) -> None:
     """Remove what an earlier simulation wrote by its own list, so that nothing old stands beside what is new."""
     told = folder / "simulation.json"
     try:

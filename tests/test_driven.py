@@ -94,6 +94,19 @@ def test_boundary_conditions_say_the_same_in_every_code(tmp_path: Path) -> None:
         assert all(found[key] == pytest.approx(expected[key], abs=1e-8) for key in expected)
 
 
+def test_boundary_conditions_are_in_the_meshs_own_numbers_unit_and_frame(tmp_path: Path) -> None:
+    mesh = slab()  # of a file without numbers: counted from 1
+    nodes, u = outside(mesh, SHEAR)
+    abaqus, _, _ = write_boundary(tmp_path / "Load1", mesh, nodes, u, unit="m", frame="RAS")
+    text = abaqus.read_text()
+    assert "in m, RAS" in text
+    rows = [line.split(",") for line in text.splitlines() if line[0].isdigit()]
+    found = {(int(n), int(a)): float(v) for n, a, _, v in rows}
+    at = int(np.argmax(np.abs(u[:, 1])))
+    assert found[int(nodes[at]) + 1, 2] == pytest.approx(-1e-3 * u[at, 1])
+    assert found[int(nodes[at]) + 1, 3] == pytest.approx(1e-3 * u[at, 2])
+
+
 def test_the_command_writes_what_compare_takes(tmp_path: Path) -> None:
     mesh = slab()
     write_tet_mesh(tmp_path / "heel.vtu", mesh, {})
@@ -106,7 +119,7 @@ def test_the_command_writes_what_compare_takes(tmp_path: Path) -> None:
     ran = CliRunner().invoke(app, [str(a) for a in argv])
     assert ran.exit_code == 0, ran.output
     assert "luboz, Load1: maximal shear" in ran.output
-    result = read_result("luboz", tmp_path / "out" / "luboz" / "Load1.vtu")
+    result = read_result("luboz", tmp_path / "out" / "luboz-driven" / "Load1.vtu")
     assert set(result.mesh.regions) == {"fat", "skin"}
     outer = np.unique(outer_faces(mesh.cells))
     assert np.abs(result.deformation.u_mm - SHEAR.displacement(mesh.points_mm))[outer].max() < 2e-3

@@ -173,7 +173,7 @@ def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], tuple[str, ...]
         estimated = whole.interval(name) if whole is not None and not name.endswith(LEVELLED) else ()
         share = float(np.mean([a.share for a in parts]))
         rows.append(Area(name, "all loads", ALL, sum(a.ml for a in parts), share, *estimated))
-    rows.sort(key=lambda a: a.best_ml)
+    rows.sort(key=lambda a: (a.model.endswith(LEVELLED), a.best_ml))
     told = []
     for one in done:
         if one.hardly_strained:
@@ -182,7 +182,7 @@ def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], tuple[str, ...]
             )
         elif ALL in one.bands:
             told.append(_told(f"under {one.load}", one.ranked(), one.bands[ALL]))
-    if len(done) > 1 and whole is not None:
+    if len(done) > 1 and whole is not None and not all(one.hardly_strained for one in done):
         told.insert(0, _told("over all loads", [a for a in rows if not a.model.endswith(LEVELLED)], whole))
     return tuple(rows), tuple(sentence for sentence in told if sentence)
 

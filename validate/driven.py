@@ -17,6 +17,7 @@ from dvc.arrays import FloatArray, IntArray
 from dvc.deformation import Deformation
 from dvc.errors import InputError, MrstrainError
 from dvc.mesh import TetMesh, outer_faces
+from dvc.meshfile import MM_PER_UNIT, TO_LPS
 from dvc.whole import write_whole
 from fe.assembly import Assembler, Model
 from fe.elements import element
@@ -143,22 +144,30 @@ def driven(
     )
 
 
-def write_boundary(stem: Path, mesh: TetMesh, nodes: IntArray, u_mm: FloatArray) -> list[Path]:
-    """Write displacements (k, 3) mm of a mesh's nodes as boundary conditions, by the mesh's own node numbers.
+def write_boundary(
+    stem: Path, mesh: TetMesh, nodes: IntArray, u_mm: FloatArray, *, unit: str = "mm", frame: str = "LPS"
+) -> list[Path]:
+    """Write displacements (k, 3) LPS mm of a mesh's nodes as boundary conditions, in its file's own unit and frame.
+
+    Nodes have the mesh's own numbers; those of a file that gives none are counted from 1, as in `fe.decks`.
 
     ``.inp`` for Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D), ``.feb`` for FEBio 4, to be merged.
     """
-    numbers = mesh.node_ids[nodes]
-    written = {".inp": _abaqus(numbers, u_mm), ".mac": _ansys(numbers, u_mm), ".feb": _febio(numbers, u_mm)}
+    numbers = mesh.node_ids[nodes] + (1 if mesh.node_ids.min() == 0 else 0)
+    u = u_mm / MM_PER_UNIT[unit] * TO_LPS[frame]
+    about = f"displacements in {unit}, {frame}, of nodes by their numbers in the mesh"
+    written = {".inp": _abaqus(numbers, u), ".mac": _ansys(numbers, u), ".feb": _febio(numbers, u)}
+    told = {".inp": f"** {about}; into a *STEP", ".mac": f"! {about}", ".feb": f"<!-- {about} -->"}
     paths = []
     for ending, lines in written.items():
         paths.append(stem.with_name(stem.name + ending))
-        write_whole(paths[-1], "\n".join(lines) + "\n")
+        first, *others = lines
+        written_lines = [first, told[ending], *others] if ending == ".feb" else [told[ending], first, *others]
+        write_whole(paths[-1], "\n".join(written_lines) + "\n")
     return paths
 
 
 def _abaqus(numbers: IntArray, u: FloatArray) -> Iterator[str]:
-    yield "** displacements in mm, of nodes by their numbers in the mesh; into a *STEP"
     yield "*BOUNDARY"
     for number, row in zip(numbers, u, strict=True):
         for axis in range(3):
@@ -166,7 +175,6 @@ def _abaqus(numbers: IntArray, u: FloatArray) -> Iterator[str]:
 
 
 def _ansys(numbers: IntArray, u: FloatArray) -> Iterator[str]:
-    yield "! displacements in mm, of nodes by their numbers in the mesh"
     for number, row in zip(numbers, u, strict=True):
         for name, value in zip(("UX", "UY", "UZ"), row, strict=True):
             yield f"D,{number},{name},{value:.9g}"
@@ -174,7 +182,7 @@ def _ansys(numbers: IntArray, u: FloatArray) -> Iterator[str]:
 
 def _febio(numbers: IntArray, u: FloatArray) -> Iterator[str]:
     yield '<?xml version="1.0" encoding="ISO-8859-1"?>'
-    yield "<!-- displacements in mm; to be merged into a model whose load controller 1 rises from 0 to 1 -->"
+    yield "<!-- to be merged into a model whose load controller 1 rises from 0 to 1 -->"
     yield '<febio_spec version="4.0">'
     yield f'<Mesh><NodeSet name="outside">{",".join(map(str, numbers))}</NodeSet></Mesh>'
     yield "<MeshData>"
