@@ -57,7 +57,8 @@ def drive(
         Results of `register` or `strain`: a folder for each load, or one of these.
     out : path
         Gets a folder for each set (SET-driven) with ``LOAD.vtu``, as `simulate` writes them and `compare` takes them,
-        and a folder ``boundary`` with the displacements of the outside for ANSYS, Abaqus and FEBio, by the mesh's node numbers.
+        and a folder ``boundary`` with the displacements of the outside for ANSYS, Abaqus and FEBio, by the mesh's
+        node numbers, in its unit and frame.
     sets : sequence of str
         Names of published sets, or files of your own (.toml).
     progress : callable, optional
