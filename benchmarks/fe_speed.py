@@ -23,11 +23,12 @@ import numpy as np
 
 from dvc.arrays import IntArray
 from dvc.mesh import TetMesh
-from fe.assembly import Assembler, Model
+from fe.assembly import Assembler
 from fe.decks import write_calculix
 from fe.elements import edges_of, element
 from fe.linear import Solver
 from fe.meshstore import read_tet_mesh
+from fe.model import Model
 from fe.newton import Tolerance, equilibrium
 from fe.published import material_set
 from fe.simulate import LoadStep, State

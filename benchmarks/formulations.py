@@ -19,11 +19,12 @@ import numpy as np
 
 from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
-from fe.assembly import Assembler, Model
+from fe.assembly import Assembler
 from fe.elements import element
 from fe.linear import Solver
 from fe.materials import NeoHooke, Ogden
 from fe.meshstore import read_tet_mesh
+from fe.model import Model
 from fe.newton import Tolerance, equilibrium
 from fe.plate import Plate
 from fe.published import material_set

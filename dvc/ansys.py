@@ -23,7 +23,6 @@ _BRICKS = {"45", "185", "95", "186"}
 _TETS = {"285": (4, "tetra"), "187": (10, "tetra10"), "92": (10, "tetra10")}
 _SHELLS = {"181", "63", "281", "154"}  # SURF154 too: a face that carries a load
 _HEAD = 11  # numbers before the nodes of an element
-_FIRST_LINE = 8  # nodes on an element's first line
 # Places in a brick's list of the nodes of what it has become; corners, then the middles of edges.
 _DEGENERATE = {
     "tetra": ([0, 1, 2, 4], [8, 9, 11, 16, 17, 18]),

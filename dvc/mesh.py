@@ -19,7 +19,8 @@ _SMALLEST_EXTENT_MM = 1.0  # a body part in metres is 0.05 to 0.5 "mm" across
 _LARGEST_EXTENT_MM = 5000.0  # a body part in mm that was declared as metres is 50,000 mm across or more
 _DEGENERATE = 1e-9  # volume over the longest edge cubed; 0.118 for a regular tetrahedron
 _EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-_FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))  # face i lies opposite to node i
+FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+"""Nodes of a tetrahedron's faces; face i lies opposite to node i."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +142,7 @@ class TetMesh:
 
 def outer_faces(cells: IntArray) -> IntArray:
     """Faces (k, 3) of tetrahedra (m, 4) that belong to one of them alone, by their nodes in rising order."""
-    faces = np.sort(np.concatenate([cells[:, face] for face in _FACES]), axis=1)
+    faces = np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
     found, times = np.unique(faces, axis=0, return_counts=True)
     return np.asarray(found[times == 1])
 
@@ -260,7 +261,7 @@ def _positively_ordered(points: FloatArray, cells: IntArray) -> IntArray:
 
 def _overlapping(points: FloatArray, cells: IntArray) -> BoolArray:
     """Which cells have a face whose cells do not lie one on either side of it (or that three cells share)."""
-    faces = np.sort(np.concatenate([cells[:, face] for face in _FACES]), axis=1)
+    faces = np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
     opposite = cells.T.ravel()
     owner = np.tile(np.arange(len(cells)), 4)
     _, which = np.unique(faces, axis=0, return_inverse=True)

@@ -15,11 +15,12 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filter1d
+from scipy.ndimage import distance_transform_edt
 
-from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import InputError
 from dvc.image import Grid
+from dvc.randomfield import GaussianField
 from dvc.regions import SHEAR_THRESHOLDS
 
 POOLED = "soft tissue"
@@ -30,7 +31,6 @@ _FORMAT = 1
 _FAR = 1.6  # a table is used for voxels and noise within this factor of its own
 _LATTICE = 30_000
 _DRAWS = 200
-_STEPS = 4  # of the lattice that noise at points is drawn on, within a correlation length
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -349,7 +349,7 @@ def _intervals(
         lattice, kept, step = box, where[box], 1
     found = max_shear[lattice][kept].astype(np.float64)
     volume = np.count_nonzero(where) * grid.voxel_volume_mm3 / 1000.0
-    noise = _Field(kept.shape, np.nonzero(kept), 0.5 * table.correlation_mm / (step * grid.spacing_mm), random)
+    noise = GaussianField(kept.shape, np.nonzero(kept), 0.5 * table.correlation_mm / (step * grid.spacing_mm), random)
     expected = [table.expected(name, found, to_bone_mm[lattice][kept], run) for run in range(len(table.runs))]
     drawn = np.empty((_DRAWS, 3 + len(thresholds)))
     for draw in range(_DRAWS):
@@ -378,71 +378,3 @@ def widened(drawn: FloatArray, factor: float) -> tuple[FloatArray, FloatArray, F
     """
     low, middle, high = np.percentile(drawn, [2.5, 50.0, 97.5], axis=0)
     return np.maximum(middle - factor * (middle - low), 0.0), middle, middle + factor * (high - middle)
-
-
-class TruthDraws:
-    """Truths that could lie behind a shear found at scattered points, drawn as those of `uncertainty_of`.
-
-    Parameters
-    ----------
-    points_mm : (n, 3)
-    shear : (n,)
-        Found there.
-    tissue : (n,) str
-    to_bone_mm : (n,)
-        Distance to bone.
-    table : ErrorTable
-    seed : int
-    """
-
-    def __init__(
-        self,
-        points_mm: FloatArray,
-        shear: FloatArray,
-        tissue: Sequence[str],
-        to_bone_mm: FloatArray,
-        table: ErrorTable,
-        seed: int = 1,
-    ) -> None:
-        self._random = np.random.default_rng(seed)
-        self._shear = shear
-        names = np.asarray(tissue)
-        self._expected = []
-        for run in range(len(table.runs)):
-            bias, sd = np.empty(len(shear)), np.empty(len(shear))
-            for name in np.unique(names):
-                here = names == name
-                bias[here], sd[here] = table.expected(str(name), shear[here], to_bone_mm[here], run)
-            self._expected.append((bias, sd))
-        step = table.correlation_mm / _STEPS
-        index = np.rint((points_mm - points_mm.min(axis=0)) / step).astype(np.int64)
-        width = np.full(3, 0.5 * table.correlation_mm / step)
-        self._noise = _Field(tuple(int(n) + 1 for n in index.max(axis=0)), tuple(index.T), width, self._random)
-
-    def drawn(self) -> FloatArray:
-        """A truth (n,): shear found less a registration's bias, less a Gaussian field of its deviation; not below 0."""
-        bias, sd = self._expected[self._random.integers(len(self._expected))]
-        return np.maximum(self._shear - bias - sd * self._noise.drawn(), 0.0)
-
-
-class _Field:
-    """Gaussian fields of unit variance at some voxels ``at`` of a lattice, smooth over ``width`` voxels."""
-
-    def __init__(
-        self, shape: tuple[int, ...], at: tuple[IntArray, ...], width: FloatArray, random: np.random.Generator
-    ) -> None:
-        self._width, self._random = width, random
-        # Room around, so that the field, which is periodic, does not meet itself.
-        room = np.ceil(6.0 * width).astype(int)
-        self._shape = tuple(int(n + r) for n, r in zip(shape, room, strict=True))
-        self._at = at
-        spread = np.ones(())
-        for w in width:
-            kernel = gaussian_filter1d(np.eye(1, 2 * int(4 * w + 1) + 1, int(4 * w + 1))[0], w, mode="constant")
-            spread = spread * (kernel**2).sum()
-        self._scale = 1.0 / np.sqrt(float(spread))
-
-    def drawn(self) -> FloatArray:
-        """Draw the values at the region's voxels, (n,)."""
-        smooth = gaussian_filter(self._random.standard_normal(self._shape), self._width, mode="wrap")
-        return np.asarray(self._scale * smooth[self._at])

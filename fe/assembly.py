@@ -8,102 +8,16 @@ rigid plate. The pattern of the matrix is made once, for all nodes that may ever
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
 from scipy import sparse
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
-from dvc.mesh import TetMesh
-from fe.elements import Element, Space
 from fe.hyperelastic import principal_response, singular_values
-from fe.materials import Material
-
-CROWDED = 0.4
-"""det F below which a cell resists with an energy of its own, K / 3 ln(CROWDED / J)^3, so that it does not fold."""
+from fe.model import CROWDED, Model
 
 _CHUNK = 16384  # cells whose matrices are held at once
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Model:
-    """A mesh with its laws, cut into elements.
-
-    Attributes
-    ----------
-    element : Element
-    space : Space
-    volumes_mm3 : (m,)
-    inverse : (m, 3, 3)
-        Reference coordinates by position, 1/mm.
-    vectors : (k, v)
-        Laws, as `fe.hyperelastic` takes them.
-    shear_mpa, bulk_mpa : (k,)
-        Initial moduli of the laws.
-    law : (m,)
-        Number of each cell's law.
-    """
-
-    element: Element
-    space: Space
-    volumes_mm3: FloatArray
-    inverse: FloatArray
-    vectors: FloatArray
-    shear_mpa: FloatArray
-    bulk_mpa: FloatArray
-    law: IntArray
-
-    @classmethod
-    def of(cls, mesh: TetMesh, laws: Mapping[str, Material], element: Element) -> Model:
-        """The model of a mesh whose regions are those of ``laws``; each cell is in one of them."""
-        law = np.full(len(mesh.cells), -1)
-        for number, region in enumerate(laws):
-            law[mesh.regions[region]] = number
-        assert (law >= 0).all()
-        corners = mesh.points_mm[mesh.cells]
-        jacobian = np.stack([corners[:, i] - corners[:, 0] for i in (1, 2, 3)], axis=2)
-        length = max(len(material.vector) for material in laws.values())
-        vectors = np.array([np.pad(m.vector, (0, length - len(m.vector))) for m in laws.values()])
-        return cls(
-            element,
-            Space.on(mesh, element.name, law),
-            mesh.volumes_mm3,
-            np.asarray(np.linalg.inv(jacobian), dtype=np.float64),
-            vectors,
-            np.array([m.shear_modulus_mpa for m in laws.values()]),
-            np.array([m.bulk_modulus_mpa for m in laws.values()]),
-            law,
-        )
-
-    @property
-    def own_bulk_mpa(self) -> FloatArray:
-        """The part of each law's bulk modulus (k,) that acts in each cell on its own; at most half of it."""
-        return np.minimum(self.element.own_volume * self.shear_mpa, 0.5 * self.bulk_mpa)
-
-    @property
-    def unknowns(self) -> int:
-        """Displacements and pressures."""
-        return 3 * len(self.space.nodes_mm) + self.space.pressures
-
-    def unknowns_of_cells(self) -> IntArray:
-        """Unknowns of each cell (m, 3 a + 4): its nodes' x, y, z one node after the other, then its pressures."""
-        nodes = self.space.cells
-        displacement = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
-        return np.hstack([displacement, 3 * len(self.space.nodes_mm) + self.space.pressure_cells])
-
-    def gradients(self, state: FloatArray) -> FloatArray:
-        """H = du/dX of each cell (m, 3, 3), mean over its quadrature points, at a state of all unknowns."""
-        table = np.einsum("q,qaj->aj", self.element.weights, self.element.gradients)
-        u = state[: 3 * len(self.space.nodes_mm)].reshape(-1, 3)[self.space.cells]
-        return np.asarray(np.einsum("mai,aj,mjk->mik", u, table, self.inverse))
-
-    def pressures(self, state: FloatArray) -> FloatArray:
-        """Pressure at each cell's corners (m, 4), MPa: the field's, and the part that acts in the cell on its own."""
-        volume = np.linalg.det(np.eye(3) + self.gradients(state))
-        crowded = np.log(CROWDED / np.clip(volume, 1e-12, CROWDED)) ** 2 / volume
-        own = self.own_bulk_mpa[self.law] * (volume - 1.0) - self.bulk_mpa[self.law] * crowded
-        return np.asarray(state[3 * len(self.space.nodes_mm) :][self.space.pressure_cells] + own[:, None])
 
 
 FIXED = -1

@@ -13,10 +13,11 @@ from scipy.sparse.csgraph import connected_components
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
-from fe.assembly import Assembler, Model
+from fe.assembly import Assembler
 from fe.elements import edges_of, element
 from fe.linear import Solver
 from fe.materials import Material
+from fe.model import Model
 from fe.newton import Tolerance, equilibrium
 from fe.plate import Contact, Plate
 

@@ -6,10 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from fe.assembly import Assembler, Model
+from fe.assembly import Assembler
 from fe.elements import Space, element
 from fe.linear import SingularError, Solver, factors
 from fe.materials import Hencky, NeoHooke, Ogden, Yeoh
+from fe.model import Model
 from fe.newton import Tolerance, equilibrium
 from tests.blocks import block
 

@@ -10,7 +10,8 @@ from dvc.errors import InputError
 from dvc.image import Grid, LabelMap
 from dvc.mesh import TetMesh
 from dvc.onmesh import OnMesh
-from dvc.uncertainty import POOLED, ErrorTable, TruthDraws
+from dvc.truths import TruthDraws
+from dvc.uncertainty import POOLED, ErrorTable
 from tests.blocks import block
 from validate.agreement import agreement, sole_under_plate
 from validate.comparison import compare

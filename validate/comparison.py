@@ -12,7 +12,8 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation import Deformation
 from dvc.image import LabelMap
 from dvc.mesh import TetMesh
-from dvc.uncertainty import ErrorTable, TruthDraws
+from dvc.truths import TruthDraws
+from dvc.uncertainty import ErrorTable
 from validate.agreement import Agreement, Travel, agreements, travel
 from validate.curves import RANGE, Area, Band, area_between, bands
 from validate.levelled import LEVELLED

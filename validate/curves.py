@@ -14,7 +14,8 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.regions import volume_above
-from dvc.uncertainty import TruthDraws, widened
+from dvc.truths import TruthDraws
+from dvc.uncertainty import widened
 
 RANGE = (0.2, 0.5)
 """Strains between which curves are compared, by default."""

@@ -19,10 +19,11 @@ from dvc.errors import InputError, MrstrainError
 from dvc.mesh import TetMesh, outer_faces
 from dvc.meshfile import MM_PER_UNIT, TO_LPS
 from dvc.whole import write_whole
-from fe.assembly import Assembler, Model
+from fe.assembly import Assembler
 from fe.elements import element
 from fe.linear import Solver
 from fe.materials import Material
+from fe.model import Model
 from fe.newton import Tolerance, equilibrium
 from fe.simulate import BONE, LoadStep, State, check_laws
 

@@ -14,12 +14,10 @@ from scipy.spatial import cKDTree
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
-from dvc.mesh import TetMesh
+from dvc.mesh import FACES, TetMesh
 
 LEAST_ML = 0.1
 """Volume under which a cluster is not told, by default."""
-
-_FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +73,7 @@ class Cluster:
 def neighbours(mesh: TetMesh) -> sparse.csr_matrix:
     """Which cells share a face, (m, m)."""
     count = len(mesh.cells)
-    faces = np.sort(np.concatenate([mesh.cells[:, face] for face in _FACES]), axis=1)
+    faces = np.sort(np.concatenate([mesh.cells[:, face] for face in FACES]), axis=1)
     order = np.lexsort(faces.T)
     same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
     first, second = order[:-1][same] % count, order[1:][same] % count

@@ -31,7 +31,7 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
     """A mesh file's volume cells as linear tetrahedra, and a matrix that carries nodal values to its nodes.
 
     A quadratic tetrahedron becomes eight, through the middles of its edges. Hexahedra, wedges and pyramids are cut from
-    their middle, which gets the mean of the corners, and faces along the diagonal from their first node, so that
+    their middle, which gets the mean of the corners, and faces along the diagonal from their lowest node, so that
     neighbours fit; of quadratic ones only the corners are used, which is said in the log (``validate.split``). Regions
     and named surfaces are kept.
 
@@ -113,7 +113,7 @@ _REFERENCE10 = np.concatenate(
 
 
 def _triangles(corners: IntArray, faces: list[tuple[int, ...]]) -> tuple[IntArray, IntArray]:
-    """Triangles (k, 3) of the faces of cells (m, c), quadrangles cut from their first node; and their cells (k,)."""
+    """Triangles (k, 3) of the faces of cells (m, c), quadrangles cut from their lowest node; and their cells (k,)."""
     found, of = [], []
     numbers = np.arange(len(corners))
     for face in faces:

@@ -1,0 +1,59 @@
+"""Truths that could lie behind a strain found at scattered points, such as the cells of a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.randomfield import GaussianField
+from dvc.uncertainty import ErrorTable
+
+_STEPS = 4  # of the lattice that noise is drawn on, within a correlation length
+
+
+class TruthDraws:
+    """Draws of the truth, as `dvc.uncertainty.uncertainty_of` makes them on a grid.
+
+    Parameters
+    ----------
+    points_mm : (n, 3)
+        Reference configuration, LPS mm.
+    shear : (n,)
+        Maximal shear found there.
+    tissue : (n,) str
+    to_bone_mm : (n,)
+        Distance to the surface of bone.
+    table : ErrorTable
+    seed : int
+    """
+
+    def __init__(
+        self,
+        points_mm: FloatArray,
+        shear: FloatArray,
+        tissue: Sequence[str],
+        to_bone_mm: FloatArray,
+        table: ErrorTable,
+        seed: int = 1,
+    ) -> None:
+        self._random = np.random.default_rng(seed)
+        self._shear = shear
+        names = np.asarray(tissue)
+        self._expected = []
+        for run in range(len(table.runs)):
+            bias, sd = np.empty(len(shear)), np.empty(len(shear))
+            for name in np.unique(names):
+                here = names == name
+                bias[here], sd[here] = table.expected(str(name), shear[here], to_bone_mm[here], run)
+            self._expected.append((bias, sd))
+        step = table.correlation_mm / _STEPS
+        index = np.rint((points_mm - points_mm.min(axis=0)) / step).astype(np.int64)
+        width = np.full(3, 0.5 * table.correlation_mm / step)
+        self._noise = GaussianField(tuple(int(n) + 1 for n in index.max(axis=0)), tuple(index.T), width, self._random)
+
+    def drawn(self) -> FloatArray:
+        """A truth (n,): shear found less a registration's bias, less a Gaussian field of its deviation; not below 0."""
+        bias, sd = self._expected[self._random.integers(len(self._expected))]
+        return np.maximum(self._shear - bias - sd * self._noise.drawn(), 0.0)
