@@ -21,7 +21,7 @@ from validate import figures
 from validate.comparison import Comparison
 from validate.curves import Area
 from validate.location import Threshold
-from validate.mapping import ALL
+from validate.mapping import ALL, filled_from_nearest
 from validate.sources import FeResult
 
 _AROUND = 4  # voxels around the tissue in the viewer
@@ -99,14 +99,7 @@ def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
     """A model's displacement at the nodes of the compared mesh; its own nodes' where that is its mesh."""
     if result.mesh.points_mm.shape == points_mm.shape and np.array_equal(result.mesh.points_mm, points_mm):
         return result.deformation.u_mm
-    u = result.deformation.displacement(points_mm)
-    missing = ~np.isfinite(u).all(axis=1)
-    if missing.any():
-        from scipy.spatial import cKDTree
-
-        _, nearest = cKDTree(result.mesh.points_mm).query(points_mm[missing])
-        u[missing] = result.deformation.u_mm[nearest]
-    return u
+    return filled_from_nearest(result.deformation.displacement(points_mm), points_mm)
 
 
 def viewer_of(

@@ -15,21 +15,19 @@ import meshio
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.deformation import Deformation, evaluate_on_grid
-from dvc.displacementfile import read_displacement
+from dvc.deformation import evaluate_on_grid
 from dvc.errors import InputError
 from dvc.image import Image, LabelMap
 from dvc.imagewrite import write_image
 from dvc.kinematics import StrainField, plate_axes
 from dvc.labels import read_labels
 from dvc.regions import volume_above
-from dvc.uncertainty import ErrorTable, read_error_model
-from dvc.verdict import Verdict
 from dvc.viewer import Viewer
 from dvc.whole import whole_file, whole_folder, write_whole
 from fe.meshstore import read_tet_mesh
 from mrstrain.comparepage import pictures_of, shown, viewer_of, write_page
 from mrstrain.inputs import make_output, refuse_touching_inputs
+from mrstrain.measurements import Measurement, measurements_in
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.provenance import provenance, write_json
 from validate.agreement import Agreement, Travel
@@ -40,42 +38,14 @@ from validate.levelled import LEVELLED
 from validate.location import LEAST_ML, Overlap, read_thresholds
 from validate.mapping import ALL
 from validate.misfit import misfits
-from validate.sources import FeResult, check_overlap, read_result
+from validate.sources import FeResult
 
 Told = Callable[[str, str, float], None]
 
-_FIELD, _REPEAT = "displacement.nii.gz", "repeat"  # a repeat scan is no load
 _TABLES = ("areas.csv", "location.csv", "agreement.csv", "travel.csv", "curves.csv")
 _WHOLE = 0.9  # share of the mesh under which a model's cover is told
 _MOST_STRAIN = 3.0
 _STEP = 0.005  # of the curves that are written
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Measurement:
-    """One load as it was measured.
-
-    Attributes
-    ----------
-    load : str
-    folder : Path
-    table : ErrorTable or None
-        Error of the maximal shear, where it is known.
-    verdict : Verdict or None
-        On the registration.
-    aligned_on : str
-        "bone", "image" or "none"; empty where it is not told.
-    """
-
-    load: str
-    folder: Path
-    table: ErrorTable | None
-    verdict: Verdict | None
-    aligned_on: str = ""
-
-    def deformation(self) -> Deformation:
-        """Displacement of tissue relative to its bone."""
-        return read_displacement(self.folder / _FIELD)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,7 +152,7 @@ def compare(
         *(file.path for file in every),
         *dict.fromkeys(f.reading.mesh for f in every if f.reading.mesh is not None),
     ]
-    refuse_touching_inputs(target, list(files), [*given, *(m.folder / _FIELD for m in measurements), Path(labels)])
+    refuse_touching_inputs(target, list(files), [*given, *(m.field for m in measurements), Path(labels)])
     for place in (Path(dvc), *(m.folder for m in measurements), *(p for p in places if p.is_dir())):
         if target.resolve() == place.resolve():
             raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
@@ -190,11 +160,7 @@ def compare(
     for load, of in files.items():
         results[load] = []
         for file in of:
-            how = file.reading
-            read = read_result(
-                file.name, file.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image
-            )
-            check_overlap(read, tissues.grid)
+            read = file.read(tissues.grid)
             notes += [f"{load}: {sentence}" for sentence in misfits(read, tissues, bones)]
             results[load].append(read)
     make_output(target)
@@ -203,7 +169,7 @@ def compare(
     record = provenance(
         "compare",
         {
-            "measured": [m.folder / _FIELD for m in measurements], "models": given, "labels": Path(labels),
+            "measured": [m.field for m in measurements], "models": given, "labels": Path(labels),
             "names": [] if names is None else [Path(names)], "mesh": [] if mesh is None else [Path(mesh)],
             "error_models": [f for m in measurements if (f := m.folder / "error_model.json").is_file()],
         },
@@ -268,27 +234,6 @@ def compare(
     write_page(target / "report.html", told, totals, noise, notes, strains, levels, record)
     tell("compare", "comparing", 1.0)
     return Compared(target, tuple(done), totals, noise, tuple(notes))
-
-
-def measurements_in(place: Path) -> list[Measurement]:
-    """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is."""
-    folders = [place] if (place / _FIELD).is_file() else sorted(p.parent for p in place.glob(f"*/{_FIELD}"))
-    folders = [f for f in folders if f == place or f.name != _REPEAT]
-    if not folders:
-        raise InputError(
-            f"{place}: no results of `register` or `strain` here (LOAD/{_FIELD}). Give the folder they wrote."
-        )
-    found = []
-    for folder in folders:
-        model = folder / "error_model.json"
-        table = read_error_model(model).tables[0] if model.is_file() else None
-        verdict, aligned_on = None, ""
-        if (folder / "quality.json").is_file():
-            told = json.loads((folder / "quality.json").read_text(encoding="utf-8"))
-            verdict = Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"]))
-            aligned_on = str(told.get("alignment", {}).get("on", ""))
-        found.append(Measurement(folder.resolve().name, folder, table, verdict, aligned_on))
-    return found
 
 
 def _clear(target: Path, loads: Sequence[str]) -> None:

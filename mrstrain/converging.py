@@ -21,9 +21,10 @@ from fe.meshstore import read_tet_mesh
 from fe.published import material_set
 from fe.simulate import LoadStep
 from mrstrain.inputs import make_output, refuse_touching_inputs
+from mrstrain.loads import LOADS
 from mrstrain.meshing import mesh as make_mesh
 from mrstrain.provenance import file_hash, provenance, write_json
-from mrstrain.simulating import LOADS, simulate
+from mrstrain.simulating import simulate
 
 Told = Callable[[str, str, float], None]
 

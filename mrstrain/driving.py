@@ -13,8 +13,8 @@ from fe.meshstore import read_tet_mesh
 from fe.published import material_set
 from fe.result import region_figures, write_regions_csv, write_state
 from fe.simulate import check_laws
-from mrstrain.comparing import measurements_in
 from mrstrain.inputs import make_output, refuse_touching_inputs
+from mrstrain.measurements import measurements_in
 from mrstrain.modelfiles import IN_IMAGE, SETTINGS
 from mrstrain.provenance import provenance, write_json
 from mrstrain.simulating import clear
@@ -61,6 +61,8 @@ def drive(
         node numbers, in its unit and frame.
     sets : sequence of str
         Names of published sets, or files of your own (.toml).
+    mesh_unit, mesh_frame : str
+        Of the mesh file: "mm" or "m", "LPS" or "RAS".
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -92,9 +94,11 @@ def drive(
     for folder in (target / BOUNDARY, *folders.values()):
         make_output(folder)
         clear(folder)
-    fields = [m.folder / "displacement.nii.gz" for m in found]
+    own = [Path(s) for s in sets if str(s).endswith(".toml")]
     record = provenance(
-        "drive", {"mesh": [place], "measured": fields}, {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame}
+        "drive",
+        {"mesh": place, "measured": [m.field for m in found], "sets": own},
+        {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame},
     )
     lines = [
         f"{m.load}: the measurement is judged: {m.verdict.words}" for m in found if m.verdict and m.verdict.reasons

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import meshio
 import numpy as np
-from scipy.spatial import cKDTree
 
 from dvc.displacementfile import read_displacement
 from dvc.errors import InputError
@@ -19,10 +17,12 @@ from dvc.tissue import tissue_mask
 from dvc.whole import whole_file, write_whole
 from mrstrain.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.modelfiles import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
+from mrstrain.provenance import provenance, write_json
 from mrstrain.registering import register
 from phantoms.twin import loaded_twin
 from validate.levelled import LEVELLED, carried_on
-from validate.sources import FeResult, check_overlap, read_result
+from validate.mapping import filled_from_nearest
+from validate.sources import FeResult
 
 _APART_MM, _FEW = 0.1, 0.01
 
@@ -106,10 +106,7 @@ def level(
     body = subject.tissue or tissue_mask(subject.reference)
     made = {}
     for load, (file,) in files.items():
-        how = file.reading
-        result = read_result(file.name, file.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image)
-        check_overlap(result, subject.reference.grid)
-        results[load] = result
+        results[load] = file.read(subject.reference.grid)
     for load, result in results.items():
         field = carried_on(result.deformation, subject.reference.grid, subject.bone.inside)
         middles = result.mesh.centroids_mm
@@ -121,11 +118,22 @@ def level(
                 f"{_APART_MM:g} mm in {share:.0%} of its cells."
             )
         made[load] = loaded_twin(subject.reference, body, field, seed=seed)
-    make_output(target)
-    for folder in (target / name, target / work):  # of an earlier run
-        shutil.rmtree(folder, ignore_errors=True)
+    for folder in (target, target / name, target / work, target / work / "images"):
         make_output(folder)
-    make_output(target / work / "images")
+    for load in results:  # of an earlier run
+        (target / name / f"{load}.vtu").unlink(missing_ok=True)
+    record = provenance(
+        "level",
+        {**subject.files, "models": [f.path for of in files.values() for f in of]},
+        {
+            "preset": preset,
+            "seed": seed,
+            "bone_label": bone_label,
+            "model_unit": model_unit,
+            "model_frame": model_frame,
+        },
+    )
+    write_json(target / name / "provenance.json", record)
     for load, twin in made.items():
         write_image(target / work / "images" / f"{load}.nii.gz", twin.image)
     series = register(
@@ -147,10 +155,7 @@ def level(
 def _write(path: Path, result: FeResult, field: Path) -> None:
     """The measured displacement at the nodes of the model's mesh; where it is not defined, that of the nearest node."""
     mesh = result.mesh
-    u = read_displacement(field).displacement(mesh.points_mm)
-    known = np.isfinite(u).all(axis=1)
-    _, nearest = cKDTree(mesh.points_mm[known]).query(mesh.points_mm[~known])
-    u[~known] = u[known][nearest]
+    u = filled_from_nearest(read_displacement(field).displacement(mesh.points_mm), mesh.points_mm)
     region = np.zeros(len(mesh.cells), dtype=np.int64)
     for number, cells in enumerate(mesh.regions.values(), start=1):
         region[cells] = number

@@ -7,7 +7,21 @@ from typing import Annotated
 
 import typer
 
-from mrstrain.options import Frame, MeshFrame, MeshUnit, Names, Out, Plate, Shear, Unit
+from mrstrain.options import (
+    Bone,
+    BoneLabel,
+    Frame,
+    Labels,
+    MeshFrame,
+    MeshUnit,
+    ModelMesh,
+    Names,
+    Out,
+    Plate,
+    Shear,
+    Tissue,
+    Unit,
+)
 
 
 def mesh(
@@ -67,8 +81,8 @@ def simulate(
     workers: Annotated[int | None, typer.Option(min=1, help="Simulations at once. Default: one for each core.")] = None,
 ) -> None:
     """A rigid plate presses and shears soft tissue on fixed bone: displacement, strain and stress for each load."""
+    from mrstrain.loads import LOADS, load_named
     from mrstrain.progress import live
-    from mrstrain.simulating import LOADS, load_named
     from mrstrain.simulating import simulate as run
 
     with live() as progress:
@@ -106,7 +120,7 @@ def compare(
     names: Names = None,
     bone: Annotated[list[str] | None, typer.Option(help="Label of bone; repeat. Default: bone.")] = None,
     mesh: Annotated[Path | None, typer.Option(help="Where to compare. Default: the first model's mesh.")] = None,
-    model_mesh: Annotated[Path | None, typer.Option(help="Mesh of nodal displacements in .csv files.")] = None,
+    model_mesh: ModelMesh = None,
     model_unit: MeshUnit = Unit.MM,
     model_frame: MeshFrame = Frame.LPS,
     to_image: Annotated[
@@ -186,14 +200,14 @@ def level(
     load0: Annotated[Path, typer.Argument(help="The unloaded image.")],
     model: Annotated[Path, typer.Argument(help="Folder of a model, with a file for each load, as in compare.")],
     out: Out,
-    bone: Annotated[Path | None, typer.Option(help="Mask of the bone on the unloaded image.")] = None,
-    bone_label: Annotated[str | None, typer.Option(help="Or its label in --labels.")] = None,
-    tissue: Annotated[Path | None, typer.Option(help="Mask of the body, as in register.")] = None,
-    labels: Annotated[Path | None, typer.Option(help="Label map, as in register.")] = None,
+    bone: Bone = None,
+    bone_label: BoneLabel = None,
+    tissue: Tissue = None,
+    labels: Labels = None,
     names: Names = None,
     load: Annotated[list[str] | None, typer.Option(help="Name of a load; repeat. Default: all of the model's.")] = None,
     preset: Annotated[str, typer.Option(help="That of the measurement.")] = "heel-mr",
-    model_mesh: Annotated[Path | None, typer.Option(help="Mesh of nodal displacements in .csv files.")] = None,
+    model_mesh: ModelMesh = None,
     model_unit: MeshUnit = Unit.MM,
     model_frame: MeshFrame = Frame.LPS,
     workers: Annotated[
@@ -243,8 +257,8 @@ def converge(
 ) -> None:
     """The same loads on meshes of several sizes: percentiles of strain and plate travel, and what they tend to."""
     from mrstrain.converging import converge as run
+    from mrstrain.loads import LOADS, load_named
     from mrstrain.progress import live
-    from mrstrain.simulating import LOADS, load_named
 
     with live() as progress:
         done = run(

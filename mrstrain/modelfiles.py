@@ -12,7 +12,9 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
+from dvc.image import Grid
 from mrstrain.inputs import read_matrix
+from validate.sources import FeResult, check_overlap, read_result
 
 ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".csv")
 SETTINGS = "model.toml"
@@ -39,6 +41,13 @@ class ModelFile:
     name: str
     path: Path
     reading: Reading
+
+    def read(self, grid: Grid) -> FeResult:
+        """The result, which has to lie in the image on this grid; errors as `read_result` and `check_overlap`."""
+        how = self.reading
+        result = read_result(self.name, self.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image)
+        check_overlap(result, grid)
+        return result
 
 
 def model_files(

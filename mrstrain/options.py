@@ -47,6 +47,7 @@ Shear = Annotated[
     tuple[float, float, float] | None,
     typer.Option(help="Direction of the shear force on the tissue, LPS, such as --shear-direction 0 -1 0 (anterior)."),
 ]
+ModelMesh = Annotated[Path | None, typer.Option(help="Mesh of nodal displacements in .csv files.")]
 MeshFile = Annotated[Path | None, typer.Option(help="Mesh to put displacement and strain on.")]
 MeshUnit = Annotated[Unit, typer.Option(help="Unit of the mesh's coordinates.")]
 MeshFrame = Annotated[Frame, typer.Option(help="Frame of the mesh's coordinates.")]

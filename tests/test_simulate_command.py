@@ -16,7 +16,7 @@ from fe.meshstore import read_tet_mesh, write_tet_mesh
 from fe.result import cauchy_stress, deformation, patch_volumes, volume_percentiles
 from fe.simulate import LoadStep, simulate
 from mrstrain.cli import app
-from mrstrain.simulating import load_named, paths_of
+from mrstrain.loads import load_named, paths_of
 from tests.test_simulate import DOWN, FAT, LAWS, PRESS, dome, press
 
 PLATE = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0"]

@@ -26,6 +26,7 @@ from fe.materials import Material
 from fe.model import Model
 from fe.newton import Tolerance, equilibrium
 from fe.simulate import BONE, LoadStep, State, check_laws
+from validate.mapping import filled_from_nearest
 
 _FIRST_STEP, _LEAST_STEP = 0.25, 1.0 / 64.0
 _GROWTH, _SHRINK = 1.7, 0.4
@@ -56,14 +57,13 @@ def _everywhere(mesh: TetMesh, measured: Deformation) -> FloatArray:
     known = np.isfinite(u).all(axis=1)
     if not known.any():
         raise InputError("The measurement is defined at no node of the mesh. Do they share a frame?")
-    distance, nearest = cKDTree(mesh.points_mm[known]).query(mesh.points_mm[~known])
+    distance, _ = cKDTree(mesh.points_mm[known]).query(mesh.points_mm[~known])
     if np.count_nonzero(distance > _FAR_MM) > _FEW * len(u):
         raise InputError(
             f"{np.count_nonzero(distance > _FAR_MM)} of {len(u)} nodes lie over {_FAR_MM:g} mm from any at which the "
             "measurement is defined; it does not cover the model."
         )
-    u[~known] = u[known][nearest]
-    return np.asarray(u)
+    return filled_from_nearest(u, mesh.points_mm)
 
 
 def driven(

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.spatial import cKDTree
 
 from dvc.arrays import FloatArray
 from dvc.deformation import Deformation
@@ -17,7 +16,7 @@ from dvc.regions import volume_above
 from dvc.sheet import DPI, FONT, INK, WIDTH_IN, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet
 from validate.curves import Band
-from validate.mapping import Mapped
+from validate.mapping import Mapped, filled_from_nearest
 
 _POINTS = 601
 _COLUMNS = 3
@@ -87,10 +86,7 @@ def slices(
     The slice holds the plate's normal and the direction of shear; the same cells in one colour scale. Grey is not
     defined. Where the measurement does not reach a node, it is drawn with the displacement of the nearest one.
     """
-    u = measured.displacement(found.mesh.points_mm)
-    known = np.isfinite(u).all(axis=1)
-    _, nearest = cKDTree(found.mesh.points_mm[known]).query(found.mesh.points_mm[~known])
-    u[~known] = u[known][nearest]
+    u = filled_from_nearest(measured.displacement(found.mesh.points_mm), found.mesh.points_mm)
     panels = [Slice("measured", u, found.measured.max_shear)]
     panels += [Slice(name, displacements[name], field.max_shear) for name, field in found.models.items()]
     return slice_sheet(found.mesh, panels, axes, point_mm)

@@ -90,6 +90,16 @@ class Mapped:
         return told | {"common": float(self.volumes_ml[self.common].sum())}
 
 
+def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray:
+    """Values (n, k) at points (n, 3), a row with NaN replaced by that of the nearest point without."""
+    known = np.isfinite(values).all(axis=1)
+    filled = values.copy()
+    if not known.all():
+        _, nearest = cKDTree(points_mm[known]).query(points_mm[~known])
+        filled[~known] = values[known][nearest]
+    return filled
+
+
 def sampled(deformation: Deformation, points_mm: FloatArray) -> Field:
     """A deformation at points (n, 3)."""
     u, H = deformation.evaluate(points_mm)

@@ -1,0 +1,68 @@
+"""What was measured: the loads in a folder that `register` or `strain` wrote."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvc.deformation import Deformation
+from dvc.displacementfile import read_displacement
+from dvc.errors import InputError
+from dvc.uncertainty import ErrorTable, read_error_model
+from dvc.verdict import Verdict
+
+_FIELD, _REPEAT = "displacement.nii.gz", "repeat"  # a repeat scan is no load
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """One load as it was measured.
+
+    Attributes
+    ----------
+    load : str
+    folder : Path
+    table : ErrorTable or None
+        Error of the maximal shear, where it is known.
+    verdict : Verdict or None
+        On the registration.
+    aligned_on : str
+        "bone", "image" or "none"; empty where it is not told.
+    """
+
+    load: str
+    folder: Path
+    table: ErrorTable | None
+    verdict: Verdict | None
+    aligned_on: str = ""
+
+    @property
+    def field(self) -> Path:
+        """The displacement image."""
+        return self.folder / _FIELD
+
+    def deformation(self) -> Deformation:
+        """Displacement of tissue relative to its bone."""
+        return read_displacement(self.field)
+
+
+def measurements_in(place: Path) -> list[Measurement]:
+    """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is."""
+    folders = [place] if (place / _FIELD).is_file() else sorted(p.parent for p in place.glob(f"*/{_FIELD}"))
+    folders = [f for f in folders if f == place or f.name != _REPEAT]
+    if not folders:
+        raise InputError(
+            f"{place}: no results of `register` or `strain` here (LOAD/{_FIELD}). Give the folder they wrote."
+        )
+    found = []
+    for folder in folders:
+        model = folder / "error_model.json"
+        table = read_error_model(model).tables[0] if model.is_file() else None
+        verdict, aligned_on = None, ""
+        if (folder / "quality.json").is_file():
+            told = json.loads((folder / "quality.json").read_text(encoding="utf-8"))
+            verdict = Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"]))
+            aligned_on = str(told.get("alignment", {}).get("on", ""))
+        found.append(Measurement(folder.resolve().name, folder, table, verdict, aligned_on))
+    return found
