@@ -14,7 +14,7 @@ from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.image import Grid
 from dvc.mesh import outer_faces
 from dvc.meshfile import read_mesh
-from tests.test_meshfile import TAGS, block, write_abaqus, write_ansys, write_gmsh22
+from tests.meshfiles import TAGS, block, write_abaqus, write_ansys, write_gmsh22
 from validate.location import clusters, neighbours
 from validate.sources import check_overlap, read_result
 from validate.split import linear_tetrahedra

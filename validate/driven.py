@@ -35,7 +35,7 @@ _NO_EQUATION = np.empty(0, dtype=np.int64)
 
 
 def outside(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
-    """Nodes on the outside of a mesh, and where a measurement puts them (k, 3), mm.
+    """Nodes (k,) on the outside of a mesh, and their measured displacement (k, 3), LPS mm.
 
     Nodes of the facets "bone" stay. A node at which the measurement is not defined (the outermost half voxel) goes with
     the nearest node of the mesh at which it is.
