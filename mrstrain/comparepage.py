@@ -226,10 +226,11 @@ def _location(one: Comparison) -> Table:
     )  # fmt: skip
     return Table(
         "Tissue above a strain: how much, and where",
-        ("model", "above", "measured, mL", "model, mL", "clusters measured", "of the model", "Dice", "centroids, mm",
-         "largest, mm", "Hausdorff 95, mm"),
+        ("model", "above", "measured, mL", "model, mL", "clusters", "model's", "Dice", "centroids, mm",
+         "largest, mm", "Hausdorff, mm"),
         rows,
-        "Clusters are connected parts; distances of the centroids of all that lies above, and of the largest clusters.",
+        "Clusters are connected parts; distances of the centroids of all that lies above, and of the largest "
+        "clusters; Hausdorff distance at its 95th percentile.",
     )  # fmt: skip
 
 
