@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.errors import InputError
 from dvc.image import Grid, Image, Mask
 from dvc.resample import fill_missing
 from dvc.strainmaps import StrainMaps
@@ -187,6 +190,24 @@ def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
         float(np.percentile(shear, 95)),
         float(np.percentile(length, 95)),
     )
+
+
+def read_noise_floor(path: Path) -> NoiseFloor | None:
+    """Read the noise floor of a repeat scan from its ``quality.json``; None where it tells none.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is another.
+    """
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))["noise_floor"]
+        if told is None:
+            return None
+        names = ("maer", "sder", "max_shear_p50", "max_shear_p95", "displacement_p95_mm")
+        return NoiseFloor(*(float(told[name]) for name in names))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: no quality of a repeat scan ({error!r}). Register the repeat scan again.") from error
 
 
 def assess(

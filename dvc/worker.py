@@ -82,9 +82,9 @@ class Worker:
     def _start(self) -> ProcessPoolExecutor:
         count = str(self.threads)
         names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
-        return ProcessPoolExecutor(
-            max_workers=1, env=dict.fromkeys(names, count), initializer=_end_with, initargs=(os.getpid(),)
-        )
+        # elastix and meshes take memory and keep it: loky must not take that for a leak and end the process for it.
+        environment = dict.fromkeys(names, count) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
+        return ProcessPoolExecutor(max_workers=1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
 
     def kill(self) -> None:
         """End the child process at once, whatever it is doing; a task in it raises `WorkerError`."""

@@ -9,6 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mrstrain.beginning import init
+    from mrstrain.checking import check
     from mrstrain.comparing import compare
     from mrstrain.converging import converge
     from mrstrain.driving import drive
@@ -17,22 +19,28 @@ if TYPE_CHECKING:
     from mrstrain.making import phantom
     from mrstrain.meshing import mesh
     from mrstrain.registering import register
+    from mrstrain.running import run
     from mrstrain.simulating import simulate
     from mrstrain.straining import strain
     from mrstrain.studying import accuracy
+    from mrstrain.subjects import cohort
     from mrstrain.twinning import twin
 
 __version__ = "0.1.0"
 __all__ = [
     "accuracy",
+    "check",
+    "cohort",
     "compare",
     "converge",
     "drive",
     "fit",
+    "init",
     "level",
     "mesh",
     "phantom",
     "register",
+    "run",
     "simulate",
     "strain",
     "twin",
@@ -40,14 +48,18 @@ __all__ = [
 
 _ROOMS = {
     "accuracy": "studying",
+    "check": "checking",
+    "cohort": "subjects",
     "compare": "comparing",
     "converge": "converging",
     "drive": "driving",
     "fit": "fitting",
+    "init": "beginning",
     "level": "levelling",
     "mesh": "meshing",
     "phantom": "making",
     "register": "registering",
+    "run": "running",
     "simulate": "simulating",
     "strain": "straining",
     "twin": "twinning",

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from mrstrain import modelcommands
+from mrstrain import modelcommands, studycommands
 from mrstrain.options import (
     Align,
     Bone,
@@ -193,13 +193,17 @@ def strain(
 def demo(
     out: Out = Path("demo"),
     seed: Annotated[int, typer.Option(min=1, help="Seed of the phantom.")] = 1,
+    full: Annotated[
+        bool, typer.Option("--full", help="The published size: seven material sets on some 80,000 tetrahedra.")
+    ] = False,
+    workers: Annotated[int | None, typer.Option(min=1, help="Stages at once. Default: one for each core.")] = None,
 ) -> None:
-    """A heel phantom with known strain: register it, tell the error by tissue, and leave a report."""
+    """A heel phantom with known strain under four loads, taken through a whole study: error by tissue, and a report."""
     from mrstrain.demo import demo as run
     from mrstrain.progress import live
 
     with live() as progress:
-        lines = run(out, seed=seed, progress=progress)
+        lines = run(out, seed=seed, full=full, workers=workers, progress=progress)
     for line in lines:
         typer.echo(line)
 
@@ -334,6 +338,10 @@ for _command in (
     modelcommands.level,
     modelcommands.converge,
     modelcommands.fit,
+    studycommands.init,
+    studycommands.check,
+    studycommands.run,
+    studycommands.cohort,
 ):
     app.command()(_command)
 

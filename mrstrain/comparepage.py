@@ -140,17 +140,14 @@ def viewer_of(
     )
 
 
-def write_page(
-    path: Path,
+def page_sections(
     shown: Sequence[tuple[Comparison, Judged, Mapping[str, bytes], Viewer]],
     totals: Sequence[Area],
     noise: Sequence[str],
     notes: Sequence[str],
     strains: tuple[float, float],
-    thresholds: Sequence[Threshold],
-    record: Mapping[str, object],
-) -> None:
-    """Write the report, one self-contained page."""
+) -> list[Section]:
+    """The report's parts: models and loads first, then each load."""
     done = [one for one, _, _, _ in shown]
     sections = [Section("Models and loads", None, (_areas(done, totals, strains),), (), (*noise, *notes))]
     for one, measurement, drawn, viewer in shown:
@@ -170,12 +167,25 @@ def write_page(
             )
         )
         sections.append(Section(f"{one.load}, cell by cell", None, (_agreement(one),), (pictures["agreement"],)))
+    return sections
+
+
+def closing_sections(thresholds: Sequence[Threshold]) -> list[Section]:
+    """How a comparison is read, and where its levels of strain come from."""
     sources = Section(
         "Levels of strain",
         None,
         (Table("Thresholds", ("maximal shear", "source"), tuple((t.max_shear, t.source) for t in thresholds)),),
     )
-    write_report(path, "Models against the measurement", None, sections, [_CLOSING, sources], flat(record))
+    return [_CLOSING, sources]
+
+
+def write_page(
+    path: Path, sections: Sequence[Section], thresholds: Sequence[Threshold], record: Mapping[str, object]
+) -> None:
+    """Write the report, one self-contained page."""
+    closing = closing_sections(thresholds)
+    write_report(path, "Models against the measurement", None, sections, closing, flat(record))
 
 
 def shown(area: Area) -> str:

@@ -22,10 +22,11 @@ from dvc.imagewrite import write_image
 from dvc.kinematics import StrainField, plate_axes
 from dvc.labels import read_labels
 from dvc.regions import volume_above
+from dvc.report import Section
 from dvc.viewer import Viewer
 from dvc.whole import whole_file, whole_folder, write_whole
 from fe.meshstore import read_tet_mesh
-from mrstrain.comparepage import pictures_of, shown, viewer_of, write_page
+from mrstrain.comparepage import page_sections, pictures_of, shown, viewer_of, write_page
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.measurements import Measurement, measurements_in
 from mrstrain.modelfiles import Reading, model_files
@@ -57,6 +58,7 @@ class Compared:
     totals: tuple[Area, ...]
     noise: tuple[str, ...]
     notes: tuple[str, ...]
+    sections: tuple[Section, ...]
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
@@ -83,6 +85,7 @@ def compare(
     labels: Path | str,
     out: Path | str,
     names: Path | str | None = None,
+    loads: Sequence[str] = (),
     bones: Sequence[str] = ("bone",),
     mesh: Path | str | None = None,
     model_mesh: Path | str | None = None,
@@ -110,6 +113,8 @@ def compare(
         Label map of the unloaded image and its names: tissues, and distance to bone.
     out : path
         Gets ``report.html``, tables, and a folder for each load.
+    loads : sequence of str
+        Names of measured loads; all by default.
     bones : sequence of str
         Labels of bone.
     mesh : path, optional
@@ -143,7 +148,7 @@ def compare(
     axes = plate_axes(-np.asarray(plate_normal, dtype=np.float64), shear_direction)
     levels = read_thresholds(None if thresholds is None else Path(thresholds))
     tissues = read_labels(labels, names)
-    measurements = measurements_in(Path(dvc))
+    measurements = measurements_in(Path(dvc), loads)
     usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame, to_image)
     places = [Path(m) for m in models]
     files, notes = model_files([m.load for m in measurements], places, usual)
@@ -231,9 +236,10 @@ def compare(
             "coverage_ml": {one.load: one.found.coverage() for one in done},
         } | record,
     )  # fmt: skip
-    write_page(target / "report.html", told, totals, noise, notes, strains, levels, record)
+    sections = page_sections(told, totals, noise, notes, strains)
+    write_page(target / "report.html", sections, levels, record)
     tell("compare", "comparing", 1.0)
-    return Compared(target, tuple(done), totals, noise, tuple(notes))
+    return Compared(target, tuple(done), totals, noise, tuple(notes), tuple(sections))
 
 
 def _clear(target: Path, loads: Sequence[str]) -> None:

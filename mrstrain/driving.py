@@ -43,6 +43,8 @@ def drive(
     *,
     out: Path | str,
     sets: Sequence[str] = ("trebbi",),
+    loads: Sequence[str] = (),
+    threads: int | None = None,
     mesh_unit: str = "mm",
     mesh_frame: str = "LPS",
     progress: Callable[[str, str, float], None] | None = None,
@@ -61,6 +63,10 @@ def drive(
         node numbers, in its unit and frame.
     sets : sequence of str
         Names of published sets, or files of your own (.toml).
+    loads : sequence of str
+        Names of measured loads; all by default.
+    threads : int, optional
+        Of the solver; all cores by default.
     mesh_unit, mesh_frame : str
         Of the mesh file: "mm" or "m", "LPS" or "RAS".
     progress : callable, optional
@@ -79,7 +85,7 @@ def drive(
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
         check_laws(read, region_laws)
-    found = measurements_in(Path(dvc))
+    found = measurements_in(Path(dvc), loads)
     loose = [m.load for m in found if m.aligned_on == "none"]
     if loose:
         raise InputError(
@@ -113,7 +119,7 @@ def drive(
         for at, (load, field) in enumerate(measured.items()):
             tell("drive", "simulating", (number * len(measured) + at) / total)
             try:
-                state = driven(read, region_laws, field, load, threads=usable_cores(), tell=log.append)
+                state = driven(read, region_laws, field, load, threads=threads or usable_cores(), tell=log.append)
             except InputError:
                 raise
             except MrstrainError as failure:

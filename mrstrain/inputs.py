@@ -17,7 +17,7 @@ from dvc.kinematics import plate_axes
 from dvc.labels import fit_mask, read_labels, read_mask
 from dvc.meshfile import MeshFile, read_mesh
 
-_SUFFIXES = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
+IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
 _INFERIOR = (0.0, 0.0, -1.0)
 
 
@@ -149,7 +149,7 @@ def case_names(loads: Sequence[Path]) -> list[str]:
     names = []
     for path in loads:
         name = path.name
-        for suffix in _SUFFIXES:
+        for suffix in IMAGE_ENDINGS:
             if name.lower().endswith(suffix):
                 name = name[: -len(suffix)]
                 break
@@ -180,7 +180,7 @@ def make_output(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".mrstrain-probe"
         probe.write_bytes(b"0")
-        probe.unlink()
+        probe.unlink(missing_ok=True)  # another run may have probed at the same time
     except OSError as error:
         raise OutputError(
             f"{out}: results cannot be written here ({error.strerror or error}). Choose another --out, or change "

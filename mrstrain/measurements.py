@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,16 +48,27 @@ class Measurement:
         return read_displacement(self.field)
 
 
-def measurements_in(place: Path) -> list[Measurement]:
-    """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is."""
+def measurements_in(place: Path, loads: Sequence[str] = ()) -> list[Measurement]:
+    """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is; or some of them by name.
+
+    Raises
+    ------
+    InputError
+        If there is none, or one that is asked for is missing.
+    """
     folders = [place] if (place / _FIELD).is_file() else sorted(p.parent for p in place.glob(f"*/{_FIELD}"))
     folders = [f for f in folders if f == place or f.name != _REPEAT]
     if not folders:
         raise InputError(
             f"{place}: no results of `register` or `strain` here (LOAD/{_FIELD}). Give the folder they wrote."
         )
+    absent = [load for load in loads if load not in [f.resolve().name for f in folders]]
+    if absent:
+        raise InputError(f"{place} has no results of {', '.join(absent)}.")
     found = []
     for folder in folders:
+        if loads and folder.resolve().name not in loads:
+            continue
         model = folder / "error_model.json"
         table = read_error_model(model).tables[0] if model.is_file() else None
         verdict, aligned_on = None, ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +26,8 @@ from mrstrain.provenance import provenance, write_json
 from mrstrain.results import Case, write_case
 
 Told = Callable[[str, str, float], None]
-_REPEAT = "repeat"
+REPEAT = "repeat"
+"""Name of a repeat scan's results."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,16 +137,16 @@ def register(
     paths = [Path(p) for p in loads]
     cases = case_names(paths)
     if repeat is not None:
-        if _REPEAT in cases:
+        if REPEAT in cases:
             raise InputError(
-                f"A loaded image is called '{_REPEAT}', the folder name kept for the repeat scan: rename it."
+                f"A loaded image is called '{REPEAT}', the folder name kept for the repeat scan: rename it."
             )
-        cases, paths = [*cases, _REPEAT], [*paths, Path(repeat)]
+        cases, paths = [*cases, REPEAT], [*paths, Path(repeat)]
     if not paths:
         raise InputError("Give at least one loaded image.")
     if landmarks is not None and len(loads) != 1:
         raise InputError(f"--landmarks belong to one loaded image; {len(loads)} are given. Register that one alone.")
-    stages = _stages(preset, parameters, allow_unknown_parameters)
+    stages = stages_of(preset, parameters, allow_unknown_parameters)
     given = [
         Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh, error_model) if p is not None
     ]
@@ -177,28 +178,22 @@ def register(
     at_once = 1 if chain else min(workers or cores, cores, len(cases))
     each = threads or max(1, cores // at_once)
     settings = Settings(stages, align, seed, each)
-    record = provenance(
-        "register",
+    record = record_of(
+        subject,
         {
-            **subject.files,
             "loads": paths[: len(loads)],
             "repeat": paths[len(loads) :],
             "landmarks": [] if landmarks is None else [Path(landmarks)],
             "error_model": [] if error_model is None else [Path(error_model)],
         },
+        settings,
         {
-            "align": align,
             "chain": chain,
-            "seed": seed,
-            "threads": each,
             "bone_label": bone_label,
-            "plate_normal_lps": subject.plate_normal.tolist(),
             "shear_direction_lps": None if shear_direction is None else list(shear_direction),
             "mesh_unit": mesh_unit,
             "mesh_frame": mesh_frame,
             "allow_missing": allow_missing,
-            "rigid": load_preset("bone-rigid").text,
-            "stages": [{"name": s.name, "text": s.text} for s in stages],
         },
     )
     body = subject.tissue or tissue_mask(subject.reference)
@@ -214,7 +209,27 @@ def register(
     return Series(target, tuple(finished), run.failures)
 
 
-def _stages(preset: str, parameters: Sequence[Path | str], allow_unknown: bool) -> tuple[Preset, ...]:
+def record_of(
+    subject: Subject, files: Mapping[str, list[Path]], settings: Settings, more: Mapping[str, object]
+) -> dict[str, object]:
+    """What a registration is made from; ``more`` are parameters beside the settings."""
+    return provenance(
+        "register",
+        {**subject.files, **files},
+        {
+            "align": settings.align_on,
+            "seed": settings.seed,
+            "threads": settings.threads,
+            "plate_normal_lps": subject.plate_normal.tolist(),
+            "rigid": load_preset("bone-rigid").text,
+            "stages": [{"name": s.name, "text": s.text} for s in settings.presets],
+            **more,
+        },
+    )
+
+
+def stages_of(preset: str, parameters: Sequence[Path | str], allow_unknown: bool = False) -> tuple[Preset, ...]:
+    """The preset, or parameter files of one's own, applied one after the other."""
     if parameters:
         return tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters)
     return (load_preset(preset),)
@@ -241,14 +256,14 @@ class _Run:
         self.failures: dict[str, str] = {}
         self._telling, self._writing = threading.Lock(), threading.Lock()
         self._floor_known = threading.Event()
-        if _REPEAT not in images:
+        if REPEAT not in images:
             self._floor_known.set()
 
     def all(self, at_once: int, chain: bool) -> None:
         last: list[BSpline] = []
 
         def one(name: str, worker: Worker) -> None:
-            start = last[-1] if chain and last and name != _REPEAT else None
+            start = last[-1] if chain and last and name != REPEAT else None
             try:
                 found = register_pair(
                     self.subject.reference,
@@ -260,33 +275,33 @@ class _Run:
                     worker=worker,
                     progress=lambda stage, fraction: self._told(name, stage, fraction),
                 )
-                if name != _REPEAT:
+                if name != REPEAT:
                     last.append(found.bspline)
                     self._floor_known.wait()
                 self._write(name, found)
             except MrstrainError as error:
                 self.failures[name] = str(error)
             finally:
-                if name == _REPEAT:
+                if name == REPEAT:
                     self._floor_known.set()
 
-        names = sorted(self.images, key=lambda name: name != _REPEAT)  # its floor is waited for
+        names = sorted(self.images, key=lambda name: name != REPEAT)  # its floor is waited for
         each_in_workers(names, one, at_once=at_once, threads=self.settings.threads)
 
     def _write(self, name: str, found: Registration) -> None:
         stage = "strain and figures"
         with self._writing:
             self._told(name, stage, 0.0)
-            floor = self.cases[_REPEAT].own_floor if _REPEAT in self.cases else None
+            floor = self.cases[REPEAT].own_floor if REPEAT in self.cases else None
             self.cases[name] = write_case(
                 self.out / name,
                 name,
                 self.subject,
                 found,
                 self.record,
-                None if name == _REPEAT else self.landmarks,
+                None if name == REPEAT else self.landmarks,
                 floor,
-                is_repeat=name == _REPEAT,
+                is_repeat=name == REPEAT,
                 model=self.model,
             )
             self._told(name, stage, 1.0)

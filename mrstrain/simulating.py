@@ -112,6 +112,7 @@ def simulate(
     mesh_frame: str = "LPS",
     decks: bool = False,
     workers: int | None = None,
+    threads: int | None = None,
     progress: Told | None = None,
 ) -> Simulations:
     """Simulate a plate that presses and shears soft tissue on fixed bone.
@@ -140,8 +141,8 @@ def simulate(
         As in `fe.elements`.
     decks : bool
         Also write each load as decks for CalculiX (C3D10) and FEBio 4 (tet10); see `fe.decks`.
-    workers : int
-        Simulations at once; by default one for each core.
+    workers, threads : int, optional
+        Simulations at once, and threads of each; by default all cores are used.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -171,7 +172,7 @@ def simulate(
     given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(fixed)}
     jobs = [(one, path) for one in chosen for path in paths]
     at_once = max(1, min(workers or usable_cores(), len(jobs)))
-    threads = max(1, usable_cores() // at_once)
+    each = threads or max(1, usable_cores() // at_once)
     found: dict[str, list[State]] = {name: [] for name in names}
     waiting = {name: len(paths) for name in names}
     done: dict[str, Simulated] = {}
@@ -192,7 +193,7 @@ def simulate(
             try:
                 states = worker.run(
                     f"simulating {case}", _simulated, read, laws[name][0], plate, path, fixed, element,
-                    target / name, share, threads,                     watch=watch,
+                    target / name, share, each,                     watch=watch,
                 )  # fmt: skip
             except MrstrainError as failure:
                 states, failures[case] = [], str(failure)
@@ -207,7 +208,7 @@ def simulate(
                 )
         tell(case, "simulating", 1.0)
 
-    each_in_workers(jobs, one, at_once=at_once, threads=threads)
+    each_in_workers(jobs, one, at_once=at_once, threads=each)
     if not done:
         raise MrstrainError("No simulation ended. " + " ".join(f"{n}: {r}" for n, r in failures.items()))
     return Simulations(target, tuple(done[name] for name in names if name in done), failures)

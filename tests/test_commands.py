@@ -23,25 +23,8 @@ from dvc.transformfile import read_transform
 from dvc.uncertainty import POOLED, ErrorModel, ErrorTable
 from mrstrain.registering import register
 from mrstrain.straining import strain
+from tests.quick import QUICK
 
-QUICK = """
-(Registration "MultiResolutionRegistration")
-(Metric "AdvancedNormalizedCorrelation")
-(Optimizer "AdaptiveStochasticGradientDescent")
-(Transform "RecursiveBSplineTransform")
-(Interpolator "LinearInterpolator")
-(ImageSampler "RandomCoordinate")
-(FixedImagePyramid "FixedSmoothingImagePyramid")
-(MovingImagePyramid "MovingSmoothingImagePyramid")
-(FinalGridSpacingInPhysicalUnits 8.0)
-(NumberOfResolutions 2)
-(MaximumNumberOfIterations 80)
-(NumberOfSpatialSamples 2000)
-(NewSamplesEveryIteration "true")
-(AutomaticParameterEstimation "true")
-(ErodeMask "false")
-(RequiredRatioOfValidSamples 0.05)
-"""
 PATIENT = "Doe^Jane"
 
 

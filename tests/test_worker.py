@@ -84,3 +84,19 @@ def test_each_item_is_done_once_and_one_that_fails_ends_all() -> None:
     with pytest.raises(KeyError):
         each_in_workers([1], wrong, at_once=1, threads=1)
     assert all(worker._executor is None for worker in used)
+
+
+def holding(megabytes: int) -> int:
+    """Take memory and keep it; which process did."""
+    holding.kept = bytearray(megabytes * 2**20)  # type: ignore[attr-defined]
+    return os.getpid()
+
+
+def test_a_process_that_keeps_memory_is_kept_for_the_next_task():
+    with Worker(threads=1) as worker:
+        first = worker.run("holding memory", holding, 1)
+        time.sleep(1.5)  # loky looks once a second
+        worker.run("holding memory", holding, 500)
+        time.sleep(1.5)
+        assert worker.run("holding memory", holding, 600) == first
+        assert worker.run("holding memory", holding, 1) == first

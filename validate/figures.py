@@ -13,7 +13,7 @@ from dvc.arrays import FloatArray
 from dvc.deformation import Deformation
 from dvc.figures import REGION_COLOURS
 from dvc.regions import volume_above
-from dvc.sheet import DPI, FONT, INK, WIDTH_IN, label_axes, png_bytes
+from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet
 from validate.curves import Band
 from validate.mapping import Mapped, filled_from_nearest
@@ -117,4 +117,26 @@ def scatter(found: Mapped) -> bytes:
         spot.set_title(name, color=INK, **FONT)
         spot.set_aspect("equal")
         label_axes(spot, "measured", "simulated")
+    return png_bytes(figure)
+
+
+def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[str]) -> bytes:
+    """Area between curves, as a share of volume and range, of every subject (points) by model; the bar is the mean.
+
+    Lines join the models of one subject.
+    """
+    figure, (axes,) = chart()
+    subjects = list(dict.fromkeys(s for model in models for s in shares[model]))
+    for number, subject in enumerate(subjects):
+        points = [(at, 100.0 * shares[m][subject]) for at, m in enumerate(models) if subject in shares[m]]
+        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+        axes.plot(*zip(*points, strict=True), "o-", color=colour, linewidth=0.8, markersize=4, label=subject)
+    for at, model in enumerate(models):
+        mean = 100.0 * float(np.mean(list(shares[model].values())))
+        axes.plot([at - 0.25, at + 0.25], [mean, mean], color=INK, linewidth=2.5)
+    axes.set_xticks(range(len(models)), list(models), rotation=30, ha="right")
+    axes.set_ylim(bottom=0.0)
+    label_axes(axes, "", "area between curves, % of volume and range")
+    if len(subjects) <= len(REGION_COLOURS):
+        axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)

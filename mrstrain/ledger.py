@@ -1,0 +1,128 @@
+"""What a study has finished: a record of each stage, from what and with which outcome, in files that outlive a kill."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from dvc.whole import write_whole
+from mrstrain.plan import Stage
+from mrstrain.provenance import file_hash, versions
+from mrstrain.stages import Given
+
+_MATTERS = ("mrstrain", "itk-elastix", "pytetwild")
+"""Packages with which results change that are long in the making."""
+
+
+class Record(BaseModel):
+    """A finished stage.
+
+    Attributes
+    ----------
+    stage : str
+    key : str
+        Hash of all that it was made from.
+    made_utc : str
+    seconds : float
+    files : dict
+        What it made, below the study's results, with the size in bytes.
+    given : Given
+    """
+
+    model_config = ConfigDict(
+        frozen=True, ser_json_bytes="base64", val_json_bytes="base64", ser_json_inf_nan="constants"
+    )
+
+    stage: str
+    key: str
+    made_utc: str
+    seconds: float
+    files: dict[str, int]
+    given: Given
+
+    @property
+    def identity(self) -> str:
+        """What stages that build on it are made from: it made anew is another, even of the same inputs."""
+        return hashlib.sha256(f"{self.key} {self.made_utc}".encode()).hexdigest()
+
+
+class Ledger:
+    """The records of a study's results folder.
+
+    Parameters
+    ----------
+    out : Path
+        The study's results.
+    home : Path
+        The study's own folder.
+    """
+
+    def __init__(self, out: Path, home: Path) -> None:
+        self.out, self.home = out, home
+        self.folder = out / ".study"
+        self._hashes: dict[tuple[str, int, int], str] = {}
+
+    def key(self, stage: Stage, arguments: Mapping[str, object], built_on: Mapping[str, Record]) -> str:
+        """Hash of what a stage would be made from now; ``built_on`` are the stages whose results it reads."""
+        told = versions()
+        content = {
+            "stage": stage.name,
+            "arguments": self._relative(arguments),
+            "files": [self._hash(path) for path in stage.files],
+            "built_on": {name: record.identity for name, record in sorted(built_on.items())},
+            "versions": {name: told[name] for name in _MATTERS},
+        }
+        return hashlib.sha256(json.dumps(content, sort_keys=True, default=list).encode()).hexdigest()
+
+    def _relative(self, arguments: Mapping[str, object]) -> str:
+        """Arguments without the study's own place: a study that is moved as a whole stays finished."""
+        return json.dumps(arguments, sort_keys=True, default=list).replace(str(self.home), "")
+
+    def _hash(self, path: Path) -> str:
+        if path.is_dir():
+            return file_hash(path)
+        told = path.stat()
+        at = (str(path), told.st_size, told.st_mtime_ns)
+        if at not in self._hashes:
+            self._hashes[at] = file_hash(path)
+        return self._hashes[at]
+
+    def finished(self, stage: Stage) -> Record | None:
+        """The record of a stage whose results are all there, whatever it was made from."""
+        try:
+            record = Record.model_validate_json(self._place(stage.name).read_bytes())
+        except (OSError, ValidationError):
+            return None
+        there = all(
+            (self.out / name).is_file() and (self.out / name).stat().st_size == size
+            for name, size in record.files.items()
+        )
+        return record if there else None
+
+    def begin(self, stage: Stage) -> None:
+        """Forget a stage and remove what it had made."""
+        self._place(stage.name).unlink(missing_ok=True)
+        for place in stage.gives:
+            if place.is_dir():
+                shutil.rmtree(place)
+            else:
+                place.unlink(missing_ok=True)
+
+    def keep(self, stage: Stage, key: str, given: Given, seconds: float) -> Record:
+        """Record that a stage is finished."""
+        found = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
+        files = {p.relative_to(self.out).as_posix(): p.stat().st_size for p in found if p.is_file()}
+        made = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+        record = Record(stage=stage.name, key=key, made_utc=made, seconds=round(seconds, 1), files=files, given=given)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_whole(self._place(stage.name), record.model_dump_json())
+        return record
+
+    def _place(self, name: str) -> Path:
+        return self.folder / f"{name}.json"

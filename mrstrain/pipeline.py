@@ -1,0 +1,208 @@
+"""Runs the stages of a study: what is finished is not done again, what fails leaves the others to finish."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mrstrain.ledger import Ledger, Record
+from mrstrain.plan import Stage
+from mrstrain.stages import Given
+
+if TYPE_CHECKING:
+    from mrstrain.cluster import Cluster
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a stage ended.
+
+    Attributes
+    ----------
+    stage : str
+    record : Record or None
+        What it made; None where it has no result.
+    reason : str
+        Why it has none.
+    again : bool
+        Whether it was there already.
+    """
+
+    stage: str
+    record: Record | None
+    reason: str = ""
+    again: bool = False
+
+    @property
+    def words(self) -> str:
+        """In a word or two, for a table."""
+        if self.record is None:
+            return "not run" if self.reason.startswith("Not run") else "FAILED"
+        return "in part" if not self.record.given.complete else "there already" if self.again else "done"
+
+
+class Pipeline:
+    """The stages of one study and their outcomes.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+        Each behind those that it waits for.
+    ledger : Ledger
+    only : sequence of str
+        Names or kinds of stages that may be run; all where empty. Others are taken as they are.
+    force : sequence of str
+        Names or kinds of stages that are made anew.
+    """
+
+    def __init__(
+        self, stages: Sequence[Stage], ledger: Ledger, *, only: Sequence[str] = (), force: Sequence[str] = ()
+    ) -> None:
+        self.stages, self.ledger = tuple(stages), ledger
+        self._only, self._force = tuple(only), tuple(force)
+        self.outcomes: dict[str, Outcome] = {}
+        self._keys: dict[str, str] = {}
+        self._waiting = {stage.name: stage for stage in stages}
+
+    def in_order(self) -> dict[str, Outcome]:
+        """Outcomes in the order of the stages."""
+        return {stage.name: self.outcomes[stage.name] for stage in self.stages}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its stages."""
+        return tuple(stage.name for stage in self.stages)
+
+    def settle(self) -> list[tuple[Stage, Mapping[str, Any]]]:
+        """Take every stage as far as it goes without work; return those that have to be run now, with arguments."""
+        ready = []
+        moved = True
+        while moved:
+            moved = False
+            for stage in list(self._waiting.values()):
+                if any(name not in self.outcomes for name in stage.before):
+                    continue
+                del self._waiting[stage.name]
+                moved = True
+                lacking = self._lacking(stage)
+                if lacking:
+                    self.outcomes[stage.name] = Outcome(stage.name, None, f"Not run: {lacking}")
+                    self.ledger.begin(stage)
+                    continue
+                arguments = self._arguments(stage)
+                built_on = {name: r for name in stage.before if (r := self.outcomes[name].record) is not None}
+                key = self.ledger.key(stage, arguments, built_on)
+                kept = self.ledger.finished(stage)
+                if not _among(stage, self._only, default=True):
+                    reason = "Not run: it is not among those asked for." if kept is None else ""
+                    if kept is not None and kept.key != key:
+                        reason = "Made from other inputs than now, and not among those asked for."
+                    self.outcomes[stage.name] = Outcome(stage.name, kept, reason, again=True)
+                elif kept is not None and kept.key == key and not _among(stage, self._force, default=False):
+                    self.outcomes[stage.name] = Outcome(stage.name, kept, again=True)
+                else:
+                    self._keys[stage.name] = key
+                    ready.append((stage, arguments))
+        return ready
+
+    def forecast(self) -> dict[str, str]:
+        """What a run would do with each stage, without doing it: "done already", "run", or "left out"."""
+        told: dict[str, str] = {}
+        kept = {stage.name: self.ledger.finished(stage) for stage in self.stages}
+        for stage in self.stages:
+            anew = any(told[name] == "run" for name in stage.before)
+            record = kept[stage.name]
+            if not _among(stage, self._only, default=True):
+                told[stage.name] = "left out"
+            elif anew or record is None or _among(stage, self._force, default=False):
+                told[stage.name] = "run"
+            else:
+                some = {
+                    argument: [value for name, value in of.items() if kept[name] is not None]
+                    for argument, of in stage.some.items()
+                }
+                built_on = {name: r for name in stage.before if (r := kept[name]) is not None}
+                same = record.key == self.ledger.key(stage, {**stage.arguments, **some}, built_on)
+                told[stage.name] = "done already" if same else "run"
+        return told
+
+    def _lacking(self, stage: Stage) -> str:
+        for name in stage.after:
+            if self.outcomes[name].record is None:
+                return f"{name} has no result."
+        for of in stage.some.values():
+            if all(self.outcomes[name].record is None for name in of):
+                return f"none of {', '.join(of)} has a result."
+        return ""
+
+    def _arguments(self, stage: Stage) -> Mapping[str, Any]:
+        there = {
+            argument: [value for name, value in of.items() if self.outcomes[name].record is not None]
+            for argument, of in stage.some.items()
+        }
+        return {**stage.arguments, **there}
+
+    def start(self, cluster: Callable[[], Cluster], tell: Tell, prefix: str = "") -> None:
+        """Settle what can be, tell it, and hand what has to be run to the cluster."""
+        before = set(self.outcomes)
+        ready = self.settle()
+        for name, outcome in self.outcomes.items():
+            if name not in before:
+                tell(f"{name}: {outcome.words}" + (f". {outcome.reason}" if outcome.reason else ""))
+        for stage, arguments in ready:
+            self.ledger.begin(stage)
+            for place in stage.gives:
+                place.parent.mkdir(parents=True, exist_ok=True)
+            cluster().begin(prefix + stage.name, stage.kind, arguments)
+
+    def end(self, name: str, outcome: Given | str, seconds: float, tell: Tell) -> None:
+        """Record how a stage ended that was handed to the cluster."""
+        stage = next(stage for stage in self.stages if stage.name == name)
+        if isinstance(outcome, str):
+            self.ledger.begin(stage)  # what an earlier run or half of this one left is no result of these inputs
+            self.outcomes[stage.name] = Outcome(stage.name, None, outcome)
+        else:
+            record = self.ledger.keep(stage, self._keys[stage.name], outcome, seconds)
+            self.outcomes[stage.name] = Outcome(stage.name, record)
+        one = self.outcomes[stage.name]
+        tell(f"{stage.name}: {one.words} after {seconds:.0f} s" + (f". {one.reason}" if one.reason else ""))
+        if one.record is not None:
+            for line in one.record.given.lines:
+                tell(f"    {line}")
+
+
+def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], tell: Mapping[str, Tell]) -> None:
+    """Run what is left of several studies on one cluster.
+
+    Parameters
+    ----------
+    pipelines : mapping of str to Pipeline
+        By a prefix of their stages' names, which tells one study's from another's.
+    pool : callable
+        Gives a context with a `Cluster`; asked for only where there is work.
+    tell : mapping
+        Of the same prefixes: gets a line for each stage that ends.
+    """
+    with ExitStack() as stack:
+        made: list[Cluster] = []
+
+        def cluster() -> Cluster:
+            if not made:
+                made.append(stack.enter_context(pool()))
+            return made[0]
+
+        for prefix, pipeline in pipelines.items():
+            pipeline.start(cluster, tell[prefix], prefix)
+        while made and made[0].busy:
+            full, given, seconds = made[0].next()
+            prefix = next(p for p in pipelines if full.startswith(p) and full[len(p) :] in pipelines[p].names)
+            pipelines[prefix].end(full[len(prefix) :], given, seconds, tell[prefix])
+            pipelines[prefix].start(cluster, tell[prefix], prefix)
+
+
+def _among(stage: Stage, chosen: Sequence[str], *, default: bool) -> bool:
+    return default if not chosen else stage.name in chosen or stage.kind in chosen

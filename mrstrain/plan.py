@@ -1,0 +1,214 @@
+"""A study as stages: what each makes, from which files and numbers, and which others it waits for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dvc.errors import InputError
+from fe.published import material_set
+from mrstrain.driving import ENDING
+from mrstrain.registering import REPEAT
+from mrstrain.studyfile import Load, Study
+from validate.levelled import LEVELLED
+
+KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
+"""Kinds of stages, in the order in which they come."""
+
+REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One piece of work.
+
+    Attributes
+    ----------
+    name : str
+        Its kind, and what it is of: "register Load1".
+    arguments : mapping
+        Of the function of its kind in `mrstrain.stages`; plain values.
+    files : tuple of Path
+        What it reads that no other stage makes, by content.
+    after : tuple of str
+        Stages that it cannot do without.
+    some : mapping
+        Argument to stages, at least one of which it needs; it gets what each that succeeded is listed with.
+    gives : tuple of Path
+        What it makes, all of it: removed before it is made anew.
+    """
+
+    name: str
+    arguments: Mapping[str, Any]
+    files: tuple[Path, ...]
+    gives: tuple[Path, ...]
+    after: tuple[str, ...] = ()
+    some: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> str:
+        """One of KINDS."""
+        return self.name.split(" ", 1)[0]
+
+    @property
+    def before(self) -> tuple[str, ...]:
+        """Every stage that it waits for."""
+        return tuple(dict.fromkeys((*self.after, *(name for of in self.some.values() for name in of))))
+
+
+def plan(study: Study) -> tuple[Stage, ...]:
+    """The stages of a study, each behind those that it waits for.
+
+    Raises
+    ------
+    InputError
+        If two material sets or models would share a folder, or a load that is simulated has no force.
+    """
+    stages = _registrations(study)
+    loads = tuple(study.loads)
+    measured = {f"register {load}": load for load in loads}
+    models: dict[str, str] = {}
+    if study.models.sets:
+        meshed = _mesh(study)
+        stages += meshed
+        for one in study.models.sets:
+            simulated = _simulation(study, one, tuple(stage.name for stage in meshed))
+            folder = simulated.gives[0]
+            if str(folder) in models.values():
+                raise InputError(f"[models] two sets are called '{folder.name}'; each needs a name of its own.")
+            stages.append(simulated)
+            models[simulated.name] = str(folder)
+            if study.models.drive:
+                stages.append(_driven(study, one, folder.name, tuple(stage.name for stage in meshed), measured))
+                models[stages[-1].name] = str(stages[-1].gives[0])
+            if study.models.level:
+                for load in loads:
+                    stages.append(_levelled(study, folder, load))
+                    models[stages[-1].name] = str(folder) + LEVELLED
+    if models or study.models.results:
+        stages.append(_comparison(study, measured, models))
+    return tuple(stages)
+
+
+def _registrations(study: Study) -> list[Stage]:
+    images, how = study.images, study.registration
+    aside = {
+        key: str(study.path(given))
+        for key in ("labels", "names", "tissue", "bone_mask")
+        if (given := getattr(images, key)) is not None
+    }
+    load0 = study.path(images.load0)
+    own = [study.path(p) for p in how.parameters]
+    error_model = [] if how.error_model is None else [study.path(how.error_model)]
+    shared: dict[str, Any] = {
+        "load0": str(load0), "images": aside, "bone": images.bone, "align": how.align, "preset": how.preset,
+        "parameters": [str(p) for p in own], "error_model": str(error_model[0]) if error_model else None,
+        "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
+        "seed": study.study.seed, "threads": 1,
+    }  # fmt: skip
+    files = (load0, *(Path(p) for p in aside.values()), *own, *error_model)
+    folder = study.out / REGISTRATION
+
+    def one(load: str, image: str, repeat: bool, after: str | None) -> Stage:
+        place = study.path(image)
+        more = {
+            "load": str(place), "out": str(folder / load), "repeat": str(folder / REPEAT) if repeat else None,
+            "after": None if after is None else str(folder / after),
+        }  # fmt: skip
+        waits = ([f"register {REPEAT}"] if repeat else []) + ([] if after is None else [f"register {after}"])
+        return Stage(f"register {load}", shared | more, (*files, place), (folder / load,), tuple(waits))
+
+    stages = [] if images.repeat is None else [one(REPEAT, images.repeat, False, None)]
+    last: str | None = None
+    for name, load in study.loads.items():
+        stages.append(one(name, load.image, images.repeat is not None, last if how.chain else None))
+        last = name
+    return stages
+
+
+def mesh_place(study: Study) -> Path:
+    """The mesh on which sets are simulated: one made here, or a file."""
+    return study.out / MESH if study.mesh.file is None else study.path(study.mesh.file)
+
+
+def _mesh(study: Study) -> list[Stage]:
+    how = study.mesh
+    if how.file is not None:
+        return []
+    labels = study.path(how.labels or study.images.labels)
+    given = how.names if how.labels is not None else study.images.names
+    names = None if given is None else study.path(given)
+    arguments = {
+        "out": str(study.out / MESH), "labels": str(labels), "names": None if names is None else str(names),
+        "edge_mm": how.edge_mm, "bones": how.bones, "limit_s": 60.0 * how.limit_minutes,
+        "finer": None if how.finer is None else how.finer.model_dump(),
+    }  # fmt: skip
+    files = (labels,) if names is None else (labels, names)
+    return [Stage("mesh", arguments, files, ((study.out / MESH).parent,))]
+
+
+def _own(study: Study, one: str) -> tuple[Path, ...]:
+    own = [study.path(one)] if one.endswith(".toml") else []
+    return (*own, *([study.path(study.mesh.file)] if study.mesh.file is not None else []))
+
+
+def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
+    name = material_set(study.set_given(one)).name
+    arguments = {
+        "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
+        "loads": [[load, _normal(load, of), of.shear_n] for load, of in study.loads.items()],
+        "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
+        "taped": study.plate.taped, "gap_mm": study.plate.gap_mm, "fixed": study.models.fixed,
+        "element": study.models.element, "decks": study.models.decks,
+    }  # fmt: skip
+    return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
+
+
+def _normal(name: str, load: Load) -> float:
+    if load.normal_n is None:
+        raise InputError(f"[loads.{name}] normal_n is missing: sets are simulated ([models] sets) under every load.")
+    return load.normal_n
+
+
+def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured: Mapping[str, str]) -> Stage:
+    arguments = {
+        "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "dvc": str(study.out / REGISTRATION),
+        "material": study.set_given(one),
+    }  # fmt: skip
+    gives = (study.out / MODELS / (name + ENDING),)
+    return Stage(f"drive {name}", arguments, _own(study, one), gives, meshed, {"loads": measured})
+
+
+def _levelled(study: Study, folder: Path, load: str) -> Stage:
+    sent = _registrations(study)[-1].arguments
+    arguments = {key: sent[key] for key in ("load0", "images", "bone", "preset", "seed")}
+    arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}
+    own = [Path(arguments["load0"]), *(Path(p) for p in arguments["images"].values())]
+    gives = (folder.with_name(folder.name + LEVELLED) / f"{load}.vtu",)
+    return Stage(f"level {folder.name} {load}", arguments, tuple(own), gives, (f"simulate {folder.name}",))
+
+
+def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, str]) -> Stage:
+    how = study.compare
+    labels = study.path(study.images.labels)
+    names = None if study.images.names is None else study.path(study.images.names)
+    thresholds = None if how.thresholds is None else study.path(how.thresholds)
+    elsewhere = [study.path(place) for place in study.models.results]
+    taken = {Path(place).name for place in models.values()}
+    twice = [place.name for place in elsewhere if place.name in taken]
+    if twice:
+        raise InputError(f"[models] a folder of results and a set are both called '{twice[0]}': rename the folder.")
+    arguments = {
+        "dvc": str(study.out / REGISTRATION), "out": str(study.out / COMPARISON), "labels": str(labels),
+        "names": None if names is None else str(names), "bones": study.mesh.bones,
+        "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
+        "strains": how.strains, "thresholds": None if thresholds is None else str(thresholds),
+        "least_ml": how.least_ml, "elsewhere": [str(place) for place in elsewhere],
+    }  # fmt: skip
+    files = [p for p in (labels, names, thresholds, *elsewhere) if p is not None]
+    some: dict[str, Mapping[str, str]] = {"loads": measured}
+    if models:
+        some["models"] = models
+    return Stage("compare", arguments, tuple(files), (study.out / COMPARISON,), (), some)

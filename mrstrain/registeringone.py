@@ -1,0 +1,102 @@
+"""One loaded image registered by itself: the part of a series that a study gives to a worker of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from dvc.align import AlignOn
+from dvc.bspline import BSpline
+from dvc.errors import InputError
+from dvc.imagefile import read_image
+from dvc.quality import read_noise_floor
+from dvc.registration import Settings
+from dvc.registration import register as register_pair
+from dvc.tissue import tissue_mask
+from dvc.transformfile import read_transform
+from dvc.uncertainty import error_model_of, read_error_model
+from dvc.worker import Worker
+from mrstrain.inputs import read_subject
+from mrstrain.registering import REPEAT, record_of, stages_of
+from mrstrain.results import Case, write_case
+
+
+def register_one(
+    load0: Path,
+    load: Path,
+    *,
+    out: Path,
+    labels: Path,
+    names: Path | None,
+    bone: str | Path,
+    tissue: Path | None = None,
+    align: AlignOn = "bone",
+    preset: str = "heel-mr",
+    parameters: Sequence[Path] = (),
+    error_model: Path | None = None,
+    plate_normal: Sequence[float] | None = None,
+    shear_direction: Sequence[float] | None = None,
+    repeat: Path | None = None,
+    after: Path | None = None,
+    threads: int = 1,
+    seed: int = 1,
+    tell: Callable[[str, float], None] = lambda *_: None,
+) -> Case:
+    """Register one loaded image by itself, as `register` does it in a series.
+
+    Parameters
+    ----------
+    out : path
+        Folder of this load's results; one that is called "repeat" is that of a repeat scan.
+    bone : str or path
+        Its name in ``labels``, or a mask.
+    repeat : path, optional
+        Folder of the repeat scan's results: the noise floor.
+    after : path, optional
+        Folder of the load whose result is the start of this one's.
+    tell : callable, optional
+        ``tell(stage, fraction)``.
+
+    Other parameters, and errors, are those of `register`.
+    """
+    subject = read_subject(
+        load0,
+        bone=bone if isinstance(bone, Path) else None,
+        bone_label=bone if isinstance(bone, str) else None,
+        tissue=tissue,
+        labels=labels,
+        names=names,
+        plate_normal=plate_normal,
+        shear_direction=shear_direction,
+    )
+    loaded = read_image(load)
+    settings = Settings(stages_of(preset, parameters), align, seed, threads)
+    model = error_model_of(settings.presets[-1].name) if error_model is None else read_error_model(error_model)
+    floor = None if repeat is None else read_noise_floor(repeat / "quality.json")
+    start = None if after is None else read_transform(after / "TransformParameters.0.txt")
+    if start is not None and not isinstance(start, BSpline):
+        raise InputError(f"{after}: no B-spline to start from.")
+    record = record_of(
+        subject,
+        {"loads": [load], "error_model": [] if error_model is None else [error_model]},
+        settings,
+        {
+            "chain": after is not None,
+            "bone_label": bone if isinstance(bone, str) else None,
+            "shear_direction_lps": None if shear_direction is None else list(shear_direction),
+        },
+    )
+    body = subject.tissue or tissue_mask(subject.reference)
+    with Worker(threads) as worker:
+        found = register_pair(
+            subject.reference,
+            loaded,
+            bone=subject.bone,
+            tissue=body,
+            settings=settings,
+            start=start,
+            worker=worker,
+            progress=tell,
+        )
+    is_repeat = out.name == REPEAT
+    return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model)

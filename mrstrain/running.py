@@ -1,0 +1,236 @@
+"""`run`: a study from its file to its report; what is finished is not done again."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from dvc.errors import InputError, OutputError
+from mrstrain.inputs import make_output
+from mrstrain.ledger import Ledger
+from mrstrain.pipeline import Outcome, Pipeline, run_all
+from mrstrain.plan import KINDS, Stage, plan
+from mrstrain.runpage import write_run_report
+from mrstrain.studyfile import Study, read_study
+
+Told = Callable[[str, str, float], None]
+
+LOG, REPORT = "study.log", "report.html"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ran:
+    """What `run` gave.
+
+    Attributes
+    ----------
+    study : Study
+    outcomes : dict
+        Of every stage, by its name.
+    """
+
+    study: Study
+    outcomes: Mapping[str, Outcome]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every stage has a whole result."""
+        return all(o.record is not None and o.record.given.complete for o in self.outcomes.values())
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        lines = []
+        for name, outcome in self.outcomes.items():
+            if outcome.record is None:
+                lines.append(f"{name}: {outcome.words}. {outcome.reason}")
+            elif not outcome.record.given.complete:
+                lines += [
+                    f"{name}: {line}" for line in outcome.record.given.lines if "ONLY" in line or "not tried" in line
+                ]
+        compared = self.outcomes.get("compare")
+        if compared is not None and compared.record is not None:
+            lines += compared.record.given.lines
+        again = sum(outcome.again for outcome in self.outcomes.values())
+        return [
+            *lines,
+            f"{len(self.outcomes)} stages, {again} of them there already. Log: {self.study.out / LOG}",
+            f"Report: {self.study.out / REPORT}",
+        ]
+
+
+def run(
+    study: Path | str | Study,
+    *,
+    only: Sequence[str] = (),
+    force: Sequence[str] = (),
+    scheduler: str | None = None,
+    workers: int | None = None,
+    progress: Told | None = None,
+) -> Ran:
+    """Run a study: register, mesh, simulate, compare and report.
+
+    Parameters
+    ----------
+    study : path or Study
+        The study file, or its folder.
+    only : sequence of str
+        Names or kinds of stages ("register", "simulate trebbi") that may be run; the others are taken as they are.
+    force : sequence of str
+        Names or kinds of stages that are made anew.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers see the study's folder; this machine's cores by default.
+    workers : int, optional
+        Stages at once on this machine; one for each core by default.
+    progress : callable, optional
+        ``progress(case, stage, fraction)``.
+
+    Returns
+    -------
+    Ran
+        With every stage's outcome; a stage that failed is named there, in the log and in the report.
+
+    Raises
+    ------
+    InputError
+        If the study cannot be read, or a file is missing; before anything is run.
+    OutputError
+        If another run is at work in the same folder, or it cannot be written to.
+    """
+    told = study if isinstance(study, Study) else read_study(study)
+    (ran,) = run_studies([told], only=only, force=force, scheduler=scheduler, workers=workers, progress=progress)
+    return ran
+
+
+def run_studies(
+    studies: Sequence[Study],
+    *,
+    only: Sequence[str] = (),
+    force: Sequence[str] = (),
+    scheduler: str | None = None,
+    workers: int | None = None,
+    progress: Told | None = None,
+) -> list[Ran]:
+    """Run several studies on one cluster, each as `run` does it; what cannot be run is refused before any begins."""
+    planned = [plan(study) for study in studies]
+    for stages in planned:
+        refuse_unknown(stages, (*only, *force))
+        refuse_missing(stages)
+    tell, total, ended = progress or (lambda *_: None), sum(map(len, planned)), 0
+    prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
+    pipelines: dict[str, Pipeline] = {}
+    lines: dict[str, Callable[[str], None]] = {}
+
+    def line_of(log: Callable[[str], None], names: tuple[str, ...]) -> Callable[[str], None]:
+        def line(text: str) -> None:
+            nonlocal ended
+            log(text)
+            if text.split(": ", maxsplit=1)[0] in names:
+                ended += 1
+                tell("all", f"{total} stages", ended / total)
+
+        return line
+
+    def pool() -> object:
+        from mrstrain.cluster import cluster
+
+        return cluster(tell, [study.out for study in studies], scheduler=scheduler, workers=workers)
+
+    with ExitStack() as stack:
+        for prefix, study, stages in zip(prefixes, studies, planned, strict=True):
+            stack.enter_context(_alone(study.out))
+            pipelines[prefix] = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
+            log = stack.enter_context(_log(study.out / LOG))
+            log(f"Study '{study.study.name}': {len(stages)} stages")
+            lines[prefix] = line_of(log, pipelines[prefix].names)
+        run_all(pipelines, pool, lines)
+        done = []
+        for prefix, study, stages in zip(prefixes, studies, planned, strict=True):
+            outcomes = pipelines[prefix].in_order()
+            write_run_report(study.out / REPORT, study, stages, outcomes)
+            lines[prefix](f"Report: {study.out / REPORT}")
+            done.append(Ran(study, outcomes))
+    return done
+
+
+def report(study: Path | str | Study) -> Ran:
+    """Write a study's report anew from what is there, without running anything.
+
+    Raises
+    ------
+    InputError
+        If no stage has a result.
+    """
+    told = study if isinstance(study, Study) else read_study(study)
+    stages, ledger = plan(told), Ledger(told.out, told.place)
+    outcomes = {}
+    for stage in stages:
+        record = ledger.finished(stage)
+        outcomes[stage.name] = Outcome(stage.name, record, "" if record else "Not run: it has no result.", again=True)
+    if all(outcome.record is None for outcome in outcomes.values()):
+        raise InputError(f"{told.out} has no results yet: `mrstrain run` makes them.")
+    with _alone(told.out):
+        write_run_report(told.out / REPORT, told, stages, outcomes)
+    return Ran(told, outcomes)
+
+
+def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = ()) -> dict[str, str]:
+    """What `run` would do with each stage: "done already", "run" or "left out"; parameters and errors are its own."""
+    told = study if isinstance(study, Study) else read_study(study)
+    stages = plan(told)
+    refuse_unknown(stages, (*only, *force))
+    refuse_missing(stages)
+    return Pipeline(stages, Ledger(told.out, told.place), only=only, force=force).forecast()
+
+
+def refuse_unknown(stages: Sequence[Stage], names: Sequence[str]) -> None:
+    """Refuse names that no stage and no kind of stage has."""
+    known = [*(stage.name for stage in stages), *KINDS]
+    for name in names:
+        if name not in known:
+            raise InputError(f"No stage is called '{name}'. There are: {', '.join(known)}.")
+
+
+def refuse_missing(stages: Sequence[Stage]) -> None:
+    """Refuse a study whose files are not there, naming every one."""
+    missing = dict.fromkeys(path for stage in stages for path in stage.files if not path.exists())
+    if missing:
+        raise InputError("These files of the study are not there:\n" + "\n".join(f"  {path}" for path in missing))
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Hold the results folder; the system lets go of it when the process ends, however it does."""
+    make_output(out)
+    folder = out / ".study"
+    make_output(folder)
+    lock = FileLock(folder / "lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as taken:
+        raise OutputError(
+            f"{out}: another run is at work here. Wait for its end, or give another [study] out."
+        ) from taken
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def _log(path: Path) -> Iterator[Callable[[str], None]]:
+    """Append lines with their time to a file."""
+    logger = logging.Logger(f"mrstrain {path}")
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)sZ %(message)s", "%Y-%m-%dT%H:%M:%S"))
+    handler.formatter.converter = time.gmtime  # type: ignore[union-attr]
+    logger.addHandler(handler)
+    try:
+        yield logger.info
+    finally:
+        handler.close()

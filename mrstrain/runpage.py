@@ -1,0 +1,70 @@
+"""The report of a study: verdict, models against the measurement, registrations, and how each stage ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from dvc.report import Section, Table, write_report
+from dvc.verdict import Verdict, worst
+from mrstrain.page import flat
+from mrstrain.pipeline import Outcome
+from mrstrain.plan import Stage
+from mrstrain.provenance import provenance, write_json
+from mrstrain.studyfile import Study
+
+
+def write_run_report(
+    path: Path,
+    study: Study,
+    stages: Sequence[Stage],
+    outcomes: Mapping[str, Outcome],
+    ahead: Sequence[Section] = (),
+) -> None:
+    """Write a study's report, one self-contained page, and what it was made from as ``provenance.json`` beside it.
+
+    ``ahead`` are sections that come first.
+    """
+    compared: list[Section] = []
+    registered: list[Section] = []
+    closing: list[Section] = []
+    for name, outcome in outcomes.items():
+        if outcome.record is None:
+            continue
+        given = outcome.record.given
+        if name.startswith("register "):
+            registered += [replace(s, title=f"Registration of {s.title}") for s in given.sections]
+        else:
+            compared += given.sections
+        closing += given.closing
+    verdicts = [section.verdict for section in registered if section.verdict is not None]
+    failed = [f"{o.stage} {o.words.lower()}: {o.reason}" for o in outcomes.values() if o.record is None]
+    if failed:
+        verdicts.append(Verdict("distrust", tuple(failed)))
+    files = list(dict.fromkeys(file for stage in stages for file in stage.files))
+    record = provenance("run", {"inputs": files}, study.model_dump(mode="json", exclude={"place"}))
+    write_json(path.with_name("provenance.json"), record)
+    write_report(
+        path,
+        study.study.name,
+        worst(verdicts) if verdicts else None,
+        [*ahead, *compared, *registered, _stages(outcomes)],
+        closing,
+        flat(record),
+    )
+
+
+def _stages(outcomes: Mapping[str, Outcome]) -> Section:
+    rows = []
+    for outcome in outcomes.values():
+        record = outcome.record
+        told = outcome.reason if record is None else "\n".join(record.given.lines)
+        rows.append((outcome.stage, outcome.words, None if record is None else record.seconds, told))
+    table = Table(
+        "How each stage ended",
+        ("stage", "outcome", "seconds", "what it says"),
+        tuple(rows),
+        "Seconds of the run that made the result, on one core beside other stages.",
+    )
+    return Section("Stages", None, (table,))

@@ -1,0 +1,88 @@
+"""The commands of a whole study. They parse, call one function, and print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mrstrain.options import Out
+
+StudyFile = Annotated[Path, typer.Argument(help="The study file, or its folder.")]
+Scheduler = Annotated[
+    str | None, typer.Option(help="Address of a Dask scheduler to use, such as tcp://node1:8786; see docs/cluster.md.")
+]
+Workers = Annotated[int | None, typer.Option(min=1, help="Stages at once. Default: one for each core.")]
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(help="With images, label map, and perhaps results of other codes.")],
+) -> None:
+    """Write a study file, with comments, from what a folder holds."""
+    from mrstrain.beginning import init as run
+
+    for line in run(folder).summary():
+        typer.echo(line)
+
+
+def check(study: StudyFile, workers: Workers = None) -> None:
+    """Look at every input of a study: all that is wrong at once, and the time, memory and disk that a run takes."""
+    from mrstrain.checking import check as run
+
+    done = run(study, workers=workers)
+    for line in done.summary():
+        typer.echo(line)
+    if done.wrong:
+        raise typer.Exit(2)
+
+
+def run(
+    study: StudyFile,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Kind or name of stages to run (register, 'simulate trebbi'); repeat.")
+    ] = None,
+    force: Annotated[list[str] | None, typer.Option(help="Kind or name of stages to make anew; repeat.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what would be done.")] = False,
+    report_only: Annotated[bool, typer.Option("--report-only", help="Only write the report anew.")] = False,
+    scheduler: Scheduler = None,
+    workers: Workers = None,
+) -> None:
+    """A study from its file to its report: register, mesh, simulate, compare. Goes on where it stopped."""
+    from mrstrain.progress import live
+    from mrstrain.running import forecast, report
+    from mrstrain.running import run as start
+
+    if dry_run:
+        for name, told in forecast(study, only=only or (), force=force or ()).items():
+            typer.echo(f"{name}: {told}")
+        return
+    if report_only:
+        done = report(study)
+    else:
+        with live() as progress:
+            done = start(
+                study, only=only or (), force=force or (), scheduler=scheduler, workers=workers, progress=progress
+            )
+    for line in done.summary():
+        typer.echo(line)
+    if not done.complete:
+        raise typer.Exit(1)
+
+
+def cohort(
+    studies: Annotated[list[Path], typer.Argument(help="Study files, or their folders.")],
+    out: Out,
+    scheduler: Scheduler = None,
+    workers: Workers = None,
+) -> None:
+    """The studies of many subjects on one cluster: one table, one report, and the models ranked over all."""
+    from mrstrain.progress import live
+    from mrstrain.subjects import cohort as start
+
+    with live() as progress:
+        done = start(studies, out=out, scheduler=scheduler, workers=workers, progress=progress)
+    for line in done.summary():
+        typer.echo(line)
+    if not done.complete:
+        raise typer.Exit(1)

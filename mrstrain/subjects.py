@@ -1,0 +1,194 @@
+"""`cohort`: the studies of many subjects run on one cluster, and one table and report of them all."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from dvc.errors import InputError
+from dvc.report import Picture, Section, Table, write_report
+from dvc.verdict import Verdict, worst
+from dvc.whole import write_whole
+from mrstrain.inputs import make_output
+from mrstrain.page import flat, said
+from mrstrain.plan import COMPARISON
+from mrstrain.provenance import provenance, write_json
+from mrstrain.running import Ran, Told, run_studies
+from mrstrain.studyfile import FILE, read_study
+from validate import figures
+from validate.cohort import Standing, standings
+from validate.levelled import LEVELLED
+from validate.mapping import ALL
+
+_TOTAL = "all loads"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cohort:
+    """What `cohort` gave.
+
+    Attributes
+    ----------
+    out : Path
+        With ``report.html``, ``cohort.csv`` (areas of every subject, model and load) and ``ranking.csv``.
+    ran : tuple of Ran
+        The studies, in the order given.
+    ranking : tuple of Standing
+        The models over all loads, the nearest first; empty where no subject has a result of all.
+    """
+
+    out: Path
+    ran: tuple[Ran, ...]
+    ranking: tuple[Standing, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every study is."""
+        return all(one.complete for one in self.ran)
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        lines = [f"{one.study.study.name}: not complete, see {one.study.out}" for one in self.ran if not one.complete]
+        lines += [
+            f"{place}. {s.model}: {100 * s.mean:.2f} % ({100 * s.low:.2f} to {100 * s.high:.2f}), nearest in "
+            f"{s.nearest_in} of {s.subjects} subjects"
+            + ("" if place == 1 or s.told_apart else "; not told from the first")
+            for place, s in enumerate(self.ranking, start=1)
+        ]
+        return [*lines, f"Report: {self.out / 'report.html'}"]
+
+
+def cohort(
+    studies: Sequence[Path | str],
+    *,
+    out: Path | str,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    progress: Told | None = None,
+) -> Cohort:
+    """Run the studies of many subjects, and rank the models over them.
+
+    Parameters
+    ----------
+    studies : sequence of path
+        Study files, or their folders; each with a name of its own.
+    out : path
+        For the cohort's report and tables; each study keeps its own results.
+    scheduler, workers, progress
+        As in `mrstrain.run`.
+
+    Raises
+    ------
+    InputError
+        If a study cannot be read, two have one name, or no subject has been compared with a model.
+    """
+    told = [read_study(place) for place in studies]
+    names = [study.study.name for study in told]
+    if not told or len(set(names)) < len(names):
+        raise InputError(f"A cohort needs studies, each with a name of its own ([study] name); got {', '.join(names)}.")
+    target = Path(out)
+    make_output(target)
+    ran = run_studies(told, scheduler=scheduler, workers=workers, progress=progress)
+    areas = {one.study.study.name: _areas(one.study.out / COMPARISON / "areas.csv") for one in ran}
+    rows = [row for of in areas.values() for row in of]
+    if not rows:
+        raise InputError(
+            "No subject was compared with a model: " + "; ".join(line for r in ran for line in r.summary())
+        )
+    shares = _shares(areas)
+    try:
+        ranking = standings(shares)
+    except InputError:
+        ranking = ()
+    _write_tables(target, areas, ranking)
+    files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
+    record = provenance("cohort", {"studies": files}, {"subjects": names})
+    write_json(target / "provenance.json", record)
+    _write_page(target / "report.html", ran, shares, ranking, record)
+    return Cohort(target, tuple(ran), ranking)
+
+
+def _areas(path: Path) -> list[dict[str, str]]:
+    """The areas of all soft tissue in a study's table; none where it has not been compared."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
+
+
+def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> dict[str, dict[str, float]]:
+    """Model to subject to the area over all loads, over volume and range: the best estimate where there is one."""
+    shares: dict[str, dict[str, float]] = {}
+    for subject, rows in areas.items():
+        loads = {row["load"] for row in rows} - {_TOTAL}
+        for row in rows:
+            if row["load"] != (_TOTAL if len(loads) > 1 else next(iter(loads))) or row["model"].endswith(LEVELLED):
+                continue
+            found, best = float(row["ml"]), float(row["estimate_ml"])
+            scale = best / found if found > 0.0 and not np.isnan(best) else 1.0
+            shares.setdefault(row["model"], {})[subject] = scale * float(row["share"])
+    return shares
+
+
+def _write_tables(target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[Standing]) -> None:
+    first = next(row for rows in areas.values() for row in rows)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["subject", *first])
+    writer.writerows([subject, *row.values()] for subject, rows in areas.items() for row in rows)
+    write_whole(target / "cohort.csv", text.getvalue())
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([f.name for f in fields(Standing)])
+    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in astuple(s)] for s in ranking)
+    write_whole(target / "ranking.csv", text.getvalue())
+
+
+def _write_page(
+    path: Path,
+    ran: Sequence[Ran],
+    shares: Mapping[str, Mapping[str, float]],
+    ranking: Sequence[Standing],
+    record: Mapping[str, object],
+) -> None:
+    order = [s.model for s in ranking] or list(shares)
+    ranked = Table(
+        "Models over all subjects and loads, the nearest first",
+        ("model", "mean, %", "95 % from", "to", "least", "greatest", "nearest in", "subjects", "behind the first, %",
+         "from", "to", "told from the first"),
+        tuple(
+            (s.model, 100 * s.mean, 100 * s.low, 100 * s.high, 100 * s.least, 100 * s.greatest, s.nearest_in,
+             s.subjects, 100 * s.behind, 100 * s.behind_low, 100 * s.behind_high,
+             "–" if at == 0 else "yes" if s.told_apart else "no")
+            for at, s in enumerate(ranking)
+        ),
+        "Area between volume-strain curves divided by the tissue's volume and the width of the range of strain. "
+        "Intervals are those of the mean over subjects (Student's t); a model is told from the first where the "
+        "interval of their difference, subject by subject, does not hold zero.",
+    )  # fmt: skip
+    names = [one.study.study.name for one in ran]
+    by_subject = Table(
+        "By subject, %",
+        ("subject", *order),
+        tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in names),
+    )
+    drawn = Picture("Distribution over subjects", said(figures.over_subjects), figures.over_subjects(shares, order))
+    sections = [Section("Models", None, (ranked, by_subject), (drawn,))]
+    for one in ran:
+        failed = [f"{o.stage}: {o.words}. {o.reason}" for o in one.outcomes.values() if o.record is None]
+        verdicts = [
+            s.verdict
+            for name, o in one.outcomes.items()
+            if o.record is not None and name.startswith("register ")
+            for s in o.record.given.sections
+            if s.verdict is not None
+        ]
+        verdicts += [Verdict("distrust", tuple(failed))] if failed else []
+        report = Table("Its own report", ("folder",), ((str(one.study.out),),))
+        sections.append(Section(one.study.study.name, worst(verdicts) if verdicts else None, (report,)))
+    write_report(path, "Models over subjects", None, sections, [], flat(record))

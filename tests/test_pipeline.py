@@ -1,0 +1,186 @@
+"""What is run, what is not run again, and what a failure leaves standing; with stages that only write a file."""
+
+from __future__ import annotations
+
+import json
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from mrstrain.ledger import Ledger
+from mrstrain.pipeline import Pipeline, run_all
+from mrstrain.plan import Stage
+from mrstrain.stages import Given
+
+
+class Here:
+    """A cluster that runs stages at once: each writes down what it reads."""
+
+    def __init__(self, failing: tuple[str, ...] = ()) -> None:
+        self.failing, self.ran, self._ended = failing, [], []
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._ended)
+
+    def begin(self, name: str, function: str, arguments: dict) -> None:
+        self.ran.append(name)
+        out = Path(arguments["out"])
+        if name in self.failing:
+            out.write_text("half")
+            self._ended.append((name, "It broke.", 1.0))
+            return
+        read = [Path(p).read_text() for p in [*arguments["reads"], *arguments.get("parts", [])]]
+        out.write_text(json.dumps([name, arguments["number"], *read]))
+        self._ended.append((name, Given((f"{name} done",)), 1.0))
+
+    def next(self) -> tuple[str, Given | str, float]:
+        return self._ended.pop(0)
+
+
+def stages_in(folder: Path, number: int = 1) -> list[Stage]:
+    """Two measurements, a mesh and two models on it, and their comparison."""
+    out = folder / "results"
+
+    def stage(name: str, reads: tuple[str, ...], made: tuple[str, ...] = (), some: dict | None = None) -> Stage:
+        given = [str(folder / r) for r in reads] + [str(out / m) for m in made]
+        place = out / name.replace(" ", "_")
+        arguments = {"out": str(place), "reads": given, "number": number if name == "mesh" else 0}
+        waits = tuple(m.replace("_", " ") for m in made)
+        return Stage(name, arguments, tuple(folder / r for r in reads), (place,), waits, some or {})
+
+    parts = {f"{kind} {n}": str(out / f"{kind}_{n}") for kind in ("register", "simulate") for n in "ab"}
+    return [
+        stage("register a", ("a.txt",)),
+        stage("register b", ("b.txt",)),
+        stage("mesh", ("labels.txt",)),
+        stage("simulate a", (), ("mesh",)),
+        stage("simulate b", (), ("mesh",)),
+        stage("compare", ("labels.txt",), (), {"parts": parts}),
+    ]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "results").mkdir()
+    for name in ("a", "b", "labels"):
+        (tmp_path / f"{name}.txt").write_text(name)
+    return tmp_path
+
+
+def ran(folder: Path, number: int = 1, failing: tuple[str, ...] = (), **how):
+    """Run the stages; give what was run, and the outcomes."""
+    cluster, asked = Here(failing), []
+
+    @contextmanager
+    def pool():
+        asked.append(1)
+        yield cluster
+
+    told: list[str] = []
+    pipeline = Pipeline(stages_in(folder, number), Ledger(folder / "results", folder), **how)
+    run_all({"": pipeline}, pool, {"": told.append})
+    outcomes = pipeline.outcomes
+    assert len(asked) == bool(cluster.ran)  # no workers are started for nothing
+    return cluster.ran, outcomes, told
+
+
+ALL = ["register a", "register b", "mesh", "simulate a", "simulate b", "compare"]
+
+
+def test_finished_work_is_not_done_again(folder):
+    first, outcomes, told = ran(folder)
+    assert first == ALL
+    assert all(o.words == "done" for o in outcomes.values())
+    assert "compare: done after 1 s" in told
+    assert "    compare done" in told
+    again, outcomes, _ = ran(folder)
+    assert again == []
+    assert all(o.words == "there already" for o in outcomes.values())
+
+
+def test_changed_content_of_the_same_size_is_done_again_and_what_builds_on_it(folder):
+    ran(folder)
+    (folder / "a.txt").write_text("z")
+    assert ran(folder)[0] == ["register a", "compare"]
+    assert '"z"' in (folder / "results" / "compare").read_text().replace("\\", "")
+
+
+def test_a_new_number_is_done_again_and_what_builds_on_it(folder):
+    ran(folder)
+    assert ran(folder, number=2)[0] == ["mesh", "simulate a", "simulate b", "compare"]
+
+
+def test_a_result_that_was_lost_is_made_again(folder):
+    ran(folder)
+    (folder / "results" / "simulate_b").unlink()
+    assert ran(folder)[0] == ["simulate b", "compare"]
+    (folder / "results" / "register_a").write_text("cut")
+    assert ran(folder)[0] == ["register a", "compare"]
+
+
+def test_a_failure_is_named_and_the_others_finish(folder):
+    first, outcomes, told = ran(folder, failing=("register b", "simulate a"))
+    assert first == ALL
+    assert outcomes["register b"].words == "FAILED"
+    assert outcomes["register b"].reason == "It broke."
+    assert outcomes["compare"].record is not None
+    assert "register b" not in (folder / "results" / "compare").read_text()
+    assert not (folder / "results" / "register_b").exists()  # a half result is none
+    assert "register b: FAILED after 1 s. It broke." in told
+    assert ran(folder)[0] == ["register b", "simulate a", "compare"]
+
+
+def test_what_cannot_do_without_a_failed_one_is_not_run(folder):
+    first, outcomes, _ = ran(folder, failing=("mesh",))
+    assert "simulate a" not in first
+    assert outcomes["simulate a"].words == "not run"
+    assert outcomes["simulate a"].reason == "Not run: mesh has no result."
+    _, outcomes, _ = ran(folder, failing=("mesh", "register a", "register b"), force=("register",))
+    assert outcomes["compare"].words == "not run"
+    assert not (folder / "results" / "compare").exists()
+
+
+def test_a_result_of_other_inputs_does_not_outlive_a_failure(folder):
+    ran(folder)
+    (folder / "a.txt").write_text("z")
+    _, outcomes, _ = ran(folder, failing=("register a",))
+    assert outcomes["register a"].record is None
+    assert not (folder / "results" / "register_a").exists()
+    assert '"a"' not in (folder / "results" / "compare").read_text().replace("\\", "")
+
+
+def test_only_and_force(folder):
+    first, outcomes, _ = ran(folder, only=("register",))
+    assert first == ["register a", "register b"]
+    assert outcomes["mesh"].words == "not run"
+    ran(folder)
+    assert ran(folder, force=("simulate b",))[0] == ["simulate b", "compare"]
+    assert ran(folder, force=("register",))[0] == ["register a", "register b", "compare"]
+    (folder / "a.txt").write_text("z")
+    first, outcomes, _ = ran(folder, only=("mesh", "simulate", "compare"))
+    assert first == []
+    assert outcomes["register a"].reason.startswith("Made from other inputs")
+
+
+def test_a_moved_study_stays_finished(folder, tmp_path_factory):
+    ran(folder)
+    moved = tmp_path_factory.mktemp("elsewhere") / "study"
+    folder.rename(moved)
+    assert ran(moved)[0] == []
+
+
+def test_the_forecast_is_what_is_run(folder):
+    def forecast(number: int = 1, **how) -> list[str]:
+        told = Pipeline(stages_in(folder, number), Ledger(folder / "results", folder), **how).forecast()
+        return [name for name, what in told.items() if what == "run"]
+
+    assert forecast() == ALL
+    assert not (folder / "results" / "mesh").exists()
+    ran(folder)
+    assert forecast() == []
+    assert forecast(force=("simulate b",)) == ["simulate b", "compare"]
+    (folder / "b.txt").write_text("y")
+    assert forecast() == ["register b", "compare"] == ran(folder)[0]
+    assert forecast(number=3) == ran(folder, number=3)[0]

@@ -1,0 +1,305 @@
+"""A study from its file to its report: run, run again, changed, broken, killed, shared out over a cluster."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.errors import InputError, OutputError
+from dvc.image import Grid, LabelMap
+from dvc.imagefile import read_image
+from dvc.imagewrite import write_image, write_labels
+from mrstrain.beginning import init
+from mrstrain.checking import check
+from mrstrain.running import forecast, report, run
+from mrstrain.studyfile import read_study
+from tests.quick import QUICK
+
+pytestmark = pytest.mark.slow
+
+STUDY = """
+[study]
+name = "Heel <b>3</b>"
+[images]
+load0 = "Load0.nii.gz"
+labels = "tissues.nii.gz"
+names = "tissues.csv"
+repeat = "Load0-again.nii.gz"
+[loads.Load1]
+image = "Load1.nii.gz"
+normal_n = 8.0
+[loads.Load2]
+image = "Load2.nii.gz"
+normal_n = 2.0
+[registration]
+parameters = ["quick.txt"]
+[mesh]
+edge_mm = 9.0
+labels = "to_mesh.nii.gz"
+names = "to_mesh.csv"
+[models]
+sets = ["akrami"]
+"""
+STAGES = ["register repeat", "register Load1", "register Load2", "mesh", "simulate akrami", "compare"]
+
+
+def coarse(labels: LabelMap) -> LabelMap:
+    """Bone and soft tissue at twice the voxel: a mesh of few cells."""
+    grid = labels.grid
+    bones = [n for n, name in labels.names.items() if name in ("bone", "ankle")]
+    values = labels.labels[::2, ::2, ::2]
+    both = np.where(np.isin(values, bones), 1, np.where(values > 0, 2, 0))
+    return LabelMap(
+        Grid(both.shape, 2.0 * grid.spacing_mm, grid.origin_mm, grid.direction), both, {1: "bone", 2: "fat"}
+    )
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory, small_pair) -> Path:
+    """A heel at 1.6 mm; the loaded image serves for two loads, of which one has a row of voxels changed."""
+    folder = tmp_path_factory.mktemp("images")
+    write_image(folder / "Load0.nii.gz", small_pair.reference)
+    write_image(folder / "Load1.nii.gz", small_pair.loaded)
+    write_image(folder / "Load2.nii.gz", small_pair.repeat)
+    write_image(folder / "Load0-again.nii.gz", small_pair.repeat)
+    write_labels(folder / "tissues.nii.gz", small_pair.labels)
+    write_labels(folder / "to_mesh.nii.gz", coarse(small_pair.labels))
+    (folder / "quick.txt").write_text(QUICK)
+    (folder / "study.toml").write_text(STUDY)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(images, tmp_path_factory):
+    """The study, run in a process of its own on two workers."""
+    folder = tmp_path_factory.mktemp("done") / "study"
+    shutil.copytree(images, folder)
+    told = subprocess.run(
+        [sys.executable, "-m", "mrstrain", "run", str(folder)], capture_output=True, text=True, check=False
+    )
+    assert told.returncode == 0, told.stderr
+    return folder, told
+
+
+def shear_of(folder: Path, load: str) -> np.ndarray:
+    return read_image(folder / "results" / "registration" / load / "max_shear.nii.gz", allow_missing=True).values
+
+
+def test_every_result_is_there_and_the_report_tells_it(done):
+    folder, told = done
+    out = folder / "results"
+    for name in (
+        "registration/Load1/displacement.nii.gz",
+        "registration/repeat/quality.json",
+        "mesh/mesh.vtu",
+        "models/akrami/Load1.vtu",
+        "models/akrami/Load2.vtu",
+        "comparison/areas.csv",
+        "provenance.json",
+    ):
+        assert (out / name).is_file(), name
+    page = (out / "report.html").read_text()
+    assert "Heel &lt;b&gt;3&lt;/b&gt;" in page
+    assert "<b>3</b>" not in page
+    assert "Registration of Load1" in page
+    assert "Area between the volume-strain curves" in page
+    assert "how each stage ended" in page.lower()
+    assert f"Report: {out / 'report.html'}" in told.stdout
+    assert "akrami" in told.stdout
+    assert "register Load1: registering" in told.stderr
+    log = (out / "study.log").read_text()
+    assert all(f"{stage}: done after" in log for stage in STAGES)
+    record = json.loads((out / "provenance.json").read_text())
+    assert {f["name"] for f in record["inputs"]["inputs"]} >= {"Load0.nii.gz", "tissues.nii.gz", "quick.txt"}
+
+
+def test_run_again_does_nothing_in_under_ten_seconds(done):
+    folder, _ = done
+    before = (folder / "results" / "mesh" / "mesh.vtu").stat().st_mtime_ns
+    assert set(forecast(folder).values()) == {"done already"}
+    began = time.monotonic()
+    outcomes = run(folder).outcomes
+    assert time.monotonic() - began < 10.0
+    assert all(o.again for o in outcomes.values())
+    assert (folder / "results" / "mesh" / "mesh.vtu").stat().st_mtime_ns == before
+
+
+def test_the_report_alone(done):
+    folder, _ = done
+    first = (folder / "results" / "report.html").read_text()
+    (folder / "results" / "report.html").unlink()
+    report(folder)
+    again = (folder / "results" / "report.html").read_text()
+    assert "Registration of Load2" in again
+    assert abs(len(again) - len(first)) < 2000  # but for times and "there already"
+
+
+def test_only_what_changed_is_done_anew(done, tmp_path):
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(folder, study)
+    (study / "study.toml").write_text(STUDY.replace("normal_n = 8.0", "normal_n = 6.0"))
+    told = forecast(study)
+    assert [name for name, what in told.items() if what == "run"] == ["simulate akrami", "compare"]
+    image = read_image(study / "Load2.nii.gz")
+    values = image.values.copy()
+    values[0, 0, 0] += 1.0
+    write_image(study / "Load2.nii.gz", type(image)(image.grid, values))  # the same shape, and nearly the same size
+    assert [name for name, what in forecast(study).items() if what == "run"] == [
+        "register Load2", "simulate akrami", "compare",
+    ]  # fmt: skip
+
+
+def test_a_broken_image_leaves_the_others_to_finish_and_is_named(done, tmp_path):
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(folder, study)
+    whole = (study / "Load2.nii.gz").read_bytes()
+    (study / "Load2.nii.gz").write_bytes(whole[: len(whole) // 2])
+    ran = subprocess.run(
+        [sys.executable, "-m", "mrstrain", "run", str(study)], capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 1
+    assert "register Load2: FAILED" in ran.stdout
+    out = study / "results"
+    assert not (out / "registration" / "Load2").exists()  # that of the whole image is no result of this one
+    with (out / "comparison" / "areas.csv").open() as file:
+        assert "Load2" not in {row["load"] for row in csv.DictReader(file)}
+    page = (out / "report.html").read_text()
+    assert "register Load2 failed" in page
+
+
+def test_two_runs_in_one_folder(done):
+    folder, _ = done
+    from filelock import FileLock
+
+    with FileLock(folder / "results" / ".study" / "lock"), pytest.raises(OutputError, match="another run"):
+        run(folder)
+
+
+def test_killed_and_run_again_gives_the_same(done, images, tmp_path):
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    command = [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--workers", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    records = study / "results" / ".study"
+    wait_for((records / "register repeat.json").is_file, process)
+    time.sleep(2.0)  # the next is under way
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (study / "results" / "registration" / "Load2").exists()
+    kept = (records / "register repeat.json").read_bytes()
+    assert set(forecast(study, only=["register"]).values()) == {"done already", "run", "left out"}
+    run(study, only=["register"])
+    assert (records / "register repeat.json").read_bytes() == kept  # not done twice
+    for load in ("Load1", "Load2"):
+        assert np.array_equal(shear_of(study, load), shear_of(folder, load), equal_nan=True)
+
+
+def test_a_cluster_whose_worker_is_killed_loses_nothing(done, images, tmp_path):
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    environment = os.environ | {"DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
+    file = tmp_path / "scheduler.json"
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    scheduler = subprocess.Popen(
+        [*dask, "--host", "127.0.0.1", "--port", "0", "--dashboard-address", ":0", "--scheduler-file", str(file)],
+        env=environment, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--no-nanny"]
+    workers = [
+        subprocess.Popen(
+            [*worker, "--nthreads", "1", "--dashboard-address", ":0", "--local-directory", str(tmp_path / str(n))],
+            env=environment, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+        )
+        for n in range(2)
+    ]  # fmt: skip
+    try:
+        wait_for(file.is_file, scheduler)
+        address = json.loads(file.read_text())["address"]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--scheduler", address],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        records = study / "results" / ".study"
+        wait_for((records / "register repeat.json").is_file, process)
+        time.sleep(2.0)  # Load1 and Load2 are under way, one on each
+        workers[0].kill()
+        assert process.wait(timeout=400) == 1  # what was left out has no result
+        for load in ("Load1", "Load2"):
+            assert np.array_equal(shear_of(study, load), shear_of(folder, load), equal_nan=True)
+        outcomes = (study / "results" / "study.log").read_text()
+        assert "FAILED" not in outcomes
+    finally:
+        for one in (*workers, scheduler):
+            one.kill()
+            one.wait()
+
+
+def wait_for(condition, process, limit_s: float = 300.0) -> None:
+    began = time.monotonic()
+    while not condition():
+        assert process.poll() is None, "it ended before"
+        assert time.monotonic() - began < limit_s, "it took too long"
+        time.sleep(0.2)
+
+
+def test_a_scheduler_that_is_not_there(images, tmp_path):
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    with pytest.raises(InputError, match="No Dask scheduler"):
+        run(study, scheduler="tcp://127.0.0.1:1")
+
+
+def test_check_tells_all_that_is_wrong_at_once(done, images, tmp_path):
+    fine = check(images)
+    assert fine.wrong == ()
+    assert any(f"To do: {len(STAGES)} of {len(STAGES)} stages" in note for note in fine.notes)
+    assert "Everything is done already" in check(done[0]).notes[-1]
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    shutil.copy(study / "Load0.nii.gz", study / "Load1.nii.gz")
+    (study / "Load2.nii.gz").unlink()
+    text = STUDY.replace('names = "tissues.csv"', 'names = "tissues.csv"\nbone = "heelbone"')
+    (study / "study.toml").write_text(text.replace('"akrami"', '"akramy"'))
+    wrong = "\n".join(check(study).wrong)
+    for words in ("Load1 is the unloaded image", "Load2.nii.gz", "heelbone", "akramy"):
+        assert words in wrong, words
+
+
+def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    with pytest.raises(OutputError, match="already"):
+        init(study)
+    (study / "study.toml").unlink()
+    (study / "ansys").mkdir()
+    (study / "ansys" / "Load1.vtu").write_text("")
+    init(study)
+    told = read_study(study)
+    assert told.images.load0 == "Load0.nii.gz"
+    assert told.images.repeat == "Load0-again.nii.gz"
+    assert (told.images.labels, told.images.names) == ("tissues.nii.gz", "tissues.csv")
+    assert list(told.loads) == ["Load1", "Load2"]
+    assert told.loads["Load1"].normal_n == 140.0
+    assert told.models.results == ("ansys",)
+    assert len(told.models.sets) == 7
+
+
+def test_init_of_an_empty_folder_says_what_is_missing(tmp_path):
+    told = "\n".join(init(tmp_path).summary())
+    assert "Load0: NOT FOUND" in told
+    with pytest.raises(InputError, match=r"\[images\] 'load0' is missing"):
+        read_study(tmp_path)

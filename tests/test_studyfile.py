@@ -1,0 +1,122 @@
+"""The study file: what is read from it, and everything that is refused, at once and with the nearest known key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dvc.errors import InputError
+from mrstrain.plan import plan
+from mrstrain.studyfile import read_study
+
+WHOLE = """
+[study]
+name = "Heel"
+[images]
+load0 = "Load0.nii.gz"
+labels = "tissues.nii.gz"
+[loads.Load1]
+image = "Load1.nii.gz"
+normal_n = 140
+[loads.Load2]
+image = "Load2.nii.gz"
+normal_n = 15.0
+shear_n = 45.0
+[models]
+sets = ["trebbi", "luboz"]
+results = ["ansys"]
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    (folder / "study.toml").write_text(text)
+    return folder
+
+
+def test_values_and_paths_start_from_the_file(tmp_path):
+    study = read_study(written(tmp_path, WHOLE))
+    assert study.loads["Load1"].normal_n == 140.0
+    assert study.path(study.images.load0) == tmp_path / "Load0.nii.gz"
+    assert study.out == tmp_path / "results"
+    assert study.plate.normal == (0.0, 0.0, -1.0)
+    assert read_study(tmp_path / "study.toml") == study
+
+
+def test_everything_wrong_is_told_at_once_with_the_nearest_key(tmp_path):
+    text = WHOLE.replace("normal_n = 140", "norml_n = 140").replace('name = "Heel"', 'nam = "Heel"')
+    text = text.replace("shear_n = 45.0", 'shear_n = "45"') + "[mesh]\nedge = 2.0\n[meshing]\n"
+    with pytest.raises(InputError) as told:
+        read_study(written(tmp_path, text))
+    for sentence in (
+        "[study] 'name' is missing",
+        "[study] 'nam' is no key here; did you mean 'name'?",
+        "[loads.Load1] 'norml_n' is no key here; did you mean 'normal_n'?",
+        "[loads.Load2] 'shear_n'",
+        "[mesh] 'edge' is no key here; did you mean 'edge_mm'?",
+        "'meshing' is no key here; did you mean 'mesh'?",
+    ):
+        assert sentence in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("normal_n = 140", "normal_n = true", "normal_n"),
+        ("normal_n = 140", "normal_n = -5.0", "greater than 0"),
+        ("normal_n = 140", "normal_n = nan", "normal_n"),
+        ("[loads.Load1]", '[loads."../Load1"]', "folder"),
+        ("[loads.Load1]", '[loads."repeat"]', "repeat scan"),
+        ('sets = ["trebbi", "luboz"]', 'sets = ["trebbi", "trebbi"]', "only once"),
+        ('name = "Heel"', 'name = "Heel"\nout = "../elsewhere"', "below the study's own folder"),
+        ('name = "Heel"', 'name = "Heel"\nout = "/tmp/elsewhere"', "below the study's own folder"),
+        ('name = "Heel"', 'name = "Heel"\nout = "."', "below the study's own folder"),
+        ('name = "Heel"', 'name = "Heel"\nseed = 0', "seed"),
+        ("[study]", "[study", "no TOML"),
+        ("[study]", 'place = "/tmp"\n[study]', "'place' is no key"),
+    ],
+)
+def test_refused(tmp_path, old, new, words):
+    assert old in WHOLE
+    with pytest.raises(InputError, match=words):
+        read_study(written(tmp_path, WHOLE.replace(old, new)))
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(InputError, match="mrstrain init"):
+        read_study(tmp_path)
+
+
+def test_the_plan_names_every_stage_behind_what_it_waits_for(tmp_path):
+    text = WHOLE.replace('labels = "', 'repeat = "again.nii.gz"\nlabels = "') + "level = true\ndrive = true\n"
+    stages = plan(read_study(written(tmp_path, text)))
+    names = [stage.name for stage in stages]
+    assert names == [
+        "register repeat", "register Load1", "register Load2", "mesh",
+        "simulate trebbi", "drive trebbi", "level trebbi Load1", "level trebbi Load2",
+        "simulate luboz", "drive luboz", "level luboz Load1", "level luboz Load2", "compare",
+    ]  # fmt: skip
+    for at, stage in enumerate(stages):
+        assert set(stage.before) <= set(names[:at])
+    by_name = dict(zip(names, stages, strict=True))
+    assert by_name["register Load2"].before == ("register repeat",)
+    assert by_name["level trebbi Load1"].before == ("simulate trebbi",)
+    assert tmp_path / "ansys" in by_name["compare"].files
+
+
+def test_chained_loads_wait_for_one_another(tmp_path):
+    stages = plan(read_study(written(tmp_path, WHOLE + "[registration]\nchain = true\n")))
+    assert next(s for s in stages if s.name == "register Load2").before == ("register Load1",)
+
+
+def test_a_simulated_load_needs_its_force(tmp_path):
+    text = WHOLE.replace("normal_n = 15.0\n", "")
+    with pytest.raises(InputError, match=r"loads.Load2\] normal_n is missing"):
+        plan(read_study(written(tmp_path, text)))
+    measured = text.replace('sets = ["trebbi", "luboz"]', "sets = []")
+    assert [s.kind for s in plan(read_study(written(tmp_path, measured)))] == ["register", "register", "compare"]
+
+
+def test_two_models_of_one_name_are_refused(tmp_path):
+    with pytest.raises(InputError, match="rename the folder"):
+        plan(read_study(written(tmp_path, WHOLE.replace('["ansys"]', '["other/trebbi"]'))))

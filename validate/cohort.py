@@ -1,0 +1,96 @@
+"""Models over many subjects: how far each is from the measurement, and which are told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from dvc.arrays import FloatArray
+from dvc.errors import InputError
+
+_LEVEL = 0.975
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A model's place over subjects.
+
+    Attributes
+    ----------
+    model : str
+    subjects : int
+        On which every model has a result.
+    mean, low, high : float
+        Of the area between its curve and the measured one, divided by the tissue's volume and the width of the range;
+        95 % interval of the mean over subjects (Student's t). NaN for one subject.
+    least, greatest : float
+        Over the subjects.
+    nearest_in : int
+        Subjects in which it is the nearest.
+    behind, behind_low, behind_high : float
+        Mean over subjects of its area minus that of the first model, in the same subject, and the interval.
+    """
+
+    model: str
+    subjects: int
+    mean: float
+    low: float
+    high: float
+    least: float
+    greatest: float
+    nearest_in: int
+    behind: float
+    behind_low: float
+    behind_high: float
+
+    @property
+    def told_apart(self) -> bool:
+        """Whether the subjects tell it from the first model."""
+        return bool(self.behind_low > 0.0)
+
+
+def standings(shares: Mapping[str, Mapping[str, float]]) -> tuple[Standing, ...]:
+    """Rank models over the subjects that have a result of each, the nearest first.
+
+    Subjects are taken as drawn from one population, independent of each other. Intervals are those of a mean: they
+    narrow with more subjects, and hold the error of the measurement as far as it differs from subject to subject.
+
+    Parameters
+    ----------
+    shares : mapping of model to mapping of subject to float
+        Area between curves over volume and width of the range.
+
+    Raises
+    ------
+    InputError
+        If no subject has a result of every model.
+    """
+    names = list(shares)
+    subjects = [s for s in dict.fromkeys(s for of in shares.values() for s in of) if all(s in shares[n] for n in names)]
+    if not names or not subjects:
+        raise InputError("No subject has a result of every model, so they cannot be ranked.")
+    table = np.array([[shares[n][s] for s in subjects] for n in names])
+    order = np.argsort(table.mean(axis=1), kind="stable")
+    first, nearest = table[order[0]], np.argmin(table, axis=0)
+    made = []
+    for at in order:
+        mean, low, high = _mean(table[at])
+        behind, behind_low, behind_high = _mean(table[at] - first)
+        made.append(
+            Standing(
+                names[at], len(subjects), mean, low, high, float(table[at].min()), float(table[at].max()),
+                int(np.count_nonzero(nearest == at)), behind, behind_low, behind_high,
+            )
+        )  # fmt: skip
+    return tuple(made)
+
+
+def _mean(values: FloatArray) -> tuple[float, float, float]:
+    mean, count = float(values.mean()), len(values)
+    if count < 2:
+        return mean, float("nan"), float("nan")
+    half = float(student.ppf(_LEVEL, count - 1) * values.std(ddof=1) / np.sqrt(count))
+    return mean, mean - half, mean + half
