@@ -15,13 +15,14 @@ from typing import Any
 
 import meshio
 import numpy as np
+from meshio._mesh import topological_dimension
 
 from dvc.abaqus import read_abaqus
 from dvc.ansys import read_ansys
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.frd import read_frd
-from dvc.gmsh import gmsh_node_numbers
+from dvc.gmsh import gmsh_node_numbers, in_vtk_order
 from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points, outer_faces
 
 _log = logging.getLogger("dvc.meshfile")
@@ -35,6 +36,8 @@ _DIMENSION = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2} | dict.fromkeys(
 # Cell arrays of VTK files that hold a region's number, in the order in which they are looked for.
 _REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part")
 _MOST_REGIONS = 256
+# meshio 5.3.5 reads and writes these cells, but has left them out of its own table of dimensions, and fails on them.
+topological_dimension.update({"wedge15": 3, "pyramid13": 3})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,7 +181,7 @@ def _from_frd(path: Path) -> _Raw:
 
 def _from_gmsh(path: Path) -> _Raw:
     mesh = _by_meshio(path, meshio.gmsh.read)
-    blocks = [(block.type, block.data) for block in mesh.cells]
+    blocks = [(block.type, in_vtk_order(block.type, block.data)) for block in mesh.cells]
     sizes = [len(data) for _, data in blocks]
     regions: dict[str, IntArray] = {}
     if "gmsh:physical" in mesh.cell_data:
