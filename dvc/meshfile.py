@@ -79,6 +79,8 @@ class MeshFile:
     tets : TetMesh or None
         The tetrahedra by their corner nodes, checked, with the regions that hold tetrahedra and, as facets,
         those that hold triangles. None where the file has volume cells of other shapes.
+    at_nodes : mapping of str to (n, ...)
+        Arrays at the nodes, such as a displacement, in the file's own unit and frame.
     """
 
     path: Path
@@ -89,6 +91,7 @@ class MeshFile:
     blocks: tuple[CellBlock, ...]
     regions: Mapping[str, IntArray]
     tets: TetMesh | None
+    at_nodes: Mapping[str, FloatArray]
 
     @property
     def cell_count(self) -> int:
@@ -162,6 +165,7 @@ class _Raw:
     blocks: list[tuple[str, Any]]
     regions: dict[str, IntArray]
     node_sets: dict[str, IntArray] = field(default_factory=dict)
+    at_nodes: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _from_abaqus(path: Path) -> _Raw:
@@ -176,7 +180,8 @@ def _from_ansys(path: Path) -> _Raw:
 
 def _from_frd(path: Path) -> _Raw:
     found = read_frd(path)
-    return _Raw(found.points, found.node_ids, list(found.blocks), found.materials)
+    moved = {} if found.displacement is None else {"displacement": found.displacement}
+    return _Raw(found.points, found.node_ids, list(found.blocks), found.materials, at_nodes=moved)
 
 
 def _from_gmsh(path: Path) -> _Raw:
@@ -197,7 +202,7 @@ def _from_gmsh(path: Path) -> _Raw:
                 raise ImageFileError(f"{path}: its $Elements section is cut short.")
             found = [np.asarray(part, dtype=np.int64) for part in parts]
             regions[name] = np.concatenate([part + start for part, start in zip(found, starts, strict=True)])
-    return _Raw(mesh.points, gmsh_node_numbers(path, len(mesh.points)), blocks, regions)
+    return _Raw(mesh.points, gmsh_node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
 
 
 def _from_vtk(path: Path) -> _Raw:
@@ -212,7 +217,7 @@ def _from_vtk(path: Path) -> _Raw:
                 regions = {f"{arrays[wanted]} {int(n)}": np.flatnonzero(values == n) for n in numbers}
                 break
     blocks = [(block.type, block.data) for block in mesh.cells]
-    return _Raw(mesh.points, np.arange(len(mesh.points)), blocks, regions)
+    return _Raw(mesh.points, np.arange(len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
 
 
 def _by_meshio(path: Path, read: Callable[[str], Any]) -> Any:
@@ -271,6 +276,7 @@ def _checked(path: Path, unit: str, frame: str, raw: _Raw) -> MeshFile:
         blocks=tuple(blocks),
         regions=MappingProxyType(regions),
         tets=tets,
+        at_nodes=MappingProxyType({name: frozen(values, np.float64) for name, values in raw.at_nodes.items()}),
     )
 
 
