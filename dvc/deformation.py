@@ -12,13 +12,14 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from scipy.ndimage import binary_dilation, map_coordinates, spline_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinates, spline_filter
 
-from dvc.arrays import BoolArray, FloatArray, frozen
+from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
 from dvc.errors import InputError
 from dvc.image import Grid, Mask
 
 _CHUNK = 200_000
+_RIM = 6  # voxels: what lies beyond weighs less than a thousandth in a cubic spline
 
 
 @runtime_checkable
@@ -290,14 +291,16 @@ class SampledDisplacement:
     Notes
     -----
     The gradient is that of the interpolant. A point is undefined outside the voxel centres' box and where
-    a voxel without a value lies among its eight neighbours. Missing voxels are filled from their nearest
-    defined neighbour before the spline is fitted, so that they do not spread.
+    a voxel without a value lies among its eight neighbours. Before the spline is fitted, missing voxels and a rim
+    around the grid are filled by reflecting the field about the nearest defined voxel, u(X) = 2 u(N) - u(2 N - X): a
+    uniform strain stays what it is up to the outermost voxels. (Filled with u(N), it would be half as large there.)
     """
 
     grid: Grid
     displacement_mm: FloatArray
     _coefficients: FloatArray
     _undefined: BoolArray
+    _shift: IntArray
 
     def __init__(self, grid: Grid, displacement_mm: FloatArray) -> None:
         values = np.asarray(displacement_mm, dtype=np.float64)
@@ -305,21 +308,18 @@ class SampledDisplacement:
             raise InputError(f"The displacement has shape {values.shape}; its grid needs {(*grid.shape, 3)}.")
         if min(grid.shape) < 2:
             raise InputError(f"A displacement grid needs two voxels or more along each axis; got {grid.shape}.")
-        undefined = ~np.isfinite(values).all(axis=-1)
+        undefined = np.asarray(~np.isfinite(values).all(axis=-1))
         if undefined.all():
             raise InputError("The displacement field has no defined voxel.")
-        if undefined.any():
-            from scipy.ndimage import distance_transform_edt
-
-            nearest = distance_transform_edt(
-                undefined, sampling=grid.spacing_mm, return_distances=False, return_indices=True
-            )
-            values = values[tuple(nearest)]
+        low, high = (np.array([edge(axis) for axis in np.nonzero(~undefined)]) for edge in (np.min, np.max))
+        box = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
+        values = _carried_past_borders(values[box], undefined[box], grid.spacing_mm)
         coefficients = np.stack([spline_filter(values[..., c], order=3, mode="mirror") for c in range(3)])
         object.__setattr__(self, "grid", grid)
         object.__setattr__(self, "displacement_mm", frozen(displacement_mm, np.float64))
         object.__setattr__(self, "_coefficients", frozen(coefficients, np.float64))
         object.__setattr__(self, "_undefined", frozen(undefined, np.bool_))
+        object.__setattr__(self, "_shift", frozen(_RIM - low, np.int64))
 
     def _inside(self, indices: FloatArray) -> BoolArray:
         slack = 1e-9 * max(self.grid.shape)
@@ -336,7 +336,10 @@ class SampledDisplacement:
         """u(X), (n, 3) mm; NaN where not defined."""
         indices = self.grid.indices_of(points_mm)
         u = np.stack(
-            [map_coordinates(c, indices.T, order=3, mode="mirror", prefilter=False) for c in self._coefficients],
+            [
+                map_coordinates(c, (indices + self._shift).T, order=3, mode="mirror", prefilter=False)
+                for c in self._coefficients
+            ],
             axis=-1,
         )
         u[~self._inside(indices)] = np.nan
@@ -347,10 +350,26 @@ class SampledDisplacement:
         from dvc.bspline import evaluate_spline
 
         indices = self.grid.indices_of(points_mm)
-        u, per_index = evaluate_spline(self._coefficients, indices, mirror=True)
+        u, per_index = evaluate_spline(self._coefficients, indices + self._shift, mirror=True)
         to_index = np.linalg.inv(self.grid.direction) / self.grid.spacing_mm[:, None]
         H = per_index @ to_index
         outside = ~self._inside(indices)
         u[outside] = np.nan
         H[outside] = np.nan
         return u, H
+
+
+def _carried_past_borders(values: FloatArray, undefined: BoolArray, spacing_mm: FloatArray) -> FloatArray:
+    """Values (ni, nj, nk, c) with a rim of voxels around them; it and undefined voxels filled by reflection."""
+    shape = np.array(undefined.shape)
+    missing = np.pad(undefined, _RIM, constant_values=True)
+    filled = np.pad(values, [(_RIM, _RIM)] * 3 + [(0, 0)])
+    nearest = distance_transform_edt(missing, sampling=spacing_mm, return_distances=False, return_indices=True)
+    at = np.argwhere(missing)
+    border = nearest[:, missing].T
+    opposite = np.clip(2 * border - at, 0, shape + 2 * _RIM - 1)
+    known = ~missing[tuple(opposite.T)]
+    carried = filled[tuple(border.T)]
+    carried[known] = 2.0 * carried[known] - filled[tuple(opposite[known].T)]
+    filled[missing] = carried
+    return np.asarray(filled)

@@ -1,4 +1,4 @@
-"""The numbers that a Gmsh file gives its nodes, which meshio reads past."""
+"""What meshio reads past in a Gmsh file: the numbers that it gives its nodes, and the order of some quadratic cells."""
 
 from __future__ import annotations
 
@@ -8,6 +8,17 @@ import numpy as np
 
 from dvc.arrays import IntArray
 from dvc.errors import ImageFileError
+
+# Quadratic cells of Gmsh in VTK's order, of those that meshio leaves as they are.
+_TO_VTK = {
+    "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
+    "pyramid14": [0, 1, 2, 3, 4, 5, 8, 10, 6, 7, 9, 11, 12, 13],
+}
+
+
+def in_vtk_order(kind: str, nodes: IntArray) -> IntArray:
+    """Nodes (m, k) of cells that meshio read from a Gmsh file, in VTK's order for quadratic wedges and pyramids too."""
+    return nodes[:, _TO_VTK[kind]] if kind in _TO_VTK else nodes
 
 
 def gmsh_node_numbers(path: Path, count: int) -> IntArray:
@@ -30,7 +41,7 @@ def gmsh_node_numbers(path: Path, count: int) -> IntArray:
 
     References
     ----------
-    Gmsh reference manual, section "MSH file format" (versions 2 and 4.1).
+    Gmsh reference manual, sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
     """
     data = path.read_bytes()
     try:

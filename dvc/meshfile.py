@@ -15,13 +15,14 @@ from typing import Any
 
 import meshio
 import numpy as np
+from meshio._mesh import topological_dimension
 
 from dvc.abaqus import read_abaqus
 from dvc.ansys import read_ansys
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.frd import read_frd
-from dvc.gmsh import gmsh_node_numbers
+from dvc.gmsh import gmsh_node_numbers, in_vtk_order
 from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points, outer_faces
 
 _log = logging.getLogger("dvc.meshfile")
@@ -35,6 +36,8 @@ _DIMENSION = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2} | dict.fromkeys(
 # Cell arrays of VTK files that hold a region's number, in the order in which they are looked for.
 _REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part")
 _MOST_REGIONS = 256
+# meshio 5.3.5 reads and writes these cells, but has left them out of its own table of dimensions, and fails on them.
+topological_dimension.update({"wedge15": 3, "pyramid13": 3})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +79,8 @@ class MeshFile:
     tets : TetMesh or None
         The tetrahedra by their corner nodes, checked, with the regions that hold tetrahedra and, as facets,
         those that hold triangles. None where the file has volume cells of other shapes.
+    at_nodes : mapping of str to (n, ...)
+        Arrays at the nodes, such as a displacement, in the file's own unit and frame.
     """
 
     path: Path
@@ -86,6 +91,7 @@ class MeshFile:
     blocks: tuple[CellBlock, ...]
     regions: Mapping[str, IntArray]
     tets: TetMesh | None
+    at_nodes: Mapping[str, FloatArray]
 
     @property
     def cell_count(self) -> int:
@@ -159,6 +165,7 @@ class _Raw:
     blocks: list[tuple[str, Any]]
     regions: dict[str, IntArray]
     node_sets: dict[str, IntArray] = field(default_factory=dict)
+    at_nodes: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _from_abaqus(path: Path) -> _Raw:
@@ -173,12 +180,13 @@ def _from_ansys(path: Path) -> _Raw:
 
 def _from_frd(path: Path) -> _Raw:
     found = read_frd(path)
-    return _Raw(found.points, found.node_ids, list(found.blocks), found.materials)
+    moved = {} if found.displacement is None else {"displacement": found.displacement}
+    return _Raw(found.points, found.node_ids, list(found.blocks), found.materials, at_nodes=moved)
 
 
 def _from_gmsh(path: Path) -> _Raw:
     mesh = _by_meshio(path, meshio.gmsh.read)
-    blocks = [(block.type, block.data) for block in mesh.cells]
+    blocks = [(block.type, in_vtk_order(block.type, block.data)) for block in mesh.cells]
     sizes = [len(data) for _, data in blocks]
     regions: dict[str, IntArray] = {}
     if "gmsh:physical" in mesh.cell_data:
@@ -194,7 +202,7 @@ def _from_gmsh(path: Path) -> _Raw:
                 raise ImageFileError(f"{path}: its $Elements section is cut short.")
             found = [np.asarray(part, dtype=np.int64) for part in parts]
             regions[name] = np.concatenate([part + start for part, start in zip(found, starts, strict=True)])
-    return _Raw(mesh.points, gmsh_node_numbers(path, len(mesh.points)), blocks, regions)
+    return _Raw(mesh.points, gmsh_node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
 
 
 def _from_vtk(path: Path) -> _Raw:
@@ -209,7 +217,7 @@ def _from_vtk(path: Path) -> _Raw:
                 regions = {f"{arrays[wanted]} {int(n)}": np.flatnonzero(values == n) for n in numbers}
                 break
     blocks = [(block.type, block.data) for block in mesh.cells]
-    return _Raw(mesh.points, np.arange(len(mesh.points)), blocks, regions)
+    return _Raw(mesh.points, np.arange(len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
 
 
 def _by_meshio(path: Path, read: Callable[[str], Any]) -> Any:
@@ -268,6 +276,7 @@ def _checked(path: Path, unit: str, frame: str, raw: _Raw) -> MeshFile:
         blocks=tuple(blocks),
         regions=MappingProxyType(regions),
         tets=tets,
+        at_nodes=MappingProxyType({name: frozen(values, np.float64) for name, values in raw.at_nodes.items()}),
     )
 
 

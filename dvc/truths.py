@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -57,3 +57,7 @@ class TruthDraws:
         """A truth (n,): shear found less a registration's bias, less a Gaussian field of its deviation; not below 0."""
         bias, sd = self._expected[self._random.integers(len(self._expected))]
         return np.maximum(self._shear - bias - sd * self._noise.drawn(), 0.0)
+
+    def many(self, count: int) -> Iterator[FloatArray]:
+        """So many truths, each drawn when it is asked for."""
+        return (self.drawn() for _ in range(count))

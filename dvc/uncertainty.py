@@ -67,6 +67,11 @@ class ErrorTable:
     correlation_mm: float
     widening: float = float("nan")
 
+    @property
+    def factor(self) -> float:
+        """`widening`, and 1 where it is not known."""
+        return 1.0 if np.isnan(self.widening) else self.widening
+
     def expected(
         self, tissue: str, shear: FloatArray, to_bone_mm: Float32Array, run: int | None = None
     ) -> tuple[FloatArray, FloatArray]:
@@ -355,7 +360,7 @@ def _intervals(
     for draw in range(_DRAWS):
         bias, sd = expected[random.integers(len(expected))]
         drawn[draw] = figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds)
-    low, middle, high = widened(drawn, 1.0 if np.isnan(table.widening) else table.widening)
+    low, middle, high = widened(drawn, table.factor)
     high[3:] = np.minimum(high[3:], volume)
     measured = figures_of(max_shear[where].astype(np.float64), volume, thresholds)
     names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]

@@ -161,13 +161,9 @@ def compare(
     for place in (Path(dvc), *(m.folder for m in measurements), *(p for p in places if p.is_dir())):
         if target.resolve() == place.resolve():
             raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
-    results: dict[str, list[FeResult]] = {}
+    # Every file is looked at before anything is computed, and read again in its turn: together they fill the memory.
     for load, of in files.items():
-        results[load] = []
-        for file in of:
-            read = file.read(tissues.grid)
-            notes += [f"{load}: {sentence}" for sentence in misfits(read, tissues, bones)]
-            results[load].append(read)
+        notes += [f"{load}: {told}" for file in of for told in misfits(file.read(tissues.grid), tissues, bones)]
     make_output(target)
     _clear(target, list(files))
     common = None if mesh is None else read_tet_mesh(mesh)
@@ -193,23 +189,21 @@ def compare(
     for number, measurement in enumerate(m for m in measurements if m.load in files):
         load = measurement.load
         tell("compare", "comparing", number / len(files))
-        measured = measurement.deformation()
+        measured, results = measurement.deformation(), [file.read(tissues.grid) for file in files[load]]
         one = compare_load(
-            load, measured, results[load], tissues, bones=bones, normal=-axes[:, 0], mesh=common,
+            load, measured, results, tissues, bones=bones, normal=-axes[:, 0], mesh=common,
             table=measurement.table, strains=strains, thresholds=levels, least_ml=least_ml,
         )  # fmt: skip
-        drawn = pictures_of(one, measured, results[load], tissues, bones, axes, strains, colours)
+        drawn = pictures_of(one, measured, results, tissues, bones, axes, strains, colours)
         with whole_folder(target / load) as folder:
             _write_fields(folder / "fields.vtu", one)
             for stem, png in drawn.items():
                 (folder / f"{stem}.png").write_bytes(png)
             if on_image:
-                _write_on_image(folder, results[load], tissues)
+                _write_on_image(folder, results, tissues)
             write_json(folder / "provenance.json", record)
         done.append(one)
-        told.append(
-            (one, measurement, drawn, viewer_of(one, measured, results[load], tissues, bones, measurement.folder))
-        )
+        told.append((one, measurement, drawn, viewer_of(one, measured, results, tissues, bones, measurement.folder)))
     notes += [
         f"{m.load}: the bone's motion was not taken out of this measurement: displacements are not the tissue's alone."
         for m in measurements

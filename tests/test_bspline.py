@@ -237,6 +237,23 @@ def test_sampled_displacement_of_a_spline_comes_back() -> None:
     np.testing.assert_allclose(found_H, expected_H, rtol=0, atol=2e-3)
 
 
+@pytest.mark.parametrize("direction", [np.eye(3), OBLIQUE @ MIRROR])
+def test_a_uniform_strain_stays_so_up_to_the_outermost_voxels(direction: np.ndarray) -> None:
+    grid = Grid((20, 17, 14), (1.0, 1.5, 0.8), (5.0, -3.0, 8.0), direction)
+    gradient = np.array([[0.2, 0.1, 0.0], [-0.3, 0.1, 0.2], [0.0, 0.4, -0.1]])
+    u = grid.points().reshape(*grid.shape, 3) @ gradient.T + np.array([1.0, -2.0, 3.0])
+    ball = ((np.indices(grid.shape) - np.reshape([8.0, 6.0, 4.0], (3, 1, 1, 1))) ** 2).sum(axis=0) < 60.0
+    for defined in (np.ones(grid.shape, dtype=bool), ball):  # the ball is cut off by three sides of the grid
+        sampled = SampledDisplacement(grid, np.where(defined[..., None], u, np.nan))
+        found, H = evaluate_on_grid(sampled, grid)
+        known = defined.ravel()
+        np.testing.assert_allclose(found[known], u.reshape(-1, 3)[known], rtol=0, atol=1e-10)
+        assert np.isnan(found[~known]).all()
+        # the rim of six voxels leaves 0.27**6 of the slope; without it 1.0 of it is lost at the grid's edge, and by
+        # filling with the nearest value 0.5 at the ball's
+        assert np.abs(H[known] - gradient).max() < 0.002
+
+
 # --- threads -----------------------------------------------------------------------------------------------
 
 

@@ -16,6 +16,7 @@ from tests.blocks import block
 from validate.agreement import agreement, sole_under_plate
 from validate.comparison import compare
 from validate.curves import area_between, bands
+from validate.doubt import with_intervals
 from validate.location import Threshold, clusters, neighbours, overlap, read_thresholds
 from validate.mapping import ALL, mapped
 from validate.sources import FeResult
@@ -205,7 +206,7 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
             ).drawn()
         )
         draws = TruthDraws(points, truth + 0.01 + noise, tissue, distance, error_table(0.01, 0.04), seed)
-        band = bands(draws, models, volumes, everywhere, 1.3)[ALL]
+        band = bands(draws.many(200), models, volumes, everywhere, 1.3)[ALL]
         _, low, high, _ = band.interval("far")
         held_by_equal.append(band.interval("equal")[1] == 0.0)
         held.append(low <= true_area["far"] <= high)
@@ -218,6 +219,40 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
     assert seen > 0.9
     assert noisy < 0.2
     assert wrong == 0.0
+
+
+def test_intervals_of_location_hold_the_truth_and_a_perfect_model_is_not_ruled_out() -> None:
+    mesh = cube(10)
+    points, volumes, touching = mesh.centroids_mm, mesh.volumes_mm3 / 1000.0, neighbours(mesh)
+
+    def spot(x: float) -> np.ndarray:
+        return 0.1 + 0.5 * np.exp(-((points - [x, 10.0, 10.0]) ** 2).sum(axis=1) / (2.0 * 5.0**2))
+
+    truth, models = spot(8.0), {"equal": spot(8.0), "apart": spot(13.0)}
+    tissue, distance = ["fat"] * len(points), np.ones(len(points))
+    flat = np.full(len(points), 0.5)
+    ideal = overlap("apart", "l", 0.35, truth, models["apart"], volumes, points, touching)
+    held: list[tuple[bool, ...]] = []
+    for seed in range(25):
+        noise = 0.5 - TruthDraws(points, flat, tissue, distance, error_table(0.0, 0.03), 100 + seed).drawn()
+        draws = TruthDraws(points, truth + 0.02 + noise, tissue, distance, error_table(0.02, 0.03), seed)
+        found = [overlap(n, "l", 0.35, truth + 0.02 + noise, m, volumes, points, touching) for n, m in models.items()]
+        equal, apart = with_intervals(found, list(draws.many(60)), models, volumes, points, 1.3)
+        assert (equal.model, apart.model) == ("equal", "apart")
+        held.append(
+            (
+                apart.measured_low_ml <= ideal.measured_ml <= apart.measured_high_ml,
+                apart.dice_low <= ideal.dice <= apart.dice_high < 0.8,
+                0.0 < apart.centroids_low_mm <= ideal.centroids_mm <= apart.centroids_high_mm,
+                0.0 < apart.hausdorff95_low_mm <= ideal.hausdorff95_mm <= apart.hausdorff95_high_mm,
+                equal.dice_high == 1.0 and equal.centroids_low_mm == equal.hausdorff95_low_mm == 0.0,
+            )
+        )
+    assert (np.mean(held, axis=0) > 0.85).all(), np.mean(held, axis=0)
+    # a truth without tissue above the threshold has no place: fewer than half of the draws are not told
+    none, _ = with_intervals(found, [truth, *[0.1 * truth] * 9], models, volumes, points, 1.0)
+    assert np.isnan(none.centroids_low_mm)
+    assert none.measured_low_ml == 0.0
 
 
 def test_the_skin_on_the_plate_is_found_from_the_deformed_shape() -> None:
@@ -243,7 +278,7 @@ def test_a_biased_measurement_ranks_by_what_lies_behind_it() -> None:
         mesh.centroids_mm, truth - 0.07, ["fat"] * len(truth), np.ones(len(truth)), error_table(-0.07, 0.02)
     )
     models = {"copy": truth - 0.07, "right": truth}
-    band = bands(draws, models, volumes, {ALL: np.ones(len(truth), dtype=bool)}, 1.0)[ALL]
+    band = bands(draws.many(200), models, volumes, {ALL: np.ones(len(truth), dtype=bool)}, 1.0)[ALL]
     assert area_between(truth - 0.07, models["copy"], volumes) < area_between(truth - 0.07, truth, volumes)
     assert band.interval("right")[0] < band.interval("copy")[0]
     assert band.surely_below("right", "copy")

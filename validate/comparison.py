@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,9 @@ from dvc.mesh import TetMesh
 from dvc.truths import TruthDraws
 from dvc.uncertainty import ErrorTable
 from validate.agreement import Agreement, Travel, agreements, travel
-from validate.curves import RANGE, Area, Band, area_between, bands
+from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands
+from validate.doubt import DRAWS as LOCATED
+from validate.doubt import with_intervals
 from validate.levelled import LEVELLED
 from validate.location import LEAST_ML, Overlap, Threshold, neighbours, overlap
 from validate.mapping import ALL, Mapped, mapped
@@ -130,7 +132,8 @@ def compare(
     tissues |= {
         name: common & (found.tissue == name) for name in found.tissues if (common & (found.tissue == name)).any()
     }
-    told = _bands(found, tissues, table, strains, zlib.crc32(load.encode()) + seed)
+    truths: list[FloatArray] = []
+    told = {} if table is None else _bands(found, tissues, table, strains, zlib.crc32(load.encode()) + seed, truths)
     areas = []
     for name, field in found.models.items():
         for tissue, where in tissues.items():
@@ -150,6 +153,11 @@ def compare(
         for name, field in found.models.items()
         for threshold in thresholds
     ]  # fmt: skip
+    if table is not None:
+        overlaps = with_intervals(
+            overlaps, truths, {name: field.max_shear[common] for name, field in found.models.items()},
+            found.volumes_ml[common], found.points_mm[common], table.factor,
+        )  # fmt: skip
     rows = [row for name in models for row in agreements(found, name, load)]
     travels = [travel(found, r.name, load, r.deformation, measured, normal) for r in results]
     return Comparison(load, found, tuple(areas), tuple(overlaps), tuple(rows), tuple(travels), told, strains)
@@ -202,20 +210,31 @@ def _told(where: str, ranked: Sequence[Area], band: Band) -> str:
 
 
 def _bands(
-    found: Mapped, tissues: Mapping[str, BoolArray], table: ErrorTable | None, strains: tuple[float, float], seed: int
+    found: Mapped,
+    tissues: Mapping[str, BoolArray],
+    table: ErrorTable,
+    strains: tuple[float, float],
+    seed: int,
+    first: list[FloatArray],
 ) -> dict[str, Band]:
-    if table is None:
-        return {}
+    """Bands by tissue; the ``first`` truths drawn for them are kept."""
     common = found.common
     draws = TruthDraws(
         found.points_mm[common], found.measured.max_shear[common], [str(t).lower() for t in found.tissue[common]],
         found.to_bone_mm[common], table, seed,
     )  # fmt: skip
+
+    def kept() -> Iterator[FloatArray]:
+        for truth in draws.many(DRAWS):
+            if len(first) < LOCATED:
+                first.append(truth.astype(np.float32))
+            yield truth
+
     return bands(
-        draws,
+        kept(),
         {name: field.max_shear[common] for name, field in found.models.items()},
         found.volumes_ml[common],
         {name: where[common] for name, where in tissues.items()},
-        1.0 if np.isnan(table.widening) else table.widening,
+        table.factor,
         strains,
     )

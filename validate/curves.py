@@ -7,20 +7,21 @@ unit); divided by the tissue's volume and the width of the range it is the mean 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.regions import volume_above
-from dvc.truths import TruthDraws
 from dvc.uncertainty import widened
 
 RANGE = (0.2, 0.5)
 """Strains between which curves are compared, by default."""
 
 DRAWS = 200
+"""Truths drawn for the curves and areas of a load."""
+
 _GRID = 301
 _SURE = 0.975
 
@@ -121,20 +122,19 @@ class Band:
 
 
 def bands(
-    draws: TruthDraws,
+    truths: Iterable[FloatArray],
     models: Mapping[str, FloatArray],
     volumes_ml: FloatArray,
     tissues: Mapping[str, np.ndarray],
     widening: float,
     strains: tuple[float, float] = RANGE,
-    count: int = DRAWS,
 ) -> dict[str, Band]:
     """Bands of the measured curve by tissue, from truths drawn for all cells at once.
 
     Parameters
     ----------
-    draws : TruthDraws
-        At the cells.
+    truths : iterable of (n,)
+        Maximal shear of each truth drawn, in the cells; see `dvc.truths.TruthDraws`.
     models : mapping of name to (n,)
         Maximal shear in the cells.
     volumes_ml : (n,)
@@ -142,8 +142,6 @@ def bands(
     widening : float
     strains : (low, high)
         Range of the areas; the band begins at 0 and ends at one and a half times its upper end.
-    count : int
-        Truths drawn.
     """
     low, high = strains
     inner = np.linspace(low, high, _GRID)
@@ -153,28 +151,28 @@ def bands(
         name: {model: volume_above(shear[inside], volumes_ml[inside], inner) for model, shear in models.items()}
         for name, inside in tissues.items()
     }
-    drawn = {name: np.empty((count, len(outer))) for name in tissues}
-    areas = {name: {model: np.empty(count) for model in models} for name in tissues}
+    drawn: dict[str, list[FloatArray]] = {name: [] for name in tissues}
+    areas: dict[str, dict[str, list[float]]] = {name: {model: [] for model in models} for name in tissues}
     last: dict[str, FloatArray] = {}
     floors: dict[str, list[float]] = {name: [] for name in tissues}
-    for n in range(count):
-        truth = draws.drawn()
+    for truth in truths:
         for name, inside in tissues.items():
             both = volume_above(truth[inside], volumes_ml[inside], np.concatenate([outer, inner]))
-            drawn[name][n], curve = both[: len(outer)], both[len(outer) :]
+            curve = both[len(outer) :]
+            drawn[name].append(both[: len(outer)])
             for model, found in curves[name].items():
-                areas[name][model][n] = np.trapezoid(np.abs(found - curve), dx=step)
+                areas[name][model].append(float(np.trapezoid(np.abs(found - curve), dx=step)))
             if name in last:
                 floors[name].append(float(np.trapezoid(np.abs(last[name] - curve), dx=step)))
             last[name] = curve
     result = {}
     for name, inside in tissues.items():
-        least, _, most = widened(drawn[name], widening)
+        least, _, most = widened(np.array(drawn[name]), widening)
         result[name] = Band(
             outer,
             least,
             np.minimum(most, volumes_ml[inside].sum()),
-            areas[name],
+            {model: np.array(found) for model, found in areas[name].items()},
             float(np.median(floors[name])),
             widening,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 
@@ -126,6 +127,9 @@ class Overlap:
         The same of the largest cluster of each.
     hausdorff95_mm : float
         95th percentile, by volume, of the distance of either to the other; the larger of the two.
+    measured_low_ml, measured_high_ml, dice_low ... : float
+        95 % intervals from the measurement's error, and what a perfect model would be given; NaN where the error is
+        not known. See `validate.doubt`.
     """
 
     model: str
@@ -139,6 +143,17 @@ class Overlap:
     centroids_mm: float
     largest_mm: float
     hausdorff95_mm: float
+    measured_low_ml: float = float("nan")
+    measured_high_ml: float = float("nan")
+    dice_low: float = float("nan")
+    dice_high: float = float("nan")
+    dice_perfect: float = float("nan")
+    centroids_low_mm: float = float("nan")
+    centroids_high_mm: float = float("nan")
+    centroids_perfect_mm: float = float("nan")
+    hausdorff95_low_mm: float = float("nan")
+    hausdorff95_high_mm: float = float("nan")
+    hausdorff95_perfect_mm: float = float("nan")
 
 
 def overlap(
@@ -153,28 +168,72 @@ def overlap(
     least_ml: float = LEAST_ML,
 ) -> Overlap:
     """Compare what lies above a threshold in two fields (n,) on the same cells; figures without a meaning are NaN."""
-    masks = measured > threshold, simulated > threshold
+    both = [Part(shear > threshold, volumes_ml, points_mm) for shear in (measured, simulated)]
     found = [
-        clusters(m, s, volumes_ml, points_mm, touching, least_ml)
-        for m, s in zip(masks, (measured, simulated), strict=True)
+        clusters(part.above, shear, volumes_ml, points_mm, touching, least_ml)
+        for part, shear in zip(both, (measured, simulated), strict=True)
     ]
-    volume = [float(volumes_ml[m].sum()) for m in masks]
-    both = float(volumes_ml[masks[0] & masks[1]].sum())
-    dice = 2.0 * both / sum(volume) if sum(volume) > 0.0 else float("nan")
-    apart = largest = far = float("nan")
-    if all(m.any() for m in masks):
-        centre = [volumes_ml[m] @ points_mm[m] / volumes_ml[m].sum() for m in masks]
-        apart = float(np.linalg.norm(centre[0] - centre[1]))
-        far = max(_distance95(a, b, points_mm, volumes_ml) for a, b in (masks, masks[::-1]))
+    largest = float("nan")
     if all(found):
         largest = float(np.linalg.norm(found[0][0].centroid_mm - found[1][0].centroid_mm))
     return Overlap(
-        model, load, threshold, volume[0], volume[1], len(found[0]), len(found[1]), dice, apart, largest, far
-    )
+        model, load, threshold, both[0].volume_ml, both[1].volume_ml, len(found[0]), len(found[1]), dice(*both),
+        centroids_apart(*both), largest, hausdorff95(*both),
+    )  # fmt: skip
 
 
-def _distance95(first: BoolArray, second: BoolArray, points: FloatArray, volumes: FloatArray) -> float:
-    distance, _ = cKDTree(points[second]).query(points[first])
-    order = np.argsort(distance)
-    share = np.cumsum(volumes[first][order]) / volumes[first].sum()
-    return float(distance[order][min(int(np.searchsorted(share, 0.95)), len(order) - 1)])
+class Part:
+    """Cells above a threshold, and what their place is told by.
+
+    Attributes
+    ----------
+    above : (n,) bool
+    volume_ml : float
+    """
+
+    def __init__(self, above: BoolArray, volumes_ml: FloatArray, points_mm: FloatArray) -> None:
+        self.above = above
+        self._volumes, self._points = volumes_ml, points_mm
+        self.volume_ml = float(volumes_ml[above].sum())
+
+    @cached_property
+    def _near(self) -> cKDTree:
+        return cKDTree(self._points[self.above])
+
+    @property
+    def centroid_mm(self) -> FloatArray:
+        """Reference configuration, LPS mm; NaN for no cell."""
+        if not self.above.any():
+            return np.full(3, np.nan)
+        return np.asarray(self._volumes[self.above] @ self._points[self.above] / self.volume_ml)
+
+    def shared_ml(self, other: Part) -> float:
+        """Volume common to both."""
+        return float(self._volumes[self.above & other.above].sum())
+
+    def distance95(self, other: Part) -> float:
+        """95th percentile, by volume, of the distance of these cells to the nearest of the other's, mm."""
+        alone = self.above & ~other.above
+        distance = np.zeros(len(self.above))
+        distance[alone] = other._near.query(self._points[alone])[0]
+        order = np.flatnonzero(self.above)[np.argsort(distance[self.above])]
+        share = np.cumsum(self._volumes[order]) / self.volume_ml
+        return float(distance[order][min(int(np.searchsorted(share, 0.95)), len(order) - 1)])
+
+
+def dice(first: Part, second: Part) -> float:
+    """Twice the common volume over the sum of both (Dice 1945); NaN where both are empty."""
+    both = first.volume_ml + second.volume_ml
+    return 2.0 * first.shared_ml(second) / both if both > 0.0 else float("nan")
+
+
+def centroids_apart(first: Part, second: Part) -> float:
+    """Distance of the centroids, mm; NaN where one is empty."""
+    return float(np.linalg.norm(first.centroid_mm - second.centroid_mm))
+
+
+def hausdorff95(first: Part, second: Part) -> float:
+    """Larger of the two distances at their 95th percentiles, mm; NaN where one is empty."""
+    if not (first.above.any() and second.above.any()):
+        return float("nan")
+    return max(first.distance95(second), second.distance95(first))

@@ -8,21 +8,18 @@ from __future__ import annotations
 
 import csv
 import json
-import warnings
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-import meshio
 import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.deformation import Affine
 from dvc.errors import GeometryError, InputError
-from dvc.frd import read_frd
 from dvc.image import Grid
 from dvc.mesh import TetMesh
-from dvc.meshfile import MM_PER_UNIT, TO_LPS, MeshFile, read_mesh, silenced
+from dvc.meshfile import MM_PER_UNIT, TO_LPS, MeshFile, read_mesh
 from dvc.onmesh import OnMesh
 from validate.split import linear_tetrahedra
 
@@ -159,30 +156,24 @@ def _rigid(matrix: FloatArray) -> Affine:
 
 def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
     """Displacement (n, 3) in the file's own unit and frame."""
-    if place.suffix.lower() == ".frd":
-        found = read_frd(place).displacement
-        if found is None:
-            raise InputError(f"{place} has no displacements: write them with *NODE FILE, U.")
-        return found
     if place.suffix.lower() in (".inp", ".cdb"):
         raise InputError(f"{place} holds a mesh and no result; give the table of its nodal displacements (.csv).")
+    if place.suffix.lower() == ".frd" and not source.at_nodes:
+        raise InputError(f"{place} has no displacements: write them with *NODE FILE, U.")
     if place.suffix.lower() == ".msh" and (np.diff(source.node_ids) <= 0).any():
         raise InputError(
             f"{place}: its nodes do not stand in the order of their numbers, so that displacements may "
             "belong to others. Write it as VTU."
         )
-    with silenced(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        data = meshio.read(place).point_data
-    known = {name.casefold(): name for name in data}
+    known = {name.casefold(): name for name in source.at_nodes}
     for wanted in _NAMES:
         if wanted in known:
-            values = np.asarray(data[known[wanted]], dtype=np.float64)
+            values = source.at_nodes[known[wanted]]
             if values.shape != source.points_mm.shape:
                 raise InputError(f"{place}: its array '{known[wanted]}' has shape {values.shape}, not three per node.")
             return values
     raise InputError(
-        f"{place} has no displacement at its nodes; its arrays are {', '.join(data) or 'none'}. Call it "
+        f"{place} has no displacement at its nodes; its arrays are {', '.join(source.at_nodes) or 'none'}. Call it "
         f"{_NAMES[1]!r}, in the unit of the coordinates."
     )
 

@@ -1,0 +1,125 @@
+"""Cells of a mesh by their nodes (VTK's order): faces as triangles, and points between the nodes of quadratic cells.
+
+A quadratic cell has a node in the middle of each edge; some kinds have one in the middle of each quadrangle, and of
+the cell, as well. Where these are missing they are interpolated, so that the cell can be cut into tetrahedra of half
+its size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvc.arrays import FloatArray, IntArray
+
+Nodes = tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """A kind of cell without its order.
+
+    Attributes
+    ----------
+    corners : (c, 3)
+        Reference coordinates.
+    edges : tuple of pairs of corners
+        In the order of the nodes in their middles.
+    faces : tuple of corners
+        Going around; quadrangles in the order of the nodes in their middles.
+    """
+
+    corners: FloatArray
+    edges: tuple[Nodes, ...]
+    faces: tuple[Nodes, ...]
+
+    @property
+    def quadrangles(self) -> tuple[Nodes, ...]:
+        """Faces with four corners."""
+        return tuple(face for face in self.faces if len(face) == 4)
+
+    @property
+    def edged(self) -> int:
+        """Number of corners and edges: the nodes that every quadratic cell of this shape has."""
+        return len(self.corners) + len(self.edges)
+
+    def around(self, face: Nodes) -> Nodes:
+        """Nodes of a quadratic cell along the rim of a face: a corner, the middle of an edge, and so on."""
+        middle = {frozenset(edge): len(self.corners) + n for n, edge in enumerate(self.edges)}
+        pairs = zip(face, (*face[1:], face[0]), strict=True)
+        return tuple(n for a, b in pairs for n in (a, middle[frozenset((a, b))]))
+
+    @property
+    def nodes(self) -> FloatArray:
+        """Reference coordinates of corners and middles of edges."""
+        return np.concatenate([self.corners, [self.corners[list(edge)].mean(axis=0) for edge in self.edges]])
+
+    def in_face(self, face: Nodes) -> tuple[Nodes, FloatArray]:
+        """Nodes along the rim of a face, and the weights with which they give the value in its middle."""
+        rim = self.around(face)
+        return rim, weights(self.nodes[list(rim)], self.corners[list(face)].mean(axis=0))
+
+    def in_body(self) -> FloatArray:
+        """Weights with which the nodes give the value at the mean of the corners."""
+        return weights(self.nodes, self.corners.mean(axis=0))
+
+    def halved(self, face: Nodes) -> IntArray:
+        """Triangles (k, 3) of half its size that make up a face of a quadratic cell.
+
+        A quadrangle's have its middle in common: node number `edged` and on, in the order of the quadrangles.
+        """
+        rim = self.around(face)
+        if len(face) == 3:
+            a, ab, b, bc, c, ca = rim
+            return np.array([(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)])
+        middle = self.edged + self.quadrangles.index(face)
+        return np.array([(rim[i], rim[(i + 1) % 8], middle) for i in range(8)])
+
+
+def weights(nodes: FloatArray, point: FloatArray) -> FloatArray:
+    """Weights (n,) by which values at nodes (n, 3) give that at a point (3,), exact for every quadratic field.
+
+    The least ones that do so: those of the serendipity elements in the middles of their faces and bodies.
+
+    Examples
+    --------
+    >>> corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    >>> middles = np.array([[0.0, -1, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0]])
+    >>> weights(np.concatenate([corners, middles]), np.zeros(3)).round(9).tolist()
+    [-0.25, -0.25, -0.25, -0.25, 0.5, 0.5, 0.5, 0.5]
+    """
+    return np.asarray(np.linalg.pinv(_monomials(nodes).T) @ _monomials(point[None])[0])
+
+
+def _monomials(at: FloatArray) -> FloatArray:
+    x, y, z = at.T
+    return np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
+
+
+_SQUARE = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
+_THIRDS = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]
+
+SHAPES = {
+    "tetra": Shape(
+        np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]),
+        ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)),
+        ((0, 1, 2), (0, 1, 3), (1, 2, 3), (2, 0, 3)),
+    ),
+    "hexahedron": Shape(
+        np.array([(x, y, z) for z in (-1.0, 1.0) for x, y in _SQUARE]),
+        ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)),
+        ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 1, 2, 3), (4, 5, 6, 7)),
+    ),
+    "wedge": Shape(
+        np.array([(x, y, z) for z in (-1.0, 1.0) for x, y in _THIRDS]),
+        ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5)),
+        ((0, 1, 2), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
+    ),
+    "pyramid": Shape(
+        np.array([*((x, y, 0.0) for x, y in _SQUARE), (0.0, 0.0, 1.0)]),
+        ((0, 1), (1, 2), (2, 3), (3, 0), (0, 4), (1, 4), (2, 4), (3, 4)),
+        ((0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
+    ),
+}  # fmt: skip
+"""Volume cells, by meshio's names."""
