@@ -62,7 +62,7 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate) -> byte
     for state in states:
         load = state.load
         part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%})"
-        told = f"{load.name}: {load.normal_n:g} N normal, {load.shear_n:g} N shear{part}"
+        told = f"{load.name}: {load.told}{part}"
         face = float(((mesh.points_mm + state.u_mm)[state.on_plate] @ plate.axes[:, 0]).mean())
         panels.append(Slice(told, state.u_mm, StrainField.from_gradient(state.gradients).max_shear, face))
     return slice_sheet(mesh, panels, plate.axes, _lowest_bone_point(mesh, plate))

@@ -104,10 +104,12 @@ def equilibrium(
         before = _norm(right, held, assembler)
         data = assembler.held(assembler.tangent(now), right, held, left)
         try:
-            change = assembler.spread(solver.solve(data, right, _ROUGH if balance > _NEAR else _INEXACT))
+            solved = solver.solve(data, right, _ROUGH if balance > _NEAR else _INEXACT)
         except SingularError as failure:
             told(f"    {failure}")
             return None
+        solved[held] = left  # exactly, though the solution may be rough
+        change = assembler.spread(solved)
         if not np.isfinite(change).all():
             return None
         share = 1.0

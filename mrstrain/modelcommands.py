@@ -65,7 +65,10 @@ def simulate(
     ] = None,
     load: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=NORMAL or NAME=NORMAL,SHEAR in N; repeat. Default: the published experiment's four."),
+        typer.Option(
+            help="NAME=NORMAL or NAME=NORMAL,SHEAR in N, or with mm after a number the plate's travel; repeat. "
+            "Default: the published experiment's four."
+        ),
     ] = None,
     plate_normal: Plate = None,
     shear_direction: Shear = None,

@@ -283,7 +283,8 @@ def _told(
         "region_numbers_in_vtu": {number: name for number, name in enumerate(laws, start=1)},
         "paths": [[asdict(load) for load in path] for path in paths],
         "plate_axes_lps": plate.axes.tolist(),
-        "plate": "rigid; moved to the tissue, then force-controlled along all three axes; rotation locked",
+        "plate": "rigid; moved to the tissue, then to the forces and travels asked for, no force along the third axis; "
+        "rotation locked",
         "element": f"{element}: {TOLD[element]}",
     }
 

@@ -106,8 +106,12 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
         (["--load", "a=1", "--load", "a=2"], "a name of its own"),
         (["--load", "a=-1"], "must press"),
         (["--load", "a=nan"], "A load is NAME=NORMAL"),
+        (["--load", "a=1,2,3"], "A load is NAME=NORMAL"),
+        (["--load", "a=1cm"], "A load is NAME=NORMAL"),
+        (["--load", "a=2mm", "--gap-mm", "3"], "must press, above 3 mm, the gap"),
+        (["--slide", "--load", "a=1,1mm"], "carries no shear"),
         (["--plate-normal", "0", "0", "0"], "not all zero"),
-        (["--slide", "--load", "a=1,1"], "carries no shear force"),
+        (["--slide", "--load", "a=1,1"], "carries no shear"),
     ],
 )
 def test_what_cannot_be_is_refused(mesh_file: Path, tmp_path: Path, given: list[str], said: str) -> None:
@@ -121,6 +125,8 @@ def test_what_cannot_be_is_refused(mesh_file: Path, tmp_path: Path, given: list[
 def test_loads_lie_on_paths_by_their_normal_force() -> None:
     loads = [load_named(text) for text in ("a=15,45", "b=140", "c=15", "d=15,12")]
     assert [[x.name for x in path] for path in paths_of(loads)] == [["c", "d", "a"], ["b"]]
+    kinds = [load_named(text) for text in ("a=15", "b=15,8mm", "c=15,45", "d=15,4mm", "e=15mm")]
+    assert [[x.name for x in path] for path in paths_of(kinds)] == [["a", "d", "b"], ["c"], ["e"]]
     both_ways = [load_named(text) for text in ("a=15", "b=15,12", "c=15,-12")]
     assert [[x.name for x in path] for path in paths_of(both_ways)] == [["a", "b"], ["c"]]
     with pytest.raises(InputError, match="a name of its own"):
