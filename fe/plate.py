@@ -12,6 +12,7 @@ from dvc.errors import InputError
 from dvc.kinematics import plate_axes
 
 _BEYOND_MM = 0.5
+_SAME_MM = 1e-6  # nodes whose heights differ by less touch together, whatever the frame does to the last digits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +106,7 @@ class Contact:
         self.nodes = surface
         self._start = nodes_mm[surface]
         face_mm = float(self._start[:, 0].min())
-        self._first = self._start[:, 0] <= face_mm
+        self._first = self._start[:, 0] <= face_mm + _SAME_MM
         over = self._start[self._first].mean(axis=0)
         if plate.pivot_mm is not None:
             over = np.asarray(plate.pivot_mm, dtype=np.float64) @ plate.axes
@@ -135,13 +136,13 @@ class Contact:
         return {axis: 3 * self.nodes + axis for axis in range(3)}
 
     def touch_first(self, state: FloatArray) -> None:
-        """Move the plate to the surface: its lowest node holds."""
+        """Move the plate to the surface: its lowest node holds, or its lowest nodes."""
         self.hold = replace(
             self.hold,
             nodes=self._first,
             places_mm=np.where(self._first[:, None], (self._start - self._pivot) * [0.0, 1.0, 1.0], np.nan),
         )
-        state[3 * self.held] = 0.0
+        state[3 * self.held] = self._pivot[0] - self._start[self._first, 0]
 
     def begin(self, state: FloatArray) -> None:
         """Remember a state of equilibrium, from which the next one is sought."""

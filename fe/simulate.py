@@ -17,7 +17,7 @@ from fe.elements import element
 from fe.materials import Material
 from fe.model import Model
 from fe.newton import Tolerance
-from fe.path import SURFACE, Goal, Path
+from fe.path import SURFACE, Goal, Path, PlateState, Standing
 from fe.plate import Contact, Plate
 
 BONE = "bone"
@@ -96,15 +96,16 @@ class State:
         Pressure at the corners of each cell, positive in tension.
     gradients : (m, 3, 3)
         H = du/dX of each cell, its mean where the element's varies.
-    travel_mm, force_n : (3,)
-        Displacement of the plate from its start, and its force on the tissue, along the plate's axes.
     on_plate : (k,)
         Nodes that hold to the plate.
-    curve : (k, 6)
-        Travel and force of every state of equilibrium on the way, from that of the load before it to this one.
+    curve : tuple of PlateState
+        The plate in every state of equilibrium on the way, from that of the load before it to this one; empty where
+        there is no plate.
     iterations : int
         Newton steps since the load before it, those of steps that failed not counted.
     seconds : float
+    standing : Standing, optional
+        What the next load goes on from.
     """
 
     load: LoadStep
@@ -112,12 +113,26 @@ class State:
     u_mm: FloatArray
     pressure_mpa: FloatArray
     gradients: FloatArray
-    travel_mm: FloatArray
-    force_n: FloatArray
     on_plate: IntArray
-    curve: FloatArray
+    curve: tuple[PlateState, ...]
     iterations: int
     seconds: float
+    standing: Standing | None = None
+
+    @property
+    def plate(self) -> PlateState:
+        """The plate under this load."""
+        return self.curve[-1]
+
+    @property
+    def travel_mm(self) -> FloatArray:
+        """Displacement of the plate (3,) from its start, along its axes at the start."""
+        return self.plate.travel_mm
+
+    @property
+    def force_n(self) -> FloatArray:
+        """Force of the plate on the tissue (3,), along its axes at the start."""
+        return self.plate.force_n
 
 
 def simulate(
@@ -178,7 +193,7 @@ def simulate(
         for number, load in enumerate(loads):
             goal = load.goal
             began, counted, known = time.monotonic(), path.iterations, len(path.curve)
-            before = path.standing(goal)
+            before = path.reached(goal)
             if states:  # what was asked for, not what was reached to the tolerance
                 last = states[-1].load.goal
                 before = np.where(goal.travels == last.travels, last.values, before)
@@ -197,16 +212,15 @@ def simulate(
             states.append(
                 State(
                     load=load,
-                    reached=1.0 if whole else _share(before, path.standing(goal), goal.values),
+                    reached=1.0 if whole else _share(before, path.reached(goal), goal.values),
                     u_mm=u @ plate.axes.T,
                     pressure_mpa=model.pressures(path.state),
                     gradients=plate.axes @ model.gradients(path.state) @ plate.axes.T,
-                    travel_mm=path.travel.copy(),
-                    force_n=path.force.copy(),
                     on_plate=path.contact.held[path.contact.held < len(mesh.points_mm)],
-                    curve=np.array(path.curve[known - 1 :]),
+                    curve=tuple(path.curve[known - 1 :]),
                     iterations=path.iterations - counted,
                     seconds=time.monotonic() - began,
+                    standing=path.standing,
                 )
             )
             keep(states[-1])
