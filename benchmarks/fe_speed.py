@@ -30,6 +30,7 @@ from fe.linear import Solver
 from fe.meshstore import read_tet_mesh
 from fe.model import Model
 from fe.newton import Tolerance, equilibrium
+from fe.path import PlateState
 from fe.published import material_set
 from fe.simulate import LoadStep, State
 from mrstrain.provenance import versions
@@ -87,10 +88,8 @@ def calculix(place: Path, quadratic: bool, limit_s: float) -> dict[str, Any]:
     u = np.zeros_like(mesh.points_mm)
     u[nodes, 2] = LIFT_MM
     cells = len(mesh.cells)
-    state = State(
-        LoadStep("lift", 1.0), 1.0, u, np.zeros((cells, 4)), np.zeros((cells, 3, 3)), np.zeros(3), np.zeros(3), nodes,
-        np.zeros((1, 6)), 0, 0.0,
-    )  # fmt: skip
+    still = PlateState(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
+    state = State(LoadStep("lift", 1.0), 1.0, u, np.zeros((cells, 4)), np.zeros((cells, 3, 3)), nodes, (still,), 0, 0.0)
     with tempfile.TemporaryDirectory() as folder:
         deck = Path(folder) / "lift.inp"
         write_calculix(deck, mesh, laws, state, quadratic=quadratic)

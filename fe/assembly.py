@@ -7,7 +7,7 @@ rigid plate. The pattern of the matrix is made once, for all nodes that may ever
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numba import njit, prange
@@ -88,7 +88,7 @@ class Assembler:
         """
         by_unknown = np.zeros(self.model.unknowns)
         lowest = self._run(state, by_unknown, None)
-        return by_unknown, self._by_equation(by_unknown), lowest
+        return by_unknown, self.by_equation(by_unknown), lowest
 
     def tangent(self, state: FloatArray) -> FloatArray:
         """Values of the upper triangle of the tangent, in the order of `indices`."""
@@ -117,35 +117,51 @@ class Assembler:
         """Change of every unknown from that of every equation; fixed ones do not change."""
         return np.where(self.equation >= 0, change[self.equation], 0.0)
 
-    def _by_equation(self, by_unknown: FloatArray) -> FloatArray:
+    def by_equation(self, by_unknown: FloatArray) -> FloatArray:
+        """Sums of a quantity of unknowns over those of each equation."""
         inside = self.equation >= 0
         return np.asarray(
             np.bincount(self.equation[inside], weights=by_unknown[inside], minlength=self.size), dtype=np.float64
         )
 
+    def acting(self, state: FloatArray, directions: FloatArray) -> FloatArray:
+        """The tangent times directions (unknowns, k), by unknown, as if each stood in an equation of its own."""
+        found = np.zeros_like(directions)
+        cells = np.flatnonzero((directions != 0.0).any(axis=1)[self._cells].any(axis=1))
+        for part, _, local, _ in self._in_chunks(state, cells, with_tangent=True):
+            _add_products(self._cells[part], local, directions, found)
+        return found
+
     def _run(self, state: FloatArray, forces: FloatArray, data: FloatArray | None) -> float:
-        m, space, element = self.model, self.model.space, self.model.element
-        u = np.ascontiguousarray(state[: 3 * len(space.nodes_mm)].reshape(-1, 3))
-        p = np.ascontiguousarray(state[3 * len(space.nodes_mm) :])
-        width = self._cells.shape[1]
         lowest = np.inf
-        local_forces = np.empty((_CHUNK, width))
-        local = np.empty((_CHUNK if data is not None else 1, self._places.shape[1]))
-        volumes = np.empty(_CHUNK)
-        for start in range(0, len(self._cells), _CHUNK):
-            part = slice(start, min(start + _CHUNK, len(self._cells)))
-            _elements(
-                space.cells[part], space.pressure_cells[part], m.volumes_mm3[part], m.inverse[part], m.law[part],
-                m.vectors, m.shear_mpa, m.bulk_mpa, self.model.own_bulk_mpa,
-                element.weights, element.gradients, element.pressure,
-                element.stabilisation, u, p, data is not None, local_forces, local, volumes,
-            )  # fmt: skip
-            count = part.stop - part.start
-            lowest = min(lowest, float(volumes[:count].min()))
+        for part, local_forces, local, volumes in self._in_chunks(state, None, with_tangent=data is not None):
+            lowest = min(lowest, float(volumes.min()))
             _add_forces(self._cells[part], local_forces, forces)
             if data is not None:
                 _add_tangents(self._places[part], local, data)
         return lowest
+
+    def _in_chunks(
+        self, state: FloatArray, cells: IntArray | None, *, with_tangent: bool
+    ) -> Iterator[tuple[slice | IntArray, FloatArray, FloatArray, FloatArray]]:
+        """Forces, tangents (upper triangles) and least det F of cells, all by default, some thousands at a time."""
+        m, space, element = self.model, self.model.space, self.model.element
+        u = np.ascontiguousarray(state[: 3 * len(space.nodes_mm)].reshape(-1, 3))
+        p = np.ascontiguousarray(state[3 * len(space.nodes_mm) :])
+        forces = np.empty((_CHUNK, self._cells.shape[1]))
+        tangents = np.empty((_CHUNK if with_tangent else 1, self._places.shape[1]))
+        volumes = np.empty(_CHUNK)
+        total = len(self._cells) if cells is None else len(cells)
+        for start in range(0, total, _CHUNK):
+            stop = min(start + _CHUNK, total)
+            part = slice(start, stop) if cells is None else cells[start:stop]
+            _elements(
+                space.cells[part], space.pressure_cells[part], m.volumes_mm3[part], m.inverse[part], m.law[part],
+                m.vectors, m.shear_mpa, m.bulk_mpa, self.model.own_bulk_mpa,
+                element.weights, element.gradients, element.pressure,
+                element.stabilisation, u, p, with_tangent, forces, tangents, volumes,
+            )  # fmt: skip
+            yield part, forces, tangents, volumes[: stop - start]
 
     def _pattern(self, shared: Mapping[int, IntArray]) -> tuple[IntArray, IntArray]:
         """Upper triangle: equations of unknowns that meet in a cell, and shared ones with all that may follow them."""
@@ -216,7 +232,21 @@ def _add_tangents(places: IntArray, local: FloatArray, data: FloatArray) -> None
                 data[-2 - place] += 2.0 * local[n, pair]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
+def _add_products(cells: IntArray, local: FloatArray, directions: FloatArray, found: FloatArray) -> None:
+    width = cells.shape[1]
+    for n in range(len(cells)):
+        pair = 0
+        for i in range(width):
+            for j in range(i, width):
+                for k in range(directions.shape[1]):
+                    found[cells[n, i], k] += local[n, pair] * directions[cells[n, j], k]
+                    if j > i:
+                        found[cells[n, j], k] += local[n, pair] * directions[cells[n, i], k]
+                pair += 1
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
 def _elements(
     cells: IntArray,
     pressure_cells: IntArray,

@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from dvc.arrays import FloatArray, IntArray
 from dvc.figures import REGION_COLOURS
@@ -58,14 +59,22 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate) -> byte
     Cells are cut in the unloaded configuration and drawn where they are under load; the dashed line is the plate. The
     colours end where a hundredth of the volume is above, over all loads.
     """
-    panels = []
+    panels, middle = [], _lowest_bone_point(mesh, plate)
     for state in states:
         load = state.load
         part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%})"
-        told = f"{load.name}: {load.normal_n:g} N normal, {load.shear_n:g} N shear{part}"
-        face = float(((mesh.points_mm + state.u_mm)[state.on_plate] @ plate.axes[:, 0]).mean())
-        panels.append(Slice(told, state.u_mm, StrainField.from_gradient(state.gradients).max_shear, face))
-    return slice_sheet(mesh, panels, plate.axes, _lowest_bone_point(mesh, plate))
+        told = f"{load.name}: {load.told}{part}"
+        along = _along_plate(mesh, state, plate, middle)
+        panels.append(Slice(told, state.u_mm, StrainField.from_gradient(state.gradients).max_shear, along))
+    return slice_sheet(mesh, panels, plate.axes, middle)
+
+
+def _along_plate(mesh: TetMesh, state: State, plate: Plate, on_slice_mm: FloatArray) -> tuple[float, float]:
+    """Height of the plate where the slice's shear coordinate is 0, and its slope."""
+    on_plate = ((mesh.points_mm + state.u_mm)[state.on_plate] @ plate.axes).mean(axis=0)
+    normal = Rotation.from_rotvec(state.plate.turn_deg, degrees=True).as_matrix()[:, 0]
+    off = np.array([0.0, 0.0, float(on_slice_mm @ plate.axes[:, 2])]) - on_plate
+    return float(-(off @ normal) / normal[0]), float(-normal[1] / normal[0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,14 +88,14 @@ class Slice:
         Displacement of the mesh's nodes, LPS mm: cells are drawn where it puts them.
     max_shear : (m,)
         Of the cells; where it is NaN, a cell is drawn grey.
-    face_mm : float, optional
-        Height of a plate along the normal force, drawn as a dashed line.
+    face : tuple of float, optional
+        A plate, drawn as a dashed line: height along the normal force where the shear's coordinate is 0, and slope.
     """
 
     title: str
     u_mm: FloatArray
     max_shear: FloatArray
-    face_mm: float | None = None
+    face: tuple[float, float] | None = None
 
 
 def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> bytes:
@@ -121,8 +130,8 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
         )  # fmt: skip
         spot.add_collection(drawn)
         spot.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        if panel.face_mm is not None:
-            spot.axhline(panel.face_mm, color=INK, linewidth=1.0, linestyle="--")
+        if panel.face is not None:
+            spot.axline((0.0, panel.face[0]), slope=panel.face[1], color=INK, linewidth=1.0, linestyle="--")
         spot.set_title(panel.title, color=INK, **FONT)
         label_axes(spot, "along the shear, mm", "along the normal force, mm")
     bar = figure.colorbar(drawn, ax=list(spots[: len(panels)]), shrink=0.8, extend="max")
@@ -178,8 +187,9 @@ def force_travel(states: Sequence[State]) -> bytes:
     figure, panels = chart(2)
     for axes, axis, name in zip(panels, (0, 1), ("normal", "shear"), strict=True):
         for number, state in enumerate(states):
+            travel, force = ([getattr(at, what)[axis] for at in state.curve] for what in ("travel_mm", "force_n"))
             axes.plot(
-                state.curve[:, axis], state.curve[:, 3 + axis], marker=".", label=state.load.name, linewidth=1.8,
+                travel, force, marker=".", label=state.load.name, linewidth=1.8,
                 color=REGION_COLOURS[number % len(REGION_COLOURS)],
             )  # fmt: skip
         label_axes(axes, f"{name} travel, mm", f"{name} force, N")

@@ -32,7 +32,7 @@ _EQUAL = (
 _SWEEPS = 30
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def isochoric(law: FloatArray, e: FloatArray, slope: FloatArray, curvature: FloatArray) -> float:
     """Wbar (MPa) at logarithmic stretches ``e`` (3,), with its derivatives by e.
 
@@ -75,7 +75,7 @@ def isochoric(law: FloatArray, e: FloatArray, slope: FloatArray, curvature: Floa
     return float(energy)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def along(law: FloatArray, strains: FloatArray, axes: FloatArray) -> FloatArray:
     """dWbar/dt (n,) MPa at e = t ``axes`` for each t of ``strains`` (n,)."""
     slope, curvature = np.empty(3), np.empty((3, 3))
@@ -86,7 +86,7 @@ def along(law: FloatArray, strains: FloatArray, axes: FloatArray) -> FloatArray:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def least_stiffness(law: FloatArray, strains: FloatArray) -> FloatArray:
     """Least eigenvalue (n,) MPa of d2Wbar/de2 at e (n, 3), over changes that keep the volume: Drucker's condition."""
     slope, c = np.empty(3), np.empty((3, 3))
@@ -101,7 +101,7 @@ def least_stiffness(law: FloatArray, strains: FloatArray) -> FloatArray:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) -> float:
     """F = U diag(s) V^T of a matrix (3, 3) with positive determinant; U, s and V are written, det F is returned.
 
@@ -146,7 +146,7 @@ def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) 
     return float(J)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def principal_response(
     law: FloatArray,
     s: FloatArray,
@@ -188,7 +188,7 @@ def principal_response(
     return float(energy)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def stress_and_tangent(
     law: FloatArray, bulk: float, gradients: FloatArray, energy: FloatArray, stress: FloatArray, tangent: FloatArray
 ) -> None:

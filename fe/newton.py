@@ -10,6 +10,7 @@ import numpy as np
 from dvc.arrays import FloatArray, IntArray
 from fe.assembly import Assembler
 from fe.linear import SingularError, Solver
+from fe.turning import Turning
 
 _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at
@@ -66,6 +67,7 @@ def equilibrium(
     tolerance: Tolerance,
     changed: Callable[[FloatArray, FloatArray], bool] = lambda _state, _forces: False,
     told: Callable[[str], None] = lambda _: None,
+    turning: Turning | None = None,
 ) -> Converged | None:
     """Find the state in which internal forces balance those from outside.
 
@@ -85,6 +87,8 @@ def equilibrium(
         follow has changed, as where more of a surface touches. It may move the state to where that is so.
     told : callable
         Gets a line for each step.
+    turning : Turning, optional
+        A plate that turns.
 
     Returns
     -------
@@ -97,34 +101,43 @@ def equilibrium(
     forces, residual, lowest = assembler.residual(now)
     if not lowest > 0.0:
         return None
-    wandering, balance = 0, 0.0
+    wandering, balance, turn = 0, 0.0, np.zeros(3)
+
+    def unbalanced(at: FloatArray, carried: FloatArray, rest: FloatArray) -> float:
+        of_forces = _norm(outside - rest, held, assembler)
+        return of_forces if turning is None else float(np.hypot(of_forces, turning.missing_n(at, carried)))
+
     for iteration in range(1, tolerance.iterations + 1):
         right = outside - residual
         right[assembler.idle] = 0.0
-        before = _norm(right, held, assembler)
+        before = unbalanced(now, forces, residual)
         data = assembler.held(assembler.tangent(now), right, held, left)
         try:
-            change = assembler.spread(solver.solve(data, right, _ROUGH if balance > _NEAR else _INEXACT))
+            solved = solver.solve(data, right, _ROUGH if balance > _NEAR else _INEXACT)
+            if turning is not None:
+                solved, turn = turning.solved(now, forces, data, solved, held, _INEXACT)
         except SingularError as failure:
             told(f"    {failure}")
             return None
+        solved[held] = left  # exactly, though the solution may be rough
+        change = assembler.spread(solved)
         if not np.isfinite(change).all():
             return None
         share = 1.0
         if wandering >= _WANDERED:
-            share = _best_share(assembler, now, change, outside, held)
+            share = _best_share(assembler, turning, now, change, turn, unbalanced)
         bound = np.inf if left.any() or iteration == 1 else _MOST_GROWTH * before
         while True:
-            tried = now + share * change
+            tried = _ahead(turning, now, change, turn, share)
             forces, residual, lowest = assembler.residual(tried)
-            after = _norm(outside - residual, held, assembler)
+            after = unbalanced(tried, forces, residual)
             if lowest > _LEAST_VOLUME and after <= bound:
                 break
             share *= 0.5
             if share < _LEAST_SHARE:
                 return None
+        largest = float(np.abs((tried - now)[:displacements]).max())
         now, left = tried, (1.0 - share) * left
-        largest = share * float(np.abs(change[:displacements]).max())
         balance = after / max(_reaction(assembler, forces), 1e-9)
         wandering = wandering + 1 if after > 0.5 * before and balance > tolerance.force else 0
         told(f"    {iteration}: out of balance {balance:.1e}, step {largest:.1e} mm, least det F {lowest:.3f}")
@@ -137,14 +150,25 @@ def equilibrium(
     return None
 
 
+def _ahead(turning: Turning | None, now: FloatArray, change: FloatArray, turn: FloatArray, share: float) -> FloatArray:
+    """The state after a share of a step."""
+    return now + share * change if turning is None else turning.ahead(now, share * change, share * turn)
+
+
 def _best_share(
-    assembler: Assembler, now: FloatArray, change: FloatArray, outside: FloatArray, held: IntArray
+    assembler: Assembler,
+    turning: Turning | None,
+    now: FloatArray,
+    change: FloatArray,
+    turn: FloatArray,
+    unbalanced: Callable[[FloatArray, FloatArray, FloatArray], float],
 ) -> float:
     """The share of a step, of a few, that leaves the least out of balance."""
     left = {}
     for share in _SHARES:
-        _, residual, lowest = assembler.residual(now + share * change)
-        left[share] = _norm(outside - residual, held, assembler) if lowest > _LEAST_VOLUME else np.inf
+        tried = _ahead(turning, now, change, turn, share)
+        forces, residual, lowest = assembler.residual(tried)
+        left[share] = unbalanced(tried, forces, residual) if lowest > _LEAST_VOLUME else np.inf
     return min(_SHARES, key=lambda share: left[share])
 
 

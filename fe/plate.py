@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +12,12 @@ from dvc.errors import InputError
 from dvc.kinematics import plate_axes
 
 _BEYOND_MM = 0.5
+_SAME_MM = 1e-6  # nodes whose heights differ by less touch together, whatever the frame does to the last digits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plate:
-    """A rigid, flat plate, large enough for the whole surface; it does not turn.
+    """A rigid, flat plate, large enough for the whole surface.
 
     Parameters
     ----------
@@ -28,27 +29,63 @@ class Plate:
         Distance from the surface that it will touch first, at the start.
     taped : bool
         Whether a node that has touched never slides or leaves again; if not, it slides without friction, and may leave.
+    turns : bool
+        Whether it turns freely about its pivot, in all three axes, once it presses; if not, it stays parallel.
+    pivot_mm : (3,), optional
+        Point in front of which the pivot lies on the plate's face at the start, LPS; by default the place on the
+        surface that is touched first. The pivot moves with the plate, and moments are told about it.
 
     Attributes
     ----------
     axes : (3, 3)
-        Columns are the plate's axes, LPS: that of the normal force on the tissue, of shear, and their cross product.
+        Columns are the plate's axes at the start, LPS: that of the normal force on the tissue, of shear, and their
+        cross product.
     """
 
     normal: npt.ArrayLike
     shear: npt.ArrayLike
     gap_mm: float = 0.0
     taped: bool = True
+    turns: bool = False
+    pivot_mm: npt.ArrayLike | None = None
     axes: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.gap_mm) and self.gap_mm >= 0.0):
             raise InputError(f"The gap between plate and tissue must be 0 mm or more; got {self.gap_mm}.")
+        if self.turns and not self.taped:
+            raise InputError("A plate without friction that turns would slip off: let it turn on tape, or stay level.")
+        if self.pivot_mm is not None:
+            pivot = np.asarray(self.pivot_mm, dtype=np.float64)
+            if pivot.shape != (3,) or not np.isfinite(pivot).all():
+                raise InputError(f"The plate's pivot is a point, three finite coordinates in mm; got {self.pivot_mm}.")
         object.__setattr__(self, "axes", plate_axes(-np.asarray(self.normal, dtype=np.float64), self.shear))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Hold:
+    """Which nodes hold to the plate, where on it, and how it is turned.
+
+    Attributes
+    ----------
+    nodes : (s,) bool
+        Of those that may touch.
+    places_mm : (s, 3)
+        From the pivot, along axes that turn with the plate; NaN where a node does not hold.
+    rotation : (3, 3)
+        Of those axes against the plate's axes at the start.
+    loose : bool
+        Whether the plate turns freely now.
+    """
+
+    nodes: BoolArray
+    places_mm: FloatArray
+    rotation: FloatArray
+    loose: bool
+
+
 class Contact:
-    """Which nodes hold to the plate, in the plate's axes (the first is that of the normal force).
+    """The nodes on the plate, in the plate's axes at the start (the first is that of the normal force).
 
     Parameters
     ----------
@@ -68,21 +105,30 @@ class Contact:
         self.plate = plate
         self.nodes = surface
         self._start = nodes_mm[surface]
-        self.holds: BoolArray = np.zeros(len(surface), dtype=bool)
-        self._face_mm = float(self._start[:, 0].min())
+        face_mm = float(self._start[:, 0].min())
+        self._first = self._start[:, 0] <= face_mm + _SAME_MM
+        over = self._start[self._first].mean(axis=0)
+        if plate.pivot_mm is not None:
+            over = np.asarray(plate.pivot_mm, dtype=np.float64) @ plate.axes
+        self._pivot = np.array([face_mm, *over[1:]])
+        self.hold = Hold(np.zeros(len(surface), dtype=bool), np.full((len(surface), 3), np.nan), np.eye(3), False)
         self._before = np.zeros_like(self._start)
         nearest = float(nodes_mm[:, 0].min())
-        if nearest < self._face_mm - _BEYOND_MM:
+        if nearest < face_mm - _BEYOND_MM:
             raise InputError(
-                f"The plate would pass through {self._face_mm - nearest:.1f} mm of tissue that is not its surface "
+                f"The plate would pass through {face_mm - nearest:.1f} mm of tissue that is not its surface "
                 "before it touches that. Its normal points away from the tissue, on the side that is to be pressed."
             )
 
     @property
+    def held(self) -> IntArray:
+        """Nodes that hold to the plate."""
+        return self.nodes[self.hold.nodes]
+
+    @property
     def followers(self) -> dict[int, IntArray]:
         """Unknowns that follow each of the plate's three displacements."""
-        held = self.nodes[self.holds]
-        return {axis: 3 * held + axis for axis in range(3 if self.plate.taped else 1)}
+        return {axis: 3 * self.held + axis for axis in range(3 if self.plate.taped else 1)}
 
     @property
     def may_follow(self) -> dict[int, IntArray]:
@@ -90,17 +136,41 @@ class Contact:
         return {axis: 3 * self.nodes + axis for axis in range(3)}
 
     def touch_first(self, state: FloatArray) -> None:
-        """Move the plate to the surface: its lowest node holds."""
-        self.holds = self._start[:, 0] <= self._face_mm
-        state[3 * self.nodes[self.holds]] = 0.0
+        """Move the plate to the surface: its lowest node holds, or its lowest nodes."""
+        self.hold = replace(
+            self.hold,
+            nodes=self._first,
+            places_mm=np.where(self._first[:, None], (self._start - self._pivot) * [0.0, 1.0, 1.0], np.nan),
+        )
+        state[3 * self.held] = self._pivot[0] - self._start[self._first, 0]
 
     def begin(self, state: FloatArray) -> None:
         """Remember a state of equilibrium, from which the next one is sought."""
-        self._before = self._moved(state)
+        self._before = self._seen_from_plate(state)
 
-    def advance_mm(self, state: FloatArray) -> float:
-        """How far the plate's face has come along the normal force since the first touch, mm."""
-        return float((self._start[self.holds, 0] + self._moved(state)[self.holds, 0]).mean()) - self._face_mm
+    def centre_mm(self, state: FloatArray) -> FloatArray:
+        """Where the pivot is, (3,) mm."""
+        hold = self.hold
+        found = (self._positions(state)[hold.nodes] - hold.places_mm[hold.nodes] @ hold.rotation.T).mean(axis=0)
+        if not self.plate.taped:
+            found[1:] = self._pivot[1:]
+        return np.asarray(found)
+
+    def travel_mm(self, state: FloatArray) -> FloatArray:
+        """How far the pivot has come from the plate's start, (3,) mm."""
+        return np.asarray(self.centre_mm(state) - self._pivot + [self.plate.gap_mm, 0.0, 0.0])
+
+    def arms_mm(self, state: FloatArray) -> FloatArray:
+        """From the pivot to each node that holds (k, 3), mm."""
+        return self._positions(state)[self.hold.nodes] - self.centre_mm(state)
+
+    def force_n(self, forces: FloatArray) -> FloatArray:
+        """Force of the plate on the tissue (3,) N, from the internal forces of all unknowns."""
+        return np.array([forces[self.followers.get(axis, np.empty(0, dtype=int))].sum() for axis in range(3)])
+
+    def moment_nmm(self, state: FloatArray, forces: FloatArray) -> FloatArray:
+        """Moment of the plate on the tissue about the pivot (3,) N mm."""
+        return np.asarray(np.cross(self.arms_mm(state), forces[_unknowns(self.held)]).sum(axis=0))
 
     def update(self, state: FloatArray, forces: FloatArray) -> bool:
         """Let nodes that are past the plate hold to it, and, without tape, those go that it would have to pull.
@@ -109,7 +179,7 @@ class Contact:
         ----------
         state : (unknowns,)
             Nodes that touch are put on the plate, in place: along its normal onto its face, and, on tape, across it to
-            where they crossed the face on a straight way from the state before.
+            where they crossed the face on a straight way from the state before, as seen from the plate.
         forces : (unknowns,)
             Internal forces, N.
 
@@ -118,21 +188,32 @@ class Contact:
         bool
             Whether any node was taken or let go.
         """
-        now, before = self._moved(state), self._before
-        plate = (now - before)[self.holds].mean(axis=0)  # its own movement in this step
-        gap = self._start[:, 0] + now[:, 0] - (self._start[self.holds, 0] + now[self.holds, 0]).mean()
-        new = (gap <= 0.0) & ~self.holds
-        pulled = self.holds & (forces[3 * self.nodes] < 0.0) if not self.plate.taped else np.zeros_like(self.holds)
-        gap_before = gap - (now - before)[:, 0] + plate[0]
-        closed = np.maximum(gap_before - gap, 1e-12)
-        share = np.clip(gap_before / closed, 0.0, 1.0)[:, None]
-        crossed = before + share * (now - plate - before) + plate
-        state[3 * self.nodes[new]] = (now[:, 0] - gap)[new]
+        hold, now, before = self.hold, self._seen_from_plate(state), self._before
+        new = (now[:, 0] <= 0.0) & ~hold.nodes
+        pulled = np.zeros_like(new)
+        place = now.copy()
         if self.plate.taped:
-            for axis in (1, 2):
-                state[3 * self.nodes[new] + axis] = crossed[new, axis]
-        self.holds = (self.holds & ~pulled) | new
-        return bool(new.any() or pulled.any())
+            closed = np.maximum(before[:, 0] - now[:, 0], 1e-12)
+            place = before + np.clip(before[:, 0] / closed, 0.0, 1.0)[:, None] * (now - before)
+        else:
+            pulled = hold.nodes & (forces[3 * self.nodes] < 0.0)
+        place[:, 0] = 0.0
+        if not (new.any() or pulled.any()):
+            return False
+        put = self.centre_mm(state) + place[new] @ hold.rotation.T
+        state[_unknowns(self.nodes[new])] = put - self._start[new]
+        places = np.where(new[:, None], place, hold.places_mm)
+        places[pulled] = np.nan
+        self.hold = replace(hold, nodes=(hold.nodes & ~pulled) | new, places_mm=places)
+        return True
 
-    def _moved(self, state: FloatArray) -> FloatArray:
-        return np.asarray(state[3 * self.nodes[:, None] + np.arange(3)])
+    def _positions(self, state: FloatArray) -> FloatArray:
+        return self._start + state[_unknowns(self.nodes)]
+
+    def _seen_from_plate(self, state: FloatArray) -> FloatArray:
+        """Positions (s, 3) from the pivot, along the axes that turn with the plate; past its face the first is < 0."""
+        return np.asarray((self._positions(state) - self.centre_mm(state)) @ self.hold.rotation)
+
+
+def _unknowns(nodes: IntArray) -> IntArray:
+    return np.asarray(3 * nodes[:, None] + np.arange(3))

@@ -20,7 +20,15 @@ from dvc.whole import whole_file, write_whole
 from fe.materials import Material
 from fe.simulate import State
 
-CURVE = ("travel_normal_mm", "travel_shear_mm", "travel_third_mm", "force_normal_n", "force_shear_n", "force_third_n")
+_SHARES = (0.5, 0.9, 0.99)
+_AXES = ("normal", "shear", "third")
+_VECTORS = {
+    "travel_mm": "travel_{}_mm",
+    "force_n": "force_{}_n",
+    "turn_deg": "turn_{}_deg",
+    "moment_nmm": "moment_{}_nmm",
+}
+"""Vectors of a plate's state, and what the columns are called that hold their components."""
 
 
 def deformation(mesh: TetMesh, state: State) -> OnMesh:
@@ -39,6 +47,18 @@ def cauchy_stress(state: State, mesh: TetMesh, laws: Mapping[str, Material]) -> 
         volume = np.linalg.det(F[cells])[:, None, None]
         stress[cells] = deviator / volume + state.pressure_mpa[cells].mean(axis=1)[:, None, None] * np.eye(3)
     return stress
+
+
+def equivalent_stress(cauchy_mpa: FloatArray) -> FloatArray:
+    """Von Mises' equivalent (n,) of stresses (n, 3, 3): sqrt(3/2 s : s), s the deviator.
+
+    Examples
+    --------
+    >>> equivalent_stress(np.array([np.diag([5.0, 2.0, 2.0]), [[0, 1, 0], [1, 0, 0], [0, 0, 0]]])).round(4).tolist()
+    [3.0, 1.7321]
+    """
+    deviator = cauchy_mpa - np.trace(cauchy_mpa, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+    return np.asarray(np.sqrt(1.5 * (deviator**2).sum(axis=(1, 2))))
 
 
 def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
@@ -76,6 +96,8 @@ class RegionFigures:
         In the reference configuration.
     shear_p50, shear_p90, shear_p99 : float
         Of the maximal shear (E1 - E3) / 2.
+    stress_p50_mpa, stress_p90_mpa, stress_p99_mpa : float
+        Of the equivalent stress (von Mises) of the Cauchy stress, MPa.
     above_ml : tuple of float
         Volume whose maximal shear exceeds 0.2, 0.3, 0.4, 0.5.
     volume_change : float
@@ -91,6 +113,9 @@ class RegionFigures:
     shear_p50: float
     shear_p90: float
     shear_p99: float
+    stress_p50_mpa: float
+    stress_p90_mpa: float
+    stress_p99_mpa: float
     above_ml: tuple[float, ...]
     volume_change: float
     stable_share: float
@@ -99,16 +124,18 @@ class RegionFigures:
 def region_figures(mesh: TetMesh, state: State, laws: Mapping[str, Material]) -> list[RegionFigures]:
     """Figures of each region under a load."""
     strain = StrainField.from_gradient(state.gradients)
+    stress = equivalent_stress(cauchy_stress(state, mesh, laws))
     rows = []
     for region, law in laws.items():
         cells = mesh.regions[region]
         volumes = mesh.volumes_mm3[cells]
         shear = strain.max_shear[cells]
-        p50, p90, p99 = volume_percentiles(shear, volumes, (0.5, 0.9, 0.99))
+        s50, s90, s99 = volume_percentiles(shear, volumes, _SHARES)
+        m50, m90, m99 = volume_percentiles(stress[cells], volumes, _SHARES)
         stable = law.is_stable(np.eye(3) + state.gradients[cells])
         rows.append(
             RegionFigures(
-                state.load.name, state.reached, region, float(volumes.sum()) / 1000.0, p50, p90, p99,
+                state.load.name, state.reached, region, float(volumes.sum()) / 1000.0, s50, s90, s99, m50, m90, m99,
                 tuple(volume_above(shear, volumes / 1000.0, SHEAR_THRESHOLDS).tolist()),
                 float(volumes @ strain.jacobian[cells] / volumes.sum()) - 1.0,
                 float(volumes[stable].sum() / volumes.sum()),
@@ -137,11 +164,14 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
     writer = csv.writer(text, lineterminator="\n")
     above = [f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS]
     writer.writerow(
-        ["load", "reached", "region", "volume_ml", "max_shear_p50", "max_shear_p90", "max_shear_p99", *above,
-         "volume_change", "stable_share"]
+        ["load", "reached", "region", "volume_ml", "max_shear_p50", "max_shear_p90", "max_shear_p99",
+         "von_mises_p50_mpa", "von_mises_p90_mpa", "von_mises_p99_mpa", *above, "volume_change", "stable_share"]
     )  # fmt: skip
     for row in rows:
-        numbers = (row.volume_ml, row.shear_p50, row.shear_p90, row.shear_p99, *row.above_ml, row.volume_change)
+        numbers = (
+            row.volume_ml, row.shear_p50, row.shear_p90, row.shear_p99,
+            row.stress_p50_mpa, row.stress_p90_mpa, row.stress_p99_mpa, *row.above_ml, row.volume_change,
+        )  # fmt: skip
         writer.writerow(
             [row.load, f"{row.reached:.4g}", row.region, *(f"{v:.6g}" for v in numbers), f"{row.stable_share:.6g}"]
         )
@@ -149,12 +179,15 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
 
 
 def write_curve_csv(path: Path, states: Sequence[State]) -> None:
-    """Write the force-travel curve: every state of equilibrium, in the plate's axes."""
+    """Write every state of equilibrium: the plate's travel, force, turn and moment along its axes, and its contact."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["load", *CURVE])
+    columns = [name.format(axis) for name in _VECTORS.values() for axis in _AXES]
+    writer.writerow(["load", *columns, "contact_area_mm2", "contact_pressure_mpa"])
     for state in states:
-        writer.writerows([state.load.name, *(f"{v:.8g}" for v in row)] for row in state.curve)
+        for at in state.curve:
+            values = np.concatenate([getattr(at, field) for field in _VECTORS] + [[at.area_mm2, at.pressure_mpa]])
+            writer.writerow([state.load.name, *(f"{v:.8g}" for v in values)])
     write_whole(path, text.getvalue())
 
 

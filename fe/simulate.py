@@ -10,42 +10,74 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
-from fe.assembly import Assembler
-from fe.elements import edges_of, element
-from fe.linear import Solver
+from fe.elements import element
 from fe.materials import Material
 from fe.model import Model
-from fe.newton import Tolerance, equilibrium
+from fe.newton import Tolerance
+from fe.path import SURFACE, Goal, Path, PlateState, Standing
 from fe.plate import Contact, Plate
 
-BONE, SURFACE = "bone", "skin"
-"""Names of the facets that are fixed, and of those that the plate may touch."""
+BONE = "bone"
+"""Name of the facets that are fixed."""
 
-_FIRST_STEP = 0.25
-_LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
-_GROWTH, _SHRINK = 1.7, 0.4
-_APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
-_LEAST_APPROACH_MM = 0.01
-_ENOUGH = 0.2  # share of the normal force up to which the plate is moved, and not yet pushed
+_TOLERANCE = Tolerance()
 
 
 @dataclass(frozen=True, slots=True)
 class LoadStep:
-    """A load to be reached from the one before it.
+    """A load to be reached from the one before it: along the normal and across it a force, or the plate's travel.
 
     Attributes
     ----------
     name : str
-    normal_n, shear_n : float
+    normal_n, shear_n : float, optional
         Force of the plate on the tissue along the normal force's and the shear's direction, N.
+    normal_mm, shear_mm : float, optional
+        In its place, the plate's travel from its start, mm.
+
+    Raises
+    ------
+    InputError
+        If along the normal not just one of the two is given, or along the shear both.
     """
 
     name: str
-    normal_n: float
-    shear_n: float = 0.0
+    normal_n: float | None = None
+    shear_n: float | None = None
+    normal_mm: float | None = None
+    shear_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.normal_n is None) == (self.normal_mm is None):
+            raise InputError(f"{self.name}: give the normal force or the travel along it, and not both.")
+        if self.shear_n is not None and self.shear_mm is not None:
+            raise InputError(f"{self.name}: give the shear force or the travel along it, and not both.")
+
+    @property
+    def sheared(self) -> bool:
+        """Whether it asks for a shear, as force or as travel."""
+        return bool(self.shear_n) or self.shear_mm is not None
+
+    @property
+    def goal(self) -> Goal:
+        """What it asks of the plate along its three axes."""
+        asked = [(self.normal_n, self.normal_mm), (self.shear_n, self.shear_mm), (0.0, None)]
+        return Goal(
+            np.array([force or 0.0 if travel is None else travel for force, travel in asked]),
+            np.array([travel is not None for _, travel in asked]),
+        )
+
+    @property
+    def told(self) -> str:
+        """The load in words, such as "15 N normal, 8 mm shear"."""
+        normal, shear, _ = (
+            f"{value:g} {'mm' if travel else 'N'}"
+            for value, travel in zip(self.goal.values, self.goal.travels, strict=True)
+        )
+        return f"{normal} normal, {shear} shear"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,22 +88,24 @@ class State:
     ----------
     load : LoadStep
     reached : float
-        Share of the force that this load adds to the one before it on its path, all of it being 1.
+        Share of what this load adds to the one before it on its path, all of it being 1: along the axis, of those that
+        it changes, where least is reached.
     u_mm : (n, 3)
         Displacement of the mesh's nodes, mm.
     pressure_mpa : (m, 4)
         Pressure at the corners of each cell, positive in tension.
     gradients : (m, 3, 3)
         H = du/dX of each cell, its mean where the element's varies.
-    travel_mm, force_n : (3,)
-        Displacement of the plate from its start, and its force on the tissue, along the plate's axes.
     on_plate : (k,)
         Nodes that hold to the plate.
-    curve : (k, 6)
-        Travel and force of every state of equilibrium on the way, from that of the load before it to this one.
+    curve : tuple of PlateState
+        The plate in every state of equilibrium on the way, from that of the load before it to this one; empty where
+        there is no plate.
     iterations : int
         Newton steps since the load before it, those of steps that failed not counted.
     seconds : float
+    standing : Standing, optional
+        What the next load goes on from.
     """
 
     load: LoadStep
@@ -79,12 +113,26 @@ class State:
     u_mm: FloatArray
     pressure_mpa: FloatArray
     gradients: FloatArray
-    travel_mm: FloatArray
-    force_n: FloatArray
     on_plate: IntArray
-    curve: FloatArray
+    curve: tuple[PlateState, ...]
     iterations: int
     seconds: float
+    standing: Standing | None = None
+
+    @property
+    def plate(self) -> PlateState:
+        """The plate under this load."""
+        return self.curve[-1]
+
+    @property
+    def travel_mm(self) -> FloatArray:
+        """Displacement of the plate (3,) from its start, along its axes at the start."""
+        return self.plate.travel_mm
+
+    @property
+    def force_n(self) -> FloatArray:
+        """Force of the plate on the tissue (3,), along its axes at the start."""
+        return self.plate.force_n
 
 
 def simulate(
@@ -96,6 +144,7 @@ def simulate(
     fixed: Sequence[str] = (BONE,),
     formulation: str = "P1",
     threads: int = 1,
+    tolerance: Tolerance = _TOLERANCE,
     keep: Callable[[State], None] = lambda _: None,
     progress: Callable[[float], None] = lambda _: None,
     tell: Callable[[str], None] = lambda _: None,
@@ -116,6 +165,8 @@ def simulate(
         As in `fe.elements`.
     threads : int
         Of the linear algebra.
+    tolerance : Tolerance
+        When a state counts as in equilibrium.
     keep : callable
         Gets each load's state as soon as it is there.
     progress : callable
@@ -136,50 +187,54 @@ def simulate(
     check(mesh, laws, plate, loads, fixed)
     turned = TetMesh(mesh.points_mm @ plate.axes, mesh.cells, mesh.regions, mesh.facets)
     model = Model.of(turned, laws, element(formulation))
-    path = _Path(model, turned, plate, fixed, threads, tell)
+    path = Path(model, turned, plate, fixed, threads, tolerance, tell)
     states: list[State] = []
-    before = np.zeros(3)
     try:
         for number, load in enumerate(loads):
-            target = np.array([load.normal_n, load.shear_n, 0.0])
+            goal = load.goal
             began, counted, known = time.monotonic(), path.iterations, len(path.curve)
+            before = path.reached(goal)
+            if states:  # what was asked for, not what was reached to the tolerance
+                last = states[-1].load.goal
+                before = np.where(goal.travels == last.travels, last.values, before)
 
             def told(share: float, done: int = number) -> None:
                 progress((done + share) / len(loads))
 
             whole = True
             if not states:
-                path.approach(load.normal_n)
-                if load.shear_n != 0.0:  # normal first, then shear
-                    whole = path.raise_force(np.array([load.normal_n, 0.0, 0.0]), told)
-            whole = whole and path.raise_force(target, told)
-            reached = (
-                1.0 if whole else float((path.force - before) @ (target - before) / ((target - before) ** 2).sum())
-            )
+                whole = path.approach(goal)
+                if load.sheared:  # normal first, then shear
+                    whole = whole and path.raise_to(goal.unsheared(), told)
+            whole = whole and path.raise_to(goal, told)
             displacements = 3 * len(model.space.nodes_mm)
             u = path.state[:displacements].reshape(-1, 3)[: len(mesh.points_mm)]
             states.append(
                 State(
                     load=load,
-                    reached=reached,
+                    reached=1.0 if whole else _share(before, path.reached(goal), goal.values),
                     u_mm=u @ plate.axes.T,
                     pressure_mpa=model.pressures(path.state),
                     gradients=plate.axes @ model.gradients(path.state) @ plate.axes.T,
-                    travel_mm=path.travel.copy(),
-                    force_n=path.force.copy(),
-                    on_plate=path.on_plate[path.on_plate < len(mesh.points_mm)],
-                    curve=np.array(path.curve[known - 1 :]),
+                    on_plate=path.contact.held[path.contact.held < len(mesh.points_mm)],
+                    curve=tuple(path.curve[known - 1 :]),
                     iterations=path.iterations - counted,
                     seconds=time.monotonic() - began,
+                    standing=path.standing,
                 )
             )
             keep(states[-1])
             if not whole:
                 break
-            before = target
     finally:
         path.solver.close()
     return states
+
+
+def _share(before: FloatArray, now: FloatArray, asked: FloatArray) -> float:
+    """The least share reached along the axes that a load changes."""
+    changed = np.abs(asked - before) > 0.0
+    return float(((now - before)[changed] / (asked - before)[changed]).min()) if changed.any() else 0.0
 
 
 def check(
@@ -202,13 +257,15 @@ def check(
     if not loads:
         raise InputError("No load is given.")
     for load in loads:
-        if not (np.isfinite([load.normal_n, load.shear_n]).all() and load.normal_n > 0.0):
+        goal = load.goal
+        least = f"{plate.gap_mm:g} mm, the gap" if goal.travels[0] else "0 N"
+        if not (np.isfinite(goal.values).all() and goal.values[0] > (plate.gap_mm if goal.travels[0] else 0.0)):
             raise InputError(
-                f"{load.name}: the normal force must press, above 0 N; got {load.normal_n:g} N. The plate's normal "
-                "points away from the tissue."
+                f"{load.name}: the normal {'travel' if goal.travels[0] else 'force'} must press, above {least}; got "
+                f"{load.told}. The plate's normal points away from the tissue."
             )
-        if load.shear_n != 0.0 and not plate.taped:
-            raise InputError(f"{load.name}: a plate without friction carries no shear force; got {load.shear_n:g} N.")
+        if load.sheared and not plate.taped:
+            raise InputError(f"{load.name}: a plate without friction carries no shear; got {load.told}.")
     _check_held(mesh, fixed)
     on_surface = np.setdiff1d(np.unique(mesh.facets[SURFACE]), _nodes_of(mesh, fixed))
     Contact(plate, mesh.points_mm @ plate.axes, on_surface)
@@ -246,143 +303,3 @@ def _check_held(mesh: TetMesh, fixed: Sequence[str]) -> None:
             f"{int(loose.sum())} of {len(loose)} cells are not joined to what is fixed ({', '.join(fixed)}): tissues "
             "are bonded where they share nodes. Merge coincident nodes where the mesh was made."
         )
-
-
-_Kept = tuple[FloatArray, FloatArray, FloatArray, BoolArray, int]
-
-
-class _Path:
-    """The state on its way, and what moves it."""
-
-    def __init__(
-        self,
-        model: Model,
-        mesh: TetMesh,
-        plate: Plate,
-        fixed: Sequence[str],
-        threads: int,
-        tell: Callable[[str], None],
-    ) -> None:
-        self.model, self.tell = model, tell
-        held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in fixed]))
-        touching = np.setdiff1d(_nodes_on(model, mesh, SURFACE), held)
-        self.contact = Contact(plate, model.space.nodes_mm, touching)
-        self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), self.contact.may_follow)
-        self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
-        self.state = np.zeros(model.unknowns)
-        self.extent_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
-        self.travel, self.force = np.zeros(3), np.zeros(3)
-        self.travel[0] = plate.gap_mm
-        self.curve: list[FloatArray] = [np.concatenate([self.travel, self.force])]
-        self.tolerance = Tolerance()
-        self.iterations = 0
-
-    @property
-    def on_plate(self) -> IntArray:
-        """Displacement nodes that hold to the plate."""
-        return self.contact.nodes[self.contact.holds]
-
-    def approach(self, normal_n: float) -> None:
-        """Move the plate from its first touch on, until it presses with a part of the force asked for."""
-        self.contact.touch_first(self.state)
-        self._push(0, _ENOUGH * normal_n, normal_n)
-
-    def raise_force(self, target: FloatArray, progress: Callable[[float], None]) -> bool:
-        """Raise the force from what it is to the target, in steps as large as converge; whether it is there.
-
-        Where tissue gives way too much for that, the plate is moved along the force for a while, and then pushed again.
-        It is given up where the plate has moved as far as the body is large.
-        """
-        before, way = self.force.copy(), target - self.force
-        axis = int(np.argmax(np.abs(way)))
-        done, step, pushed = 0.0, _FIRST_STEP, False
-        while done < 1.0 and step > _LEAST_STEP:
-            share = min(1.0, done + step)
-            kept = self._kept()
-            if self._go(before + share * way, [], np.zeros(0)):
-                done, step, pushed = share, step * _GROWTH, False
-                self._told(f"{done:.0%} of the way")
-                progress(done)
-                continue
-            self._restore(kept)
-            step *= _SHRINK
-            if step < _SOFT_STEP and not pushed:
-                pushed = True
-                self._push(axis, before[axis] + min(1.0, done + _FIRST_STEP) * way[axis], target[axis])
-                done, step = float((self.force - before) @ way / (way @ way)), _FIRST_STEP
-        return done >= 1.0
-
-    def _push(self, axis: int, enough_n: float, most_n: float) -> None:
-        """Move the plate along an axis until its force there is enough, or no more can be had; never past the most."""
-        sign = 1.0 if most_n >= self.force[axis] else -1.0
-        farthest = self.travel[axis] + sign * float(np.ptp(self.model.space.nodes_mm[:, 0]))
-        step = _APPROACH_MM
-        while sign * (enough_n - self.force[axis]) > 0.0 and step > _LEAST_APPROACH_MM:
-            if sign * (farthest - self.travel[axis]) < step:
-                break
-            kept = self._kept()
-            if self._go(self.force, [axis], np.array([sign * step])) and sign * (most_n - self.force[axis]) > 0.0:
-                step = min(_GROWTH * step, _MOST_APPROACH_MM)
-                self._told("moved")
-            else:
-                self._restore(kept)
-                step *= _SHRINK
-
-    def _go(self, force: FloatArray, held: list[int], moves: FloatArray) -> bool:
-        """Find equilibrium under a force along the axes that are not held, and moves along those that are."""
-        self.contact.begin(self.state)
-        follows = self.contact.followers
-        plate = self.assembler.own_equations + np.arange(3)
-        outside = np.zeros(self.assembler.size)
-        outside[plate] = force
-        self.assembler.share(follows)
-        found = equilibrium(
-            self.assembler,
-            self.solver,
-            self.state,
-            outside,
-            plate[held],
-            moves,
-            self.tolerance,
-            self._changed,
-            self.tell,
-        )
-        if found is None:
-            return False
-        self.travel[0] = self.contact.plate.gap_mm + self.contact.advance_mm(found.state)
-        if self.contact.plate.taped:  # whoever was on the plate still is
-            for axis in (1, 2):
-                self.travel[axis] += (found.state - self.state)[follows[axis][0]]
-        if np.abs(self.travel - [self.contact.plate.gap_mm, 0.0, 0.0]).max() > self.extent_mm:
-            self.tell("the plate would have moved farther than the body is large")
-            return False
-        self.force = np.array([found.forces[self.contact.followers.get(axis, [])].sum() for axis in range(3)])
-        self.state = found.state
-        self.iterations += found.iterations
-        self.curve.append(np.concatenate([self.travel, self.force]))
-        return True
-
-    def _changed(self, state: FloatArray, forces: FloatArray) -> bool:
-        if not self.contact.update(state, forces):
-            return False
-        self.assembler.share(self.contact.followers)
-        return True
-
-    def _kept(self) -> _Kept:
-        return self.state, self.travel.copy(), self.force, self.contact.holds, len(self.curve)
-
-    def _restore(self, kept: _Kept) -> None:
-        self.state, self.travel, self.force, self.contact.holds, known = kept
-        del self.curve[known:]
-
-    def _told(self, what: str) -> None:
-        travel, force = (", ".join(f"{v:.3f}" for v in vector) for vector in (self.travel, self.force))
-        self.tell(f"{what}: travel {travel} mm, force {force} N, {int(self.contact.holds.sum())} nodes on the plate")
-
-
-def _nodes_on(model: Model, mesh: TetMesh, facets: str) -> IntArray:
-    """Displacement nodes on named facets; those in the middle of edges too."""
-    corners = np.unique(mesh.facets[facets])
-    if model.element.name != "P2":
-        return corners
-    return np.union1d(corners, model.space.middles(edges_of(mesh.facets[facets])))

@@ -20,7 +20,9 @@ LOADS = (
 
 
 def paths_of(loads: Sequence[LoadStep]) -> list[tuple[LoadStep, ...]]:
-    """Loads by path: those of one normal force, and of shear to the same side, in the order of their shear.
+    """Loads by path: pressed alike and sheared to the same side, by force or by travel, in the order of the shear.
+
+    A load without shear lies on the path of the first that is pressed like it and sheared.
 
     Examples
     --------
@@ -30,34 +32,47 @@ def paths_of(loads: Sequence[LoadStep]) -> list[tuple[LoadStep, ...]]:
     names = [load.name for load in loads]
     if not names or len(set(names)) < len(names):
         raise InputError(f"Loads are needed, each with a name of its own; got {', '.join(names) or 'none'}.")
-    both = {load.normal_n for load in loads if load.shear_n > 0.0} & {x.normal_n for x in loads if x.shear_n < 0.0}
 
-    def path(load: LoadStep) -> tuple[float, bool]:
-        return load.normal_n, load.shear_n < 0.0 and load.normal_n in both
+    def key(load: LoadStep) -> tuple[float | bool, ...]:
+        like = next((x for x in loads if x.sheared and _pressed(x) == _pressed(load)), load)
+        shear = load if load.sheared else like
+        return *_pressed(load), bool(shear.goal.travels[1]), bool(shear.goal.values[1] < 0.0)
 
     return [
-        tuple(sorted((x for x in loads if path(x) == key), key=lambda x: abs(x.shear_n)))
-        for key in dict.fromkeys(path(load) for load in loads)
+        tuple(sorted((x for x in loads if key(x) == one), key=lambda x: (x.sheared, abs(float(x.goal.values[1])))))
+        for one in dict.fromkeys(key(load) for load in loads)
     ]
 
 
+def _pressed(load: LoadStep) -> tuple[float, bool]:
+    return float(load.goal.values[0]), bool(load.goal.travels[0])
+
+
 def load_named(text: str) -> LoadStep:
-    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR, in N.
+    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR; each a force in N, or, with mm after it, the plate's travel.
 
     Examples
     --------
-    >>> load_named("Load3=15,45")
-    LoadStep(name='Load3', normal_n=15.0, shear_n=45.0)
+    >>> load_named("Load3=15,45").told
+    '15 N normal, 45 N shear'
+    >>> load_named("Load3=15,8mm").told
+    '15 N normal, 8 mm shear'
     """
-    name, _, forces = text.partition("=")
+    name, _, asked = text.partition("=")
+    found = [re.fullmatch(r"\s*([^\s]+?)\s*(mm|N)?\s*", part) for part in asked.split(",")]
     try:
-        normal, shear = (float(v) for v in (forces if "," in forces else forces + ",0").split(","))
-        if not np.isfinite([normal, shear]).all():
-            raise ValueError("not finite")
+        values = {
+            f"{axis}_{'mm' if match[2] == 'mm' else 'n'}": float(match[1])
+            for axis, match in zip(("normal", "shear"), found, strict=False)
+            if match
+        }
+        if len(values) < len(found) or not np.isfinite(list(values.values())).all():
+            raise ValueError("not finite numbers")
     except ValueError as failure:
         raise InputError(
-            f"A load is NAME=NORMAL or NAME=NORMAL,SHEAR in N, such as Load3=15,45; got '{text}'."
+            "A load is NAME=NORMAL or NAME=NORMAL,SHEAR in N, such as Load3=15,45, or the plate's travel in mm, such "
+            f"as Load3=15,8mm; got '{text}'."
         ) from failure
     if not name.strip() or not re.fullmatch(r"[\w. -]+", name.strip()):
         raise InputError(f"A load needs a name of letters, digits, dots, blanks or dashes; got '{name}'.")
-    return LoadStep(name.strip(), normal, shear)
+    return LoadStep(name.strip(), **values)

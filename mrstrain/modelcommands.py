@@ -65,7 +65,10 @@ def simulate(
     ] = None,
     load: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=NORMAL or NAME=NORMAL,SHEAR in N; repeat. Default: the published experiment's four."),
+        typer.Option(
+            help="NAME=NORMAL or NAME=NORMAL,SHEAR in N, or with mm after a number the plate's travel; repeat. "
+            "Default: the published experiment's four."
+        ),
     ] = None,
     plate_normal: Plate = None,
     shear_direction: Shear = None,
@@ -73,6 +76,11 @@ def simulate(
         bool, typer.Option("--slide", help="No tape: skin slides along the plate without friction.")
     ] = False,
     gap_mm: Annotated[float, typer.Option(min=0.0, help="Distance of the plate from the skin at the start, mm.")] = 0.0,
+    turns: Annotated[bool, typer.Option("--turns", help="The plate turns freely about its pivot.")] = False,
+    pivot: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Point over which the plate's pivot lies, LPS mm. Default: where it touches first."),
+    ] = None,
     fix: Annotated[list[str] | None, typer.Option(help="Facets that do not move; repeat. Default: bone.")] = None,
     element: Annotated[str, typer.Option(help="P1 (fast), MINI, or P2 (quadratic: more exact, slow).")] = "P1",
     decks: Annotated[bool, typer.Option("--decks", help="Also write each load for CalculiX and FEBio.")] = False,
@@ -95,6 +103,8 @@ def simulate(
             shear_direction=shear_direction or (0.0, -1.0, 0.0),
             taped=not slide,
             gap_mm=gap_mm,
+            turns=turns,
+            pivot_mm=pivot,
             fixed=fix or ("bone",),
             element=element,
             decks=decks,

@@ -106,6 +106,8 @@ def simulate(
     shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
     taped: bool = True,
     gap_mm: float = 0.0,
+    turns: bool = False,
+    pivot_mm: Sequence[float] | None = None,
     fixed: Sequence[str] = (BONE,),
     element: str = "P1",
     mesh_unit: str = "mm",
@@ -135,6 +137,10 @@ def simulate(
         Whether skin that has touched the plate holds to it; if not, it slides without friction.
     gap_mm : float
         Distance of the plate from the skin at the start, which its travel begins with.
+    turns : bool
+        Whether the plate turns freely about its pivot once it presses.
+    pivot_mm : (3,), optional
+        As in `fe.plate.Plate`.
     fixed : sequence of str
         Facets that do not move.
     element : {"P1", "MINI", "P2"}
@@ -152,7 +158,7 @@ def simulate(
         If the mesh, a set or a load cannot be used; before anything is computed.
     """
     place, target = Path(mesh), Path(out)
-    plate = Plate(plate_normal, shear_direction, gap_mm, taped)
+    plate = Plate(plate_normal, shear_direction, gap_mm, taped, turns, pivot_mm)
     formulation(element)
     read = read_tet_mesh(place, unit=mesh_unit, frame=mesh_frame)
     chosen = [material_set(name) for name in sets]
@@ -170,6 +176,7 @@ def simulate(
         clear(target / name)
     files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
     given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(fixed)}
+    given |= {"turns": turns, "pivot_mm": None if pivot_mm is None else list(pivot_mm)}
     jobs = [(one, path) for one in chosen for path in paths]
     at_once = max(1, min(workers or usable_cores(), len(jobs)))
     each = threads or max(1, usable_cores() // at_once)
@@ -284,7 +291,8 @@ def _told(
         "region_numbers_in_vtu": {number: name for number, name in enumerate(laws, start=1)},
         "paths": [[asdict(load) for load in path] for path in paths],
         "plate_axes_lps": plate.axes.tolist(),
-        "plate": "rigid; moved to the tissue, then force-controlled along all three axes; rotation locked",
+        "plate": "rigid; moved to the tissue, then to the forces and travels asked for, no force along the third axis; "
+        + ("let go to turn about its pivot once it presses" if plate.turns else "rotation locked"),
         "element": f"{element}: {TOLD[element]}",
     }
 
@@ -333,6 +341,10 @@ def _written(
             "reached": state.reached,
             "plate_travel_mm": state.travel_mm.tolist(),
             "plate_force_n": state.force_n.tolist(),
+            "plate_turn_deg": state.plate.turn_deg.tolist(),
+            "plate_moment_nmm": state.plate.moment_nmm.tolist(),
+            "contact_area_mm2": state.plate.area_mm2,
+            "contact_pressure_mpa": state.plate.pressure_mpa if state.plate.area_mm2 > 0.0 else None,
             "nodes_on_plate": len(state.on_plate),
             "iterations": state.iterations,
             "seconds": round(state.seconds, 1),

@@ -154,6 +154,11 @@ def test_folded_gradients_have_no_stress() -> None:
     assert np.isnan(NeoHooke.of(0.1).stress(np.diag([-1.0, 1.0, 1.0])[None])).all()
 
 
+def test_a_gradient_on_its_last_legs_gives_no_number_and_no_crash() -> None:
+    flat = np.diag([1e-200, 1.0, 1.0])[None]  # its square has no digits left
+    assert not np.isfinite(NeoHooke.of(0.1).stress(flat)).all()
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [

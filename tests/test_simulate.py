@@ -10,6 +10,7 @@ from dvc.errors import InputError
 from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
 from fe.materials import NeoHooke, Ogden
+from fe.newton import Tolerance
 from fe.plate import Plate
 from fe.simulate import LoadStep, State, simulate
 from tests.blocks import block
@@ -50,15 +51,14 @@ def test_the_force_is_the_one_asked_for(sheared: list[State]) -> None:
     for state, force in zip(sheared, ([2, 0, 0], [2, 1, 0], [2, 2, 0]), strict=True):
         assert state.reached == 1.0
         assert state.force_n == pytest.approx(force, abs=1e-3 * np.linalg.norm(force))
-        assert state.curve[-1, 3:] == pytest.approx(state.force_n)
-        assert state.curve[-1, :3] == pytest.approx(state.travel_mm)
 
 
 def test_one_path_from_load_to_load(sheared: list[State]) -> None:
-    assert sheared[0].curve[0].tolist() == [0.0] * 6
+    start = sheared[0].curve[0]
+    assert [*start.travel_mm, *start.force_n, start.area_mm2] == [0.0] * 7
     for before, after in itertools.pairwise(sheared):
-        assert after.curve[0].tolist() == before.curve[-1].tolist()
-        assert (np.diff(after.curve[:, 1]) > 0).all()  # sheared ever further
+        assert after.curve[0] is before.curve[-1]
+        assert (np.diff([at.travel_mm[1] for at in after.curve]) > 0).all()  # sheared ever further
     assert sheared[1].travel_mm[1] < sheared[2].travel_mm[1]
     assert len(sheared[2].on_plate) >= len(sheared[1].on_plate) >= len(sheared[0].on_plate) > 4
 
@@ -145,21 +145,76 @@ def test_a_load_too_large_ends_with_the_last_state_in_balance() -> None:
 def test_normal_first_then_shear() -> None:
     alone, after = (press(dome(), loads)[-1] for loads in ([SHEARED], [*PRESS, SHEARED]))
     assert np.abs(alone.u_mm - after.u_mm).max() < 1e-6
-    assert alone.curve[0].tolist() == [0.0] * 6
+    assert alone.curve[0].travel_mm.tolist() == alone.curve[0].force_n.tolist() == [0.0] * 3
 
 
 def test_halved_steps_put_the_tape_in_the_same_places(monkeypatch: pytest.MonkeyPatch) -> None:
     soft = {"skin": FAT, "fat": FAT}
     loads = [LoadStep("pressed", 4.0)]
     plain = press(dome((3, 7, 7)), loads, soft)[0]
-    monkeypatch.setattr("fe.simulate._MOST_APPROACH_MM", 0.1)
-    monkeypatch.setattr("fe.simulate._APPROACH_MM", 0.1)
-    monkeypatch.setattr("fe.simulate._FIRST_STEP", 0.05)
-    monkeypatch.setattr("fe.simulate._GROWTH", 1.0)
+    monkeypatch.setattr("fe.path._MOST_APPROACH_MM", 0.1)
+    monkeypatch.setattr("fe.path._APPROACH_MM", 0.1)
+    monkeypatch.setattr("fe.path._FIRST_STEP", 0.05)
+    monkeypatch.setattr("fe.path._GROWTH", 1.0)
     small = press(dome((3, 7, 7)), loads, soft)[0]
     assert len(small.curve) > 2 * len(plain.curve)
     assert plain.travel_mm[0] == pytest.approx(small.travel_mm[0], rel=0.005)
     assert np.abs(plain.u_mm - small.u_mm).max() < 0.06
+
+
+EXACT = Tolerance(force=1e-9, step_mm=1e-8)
+
+
+@pytest.fixture(scope="module")
+def moved() -> list[State]:
+    loads = [LoadStep("in", normal_mm=1.5), LoadStep("along", normal_mm=1.5, shear_mm=1.0)]
+    return press(block_under_plate(), loads, tolerance=EXACT)
+
+
+def block_under_plate() -> TetMesh:
+    box = block((4, 5, 5), (10.0, 20.0, 20.0), layers=4, wobble=0.15)
+    fat = np.concatenate([box.regions[f"layer {k}"] for k in (1, 2, 3)])
+    facets = {"bone": box.facets["x1"], "skin": box.facets["x0"]}
+    return TetMesh(box.points_mm, box.cells, {"skin": box.regions["layer 0"], "fat": fat}, facets)
+
+
+def test_the_travel_is_the_one_asked_for(moved: list[State]) -> None:
+    assert [state.reached for state in moved] == [1.0, 1.0]
+    assert moved[0].travel_mm[0] == pytest.approx(1.5, abs=1e-9)
+    assert moved[1].travel_mm[:2] == pytest.approx([1.5, 1.0], abs=1e-9)
+    assert np.abs(moved[0].force_n[1:]).max() < 1e-6  # free across, where no travel is given
+    assert abs(moved[1].force_n[2]) < 1e-6
+    assert (np.diff([at.travel_mm[0] for at in moved[0].curve]) <= 0.6 + 1e-9).all()
+
+
+def test_the_force_of_a_travel_gives_that_travel(moved: list[State]) -> None:
+    forces = [LoadStep(state.load.name, float(state.force_n[0]), float(state.force_n[1])) for state in moved]
+    forces[0] = LoadStep("in", forces[0].normal_n)
+    for travelled, pushed in zip(moved, press(block_under_plate(), forces, tolerance=EXACT), strict=True):
+        assert pushed.travel_mm == pytest.approx(travelled.travel_mm, abs=1e-6)
+        assert np.abs(pushed.u_mm - travelled.u_mm).max() < 1e-6
+        assert np.abs(pushed.u_mm).max() > 1.0
+
+
+def test_a_force_along_the_normal_and_a_travel_across(moved: list[State]) -> None:
+    normal = float(moved[1].force_n[0])
+    state = press(block_under_plate(), [LoadStep("both", normal_n=normal, shear_mm=1.0)], tolerance=EXACT)[0]
+    assert state.travel_mm == pytest.approx(moved[1].travel_mm, abs=1e-6)
+    assert state.force_n == pytest.approx(moved[1].force_n, abs=1e-5)
+
+
+def test_a_travel_too_far_ends_with_the_last_state_in_balance() -> None:
+    state = press(dome((3, 4, 4)), [LoadStep("in", normal_mm=9.5)])[0]
+    assert 0.3 < state.reached < 1.0
+    assert state.travel_mm[0] == pytest.approx(9.5 * state.reached)
+
+
+@pytest.mark.parametrize("given", [{}, {"normal_n": 1.0, "normal_mm": 1.0}])
+def test_a_load_is_a_force_or_a_travel(given: dict) -> None:
+    with pytest.raises(InputError, match="the normal force or the travel along it, and not both"):
+        LoadStep("x", **given)
+    with pytest.raises(InputError, match="the shear force or the travel along it, and not both"):
+        LoadStep("x", 1.0, 1.0, shear_mm=1.0)
 
 
 def test_a_plate_from_the_wrong_side_is_refused() -> None:
@@ -182,7 +237,7 @@ def test_tissue_that_hangs_on_no_bone_is_refused() -> None:
 
 
 def test_a_plate_without_friction_carries_no_shear() -> None:
-    with pytest.raises(InputError, match="carries no shear force"):
+    with pytest.raises(InputError, match="carries no shear"):
         press(dome(), [SHEARED], taped=False)
 
 

@@ -17,7 +17,7 @@ from fe.result import cauchy_stress, deformation, patch_volumes, volume_percenti
 from fe.simulate import LoadStep, simulate
 from mrstrain.cli import app
 from mrstrain.loads import load_named, paths_of
-from tests.test_simulate import DOWN, FAT, LAWS, PRESS, dome, press
+from tests.test_simulate import DOWN, FAT, LAWS, PRESS, block_under_plate, dome, press
 
 PLATE = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0"]
 MINE = """
@@ -61,8 +61,16 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         regions = np.genfromtxt(folder / "regions.csv", delimiter=",", names=True, dtype=None, encoding=None)
         assert len(regions) == 6
         assert (np.abs(regions["volume_change"]) < 0.02).all()
+        skin, whole = regions["von_mises_p90_mpa"][regions["region"] == "skin"], regions["von_mises_p50_mpa"]
+        assert (skin > 0.0005).all()  # stiff, and under load
+        assert (regions["von_mises_p99_mpa"] >= regions["von_mises_p90_mpa"]).all()
+        assert (whole < regions["von_mises_p90_mpa"]).all()
         curve = np.genfromtxt(folder / "curve.csv", delimiter=",", names=True, dtype=None, encoding=None)
         assert curve["force_normal_n"].max() == pytest.approx(4.0, abs=0.01)
+        at = curve[-1]
+        assert 40.0 < at["contact_area_mm2"] < 400.0  # of a dome of 20 mm x 20 mm
+        assert at["contact_pressure_mpa"] == pytest.approx(at["force_normal_n"] / at["contact_area_mm2"])
+        assert told["outcome"]["Load1"]["contact_area_mm2"] == pytest.approx(at["contact_area_mm2"])
         load3 = curve[curve["load"] == "Load3"]
         assert load3["force_shear_n"][0] == pytest.approx(0.0, abs=1e-3)  # begins where Load2 ended
         assert load3["force_normal_n"][0] == pytest.approx(2.0, abs=2e-3)
@@ -71,6 +79,20 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         F = load3.cell_data["F"][0].reshape(-1, 3, 3)
         strain = StrainField.from_gradient(F - np.eye(3))
         assert load3.cell_data["max_shear"][0] == pytest.approx(strain.max_shear, abs=1e-12)
+
+
+def test_a_plate_that_turns_says_so(mesh_file: Path, tmp_path: Path) -> None:
+    given = ["--load", "a=1", "--load", "b=1,0.5mm", *PLATE, "--turns", "--pivot", "0", "12", "10", "--set", "luboz"]
+    done = CliRunner().invoke(app, ["simulate", str(mesh_file), *given, "--out", str(tmp_path / "sim")])
+    assert done.exit_code == 0, done.output
+    told = json.loads((tmp_path / "sim" / "luboz" / "simulation.json").read_text())
+    assert told["parameters"]["turns"] is True
+    assert told["parameters"]["pivot_mm"] == [0.0, 12.0, 10.0]
+    assert "let go to turn" in told["parameters"]["plate"]
+    b = told["outcome"]["b"]
+    assert b["plate_travel_mm"][1] == pytest.approx(0.5)
+    assert abs(b["plate_turn_deg"][2]) > 0.5
+    assert np.abs(b["plate_moment_nmm"]).max() < 1e-2
 
 
 def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, tmp_path: Path) -> None:
@@ -106,8 +128,12 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
         (["--load", "a=1", "--load", "a=2"], "a name of its own"),
         (["--load", "a=-1"], "must press"),
         (["--load", "a=nan"], "A load is NAME=NORMAL"),
+        (["--load", "a=1,2,3"], "A load is NAME=NORMAL"),
+        (["--load", "a=1cm"], "A load is NAME=NORMAL"),
+        (["--load", "a=2mm", "--gap-mm", "3"], "must press, above 3 mm, the gap"),
+        (["--slide", "--load", "a=1,1mm"], "carries no shear"),
         (["--plate-normal", "0", "0", "0"], "not all zero"),
-        (["--slide", "--load", "a=1,1"], "carries no shear force"),
+        (["--slide", "--load", "a=1,1"], "carries no shear"),
     ],
 )
 def test_what_cannot_be_is_refused(mesh_file: Path, tmp_path: Path, given: list[str], said: str) -> None:
@@ -121,6 +147,8 @@ def test_what_cannot_be_is_refused(mesh_file: Path, tmp_path: Path, given: list[
 def test_loads_lie_on_paths_by_their_normal_force() -> None:
     loads = [load_named(text) for text in ("a=15,45", "b=140", "c=15", "d=15,12")]
     assert [[x.name for x in path] for path in paths_of(loads)] == [["c", "d", "a"], ["b"]]
+    kinds = [load_named(text) for text in ("a=15", "b=15,8mm", "c=15,45", "d=15,4mm", "e=15mm")]
+    assert [[x.name for x in path] for path in paths_of(kinds)] == [["a", "d", "b"], ["c"], ["e"]]
     both_ways = [load_named(text) for text in ("a=15", "b=15,12", "c=15,-12")]
     assert [[x.name for x in path] for path in paths_of(both_ways)] == [["a", "b"], ["c"]]
     with pytest.raises(InputError, match="a name of its own"):
@@ -148,6 +176,14 @@ def test_stress_balances_the_plates_force() -> None:
     volumes = mesh.volumes_mm3 * np.linalg.det(np.eye(3) + state.gradients)
     force = -(stress[slab, 0, 0] * volumes[slab]).sum() / 3.0
     assert force == pytest.approx(2.0, rel=0.15)
+
+
+def test_the_area_under_the_plate_is_that_of_its_faces() -> None:
+    mesh = block_under_plate()
+    bound = LoadStep("in", normal_mm=0.5)
+    state = press(mesh, [bound])[0]
+    assert state.plate.area_mm2 == pytest.approx(400.0)  # taped, so as wide as it was
+    assert state.plate.pressure_mpa == pytest.approx(state.force_n[0] / 400.0)
 
 
 def test_patches_and_percentiles() -> None:

@@ -136,10 +136,8 @@ def driven(
         u_mm=state[:count].reshape(-1, 3),
         pressure_mpa=model.pressures(state),
         gradients=model.gradients(state),
-        travel_mm=np.full(3, np.nan),
-        force_n=np.full(3, np.nan),
         on_plate=_NO_EQUATION,
-        curve=np.empty((0, 6)),
+        curve=(),
         iterations=iterations,
         seconds=time.monotonic() - began,
     )
