@@ -151,7 +151,7 @@ def images(work: Path, heel: Heel, labels: LabelMap, hidden: Path, seed: int) ->
             write_image(study / f"{load.name}.nii.gz", scan(heel, where, moved, foot, snr=SNR, number=number))
             print(load.name, "imaged", flush=True)
         loads = "".join(
-            f'[loads.{x.name}]\nimage = "{x.name}.nii.gz"\nnormal_n = {x.normal_n}\nshear_n = {x.shear_n}\n'
+            f'[loads.{x.name}]\nimage = "{x.name}.nii.gz"\nnormal_n = {x.normal_n}\nshear_n = {x.shear_n or 0.0}\n'
             for x in LOADS
         )
         (study / "study.toml").write_text(

@@ -114,7 +114,7 @@ def _make(target: Path, seed: int, full: bool, progress: Told | None) -> None:
     if not full:
         grid = heel_grid(_COARSE_MM, heel.size)
         write_labels(target / f"{to_mesh}.nii.gz", labels_to_mesh(heel, labels_of(heel, grid)))
-    loads = "".join(_LOAD.format(**{f.name: getattr(load, f.name) for f in fields(load)}) for load in LOADS)
+    loads = "".join(_LOAD.format(name=load.name, normal_n=load.normal_n, shear_n=load.shear_n or 0.0) for load in LOADS)
     text = _STUDY.format(
         seed=seed, loads=loads, edge_mm=2.8 if full else 4.0, to_mesh=to_mesh,
         sets=json.dumps(_ALL_SETS if full else _SETS),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dvc.errors import InputError
 from fe.published import material_set
+from fe.simulate import LoadStep
 from mrstrain.driving import ENDING
 from mrstrain.registering import REPEAT
 from mrstrain.studyfile import Load, Study
@@ -158,18 +159,18 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
     name = material_set(study.set_given(one)).name
     arguments = {
         "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
-        "loads": [[load, _normal(load, of), of.shear_n] for load, of in study.loads.items()],
+        "loads": [asdict(_step(load, of)) for load, of in study.loads.items()],
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
-        "taped": study.plate.taped, "gap_mm": study.plate.gap_mm, "fixed": study.models.fixed,
+        "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm, "fixed": study.models.fixed,
         "element": study.models.element, "decks": study.models.decks,
     }  # fmt: skip
     return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
 
 
-def _normal(name: str, load: Load) -> float:
-    if load.normal_n is None:
+def _step(name: str, load: Load) -> LoadStep:
+    if load.normal_n is None and load.normal_mm is None:
         raise InputError(f"[loads.{name}] normal_n is missing: sets are simulated ([models] sets) under every load.")
-    return load.normal_n
+    return LoadStep(name, load.normal_n, load.shear_n, load.normal_mm, load.shear_mm)
 
 
 def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured: Mapping[str, str]) -> Stage:

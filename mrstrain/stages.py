@@ -80,13 +80,13 @@ def mesh(tell: Tell, *, out: str, labels: str, names: str | None, **options: Any
 
 
 def simulate(
-    tell: Tell, *, out: str, mesh: str, material: str, loads: Sequence[Sequence[Any]], **options: Any
+    tell: Tell, *, out: str, mesh: str, material: str, loads: Sequence[Mapping[str, Any]], **options: Any
 ) -> Given:
     """One material set under all loads; as `mrstrain.simulate`."""
     from fe.simulate import LoadStep
     from mrstrain.simulating import simulate as run
 
-    steps = [LoadStep(name, normal, shear) for name, normal, shear in loads]
+    steps = [LoadStep(**load) for load in loads]
     begun: dict[str, float] = {}
 
     def told(case: str, stage: str, fraction: float) -> None:

@@ -91,11 +91,16 @@ class Images(_Part):
 
 
 class Load(_Part):
-    """One loaded image and the forces of the plate, N; without a normal force it is measured and not simulated."""
+    """One loaded image, and the plate's forces, N, or in their place its travels, mm; as in `fe.simulate.LoadStep`.
+
+    Without either along the normal it is measured and not simulated.
+    """
 
     image: str
     normal_n: Annotated[Real, Field(gt=0.0)] | None = None
-    shear_n: Real = 0.0
+    shear_n: Real | None = None
+    normal_mm: Annotated[Real, Field(gt=0.0)] | None = None
+    shear_mm: Real | None = None
 
 
 class PlateOf(_Part):
@@ -104,6 +109,7 @@ class PlateOf(_Part):
     normal: Vector = (0.0, 0.0, -1.0)
     shear_direction: Vector = (0.0, -1.0, 0.0)
     taped: Flag = True
+    turns: Flag = False
     gap_mm: Annotated[Real, Field(ge=0.0)] = 0.0
 
 
