@@ -161,8 +161,8 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
         "loads": [asdict(_step(load, of)) for load, of in study.loads.items()],
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
-        "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm, "fixed": study.models.fixed,
-        "element": study.models.element, "decks": study.models.decks,
+        "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
+        "fixed": study.models.fixed, "element": study.models.element, "decks": study.models.decks,
     }  # fmt: skip
     return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
 
