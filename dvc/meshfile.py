@@ -24,6 +24,7 @@ from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.frd import read_frd
 from dvc.gmsh import gmsh_node_numbers, in_vtk_order
 from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points, outer_faces
+from dvc.xplt import read_xplt
 
 _log = logging.getLogger("dvc.meshfile")
 
@@ -110,7 +111,7 @@ class MeshFile:
 
 
 def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
-    """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2, 4.1), Abaqus (.inp), ANSYS (.cdb), CalculiX (.frd).
+    """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2, 4.1), Abaqus (.inp), ANSYS (.cdb), CalculiX (.frd), FEBio (.xplt).
 
     Parameters
     ----------
@@ -124,9 +125,9 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     Returns
     -------
     MeshFile
-        With regions from Abaqus element sets, ANSYS components and materials, Gmsh physical groups, or, in VTK files, a
-        cell array of whole numbers called region, label, tissue, material or part. Sets of nodes (Abaqus, ANSYS)
-        become facets: the triangles on the outside of the tetrahedra whose corners are all in the set.
+        With regions from Abaqus element sets, ANSYS components and materials, FEBio's parts, Gmsh physical groups, or,
+        in VTK files, a cell array of whole numbers called region, label, tissue, material or part. Sets of nodes
+        (Abaqus, ANSYS) become facets: the triangles on the outside of the tetrahedra whose corners are all in the set.
 
     Raises
     ------
@@ -143,7 +144,7 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     if frame not in TO_LPS:
         raise InputError(f"The frame of a mesh is LPS or RAS; got {frame!r}.")
     readers: dict[str, Callable[[Path], _Raw]] = {
-        ".inp": _from_abaqus, ".cdb": _from_ansys, ".frd": _from_frd,
+        ".inp": _from_abaqus, ".cdb": _from_ansys, ".frd": _from_frd, ".xplt": _from_xplt,
         ".msh": _from_gmsh, ".vtu": _from_vtk, ".vtk": _from_vtk,
     }  # fmt: skip
     if path.suffix.lower() not in readers:
@@ -182,6 +183,12 @@ def _from_frd(path: Path) -> _Raw:
     found = read_frd(path)
     moved = {} if found.displacement is None else {"displacement": found.displacement}
     return _Raw(found.points, found.node_ids, list(found.blocks), found.materials, at_nodes=moved)
+
+
+def _from_xplt(path: Path) -> _Raw:
+    found = read_xplt(path)
+    moved = {} if found.displacement is None else {"displacement": found.displacement}
+    return _Raw(found.points, found.node_ids, list(found.blocks), found.parts, at_nodes=moved)
 
 
 def _from_gmsh(path: Path) -> _Raw:

@@ -176,7 +176,7 @@ def simulate(
         clear(target / name)
     files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
     given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(fixed)}
-    given |= {"turns": turns, "pivot_mm": None if pivot_mm is None else list(pivot_mm)}
+    given |= {"turns": turns, "pivot_mm": None if pivot_mm is None else list(pivot_mm), "mesh_made": _mesh_made(place)}
     jobs = [(one, path) for one in chosen for path in paths]
     at_once = max(1, min(workers or usable_cores(), len(jobs)))
     each = threads or max(1, usable_cores() // at_once)
@@ -237,6 +237,17 @@ def clear(folder: Path) -> None:
 def _beside(place: Path) -> list[Path]:
     names = place.with_suffix(".json")
     return [names] if names.is_file() else []
+
+
+def _mesh_made(place: Path) -> dict[str, object] | None:
+    """How `mesh` made a mesh, by the record that it leaves beside it; None for meshes made elsewhere."""
+    try:
+        told = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
+        if told["command"] == "mesh":
+            return {"edge_mm": told["parameters"]["edge_mm"], "pytetwild": told["versions"]["pytetwild"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return None
 
 
 def _simulated(
