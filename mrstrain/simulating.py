@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,10 +18,12 @@ from fe import figures
 from fe.decks import write_calculix, write_febio
 from fe.elements import TOLD
 from fe.elements import element as formulation
+from fe.leg import Kept
 from fe.materials import MODES, Material
 from fe.meshstore import read_tet_mesh
 from fe.plate import Plate
 from fe.published import MaterialSet, material_set
+from fe.restart import ENDING, fingerprint, read_kept, write_kept
 from fe.result import (
     RegionFigures,
     region_figures,
@@ -38,6 +41,7 @@ from mrstrain.provenance import provenance, write_json
 Told = Callable[[str, str, float], None]
 
 _TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
+_EVERY_S = 30.0  # at most so often is a state on the way to a load written, to go on from
 _FAR = 0.05  # det F of a patch further from 1 than this is counted
 _MUCH = 0.05  # share of the volume above which that is told
 
@@ -174,6 +178,9 @@ def simulate(
     for name in names:
         make_output(target / name)
         clear(target / name)
+        for left in (target / name).glob(f"*{ENDING}"):
+            if left.name.removesuffix(ENDING) not in {load.name for load in loads}:
+                left.unlink()
     files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
     given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(fixed)}
     given |= {"turns": turns, "pivot_mm": None if pivot_mm is None else list(pivot_mm), "mesh_made": _mesh_made(place)}
@@ -261,17 +268,40 @@ def _simulated(
     share: Path,
     threads: int,
 ) -> list[State]:
-    """Run one path in a worker: each load's file is written as soon as it is there."""
+    """Run one path in a worker: each load's files are written as soon as it is there.
+
+    It goes on from where an earlier run came to, if that was made from the same.
+    """
     log: list[str] = []
+    made_from = {
+        load.name: fingerprint(mesh, laws, plate, path[: n + 1], fixed, element) for n, load in enumerate(path)
+    }
+    earlier: list[Kept] = []
+    for load in path:
+        found = read_kept(folder / f"{load.name}{ENDING}", made_from[load.name])
+        if found is None:
+            break
+        log.append(f"{load.name}: {found.reached:.0%} of it was there from an earlier run")
+        earlier.append(found)
+        if found.reached < 1.0:
+            break
+    last = time.monotonic()
+
+    def settled(load: LoadStep, kept: Kept) -> None:
+        nonlocal last
+        if time.monotonic() - last > _EVERY_S:
+            write_kept(folder / f"{load.name}{ENDING}", kept, made_from[load.name])
+            last = time.monotonic()
 
     def keep(state: State) -> None:
-        if state.reached > 0.0:
+        if state.reached > 0.0 and state.kept is not None:
             write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
+            write_kept(folder / f"{state.load.name}{ENDING}", state.kept, made_from[state.load.name])
 
     try:
         return solve(
             mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=log.append, keep=keep,
-            progress=lambda done: _replaced(share, f"{done:.4f}"),
+            settled=settled, earlier=earlier, progress=lambda done: _replaced(share, f"{done:.4f}"),
         )  # fmt: skip
     finally:
         write_whole(folder / f"log-{path[0].name}.txt", "\n".join(log) + "\n")
