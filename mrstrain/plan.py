@@ -54,6 +54,11 @@ class Stage:
         return self.name.split(" ", 1)[0]
 
     @property
+    def goes_on(self) -> bool:
+        """Whether it finds by itself what it did before it was cut, and takes of that only what still holds."""
+        return self.kind == "simulate"
+
+    @property
     def before(self) -> tuple[str, ...]:
         """Every stage that it waits for."""
         return tuple(dict.fromkeys((*self.after, *(name for of in self.some.values() for name in of))))
