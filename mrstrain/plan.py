@@ -18,6 +18,8 @@ from validate.levelled import LEVELLED
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
 """Kinds of stages, in the order in which they come."""
 
+_MINUTES = {"register": 1.0, "mesh": 1.3, "simulate": 2.5, "drive": 2.0, "level": 1.5, "compare": 1.5}
+
 REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
 
 
@@ -52,6 +54,11 @@ class Stage:
     def kind(self) -> str:
         """One of KINDS."""
         return self.name.split(" ", 1)[0]
+
+    @property
+    def minutes(self) -> float:
+        """About how long it takes on one core at the usual size: what progress is counted in."""
+        return _MINUTES[self.kind]
 
     @property
     def goes_on(self) -> bool:
