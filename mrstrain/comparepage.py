@@ -11,7 +11,7 @@ import numpy as np
 from dvc.arrays import FloatArray
 from dvc.deformation import Deformation, evaluate_on_grid
 from dvc.image import LabelMap, Mask
-from dvc.imagefile import read_image
+from dvc.imagefile import read_voxels
 from dvc.kinematics import StrainField
 from dvc.report import Cell, Picture, Section, Table
 from dvc.verdict import Verdict
@@ -125,9 +125,9 @@ def viewer_of(
         values[inside] = StrainField.from_gradient(evaluate_on_grid(field, grid, inside)[1]).max_shear
         shear.append(values)
     scanned = folder / "registered.nii.gz"
-    image = read_image(scanned, allow_missing=True) if scanned.is_file() else None
-    if image is not None and image.grid.same_as(labels.grid):
-        shown = np.nan_to_num(image.values[box])
+    seen, voxels = read_voxels(scanned) if scanned.is_file() else (None, np.empty(0))
+    if seen is not None and seen.same_as(labels.grid):
+        shown = np.nan_to_num(voxels[box])
     else:
         shown = labels.labels[box].astype(np.float64)
     most = max(0.05, float(np.ceil(20.0 * np.nanquantile(shear[0], 0.99)) / 20.0))
