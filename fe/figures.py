@@ -27,6 +27,7 @@ from fe.simulate import BONE, State
 
 _POINTS = 200
 _FLAT_MM = 0.1
+_MARGIN_MM = 7.0  # around what is drawn; the letters stand there
 _UNKNOWN = "#c9ced6"
 
 
@@ -113,7 +114,7 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
     """
     cuts = [cut(mesh, panel.u_mm, axes, point_mm) for panel in panels]
     corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
-    low, high = corners.min(axis=0) - 2.0, corners.max(axis=0) + 2.0
+    low, high = corners.min(axis=0) - _MARGIN_MM, corners.max(axis=0) + _MARGIN_MM
     shears = np.concatenate([panel.max_shear for panel in panels])
     known = np.isfinite(shears)
     (most,) = volume_percentiles(shears[known], np.tile(mesh.volumes_mm3, len(panels))[known], [0.99])

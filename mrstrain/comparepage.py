@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -208,15 +208,18 @@ def _areas(done: Sequence[Comparison], totals: Sequence[Area], strains: tuple[fl
 
 
 def _tissues(one: Comparison) -> Table:
-    rows = tuple(
-        (a.model, a.tissue, a.ml, 100.0 * a.share, a.estimate_ml, a.low_ml, a.high_ml, a.floor_ml) for a in one.areas
-    )
+    def told(areas: Iterable[Area]) -> tuple[tuple[Cell, ...], ...]:
+        return tuple(
+            (a.model, a.tissue, a.ml, 100.0 * a.share, a.estimate_ml, a.low_ml, a.high_ml, a.floor_ml) for a in areas
+        )
+
     return Table(
         "Area between the curves, by tissue",
         ("model", "tissue", "as found, mL", "share, %", "estimate, mL", "95 % from", "to", "a perfect model's"),
-        rows,
+        told(a for a in one.areas if a.model != NOTHING),
         "As found: with the measurement's noise and smoothing. Estimate and interval: these taken out. A perfect "
         "model's: what noise alone would give; an interval that reaches it begins at 0.",
+        told(a for a in one.areas if a.model == NOTHING),
     )
 
 
@@ -229,14 +232,15 @@ def _location(one: Comparison) -> Table:
         for o in one.overlaps
     )  # fmt: skip
     perfect: dict[float, tuple[Cell, ...]] = {
-        o.threshold: ("a perfect model", o.threshold, "", "", "", _ranged(o.dice_perfect),
+        o.threshold: ("perfect", o.threshold, "", "", "", _ranged(o.dice_perfect),
                       _ranged(o.centroids_perfect_mm), "", _ranged(o.hausdorff95_perfect_mm))
         for o in one.overlaps
         if not np.isnan(o.measured_low_ml)
     }  # fmt: skip
     known = (
-        "In brackets 95 % intervals by the measurement's error; below the line what noise alone leaves of a perfect "
-        "model: an interval that reaches it goes on to 1, or to 0 mm. "
+        "In brackets 95 % intervals with the measurement's bias and noise taken out, so that one need not hold the "
+        "figure as found; below the line what noise alone leaves of a perfect model: an interval that reaches it goes "
+        "on to 1, or to 0 mm. "
         if perfect
         else "The measurement's error is not known: no intervals. "
     )
@@ -255,12 +259,12 @@ def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
     """A figure with its interval, where there is one."""
     if np.isnan(value):
         return "–"
-    return f"{value:.2f}" if np.isnan(low) else f"{value:.2f} ({low:.2f} to {high:.2f})"
+    return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.2g}–{high:.2g})"
 
 
 def _agreement(one: Comparison) -> Table:
     rows = tuple(
-        (a.model, {"max_shear": "maximal shear", "u_mm": "displacement, mm"}[a.quantity], a.part, a.measured_mean,
+        (a.model, {"max_shear": "shear", "u_mm": "u, mm"}[a.quantity], a.part, a.measured_mean,
          a.model_mean, a.slope, a.intercept, a.r2, a.rmse, a.concordance, a.bias, a.lower, a.upper)
         for a in one.agreements
         if a.part == ALL or a.part in one.found.tissues
@@ -270,10 +274,10 @@ def _agreement(one: Comparison) -> Table:
         ("model", "quantity", "tissue", "measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias",
          "limits from", "to"),
         rows,
-        "Means, regression of the model on the measurement, Lin's concordance, Bland and Altman's limits. Of "
-        "displacements: lengths, but for regression and concordance (the three components together) and RMSE (of the "
-        "difference). By distance to bone in agreement.csv. All as found, without intervals: the error model tells of "
-        "maximal shear, and there is none of displacement.",
+        "Of maximal shear and displacement u: means, regression of the model on the measurement, Lin's concordance, "
+        "Bland and Altman's limits. Of displacements: lengths, but for regression and concordance (the three "
+        "components together) and RMSE (of the difference). By distance to bone in agreement.csv. All as found, "
+        "without intervals: the error model tells of maximal shear, and there is none of displacement.",
     )  # fmt: skip
 
 

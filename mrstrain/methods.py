@@ -72,7 +72,7 @@ def methods(
         parts.append(_doubt(measured))
     parts.append(f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue).")
     used = [paper for name, paper in _PAPERS.items() if any(name in part for part in parts)]
-    return (*parts, "References. " + " ".join(used))
+    return (*parts, "References", *used)
 
 
 def _record(place: Path) -> Record:
