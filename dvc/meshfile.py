@@ -22,7 +22,7 @@ from dvc.ansys import read_ansys
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.frd import read_frd
-from dvc.gmsh import gmsh_node_numbers, in_vtk_order
+from dvc.gmsh import gmsh_group_names, gmsh_node_numbers, in_vtk_order, with_names_apart
 from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points, outer_faces
 from dvc.xplt import read_xplt
 
@@ -192,23 +192,28 @@ def _from_xplt(path: Path) -> _Raw:
 
 
 def _from_gmsh(path: Path) -> _Raw:
-    mesh = _by_meshio(path, meshio.gmsh.read)
+    names = gmsh_group_names(path)
+    with with_names_apart(path, names) as (place, real):
+        mesh = _by_meshio(path, lambda _: meshio.gmsh.read(str(place)))
     blocks = [(block.type, in_vtk_order(block.type, block.data)) for block in mesh.cells]
     sizes = [len(data) for _, data in blocks]
-    regions: dict[str, IntArray] = {}
+    groups: list[tuple[str, IntArray]] = []
     if "gmsh:physical" in mesh.cell_data:
         tag = np.concatenate(mesh.cell_data["gmsh:physical"])
         dimension = np.repeat([_DIMENSION.get(kind.rstrip("0123456789"), -1) for kind, _ in blocks], sizes)
-        names = {(int(d), int(t)): name for name, (t, d) in mesh.field_data.items()}
         for d, t in np.unique(np.column_stack([dimension, tag])[tag != 0], axis=0).tolist():
-            regions[names.get((d, t), f"physical {t}")] = np.flatnonzero((dimension == d) & (tag == t))
+            groups.append((names.get((d, t), f"physical {t}"), np.flatnonzero((dimension == d) & (tag == t))))
     starts = np.cumsum([0, *sizes])[:-1]
     for name, parts in mesh.cell_sets.items():  # version 4.1, where a cell may be in several groups
         if not name.startswith("gmsh:"):
             if len(parts) != len(starts):
                 raise ImageFileError(f"{path}: its $Elements section is cut short.")
             found = [np.asarray(part, dtype=np.int64) for part in parts]
-            regions[name] = np.concatenate([part + start for part, start in zip(found, starts, strict=True)])
+            cells = np.concatenate([part + start for part, start in zip(found, starts, strict=True)])
+            groups.append((real[name], cells))
+    regions: dict[str, IntArray] = {}
+    for name, cells in groups:  # a volume and its surface may share a name: their cells are told apart by their shape
+        regions[name] = np.union1d(regions.get(name, np.empty(0, dtype=np.int64)), cells)
     return _Raw(mesh.points, gmsh_node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
 
 
