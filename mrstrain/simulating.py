@@ -5,43 +5,39 @@ from __future__ import annotations
 import json
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dvc.errors import InputError, MrstrainError
 from dvc.mesh import TetMesh
-from dvc.whole import whole_file, write_whole
+from dvc.whole import whole_file
 from dvc.worker import Worker, each_in_workers, usable_cores
 from fe import figures
 from fe.decks import write_calculix, write_febio
 from fe.elements import TOLD
 from fe.elements import element as formulation
-from fe.leg import Kept
 from fe.materials import MODES, Material
 from fe.meshstore import read_tet_mesh
 from fe.plate import Plate
 from fe.published import MaterialSet, material_set
-from fe.restart import ENDING, fingerprint, read_kept, write_kept
+from fe.restart import ENDING
 from fe.result import (
     RegionFigures,
     region_figures,
     volume_share_off,
     write_curve_csv,
     write_regions_csv,
-    write_state,
 )
 from fe.simulate import BONE, LoadStep, State, check
-from fe.simulate import simulate as solve
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.loads import LOADS, paths_of
+from mrstrain.onepath import simulated_path
 from mrstrain.provenance import provenance, write_json
 
 Told = Callable[[str, str, float], None]
 
 _TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
-_EVERY_S = 30.0  # at most so often is a state on the way to a load written, to go on from
 _FAR = 0.05  # det F of a patch further from 1 than this is counted
 _MUCH = 0.05  # share of the volume above which that is told
 
@@ -206,7 +202,7 @@ def simulate(
 
             try:
                 states = worker.run(
-                    f"simulating {case}", _simulated, read, laws[name][0], plate, path, fixed, element,
+                    f"simulating {case}", simulated_path, read, laws[name][0], plate, path, fixed, element,
                     target / name, share, each,                     watch=watch,
                 )  # fmt: skip
             except MrstrainError as failure:
@@ -255,62 +251,6 @@ def _mesh_made(place: Path) -> dict[str, object] | None:
     except (OSError, ValueError, KeyError, TypeError):
         pass
     return None
-
-
-def _simulated(
-    mesh: TetMesh,
-    laws: Mapping[str, Material],
-    plate: Plate,
-    path: Sequence[LoadStep],
-    fixed: Sequence[str],
-    element: str,
-    folder: Path,
-    share: Path,
-    threads: int,
-) -> list[State]:
-    """Run one path in a worker: each load's files are written as soon as it is there.
-
-    It goes on from where an earlier run came to, if that was made from the same.
-    """
-    log: list[str] = []
-    made_from = {
-        load.name: fingerprint(mesh, laws, plate, path[: n + 1], fixed, element) for n, load in enumerate(path)
-    }
-    earlier: list[Kept] = []
-    for load in path:
-        found = read_kept(folder / f"{load.name}{ENDING}", made_from[load.name])
-        if found is None:
-            break
-        log.append(f"{load.name}: {found.reached:.0%} of it was there from an earlier run")
-        earlier.append(found)
-        if found.reached < 1.0:
-            break
-    last = time.monotonic()
-
-    def settled(load: LoadStep, kept: Kept) -> None:
-        nonlocal last
-        if time.monotonic() - last > _EVERY_S:
-            write_kept(folder / f"{load.name}{ENDING}", kept, made_from[load.name])
-            last = time.monotonic()
-
-    def keep(state: State) -> None:
-        if state.reached > 0.0 and state.kept is not None:
-            write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
-            write_kept(folder / f"{state.load.name}{ENDING}", state.kept, made_from[state.load.name])
-
-    try:
-        return solve(
-            mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=log.append, keep=keep,
-            settled=settled, earlier=earlier, progress=lambda done: _replaced(share, f"{done:.4f}"),
-        )  # fmt: skip
-    finally:
-        write_whole(folder / f"log-{path[0].name}.txt", "\n".join(log) + "\n")
-
-
-def _replaced(path: Path, text: str) -> None:
-    part = path.with_suffix(".part")
-    part.write_text(text)
-    part.replace(path)
 
 
 def _told(
