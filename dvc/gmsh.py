@@ -1,7 +1,11 @@
-"""What meshio reads past in a Gmsh file: the numbers that it gives its nodes, and the order of some quadratic cells."""
+"""What meshio reads past in a Gmsh file: numbers of nodes, groups of one name, and the order of some cells' nodes."""
 
 from __future__ import annotations
 
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +69,35 @@ def gmsh_node_numbers(path: Path, count: int) -> IntArray:
             f"{path}: {len(np.unique(tags))} different node numbers were found for {count} nodes; the file is damaged."
         )
     return tags
+
+
+_GROUP = re.compile(rb'^[ \t]*(\d+)[ \t]+(\d+)[ \t]+"(.*)"[ \t]*\r?$', re.MULTILINE)
+
+
+def gmsh_group_names(path: Path) -> dict[tuple[int, int], str]:
+    """Names of a .msh file's physical groups by dimension and tag; a volume and its surface may share one."""
+    try:
+        named = _section(path.read_bytes(), b"PhysicalNames")
+    except ValueError:
+        return {}
+    return {(int(d), int(tag)): name.decode(errors="replace") for d, tag, name in _GROUP.findall(named)}
+
+
+@contextmanager
+def with_names_apart(path: Path, names: dict[tuple[int, int], str]) -> Iterator[tuple[Path, dict[str, str]]]:
+    """A file in which every group has a name of its own, as meshio needs it, and the real name of each of these.
+
+    It is ``path`` itself where no two groups share a name.
+    """
+    if len(set(names.values())) == len(names):
+        yield path, {name: name for name in names.values()}
+        return
+    data = path.read_bytes()
+    old = _section(data, b"PhysicalNames")
+    with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
+        copy = Path(folder) / path.name
+        copy.write_bytes(data.replace(old, _GROUP.sub(rb'\1 \2 "\1 \2"', old), 1))
+        yield copy, {f"{dimension} {tag}": name for (dimension, tag), name in names.items()}
 
 
 def _section(data: bytes, name: bytes, *, whole: bool = False) -> bytes:

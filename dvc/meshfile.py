@@ -22,8 +22,9 @@ from dvc.ansys import read_ansys
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.frd import read_frd
-from dvc.gmsh import gmsh_node_numbers, in_vtk_order
+from dvc.gmsh import gmsh_group_names, gmsh_node_numbers, in_vtk_order, with_names_apart
 from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points, outer_faces
+from dvc.xplt import read_xplt
 
 _log = logging.getLogger("dvc.meshfile")
 
@@ -110,7 +111,7 @@ class MeshFile:
 
 
 def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
-    """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2, 4.1), Abaqus (.inp), ANSYS (.cdb), CalculiX (.frd).
+    """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2, 4.1), Abaqus (.inp), ANSYS (.cdb), CalculiX (.frd), FEBio (.xplt).
 
     Parameters
     ----------
@@ -124,9 +125,9 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     Returns
     -------
     MeshFile
-        With regions from Abaqus element sets, ANSYS components and materials, Gmsh physical groups, or, in VTK files, a
-        cell array of whole numbers called region, label, tissue, material or part. Sets of nodes (Abaqus, ANSYS)
-        become facets: the triangles on the outside of the tetrahedra whose corners are all in the set.
+        With regions from Abaqus element sets, ANSYS components and materials, FEBio's parts, Gmsh physical groups, or,
+        in VTK files, a cell array of whole numbers called region, label, tissue, material or part. Sets of nodes
+        (Abaqus, ANSYS) become facets: the triangles on the outside of the tetrahedra whose corners are all in the set.
 
     Raises
     ------
@@ -143,7 +144,7 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     if frame not in TO_LPS:
         raise InputError(f"The frame of a mesh is LPS or RAS; got {frame!r}.")
     readers: dict[str, Callable[[Path], _Raw]] = {
-        ".inp": _from_abaqus, ".cdb": _from_ansys, ".frd": _from_frd,
+        ".inp": _from_abaqus, ".cdb": _from_ansys, ".frd": _from_frd, ".xplt": _from_xplt,
         ".msh": _from_gmsh, ".vtu": _from_vtk, ".vtk": _from_vtk,
     }  # fmt: skip
     if path.suffix.lower() not in readers:
@@ -184,24 +185,35 @@ def _from_frd(path: Path) -> _Raw:
     return _Raw(found.points, found.node_ids, list(found.blocks), found.materials, at_nodes=moved)
 
 
+def _from_xplt(path: Path) -> _Raw:
+    found = read_xplt(path)
+    moved = {} if found.displacement is None else {"displacement": found.displacement}
+    return _Raw(found.points, found.node_ids, list(found.blocks), found.parts, at_nodes=moved)
+
+
 def _from_gmsh(path: Path) -> _Raw:
-    mesh = _by_meshio(path, meshio.gmsh.read)
+    names = gmsh_group_names(path)
+    with with_names_apart(path, names) as (place, real):
+        mesh = _by_meshio(path, lambda _: meshio.gmsh.read(str(place)))
     blocks = [(block.type, in_vtk_order(block.type, block.data)) for block in mesh.cells]
     sizes = [len(data) for _, data in blocks]
-    regions: dict[str, IntArray] = {}
+    groups: list[tuple[str, IntArray]] = []
     if "gmsh:physical" in mesh.cell_data:
         tag = np.concatenate(mesh.cell_data["gmsh:physical"])
         dimension = np.repeat([_DIMENSION.get(kind.rstrip("0123456789"), -1) for kind, _ in blocks], sizes)
-        names = {(int(d), int(t)): name for name, (t, d) in mesh.field_data.items()}
         for d, t in np.unique(np.column_stack([dimension, tag])[tag != 0], axis=0).tolist():
-            regions[names.get((d, t), f"physical {t}")] = np.flatnonzero((dimension == d) & (tag == t))
+            groups.append((names.get((d, t), f"physical {t}"), np.flatnonzero((dimension == d) & (tag == t))))
     starts = np.cumsum([0, *sizes])[:-1]
     for name, parts in mesh.cell_sets.items():  # version 4.1, where a cell may be in several groups
         if not name.startswith("gmsh:"):
             if len(parts) != len(starts):
                 raise ImageFileError(f"{path}: its $Elements section is cut short.")
             found = [np.asarray(part, dtype=np.int64) for part in parts]
-            regions[name] = np.concatenate([part + start for part, start in zip(found, starts, strict=True)])
+            cells = np.concatenate([part + start for part, start in zip(found, starts, strict=True)])
+            groups.append((real[name], cells))
+    regions: dict[str, IntArray] = {}
+    for name, cells in groups:  # a volume and its surface may share a name: their cells are told apart by their shape
+        regions[name] = np.union1d(regions.get(name, np.empty(0, dtype=np.int64)), cells)
     return _Raw(mesh.points, gmsh_node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
 
 

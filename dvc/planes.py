@@ -29,6 +29,21 @@ LETTERS: dict[Plane, tuple[str, str, str, str]] = {  # left, right, top, bottom 
     "axial": ("R", "L", "A", "P"),
 }
 OBLIQUE_DEG = 3.0
+_SIDES = (("R", "L"), ("A", "P"), ("I", "S"))  # of the axes L, P, S: against it and along it
+_LEAST_SHARE = 0.3827  # cosine of 67.5 degrees: half-way between one letter and two
+
+
+def letters(direction: npt.ArrayLike) -> str:
+    """Side of the body to which a direction (3,) LPS points: letters of axes within 67.5 degrees of it, nearest first.
+
+    Examples
+    --------
+    >>> letters([0.0, -1.0, 0.0]), letters([0.0, -0.8, 0.6]), letters([0.1, 0.0, 0.99])
+    ('A', 'AS', 'S')
+    """
+    unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(np.asarray(direction, dtype=np.float64))
+    shown = [axis for axis in np.argsort(-np.abs(unit)) if abs(unit[axis]) > _LEAST_SHARE]
+    return "".join(_SIDES[axis][int(unit[axis] > 0.0)] for axis in shown)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -55,6 +55,8 @@ class Picture:
 class Table:
     """Rows under named columns; numbers are shown to three digits, missing ones as a dash.
 
+    Rows ``apart`` stand below a line: what the others are to be seen beside.
+
     Raises
     ------
     InputError
@@ -65,9 +67,10 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     note: str = ""
+    apart: tuple[tuple[Cell, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        for number, row in enumerate(self.rows):
+        for number, row in enumerate((*self.rows, *self.apart)):
             if len(row) != len(self.columns):
                 raise InputError(
                     f"Row {number} of the table '{self.title}' has {len(row)} cells, its header "

@@ -17,6 +17,10 @@ _STEPS = 250  # of a volume's values: one byte for each voxel
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
+NIIVUE = "0.69.0"
+"""Version of the viewer that comes with the package."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Volume:
     """A volume as a page holds it: NIfTI, eight bits, compressed, base64.
@@ -59,7 +63,7 @@ def script() -> str:
     folder = files("dvc") / "templates"
     licence = (folder / "niivue-LICENSE.txt").read_text(encoding="utf-8")
     library = (folder / "niivue.umd.js").read_text(encoding="utf-8")
-    return f"/* niivue 0.69.0\n{licence}*/\n{library}\n{(folder / 'viewer.js').read_text(encoding='utf-8')}"
+    return f"/* niivue {NIIVUE}\n{licence}*/\n{library}\n{(folder / 'viewer.js').read_text(encoding='utf-8')}"
 
 
 def _compressed(data: bytes) -> bytes:

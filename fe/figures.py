@@ -17,6 +17,7 @@ from dvc.arrays import FloatArray, IntArray
 from dvc.figures import REGION_COLOURS
 from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
+from dvc.planes import letters
 from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.convergence import Limit
 from fe.fitting import Curve, Fit
@@ -26,6 +27,7 @@ from fe.simulate import BONE, State
 
 _POINTS = 200
 _FLAT_MM = 0.1
+_MARGIN_MM = 7.0  # around what is drawn; the letters stand there
 _UNKNOWN = "#c9ced6"
 
 
@@ -101,6 +103,8 @@ class Slice:
 def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> bytes:
     """Fields on one slice, in one colour scale that ends where a hundredth of the volume is above.
 
+    Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
+
     Parameters
     ----------
     axes : (3, 3)
@@ -110,7 +114,7 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
     """
     cuts = [cut(mesh, panel.u_mm, axes, point_mm) for panel in panels]
     corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
-    low, high = corners.min(axis=0) - 2.0, corners.max(axis=0) + 2.0
+    low, high = corners.min(axis=0) - _MARGIN_MM, corners.max(axis=0) + _MARGIN_MM
     shears = np.concatenate([panel.max_shear for panel in panels])
     known = np.isfinite(shears)
     (most,) = volume_percentiles(shears[known], np.tile(mesh.volumes_mm3, len(panels))[known], [0.99])
@@ -134,6 +138,13 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
             spot.axline((0.0, panel.face[0]), slope=panel.face[1], color=INK, linewidth=1.0, linestyle="--")
         spot.set_title(panel.title, color=INK, **FONT)
         label_axes(spot, "along the shear, mm", "along the normal force, mm")
+        sides = ((0.01, 0.5, -axes[:, 1]), (0.99, 0.5, axes[:, 1]), (0.5, 0.01, -axes[:, 0]), (0.5, 0.99, axes[:, 0]))
+        for x, y, direction in sides:
+            spot.text(
+                x, y, letters(direction), transform=spot.transAxes, weight="bold", color=INK,
+                ha={0.01: "left", 0.99: "right"}.get(x, "center"), va={0.01: "bottom", 0.99: "top"}.get(y, "center"),
+                **FONT,
+            )  # fmt: skip
     bar = figure.colorbar(drawn, ax=list(spots[: len(panels)]), shrink=0.8, extend="max")
     bar.set_label("maximal shear", color=INK, **FONT)
     return png_bytes(figure)

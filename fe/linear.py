@@ -144,6 +144,10 @@ class Solver:
         self.factorisations += 1
         return self._factors.solve(right)
 
+    def forget(self) -> None:
+        """Factorise at the next solution, whatever came before: what is solved then depends on nothing older."""
+        self._known = False
+
     def _iterated(self, data: FloatArray, right: FloatArray, tolerance: float) -> FloatArray | None:
         self._upper.data = np.ascontiguousarray(data)
         diagonal = data[self._diagonal]

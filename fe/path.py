@@ -44,6 +44,11 @@ class Goal:
     values: FloatArray
     travels: BoolArray
 
+    @property
+    def sheared(self) -> bool:
+        """Whether it asks for a force or a travel across the normal."""
+        return bool(self.values[1:].any() or self.travels[1:].any())
+
     def unsheared(self) -> Goal:
         """The same along the normal, without a force across it."""
         return Goal(self.values * [1.0, 0.0, 0.0], self.travels & [True, False, False])
@@ -120,6 +125,7 @@ class Path:
         tell: Callable[[str], None],
     ) -> None:
         self.model, self.tolerance, self.tell = model, tolerance, tell
+        self.settled: Callable[[], None] = lambda: None  # called at each equilibrium from which one can go on
         held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in fixed]))
         touching = np.setdiff1d(_nodes_on(model, mesh, SURFACE), held)
         self.contact = Contact(plate, model.space.nodes_mm, touching)
@@ -142,11 +148,13 @@ class Path:
         Until then it stays level, as a plate on a node or two would tip over; and if it cannot be let go there, it is
         pressed further and tried again. Returns whether going on makes sense.
         """
-        self.contact.touch_first(self.state)
-        start = self.plate.travel_mm
+        if not len(self.contact.held):
+            self.contact.touch_first(self.state)
+        start = np.array([self.contact.plate.gap_mm, 0.0, 0.0])
         for share in _ENOUGH:
             if goal.travels[0]:
-                if not self.raise_to(Goal(start + share * (goal.values - start), goal.travels).unsheared()):
+                part = start + share * (goal.values - start)
+                if part[0] > self.plate.travel_mm[0] and not self.raise_to(Goal(part, goal.travels).unsheared()):
                     return False
             else:
                 self._push(0, share * goal.values[0], goal.values[0])
@@ -192,6 +200,7 @@ class Path:
                 done, step = share, step * _GROWTH
                 pushed = bool(goal.travels.any())
                 self._told(f"{done:.0%} of the way")
+                self.settled()
                 progress(done)
                 continue
             self._back(kept)
@@ -216,6 +225,7 @@ class Path:
             if self._go(moving, aim) and sign * (most_n - self.plate.force_n[axis]) > 0.0:
                 step = min(_GROWTH * step, _MOST_APPROACH_MM)
                 self._told("moved")
+                self.settled()
             else:
                 self._back(kept)
                 step *= _SHRINK
@@ -283,7 +293,7 @@ class Path:
         return Standing(self.state, self.plate, self.contact.hold)
 
     def stand(self, where: Standing) -> None:
-        """Go to where it has been before; the curve and the count of iterations stay as they are."""
+        """Go to where it, or another on the same model, has been before; the curve stays as it is."""
         self.state, self.plate, self.contact.hold = where.unknowns, where.plate, where.hold
 
     def _back(self, where: Standing) -> None:

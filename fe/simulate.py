@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import sparse
@@ -14,10 +14,11 @@ from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from fe.elements import element
+from fe.leg import Kept, Leg
 from fe.materials import Material
 from fe.model import Model
 from fe.newton import Tolerance
-from fe.path import SURFACE, Goal, Path, PlateState, Standing
+from fe.path import SURFACE, Goal, Path, PlateState
 from fe.plate import Contact, Plate
 
 BONE = "bone"
@@ -59,7 +60,7 @@ class LoadStep:
     @property
     def sheared(self) -> bool:
         """Whether it asks for a shear, as force or as travel."""
-        return bool(self.shear_n) or self.shear_mm is not None
+        return self.goal.sheared
 
     @property
     def goal(self) -> Goal:
@@ -87,9 +88,8 @@ class State:
     Attributes
     ----------
     load : LoadStep
-    reached : float
-        Share of what this load adds to the one before it on its path, all of it being 1: along the axis, of those that
-        it changes, where least is reached.
+    reached, curve, iterations, seconds
+        As in `fe.leg.Kept`; the curve is empty where there is no plate.
     u_mm : (n, 3)
         Displacement of the mesh's nodes, mm.
     pressure_mpa : (m, 4)
@@ -98,13 +98,7 @@ class State:
         H = du/dX of each cell, its mean where the element's varies.
     on_plate : (k,)
         Nodes that hold to the plate.
-    curve : tuple of PlateState
-        The plate in every state of equilibrium on the way, from that of the load before it to this one; empty where
-        there is no plate.
-    iterations : int
-        Newton steps since the load before it, those of steps that failed not counted.
-    seconds : float
-    standing : Standing, optional
+    kept : Kept, optional
         What the next load goes on from.
     """
 
@@ -117,7 +111,7 @@ class State:
     curve: tuple[PlateState, ...]
     iterations: int
     seconds: float
-    standing: Standing | None = None
+    kept: Kept | None = None
 
     @property
     def plate(self) -> PlateState:
@@ -145,7 +139,9 @@ def simulate(
     formulation: str = "P1",
     threads: int = 1,
     tolerance: Tolerance = _TOLERANCE,
+    earlier: Sequence[Kept] = (),
     keep: Callable[[State], None] = lambda _: None,
+    settled: Callable[[LoadStep, Kept], None] = lambda *_: None,
     progress: Callable[[float], None] = lambda _: None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> list[State]:
@@ -167,8 +163,13 @@ def simulate(
         Of the linear algebra.
     tolerance : Tolerance
         When a state counts as in equilibrium.
+    earlier : sequence of Kept
+        Of the first loads, from an earlier simulation of the same model, plate and loads: they are not solved again.
+        The last may have been on its way.
     keep : callable
         Gets each load's state as soon as it is there.
+    settled : callable
+        Gets the load and what it takes to go on, at each equilibrium on the way to it.
     progress : callable
         Gets the share of all loads that is done.
     tell : callable
@@ -191,36 +192,33 @@ def simulate(
     states: list[State] = []
     try:
         for number, load in enumerate(loads):
-            goal = load.goal
-            began, counted, known = time.monotonic(), path.iterations, len(path.curve)
-            before = path.reached(goal)
-            if states:  # what was asked for, not what was reached to the tolerance
-                last = states[-1].load.goal
-                before = np.where(goal.travels == last.travels, last.values, before)
+            leg = Leg(
+                path,
+                load.goal,
+                states[-1].load.goal if states else None,
+                earlier[number] if number < len(earlier) else None,
+                partial(settled, load),
+            )
 
             def told(share: float, done: int = number) -> None:
                 progress((done + share) / len(loads))
 
-            whole = True
-            if not states:
-                whole = path.approach(goal)
-                if load.sheared:  # normal first, then shear
-                    whole = whole and path.raise_to(goal.unsheared(), told)
-            whole = whole and path.raise_to(goal, told)
-            displacements = 3 * len(model.space.nodes_mm)
-            u = path.state[:displacements].reshape(-1, 3)[: len(mesh.points_mm)]
+            whole = leg.go(told)
+            kept = leg.kept()
+            u = kept.unknowns[: 3 * len(model.space.nodes_mm)].reshape(-1, 3)[: len(mesh.points_mm)]
+            held = path.contact.held
             states.append(
                 State(
                     load=load,
-                    reached=1.0 if whole else _share(before, path.reached(goal), goal.values),
+                    reached=kept.reached,
                     u_mm=u @ plate.axes.T,
-                    pressure_mpa=model.pressures(path.state),
-                    gradients=plate.axes @ model.gradients(path.state) @ plate.axes.T,
-                    on_plate=path.contact.held[path.contact.held < len(mesh.points_mm)],
-                    curve=tuple(path.curve[known - 1 :]),
-                    iterations=path.iterations - counted,
-                    seconds=time.monotonic() - began,
-                    standing=path.standing,
+                    pressure_mpa=model.pressures(kept.unknowns),
+                    gradients=plate.axes @ model.gradients(kept.unknowns) @ plate.axes.T,
+                    on_plate=held[held < len(mesh.points_mm)],
+                    curve=kept.curve,
+                    iterations=kept.iterations,
+                    seconds=kept.seconds,
+                    kept=kept,
                 )
             )
             keep(states[-1])
@@ -229,12 +227,6 @@ def simulate(
     finally:
         path.solver.close()
     return states
-
-
-def _share(before: FloatArray, now: FloatArray, asked: FloatArray) -> float:
-    """The least share reached along the axes that a load changes."""
-    changed = np.abs(asked - before) > 0.0
-    return float(((now - before)[changed] / (asked - before)[changed]).min()) if changed.any() else 0.0
 
 
 def check(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -11,14 +11,14 @@ import numpy as np
 from dvc.arrays import FloatArray
 from dvc.deformation import Deformation, evaluate_on_grid
 from dvc.image import LabelMap, Mask
-from dvc.imagefile import read_image
+from dvc.imagefile import read_voxels
 from dvc.kinematics import StrainField
-from dvc.report import Cell, Picture, Section, Table, write_report
+from dvc.report import Cell, Picture, Section, Table
 from dvc.verdict import Verdict
 from dvc.viewer import Viewer, Volume
-from mrstrain.page import flat, said
+from mrstrain.page import said
 from validate import figures
-from validate.comparison import Comparison
+from validate.comparison import NOTHING, Comparison
 from validate.curves import Area
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
@@ -125,9 +125,9 @@ def viewer_of(
         values[inside] = StrainField.from_gradient(evaluate_on_grid(field, grid, inside)[1]).max_shear
         shear.append(values)
     scanned = folder / "registered.nii.gz"
-    image = read_image(scanned, allow_missing=True) if scanned.is_file() else None
-    if image is not None and image.grid.same_as(labels.grid):
-        shown = np.nan_to_num(image.values[box])
+    seen, voxels = read_voxels(scanned) if scanned.is_file() else (None, np.empty(0))
+    if seen is not None and seen.same_as(labels.grid):
+        shown = np.nan_to_num(voxels[box])
     else:
         shown = labels.labels[box].astype(np.float64)
     most = max(0.05, float(np.ceil(20.0 * np.nanquantile(shear[0], 0.99)) / 20.0))
@@ -170,22 +170,14 @@ def page_sections(
     return sections
 
 
-def closing_sections(thresholds: Sequence[Threshold]) -> list[Section]:
-    """How a comparison is read, and where its levels of strain come from."""
+def closing_sections(thresholds: Sequence[Threshold], methods: Sequence[str]) -> list[Section]:
+    """How a comparison is read, where its levels of strain come from, and paragraphs for a methods section."""
     sources = Section(
         "Levels of strain",
         None,
         (Table("Thresholds", ("maximal shear", "source"), tuple((t.max_shear, t.source) for t in thresholds)),),
     )
-    return [_CLOSING, sources]
-
-
-def write_page(
-    path: Path, sections: Sequence[Section], thresholds: Sequence[Threshold], record: Mapping[str, object]
-) -> None:
-    """Write the report, one self-contained page."""
-    closing = closing_sections(thresholds)
-    write_report(path, "Models against the measurement", None, sections, closing, flat(record))
+    return [_CLOSING, sources, Section("Methods, to be pasted", paragraphs=tuple(methods))]
 
 
 def shown(area: Area) -> str:
@@ -198,55 +190,81 @@ def _areas(done: Sequence[Comparison], totals: Sequence[Area], strains: tuple[fl
     areas = {(a.model, a.load): a for one in done for a in one.areas if a.tissue == ALL}
     sums = {a.model: a for a in totals}
     names = [*sums, *dict.fromkeys(model for model, _ in areas if model not in sums)]
-    rows = []
+    rows: dict[str, tuple[Cell, ...]] = {}
     for name in names:
-        cells: list[Cell] = [name]
-        for one in done:
-            area = areas.get((name, one.load))
-            cells.append("–" if area is None else shown(area))
-        rows.append((*cells, shown(sums[name]) if name in sums else "–"))
+        cells = ["–" if (area := areas.get((name, one.load))) is None else shown(area) for one in done]
+        rows[name] = (name, *cells, shown(sums[name]) if name in sums else "–")
+    nothing = rows.pop(NOTHING)
     return Table(
         f"Area between the volume-strain curves of soft tissue, strains {strains[0]:g} to {strains[1]:g}, mL",
         ("model", *(one.load for one in done), "all loads"),
-        tuple(rows),
+        tuple(rows.values()),
         "The nearest model first. Where the measurement's error is known, the area is the median over truths that "
         "could lie behind it, with a 95 % interval; areas as found, and by tissue, stand below and in areas.csv. "
-        "Levelled models come last, with their area as found.",
+        "Levelled models come last, with their area as found. Below the line: the area of a model that predicts no "
+        "strain at all.",
+        (nothing,),
     )
 
 
 def _tissues(one: Comparison) -> Table:
-    rows = tuple(
-        (a.model, a.tissue, a.ml, 100.0 * a.share, a.estimate_ml, a.low_ml, a.high_ml, a.floor_ml) for a in one.areas
-    )
+    def told(areas: Iterable[Area]) -> tuple[tuple[Cell, ...], ...]:
+        return tuple(
+            (a.model, a.tissue, a.ml, 100.0 * a.share, a.estimate_ml, a.low_ml, a.high_ml, a.floor_ml) for a in areas
+        )
+
     return Table(
         "Area between the curves, by tissue",
         ("model", "tissue", "as found, mL", "share, %", "estimate, mL", "95 % from", "to", "a perfect model's"),
-        rows,
+        told(a for a in one.areas if a.model != NOTHING),
         "As found: with the measurement's noise and smoothing. Estimate and interval: these taken out. A perfect "
         "model's: what noise alone would give; an interval that reaches it begins at 0.",
+        told(a for a in one.areas if a.model == NOTHING),
     )
 
 
 def _location(one: Comparison) -> Table:
     rows = tuple(
-        (o.model, o.threshold, o.measured_ml, o.model_ml, o.measured_clusters, o.model_clusters, o.dice, o.centroids_mm,
-         o.largest_mm, o.hausdorff95_mm)
+        (o.model, o.threshold, _ranged(o.measured_ml, o.measured_low_ml, o.measured_high_ml), o.model_ml,
+         f"{o.measured_clusters} / {o.model_clusters}", _ranged(o.dice, o.dice_low, o.dice_high),
+         _ranged(o.centroids_mm, o.centroids_low_mm, o.centroids_high_mm), o.largest_mm,
+         _ranged(o.hausdorff95_mm, o.hausdorff95_low_mm, o.hausdorff95_high_mm))
         for o in one.overlaps
     )  # fmt: skip
+    perfect: dict[float, tuple[Cell, ...]] = {
+        o.threshold: ("perfect", o.threshold, "", "", "", _ranged(o.dice_perfect),
+                      _ranged(o.centroids_perfect_mm), "", _ranged(o.hausdorff95_perfect_mm))
+        for o in one.overlaps
+        if not np.isnan(o.measured_low_ml)
+    }  # fmt: skip
+    known = (
+        "In brackets 95 % intervals with the measurement's bias and noise taken out, so that one need not hold the "
+        "figure as found; below the line what noise alone leaves of a perfect model: an interval that reaches it goes "
+        "on to 1, or to 0 mm. "
+        if perfect
+        else "The measurement's error is not known: no intervals. "
+    )
     return Table(
         "Tissue above a strain: how much, and where",
-        ("model", "above", "measured, mL", "model, mL", "clusters", "model's", "Dice", "centroids, mm",
-         "largest, mm", "Hausdorff, mm"),
+        ("model", "above", "measured, mL", "model, mL", "clusters", "Dice", "centroids, mm", "largest, mm",
+         "Hausdorff, mm"),
         rows,
-        "Clusters are connected parts; distances of the centroids of all that lies above, and of the largest "
-        "clusters; Hausdorff distance at its 95th percentile.",
+        known + "Clusters are connected parts, measured / model's; distances of the centroids of all that lies above, "
+        "and of the largest clusters; Hausdorff distance at its 95th percentile.",
+        tuple(perfect.values()),
     )  # fmt: skip
+
+
+def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
+    """A figure with its interval, where there is one."""
+    if np.isnan(value):
+        return "–"
+    return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.2g}–{high:.2g})"
 
 
 def _agreement(one: Comparison) -> Table:
     rows = tuple(
-        (a.model, {"max_shear": "maximal shear", "u_mm": "displacement, mm"}[a.quantity], a.part, a.measured_mean,
+        (a.model, {"max_shear": "shear", "u_mm": "u, mm"}[a.quantity], a.part, a.measured_mean,
          a.model_mean, a.slope, a.intercept, a.r2, a.rmse, a.concordance, a.bias, a.lower, a.upper)
         for a in one.agreements
         if a.part == ALL or a.part in one.found.tissues
@@ -256,9 +274,10 @@ def _agreement(one: Comparison) -> Table:
         ("model", "quantity", "tissue", "measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias",
          "limits from", "to"),
         rows,
-        "Means, regression of the model on the measurement, Lin's concordance, Bland and Altman's limits. Of "
-        "displacements: lengths, but for regression and concordance (the three components together) and RMSE (of the "
-        "difference). By distance to bone in agreement.csv.",
+        "Of maximal shear and displacement u: means, regression of the model on the measurement, Lin's concordance, "
+        "Bland and Altman's limits. Of displacements: lengths, but for regression and concordance (the three "
+        "components together) and RMSE (of the difference). By distance to bone in agreement.csv. All as found, "
+        "without intervals: the error model tells of maximal shear, and there is none of displacement.",
     )  # fmt: skip
 
 

@@ -22,15 +22,17 @@ from dvc.imagewrite import write_image
 from dvc.kinematics import StrainField, plate_axes
 from dvc.labels import read_labels
 from dvc.regions import volume_above
-from dvc.report import Section
+from dvc.report import Section, write_report
 from dvc.viewer import Viewer
 from dvc.whole import whole_file, whole_folder, write_whole
 from fe.meshstore import read_tet_mesh
-from mrstrain.comparepage import page_sections, pictures_of, shown, viewer_of, write_page
+from mrstrain.comparepage import closing_sections, page_sections, pictures_of, shown, viewer_of
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.measurements import Measurement, measurements_in
+from mrstrain.methods import methods
 from mrstrain.modelfiles import Reading, model_files
-from mrstrain.provenance import provenance, write_json
+from mrstrain.page import flat
+from mrstrain.provenance import provenance, versions, write_json
 from validate.agreement import Agreement, Travel
 from validate.comparison import Comparison, total
 from validate.comparison import compare as compare_load
@@ -59,6 +61,7 @@ class Compared:
     noise: tuple[str, ...]
     notes: tuple[str, ...]
     sections: tuple[Section, ...]
+    closing: tuple[Section, ...]
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
@@ -221,8 +224,8 @@ def compare(
             "difference counts as seen."
         )
     notes += _covered(done)
-    totals, noise = total(done)
-    _write_tables(target, done, strains)
+    totals, nothing, noise = total(done)
+    _write_tables(target, done, [*totals, nothing], strains)
     write_json(
         target / "comparison.json",
         {
@@ -230,10 +233,17 @@ def compare(
             "coverage_ml": {one.load: one.found.coverage() for one in done},
         } | record,
     )  # fmt: skip
-    sections = page_sections(told, totals, noise, notes, strains)
-    write_page(target / "report.html", sections, levels, record)
+    done_how = methods(
+        {m.load: m.folder for m in measurements if m.load in files},
+        {file.name: file.path for of in files.values() for file in of},
+        len(done[0].found.points_mm), strains, [t.max_shear for t in levels], least_ml,
+        error_known=any(one.bands for one in done), version=versions()["mrstrain"],
+    )  # fmt: skip
+    sections = page_sections(told, [*totals, nothing], noise, notes, strains)
+    closing = closing_sections(levels, done_how)
+    write_report(target / "report.html", "Models against the measurement", None, sections, closing, flat(record))
     tell("compare", "comparing", 1.0)
-    return Compared(target, tuple(done), totals, noise, tuple(notes), tuple(sections))
+    return Compared(target, tuple(done), totals, noise, tuple(notes), tuple(sections), tuple(closing))
 
 
 def _clear(target: Path, loads: Sequence[str]) -> None:
@@ -292,8 +302,10 @@ def _write_on_image(folder: Path, results: Sequence[FeResult], labels: LabelMap)
         write_image(folder / f"{result.name}_max_shear.nii.gz", Image(labels.grid, values))
 
 
-def _write_tables(target: Path, done: Sequence[Comparison], strains: tuple[float, float]) -> None:
-    _rows(target / "areas.csv", Area, [*(a for one in done for a in one.areas), *total(done)[0]])
+def _write_tables(
+    target: Path, done: Sequence[Comparison], totals: Sequence[Area], strains: tuple[float, float]
+) -> None:
+    _rows(target / "areas.csv", Area, [*(a for one in done for a in one.areas), *totals])
     _rows(target / "location.csv", Overlap, [o for one in done for o in one.overlaps])
     _rows(target / "agreement.csv", Agreement, [a for one in done for a in one.agreements])
     _rows(target / "travel.csv", Travel, [t for one in done for t in one.travels])

@@ -105,9 +105,13 @@ class Ledger:
         )
         return record if there else None
 
-    def begin(self, stage: Stage) -> None:
-        """Forget a stage and remove what it had made."""
+    def forget(self, stage: Stage) -> None:
+        """Take a stage as not finished; what it had made stays for it to go on from."""
         self._place(stage.name).unlink(missing_ok=True)
+
+    def remove(self, stage: Stage) -> None:
+        """Forget a stage and remove what it had made."""
+        self.forget(stage)
         for place in stage.gives:
             if place.is_dir():
                 shutil.rmtree(place)

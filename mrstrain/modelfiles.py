@@ -16,7 +16,7 @@ from dvc.image import Grid
 from mrstrain.inputs import read_matrix
 from validate.sources import FeResult, check_overlap, read_result
 
-ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".csv")
+ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
 SETTINGS = "model.toml"
 """In a model's folder: mesh, unit, frame and to_image of this model alone."""
 

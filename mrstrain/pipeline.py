@@ -91,7 +91,7 @@ class Pipeline:
                 lacking = self._lacking(stage)
                 if lacking:
                     self.outcomes[stage.name] = Outcome(stage.name, None, f"Not run: {lacking}")
-                    self.ledger.begin(stage)
+                    self.ledger.remove(stage)
                     continue
                 arguments = self._arguments(stage)
                 built_on = {name: r for name in stage.before if (r := self.outcomes[name].record) is not None}
@@ -154,7 +154,10 @@ class Pipeline:
             if name not in before:
                 tell(f"{name}: {outcome.words}" + (f". {outcome.reason}" if outcome.reason else ""))
         for stage, arguments in ready:
-            self.ledger.begin(stage)
+            if stage.goes_on and not _among(stage, self._force, default=False):
+                self.ledger.forget(stage)
+            else:
+                self.ledger.remove(stage)
             for place in stage.gives:
                 place.parent.mkdir(parents=True, exist_ok=True)
             cluster().begin(prefix + stage.name, stage.kind, arguments)
@@ -163,7 +166,7 @@ class Pipeline:
         """Record how a stage ended that was handed to the cluster."""
         stage = next(stage for stage in self.stages if stage.name == name)
         if isinstance(outcome, str):
-            self.ledger.begin(stage)  # what an earlier run or half of this one left is no result of these inputs
+            self.ledger.remove(stage)  # what an earlier run or half of this one left is no result of these inputs
             self.outcomes[stage.name] = Outcome(stage.name, None, outcome)
         else:
             record = self.ledger.keep(stage, self._keys[stage.name], outcome, seconds)

@@ -18,6 +18,8 @@ from validate.levelled import LEVELLED
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
 """Kinds of stages, in the order in which they come."""
 
+_MINUTES = {"register": 1.0, "mesh": 1.3, "simulate": 2.5, "drive": 2.0, "level": 1.5, "compare": 1.5}
+
 REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
 
 
@@ -52,6 +54,16 @@ class Stage:
     def kind(self) -> str:
         """One of KINDS."""
         return self.name.split(" ", 1)[0]
+
+    @property
+    def minutes(self) -> float:
+        """About how long it takes on one core at the usual size: what progress is counted in."""
+        return _MINUTES[self.kind]
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it finds by itself what it did before it was cut, and takes of that only what still holds."""
+        return self.kind == "simulate"
 
     @property
     def before(self) -> tuple[str, ...]:
@@ -161,8 +173,8 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
         "loads": [asdict(_step(load, of)) for load, of in study.loads.items()],
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
-        "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm, "fixed": study.models.fixed,
-        "element": study.models.element, "decks": study.models.decks,
+        "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
+        "fixed": study.models.fixed, "element": study.models.element, "decks": study.models.decks,
     }  # fmt: skip
     return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
 

@@ -121,18 +121,23 @@ def run_studies(
     for stages in planned:
         refuse_unknown(stages, (*only, *force))
         refuse_missing(stages)
-    tell, total, ended = progress or (lambda *_: None), sum(map(len, planned)), 0
+    tell, ended = progress or (lambda *_: None), 0.0
+    total = sum(stage.minutes for stages in planned for stage in stages)
+    stages_told = f"{sum(map(len, planned))} stages"
     prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
     pipelines: dict[str, Pipeline] = {}
     lines: dict[str, Callable[[str], None]] = {}
 
-    def line_of(log: Callable[[str], None], names: tuple[str, ...]) -> Callable[[str], None]:
+    def line_of(log: Callable[[str], None], stages: Sequence[Stage]) -> Callable[[str], None]:
+        minutes = {stage.name: stage.minutes for stage in stages}
+
         def line(text: str) -> None:
             nonlocal ended
             log(text)
-            if text.split(": ", maxsplit=1)[0] in names:
-                ended += 1
-                tell("all", f"{total} stages", ended / total)
+            name = text.split(": ", maxsplit=1)[0]
+            if name in minutes:
+                ended += minutes[name]
+                tell("all", stages_told, ended / total)
 
         return line
 
@@ -147,7 +152,7 @@ def run_studies(
             pipelines[prefix] = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
             log = stack.enter_context(_log(study.out / LOG))
             log(f"Study '{study.study.name}': {len(stages)} stages")
-            lines[prefix] = line_of(log, pipelines[prefix].names)
+            lines[prefix] = line_of(log, stages)
         run_all(pipelines, pool, lines)
         done = []
         for prefix, study, stages in zip(prefixes, studies, planned, strict=True):

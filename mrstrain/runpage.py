@@ -48,11 +48,20 @@ def write_run_report(
     write_report(
         path,
         study.study.name,
-        worst(verdicts) if verdicts else None,
+        _verdict(verdicts),
         [*ahead, *compared, *registered, _stages(outcomes)],
         closing,
         flat(record),
     )
+
+
+def _verdict(verdicts: Sequence[Verdict]) -> Verdict | None:
+    """The worst of all, saying what a good one is about: the measurement, and not the models."""
+    if not verdicts:
+        return None
+    found = worst(verdicts)
+    told = f"The measurement: {len(verdicts)} images are registered soundly. The models are judged below."
+    return found if found.reasons else replace(found, reasons=(told,))
 
 
 def _stages(outcomes: Mapping[str, Outcome]) -> Section:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from dvc.errors import InputError, MrstrainError
 from dvc.mesh import TetMesh
-from dvc.whole import whole_file, write_whole
+from dvc.whole import whole_file
 from dvc.worker import Worker, each_in_workers, usable_cores
 from fe import figures
 from fe.decks import write_calculix, write_febio
@@ -21,18 +21,18 @@ from fe.materials import MODES, Material
 from fe.meshstore import read_tet_mesh
 from fe.plate import Plate
 from fe.published import MaterialSet, material_set
+from fe.restart import ENDING
 from fe.result import (
     RegionFigures,
     region_figures,
     volume_share_off,
     write_curve_csv,
     write_regions_csv,
-    write_state,
 )
 from fe.simulate import BONE, LoadStep, State, check
-from fe.simulate import simulate as solve
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.loads import LOADS, paths_of
+from mrstrain.onepath import simulated_path
 from mrstrain.provenance import provenance, write_json
 
 Told = Callable[[str, str, float], None]
@@ -174,9 +174,12 @@ def simulate(
     for name in names:
         make_output(target / name)
         clear(target / name)
+        for left in (target / name).glob(f"*{ENDING}"):
+            if left.name.removesuffix(ENDING) not in {load.name for load in loads}:
+                left.unlink()
     files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
     given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(fixed)}
-    given |= {"turns": turns, "pivot_mm": None if pivot_mm is None else list(pivot_mm)}
+    given |= {"turns": turns, "pivot_mm": None if pivot_mm is None else list(pivot_mm), "mesh_made": _mesh_made(place)}
     jobs = [(one, path) for one in chosen for path in paths]
     at_once = max(1, min(workers or usable_cores(), len(jobs)))
     each = threads or max(1, usable_cores() // at_once)
@@ -199,7 +202,7 @@ def simulate(
 
             try:
                 states = worker.run(
-                    f"simulating {case}", _simulated, read, laws[name][0], plate, path, fixed, element,
+                    f"simulating {case}", simulated_path, read, laws[name][0], plate, path, fixed, element,
                     target / name, share, each,                     watch=watch,
                 )  # fmt: skip
             except MrstrainError as failure:
@@ -239,37 +242,15 @@ def _beside(place: Path) -> list[Path]:
     return [names] if names.is_file() else []
 
 
-def _simulated(
-    mesh: TetMesh,
-    laws: Mapping[str, Material],
-    plate: Plate,
-    path: Sequence[LoadStep],
-    fixed: Sequence[str],
-    element: str,
-    folder: Path,
-    share: Path,
-    threads: int,
-) -> list[State]:
-    """Run one path in a worker: each load's file is written as soon as it is there."""
-    log: list[str] = []
-
-    def keep(state: State) -> None:
-        if state.reached > 0.0:
-            write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
-
+def _mesh_made(place: Path) -> dict[str, object] | None:
+    """How `mesh` made a mesh, by the record that it leaves beside it; None for meshes made elsewhere."""
     try:
-        return solve(
-            mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=log.append, keep=keep,
-            progress=lambda done: _replaced(share, f"{done:.4f}"),
-        )  # fmt: skip
-    finally:
-        write_whole(folder / f"log-{path[0].name}.txt", "\n".join(log) + "\n")
-
-
-def _replaced(path: Path, text: str) -> None:
-    part = path.with_suffix(".part")
-    part.write_text(text)
-    part.replace(path)
+        told = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
+        if told["command"] == "mesh":
+            return {"edge_mm": told["parameters"]["edge_mm"], "pytetwild": told["versions"]["pytetwild"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return None
 
 
 def _told(

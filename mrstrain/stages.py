@@ -141,15 +141,12 @@ def compare(tell: Tell, **options: Any) -> Given:
 
 
 def _compared(options: dict[str, Any]) -> Given:
-    from mrstrain.comparepage import closing_sections
     from mrstrain.comparing import compare as run
-    from validate.location import read_thresholds
 
     strains = options.pop("strains")
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
     done = run(options.pop("dvc"), models, strains=(strains[0], strains[1]), **options)
-    levels = read_thresholds(_path(options["thresholds"]))
-    return Given(tuple(done.summary()[:-1]), done.sections, tuple(closing_sections(levels)))
+    return Given(tuple(done.summary()[:-1]), done.sections, done.closing)
 
 
 def _path(given: str | None) -> Path | None:

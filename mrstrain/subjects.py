@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -22,6 +23,7 @@ from mrstrain.running import Ran, Told, run_studies
 from mrstrain.studyfile import FILE, read_study
 from validate import figures
 from validate.cohort import Standing, standings
+from validate.comparison import NOTHING
 from validate.levelled import LEVELLED
 from validate.mapping import ALL
 
@@ -127,7 +129,8 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> dict[str, dict[
     for subject, rows in areas.items():
         loads = {row["load"] for row in rows} - {_TOTAL}
         for row in rows:
-            if row["load"] != (_TOTAL if len(loads) > 1 else next(iter(loads))) or row["model"].endswith(LEVELLED):
+            judged = row["model"] != NOTHING and not row["model"].endswith(LEVELLED)
+            if not judged or row["load"] != (_TOTAL if len(loads) > 1 else next(iter(loads))):
                 continue
             found, best = float(row["ml"]), float(row["estimate_ml"])
             scale = best / found if found > 0.0 and not np.isnan(best) else 1.0
@@ -189,6 +192,6 @@ def _write_page(
             if s.verdict is not None
         ]
         verdicts += [Verdict("distrust", tuple(failed))] if failed else []
-        report = Table("Its own report", ("folder",), ((str(one.study.out),),))
+        report = Table("Its own report", ("folder",), ((os.path.relpath(one.study.out, path.parent),),))
         sections.append(Section(one.study.study.name, worst(verdicts) if verdicts else None, (report,)))
     write_report(path, "Models over subjects", None, sections, [], flat(record))

@@ -80,6 +80,19 @@ def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
     assert float(found["ml"]) == pytest.approx(expected, rel=1e-3)
     assert float(found["low_ml"]) < expected < float(found["high_ml"])
     assert float(areas["half", "Load1", "fat"]["ml"]) == pytest.approx(expected / 2.0, rel=0.05)
+    # a model that predicts nothing has the measured curve itself as its area, from 0.2 on; it stands below the others
+    nothing = areas["no deformation", "Load1", "all soft tissue"]
+    assert float(nothing["ml"]) == pytest.approx(volume * (np.hypot(0.8, 0.32) / 2.0 - 0.2), rel=1e-3)
+    assert float(nothing["low_ml"]) < float(nothing["ml"]) < float(nothing["high_ml"])
+    page = (study / "out" / "report.html").read_text()
+    assert page.index("<tfoot>") < page.index("no deformation") < page.index("</tfoot>")
+    assert not any("no deformation" in sentence for sentence in done.noise)
+    places = {(r["model"], r["load"], r["threshold"]): r for r in rows(study / "out" / "location.csv")}
+    right = places["right", "Load1", "0.3"]
+    assert float(right["measured_low_ml"]) <= float(right["measured_ml"]) <= float(right["measured_high_ml"])
+    assert float(right["dice_high"]) == 1.0
+    assert float(right["dice_perfect"]) > 0.95
+    assert float(places["half", "Load1", "0.3"]["dice_high"]) < 0.5
     travel = {(r["model"], r["load"]): r for r in rows(study / "out" / "travel.csv")}
     assert float(travel["right", "Load1"]["model_along_mm"]) >= 0.0
     for load, gamma in LOADS.items():
@@ -140,6 +153,8 @@ def test_the_report_needs_nothing_else_and_says_what_it_rests_on(study: Path) ->
     corner = right.affine @ [4, 4, 4, 1]  # RAS: x and y turn their sign
     assert corner[:3].tolist() == [-0.5, -0.5, 0.5]
     text = re.sub(r"\s+", " ", page)
+    assert "there is none of displacement" in text
+    assert "the displacement was taken as it was given" in text
     assert "measurement&#39;s error is not known" in text
     assert text.index("Models and loads") < text.index("Volume above a strain")
 

@@ -90,6 +90,20 @@ def test_bricks_that_are_tetrahedra_are_read_as_such(tmp_path: Path, nodes: int,
         read_mesh(path)
 
 
+@pytest.mark.parametrize("kind", ["msh-22", "msh-41", "msh-41-binary"])
+def test_a_volume_and_its_surface_may_share_a_name(tmp_path: Path, kind: str) -> None:
+    _, cells = block()
+    path = written(tmp_path, kind)
+    path.write_bytes(path.read_bytes().replace(b'"sole"', b'"skin"'))
+    mesh = read_mesh(path)
+    assert mesh.tets is not None
+    assert set(mesh.tets.regions) == {"fat", "skin"}
+    np.testing.assert_array_equal(mesh.tets.regions["skin"], np.arange(20, 48))
+    assert set(mesh.tets.facets) == {"skin"}
+    np.testing.assert_array_equal(mesh.tets.facets["skin"], skin(cells))
+    np.testing.assert_array_equal(mesh.node_ids, TAGS)
+
+
 def test_gmsh_22_binary_numbers_are_read(tmp_path: Path) -> None:
     points, cells = block()
     path = tmp_path / "heel.msh"
@@ -149,7 +163,7 @@ def test_a_file_cut_anywhere_is_refused(tmp_path: Path, kind: str) -> None:
 
 
 def test_what_cannot_be_a_mesh_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"\.inp, \.cdb, \.frd, \.msh, \.vtu, \.vtk; got '\.stl'"):
+    with pytest.raises(InputError, match=r"\.inp, \.cdb, \.frd, \.xplt, \.msh, \.vtu, \.vtk; got '\.stl'"):
         read_mesh(tmp_path / "heel.stl")
     with pytest.raises(ImageFileError, match="no such file"):
         read_mesh(tmp_path / "heel.vtu")

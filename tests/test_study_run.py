@@ -23,6 +23,7 @@ from mrstrain.beginning import init
 from mrstrain.checking import check
 from mrstrain.running import forecast, report, run
 from mrstrain.studyfile import read_study
+from mrstrain.subjects import cohort
 from tests.quick import QUICK
 
 pytestmark = pytest.mark.slow
@@ -303,3 +304,28 @@ def test_init_of_an_empty_folder_says_what_is_missing(tmp_path):
     assert "Load0: NOT FOUND" in told
     with pytest.raises(InputError, match=r"\[images\] 'load0' is missing"):
         read_study(tmp_path)
+
+
+def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path):
+    folder, _ = done
+    places = []
+    for name in ("Ada", "Ben"):
+        places.append(tmp_path / name)
+        shutil.copytree(folder, places[-1])
+        (places[-1] / "study.toml").write_text(STUDY.replace("Heel <b>3</b>", name))
+    told = cohort(places, out=tmp_path / "cohort")
+    assert all(o.again for one in told.ran for o in one.outcomes.values())
+    (first,) = told.ranking
+    assert (first.model, first.subjects, first.nearest_in) == ("akrami", 2, 2)
+    with (folder / "results" / "comparison" / "areas.csv").open() as file:
+        shares = [float(r["share"]) for r in csv.DictReader(file) if r["load"] == "all loads"]
+    assert first.mean == pytest.approx(shares[0], rel=1e-5)
+    assert first.high - first.low == pytest.approx(0.0, abs=1e-12)  # one subject twice
+    with (tmp_path / "cohort" / "cohort.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {r["subject"] for r in rows} == {"Ada", "Ben"}
+    page = (tmp_path / "cohort" / "report.html").read_text()
+    assert "Ada" in page
+    assert "Ben" in page
+    with pytest.raises(InputError, match="name of its own"):
+        cohort([places[0], places[0]], out=tmp_path / "cohort")

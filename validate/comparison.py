@@ -25,6 +25,9 @@ from validate.sources import FeResult
 
 _STRAINED = 0.01
 
+NOTHING = "no deformation"
+"""A model that predicts no strain anywhere: what areas are to be seen beside, and outside the order."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
@@ -35,7 +38,7 @@ class Comparison:
     load : str
     found : Mapped
     areas : tuple of Area
-        By model and tissue; that of all soft tissue first.
+        By model and tissue; that of all soft tissue first. Those of `NOTHING` come last.
     overlaps : tuple of Overlap
     agreements : tuple of Agreement
     travels : tuple of Travel
@@ -65,9 +68,9 @@ class Comparison:
     def ranked(self, tissue: str = ALL) -> list[Area]:
         """Areas of a tissue, the smallest first: as estimated from the truths drawn, where the error is known.
 
-        Levelled models are left out: their areas are those as found, and of another kind.
+        Levelled models are left out, as their areas are those as found, and of another kind; so is `NOTHING`.
         """
-        models = (a for a in self.areas if a.tissue == tissue and not a.model.endswith(LEVELLED))
+        models = (a for a in self.areas if a.tissue == tissue and a.model != NOTHING and not a.model.endswith(LEVELLED))
         return sorted(models, key=lambda a: a.best_ml)
 
     def within_noise(self, model: str, other: str, tissue: str = ALL) -> bool:
@@ -135,10 +138,10 @@ def compare(
     truths: list[FloatArray] = []
     told = {} if table is None else _bands(found, tissues, table, strains, zlib.crc32(load.encode()) + seed, truths)
     areas = []
-    for name, field in found.models.items():
+    for name, shear in _shears(found).items():
         for tissue, where in tissues.items():
             volumes = found.volumes_ml[where]
-            area = area_between(found.measured.max_shear[where], field.max_shear[where], volumes, strains)
+            area = area_between(found.measured.max_shear[where], shear[where], volumes, strains)
             share = area / volumes.sum() / (strains[1] - strains[0])
             # what was measured itself carries the measurement's bias as well: as found, like is compared with like
             estimated = told[tissue].interval(name) if tissue in told and not name.endswith(LEVELLED) else ()
@@ -163,25 +166,26 @@ def compare(
     return Comparison(load, found, tuple(areas), tuple(overlaps), tuple(rows), tuple(travels), told, strains)
 
 
-def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], tuple[str, ...]]:
-    """Areas over all loads of the models that have every one, the nearest first; and sentences on what can be told.
+def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], Area, tuple[str, ...]]:
+    """Areas over all loads of the models that have every one, the nearest first; of `NOTHING`; and what can be told.
 
     Loads are measured one by one, so their errors are taken as independent. The share is the mean of the loads' shares.
     """
     everywhere = [name for name in done[0].found.models if all(name in one.found.models for one in done)]
     bands_of = [one.bands[ALL] for one in done if ALL in one.bands]
     whole: Band | None = None
-    if everywhere and len(bands_of) == len(done):
-        areas = {name: np.sum([band.areas_ml[name] for band in bands_of], axis=0) for name in everywhere}
+    if len(bands_of) == len(done):
+        areas = {name: np.sum([band.areas_ml[name] for band in bands_of], axis=0) for name in (*everywhere, NOTHING)}
         floor = float(sum(band.floor_ml for band in bands_of))
         first = bands_of[0]
         whole = Band(first.strains, first.low_ml, first.high_ml, areas, floor, max(b.widening for b in bands_of))
     rows = []
-    for name in everywhere:
+    for name in (*everywhere, NOTHING):
         parts = [a for one in done for a in one.areas if a.tissue == ALL and a.model == name]
         estimated = whole.interval(name) if whole is not None and not name.endswith(LEVELLED) else ()
         share = float(np.mean([a.share for a in parts]))
         rows.append(Area(name, "all loads", ALL, sum(a.ml for a in parts), share, *estimated))
+    nothing = rows.pop()
     rows.sort(key=lambda a: (a.model.endswith(LEVELLED), a.best_ml))
     told = []
     for one in done:
@@ -191,9 +195,9 @@ def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], tuple[str, ...]
             )
         elif ALL in one.bands:
             told.append(_told(f"under {one.load}", one.ranked(), one.bands[ALL]))
-    if len(done) > 1 and whole is not None and not all(one.hardly_strained for one in done):
+    if len(done) > 1 and everywhere and whole is not None and not all(one.hardly_strained for one in done):
         told.insert(0, _told("over all loads", [a for a in rows if not a.model.endswith(LEVELLED)], whole))
-    return tuple(rows), tuple(sentence for sentence in told if sentence)
+    return tuple(rows), nothing, tuple(sentence for sentence in told if sentence)
 
 
 def _told(where: str, ranked: Sequence[Area], band: Band) -> str:
@@ -207,6 +211,11 @@ def _told(where: str, ranked: Sequence[Area], band: Band) -> str:
         if near
         else "It is told apart from all others."
     )
+
+
+def _shears(found: Mapped) -> dict[str, FloatArray]:
+    """Maximal shear of each model, and that of none."""
+    return {name: field.max_shear for name, field in found.models.items()} | {NOTHING: np.zeros(len(found.points_mm))}
 
 
 def _bands(
@@ -232,7 +241,7 @@ def _bands(
 
     return bands(
         kept(),
-        {name: field.max_shear[common] for name, field in found.models.items()},
+        {name: shear[common] for name, shear in _shears(found).items()},
         found.volumes_ml[common],
         {name: where[common] for name, where in tissues.items()},
         table.factor,

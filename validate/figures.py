@@ -84,7 +84,8 @@ def slices(
     """Maximal shear on the slice through the bone's lowest point, measured and simulated, where tissue is under load.
 
     The slice holds the plate's normal and the direction of shear; the same cells in one colour scale. Grey is not
-    defined. Where the measurement does not reach a node, it is drawn with the displacement of the nearest one.
+    defined. Where the measurement does not reach a node, it is drawn with the displacement of the nearest one. Letters
+    name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
     u = filled_from_nearest(measured.displacement(found.mesh.points_mm), found.mesh.points_mm)
     panels = [Slice("measured", u, found.measured.max_shear)]

@@ -1,7 +1,7 @@
 """What a finite-element code computed, as a `Deformation`: whatever the code, its unit and its frame.
 
-A result is one file with mesh and displacement (VTU, VTK, Gmsh, CalculiX .frd), or a mesh (also Abaqus .inp, ANSYS
-.cdb) and a table of its nodes' displacements (.csv: node number, and three components).
+A result is one file with mesh and displacement (VTU, VTK, Gmsh, CalculiX .frd, FEBio .xplt), or a mesh (also Abaqus
+.inp, ANSYS .cdb) and a table of its nodes' displacements (.csv: node number, and three components).
 """
 
 from __future__ import annotations

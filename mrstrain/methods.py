@@ -1,0 +1,203 @@
+"""What was done, in sentences for a methods section: filled in from the records beside what was compared."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from dvc.elastixtext import parse_parameters
+from dvc.errors import ParameterError
+from dvc.viewer import NIIVUE
+from fe.simulate import LoadStep
+from validate.curves import DRAWS
+from validate.doubt import DRAWS as LOCATED
+
+# Checked against the publishers' records or the projects' own pages; a paper whose DOI was not found goes without.
+_PAPERS = {
+    "Klein 2010": "Klein S, Staring M, Murphy K, Viergever MA, Pluim JPW. elastix: a toolbox for intensity-based "
+    "medical image registration. IEEE Trans Med Imaging 29(1):196-205, 2010. doi:10.1109/TMI.2009.2035616",
+    "Shamonin 2014": "Shamonin DP, Bron EE, Lelieveldt BPF, Smits M, Klein S, Staring M. Fast parallel image "
+    "registration on CPU and GPU for diagnostic classification of Alzheimer's disease. Front Neuroinform 7:50, 2014. "
+    "doi:10.3389/fninf.2013.00050",
+    "Lowekamp 2013": "Lowekamp BC, Chen DT, Ibáñez L, Blezek D. The design of SimpleITK. Front Neuroinform 7:45, 2013. "
+    "doi:10.3389/fninf.2013.00045",
+    "Hu 2020": "Hu Y, Schneider T, Wang B, Zorin D, Panozzo D. Fast tetrahedral meshing in the wild. ACM Trans Graph "
+    "39(4):117, 2020. doi:10.1145/3386569.3392385",
+    "Trebbi 2023": "Trebbi A, Fougeron N, Payan Y. Definition and evaluation of a finite element model of the human "
+    "heel for diabetic foot ulcer prevention under shearing loads. Med Eng Phys, 2023.",
+    "Dice 1945": "Dice LR. Measures of the amount of ecologic association between species. Ecology 26(3):297-302, "
+    "1945. doi:10.2307/1932409",
+    "Lin 1989": "Lin LI-K. A concordance correlation coefficient to evaluate reproducibility. Biometrics "
+    "45(1):255-268, 1989. doi:10.2307/2532051",
+    "Bland 1986": "Bland JM, Altman DG. Statistical methods for assessing agreement between two methods of clinical "
+    "measurement. Lancet 327(8476):307-310, 1986. doi:10.1016/S0140-6736(86)90837-8",
+}
+_PUBLISHED = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")  # tables 2 and 3 of Trebbi 2023
+
+Record = Mapping[str, Any]
+
+
+def methods(
+    measured: Mapping[str, Path],
+    models: Mapping[str, Path],
+    cells: int,
+    strains: tuple[float, float],
+    thresholds: Sequence[float],
+    least_ml: float,
+    *,
+    error_known: bool,
+    version: str,
+) -> tuple[str, ...]:
+    """Paragraphs for a methods section, the references last.
+
+    Parameters
+    ----------
+    measured : mapping of load to path
+        Folders of the measurement, with their ``provenance.json`` where `register` or `strain` wrote them.
+    models : mapping of name to path
+        A result's file of each; a ``simulation.json`` beside it tells how it was computed.
+    cells : int
+        Number of cells on which fields are compared.
+    strains, thresholds, least_ml
+        As in `mrstrain.comparing.compare`.
+    error_known : bool
+        Whether intervals come from an error model.
+    version : str
+        Of the program that compares.
+    """
+    parts = [_measured(measured), *_simulated(models), _compared(cells, strains, thresholds, least_ml, version)]
+    if error_known:
+        parts.append(_doubt(measured))
+    parts.append(f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue).")
+    used = [paper for name, paper in _PAPERS.items() if any(name in part for part in parts)]
+    return (*parts, "References", *used)
+
+
+def _record(place: Path) -> Record:
+    try:
+        told = json.loads(place.read_text(encoding="utf-8"))
+        return told if isinstance(told, dict) else {}
+    except (OSError, ValueError):
+        return {}
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _measured(measured: Mapping[str, Path]) -> str:
+    """How displacement was measured; loads that were registered alike go into one sentence."""
+    groups: dict[str, list[str]] = {}
+    for load, folder in measured.items():
+        groups.setdefault(_registration(_record(folder / "provenance.json")), []).append(load)
+    told = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
+    return (
+        told + " Displacement is that of tissue in the unloaded configuration; strain is Green-Lagrange, "
+        "E = (F^T F - I)/2, and maximal shear half the difference of its largest and smallest principal value."
+    )
+
+
+def _registration(record: Record) -> str:
+    given, versions = record.get("parameters", {}), record.get("versions", {})
+    stages = given.get("stages") or []
+    if record.get("command") != "register" or not stages:
+        return "the displacement was taken as it was given."
+    align = {
+        "bone": "The loaded image was aligned with the unloaded one rigidly on the bone, and then",
+        "image": "The loaded image was aligned with the unloaded one rigidly on the whole image, and then",
+    }.get(str(given.get("align")), "The loaded image was, without rigid alignment,")
+    return (
+        f"{align} registered non-rigidly with elastix (Klein 2010, Shamonin 2014; itk-elastix "
+        f"{versions.get('itk-elastix', '?')}) through mrstrain {versions.get('mrstrain', '?')}: "
+        f"{'; then '.join(_stage(stage) for stage in stages)}; seed {given.get('seed')}. Images were read and "
+        f"written with SimpleITK {versions.get('SimpleITK', '?')} (Lowekamp 2013)."
+    )
+
+
+def _stage(stage: Record) -> str:
+    try:
+        told = parse_parameters(str(stage.get("text", "")))
+    except ParameterError:
+        return f"parameters '{stage.get('name')}'"
+
+    def value(name: str) -> str:
+        """Values of a parameter, one for all where they are equal."""
+        values = told.get(name, ())
+        return ", ".join(dict.fromkeys(values) if len(set(values)) == 1 else values) or "elastix' default"
+
+    spacing = value("FinalGridSpacingInPhysicalUnits")
+    return (
+        f"parameters '{stage.get('name')}', metric {value('Metric')}, {value('Transform')} with control points every "
+        f"{spacing} mm, {value('NumberOfResolutions')} resolutions, {value('Optimizer')} with "
+        f"{value('MaximumNumberOfIterations')} iterations of {value('NumberOfSpatialSamples')} samples"
+    )
+
+
+def _simulated(models: Mapping[str, Path]) -> list[str]:
+    """How models were computed: those of ours by their own records, others by their files."""
+    parts, others, groups = [], [], dict[str, list[str]]()
+    published = False
+    for name, path in models.items():
+        record = _record(path.parent / "simulation.json")
+        given = record.get("parameters", {})
+        if record.get("command") != "simulate" or "set" not in given:
+            others.append(f"{name} ({path.suffix[1:]})")
+            continue
+        laws = "; ".join(f"{region}: {law['law']}" for region, law in given["laws"].items())
+        parts.append(f"{name}: {given['title']} ({laws}).")
+        published = published or given["set"] in _PUBLISHED
+        groups.setdefault(_solver(record), []).append(name)
+    told = []
+    if parts:
+        told.append(
+            " ".join(f"{_listed(names)} {how}" for how, names in groups.items())
+            + (" Published sets of laws are those that Trebbi 2023 compiled. " if published else " ")
+            + " ".join(parts)
+        )
+    if others:
+        told.append(f"Results of other programs were taken as given: {_listed(others)}.")
+    return told
+
+
+def _solver(record: Record) -> str:
+    given, versions = record["parameters"], record.get("versions", {})
+    made = given.get("mesh_made")
+    mesh = (
+        f" on a mesh of fTetWild (Hu 2020; pytetwild {made['pytetwild']}) with edges of {made['edge_mm']:g} mm"
+        if made
+        else ""
+    )
+    loads = _listed([f"{step['name']} {LoadStep(**step).told}" for path in given["paths"] for step in path])
+    contact = "bonded to the plate from the first touch" if given.get("taped", True) else "without friction"
+    return (
+        f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh}: {given['element']}; "
+        f"plate {given['plate']}; skin {contact}; fixed: {', '.join(given['fixed'])}; loads {loads}."
+    )
+
+
+def _compared(
+    cells: int, strains: tuple[float, float], thresholds: Sequence[float], least_ml: float, version: str
+) -> str:
+    levels = _listed([f"{t:g}" for t in thresholds])
+    return (
+        f"Models and measurement were compared with mrstrain {version} at the centroids of the same {cells} "
+        "tetrahedra, weighted by volume, in the unloaded configuration. Intensity: area between the curves of tissue "
+        f"volume above a maximal shear, from {strains[0]:g} to {strains[1]:g}. Location: tissue above {levels}; "
+        "overlap (Dice 1945), distance of the centroids, 95th percentile of the Hausdorff distance, clusters of "
+        f"{least_ml:g} mL or more. "
+        "Agreement cell by cell: regression, concordance (Lin 1989), limits of agreement (Bland 1986)."
+    )
+
+
+def _doubt(measured: Mapping[str, Path]) -> str:
+    sources = {
+        str(_record(folder / "quality.json").get("error_of_max_shear", {}).get("source", ""))
+        for folder in measured.values()
+    }
+    known = " ".join(sorted(s for s in sources if s))
+    return (
+        f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATED} draws) come from truths drawn by the "
+        f"registration's error model: bias, spatially correlated noise. {known} Displacement has no error model."
+    )

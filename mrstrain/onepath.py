@@ -1,0 +1,75 @@
+"""One path of loads, simulated in a worker: each load's files are there as soon as it is reached."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from dvc.mesh import TetMesh
+from dvc.whole import write_whole
+from fe.leg import Kept
+from fe.materials import Material
+from fe.plate import Plate
+from fe.restart import ENDING, fingerprint, read_kept, write_kept
+from fe.result import write_state
+from fe.simulate import LoadStep, State
+from fe.simulate import simulate as solve
+
+_EVERY_S = 30.0  # at most so often is a state on the way to a load written, to go on from
+
+
+def simulated_path(
+    mesh: TetMesh,
+    laws: Mapping[str, Material],
+    plate: Plate,
+    path: Sequence[LoadStep],
+    fixed: Sequence[str],
+    element: str,
+    folder: Path,
+    share: Path,
+    threads: int,
+) -> list[State]:
+    """Run one path in a worker: each load's files are written as soon as it is there.
+
+    It goes on from where an earlier run came to, if that was made from the same.
+    """
+    log: list[str] = []
+    made_from = {
+        load.name: fingerprint(mesh, laws, plate, path[: n + 1], fixed, element) for n, load in enumerate(path)
+    }
+    earlier: list[Kept] = []
+    for load in path:
+        found = read_kept(folder / f"{load.name}{ENDING}", made_from[load.name])
+        if found is None:
+            break
+        log.append(f"{load.name}: {found.reached:.0%} of it was there from an earlier run")
+        earlier.append(found)
+        if found.reached < 1.0:
+            break
+    last = time.monotonic()
+
+    def settled(load: LoadStep, kept: Kept) -> None:
+        nonlocal last
+        if time.monotonic() - last > _EVERY_S:
+            write_kept(folder / f"{load.name}{ENDING}", kept, made_from[load.name])
+            last = time.monotonic()
+
+    def keep(state: State) -> None:
+        if state.reached > 0.0 and state.kept is not None:
+            write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
+            write_kept(folder / f"{state.load.name}{ENDING}", state.kept, made_from[state.load.name])
+
+    try:
+        return solve(
+            mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=log.append, keep=keep,
+            settled=settled, earlier=earlier, progress=lambda done: _replaced(share, f"{done:.4f}"),
+        )  # fmt: skip
+    finally:
+        write_whole(folder / f"log-{path[0].name}.txt", "\n".join(log) + "\n")
+
+
+def _replaced(path: Path, text: str) -> None:
+    part = path.with_suffix(".part")
+    part.write_text(text)
+    part.replace(path)

@@ -1,0 +1,45 @@
+"""The demonstration's study file, in both sizes; the demonstration itself is run by `make demo`."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from dvc.errors import OutputError
+from dvc.labels import read_labels
+from mrstrain.demo import _make
+from mrstrain.loads import LOADS
+from mrstrain.plan import plan
+from mrstrain.studyfile import read_study
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "phantom.json").write_text(json.dumps({"parameters": {"seed": 1}}))  # as if the images were there
+    return tmp_path
+
+
+def test_three_sets_on_a_coarser_mesh(folder):
+    _make(folder, 1, False, None)
+    study = read_study(folder)
+    names = [stage.name for stage in plan(study)]
+    assert names[:6] == ["register repeat", *(f"register {x.name}" for x in LOADS), "mesh"]
+    assert [n.split()[0] for n in names[6:]] == ["simulate"] * 3 + ["compare"]
+    for load in LOADS:
+        told = study.loads[load.name]
+        assert (told.normal_n, told.shear_n) == (load.normal_n, load.shear_n or 0.0)
+    labels = read_labels(study.path(str(study.mesh.labels)), study.path(str(study.mesh.names)))
+    assert labels.grid.spacing_mm[0] > 1.0
+
+
+def test_the_published_size_has_all_seven_sets(folder):
+    _make(folder, 1, True, None)
+    study = read_study(folder)
+    assert len(study.models.sets) == 7
+    assert study.mesh.edge_mm < 3.0
+
+
+def test_another_phantom_in_the_folder_is_refused(folder):
+    with pytest.raises(OutputError, match="seed 1"):
+        _make(folder, 2, False, None)

@@ -1,0 +1,80 @@
+"""The methods text: figures from the records of what was done, and no paper that was not used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from dvc.presets import load_preset
+from mrstrain.methods import methods
+
+VERSIONS = {"mrstrain": "9.8.7", "itk-elastix": "0.1.2", "SimpleITK": "3.4.5", "pytetwild": "6.7"}
+
+
+def measured(folder: Path, load: str, align: str = "bone") -> Path:
+    place = folder / load
+    place.mkdir(parents=True)
+    stage = {"name": "heel-mr", "text": load_preset("heel-mr").text}
+    record = {"command": "register", "versions": VERSIONS, "parameters": {"align": align, "seed": 5, "stages": [stage]}}
+    (place / "provenance.json").write_text(json.dumps(record))
+    (place / "quality.json").write_text(json.dumps({"error_of_max_shear": {"source": "A study of 3 heels."}}))
+    return place
+
+
+def simulated(folder: Path, name: str, made: object = None) -> Path:
+    place = folder / name
+    place.mkdir(parents=True)
+    given = {
+        "set": name, "title": f"Set of {name}", "laws": {"fat": {"law": "Ogden, mu0 10.54 kPa"}}, "mesh_made": made,
+        "fixed": ["bone"], "taped": True, "plate": "rigid", "element": "P1: stabilised",
+        "paths": [[{"name": "Load1", "normal_n": 140.0, "shear_n": 0.0}]],
+    }  # fmt: skip
+    (place / "simulation.json").write_text(
+        json.dumps({"command": "simulate", "versions": VERSIONS, "parameters": given})
+    )
+    return place / "Load1.vtu"
+
+
+def told(loads: dict[str, Path], models: dict[str, Path], error_known: bool = True) -> str:
+    return "\n".join(methods(loads, models, 1234, (0.2, 0.5), (0.2, 0.3), 0.1, error_known=error_known, version="1.0"))
+
+
+def test_figures_and_papers_are_those_of_the_records(tmp_path: Path) -> None:
+    loads = {load: measured(tmp_path / "res", load) for load in ("Load1", "Load2")}
+    models = {"trebbi": simulated(tmp_path, "trebbi", {"edge_mm": 2.5, "pytetwild": "6.7"})}
+    models |= {"mine": simulated(tmp_path, "mine"), "ansys": tmp_path / "ansys" / "Load1.csv"}
+    text = told(loads, models)
+    assert text.count("registered non-rigidly") == 1  # both loads alike, in one sentence
+    for said in (
+        "Load1 and Load2: The loaded image was aligned with the unloaded one rigidly on the bone",
+        "itk-elastix 0.1.2", "mrstrain 9.8.7", "control points every 4.5 mm",
+        "1000, 1000, 1000, 500 iterations of 5000",
+        "metric AdvancedNormalizedCorrelation", "seed 5", "SimpleITK 3.4.5", "pytetwild 6.7", "edges of 2.5 mm",
+        "trebbi: Set of trebbi (fat: Ogden, mu0 10.54 kPa)", "Load1 140 N normal, 0 N shear", "ansys (csv)",
+        "1234 tetrahedra", "from 0.2 to 0.5", "tissue above 0.2 and 0.3", "A study of 3 heels.", "no error model",
+    ):  # fmt: skip
+        assert said in text, said
+    for paper in (
+        "Klein S, Staring M, Murphy",
+        "Shamonin DP",
+        "Lowekamp BC",
+        "Hu Y",
+        "Trebbi A",
+        "Dice LR",
+        "Lin LI-K",
+        "Bland JM",
+    ):
+        assert text.count(paper) == 1, paper
+
+
+def test_what_is_not_known_is_not_claimed(tmp_path: Path) -> None:
+    (tmp_path / "Load1").mkdir()
+    text = told({"Load1": tmp_path / "Load1"}, {"ansys": tmp_path / "Load1.csv"}, error_known=False)
+    assert "Load1: the displacement was taken as it was given." in text
+    for absent in ("elastix", "SimpleITK", "fTetWild", "Hu Y", "Trebbi", "draws", "Klein"):
+        assert absent not in text, absent
+    # a set of one's own on a mesh made elsewhere: neither the published sets nor the mesher
+    text = told({"Load1": measured(tmp_path, "a", "none")}, {"mine": simulated(tmp_path, "mine")}, error_known=False)
+    assert "without rigid alignment" in text
+    assert "Hu 2020" not in text
+    assert "Trebbi" not in text
