@@ -203,9 +203,11 @@ def demo(
     from mrstrain.progress import live
 
     with live() as progress:
-        lines = run(out, seed=seed, full=full, workers=workers, progress=progress)
-    for line in lines:
+        done = run(out, seed=seed, full=full, workers=workers, progress=progress)
+    for line in done.lines:
         typer.echo(line)
+    if not done.complete:
+        raise typer.Exit(1)
 
 
 @app.command()
