@@ -113,6 +113,8 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         model = tried(lambda: error_model_of(stages[-1].name) if own is None else read_error_model(told.path(own)))
         if model is None:
             notes.append(f"{stages[-1].name} has no error model: results will have no intervals (`mrstrain accuracy`).")
+    if how.engine != "elastix":
+        notes.append(f"The error of the engine {how.engine} has not been measured yet: results will have no intervals.")
     if told.compare.thresholds is not None:
         tried(lambda: read_thresholds(told.path(str(told.compare.thresholds))))
     for name in told.models.sets:

@@ -144,7 +144,8 @@ def _registrations(study: Study) -> list[Stage]:
     own = [study.path(p) for p in how.parameters]
     error_model = [] if how.error_model is None else [study.path(how.error_model)]
     shared: dict[str, Any] = {
-        "load0": str(load0), "images": aside, "bone": images.bone, "align": how.align, "preset": how.preset,
+        "load0": str(load0), "images": aside, "bone": images.bone, "align": how.align,
+        "engine": how.engine, "preset": how.preset,
         "parameters": [str(p) for p in own], "error_model": str(error_model[0]) if error_model else None,
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "seed": study.study.seed, "threads": 1,
@@ -231,8 +232,8 @@ def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
-    if study.registration.parameters:
-        raise InputError("[models] level sends models through a preset; it does not take [registration] parameters.")
+    if study.registration.parameters or study.registration.engine != "elastix":
+        raise InputError("[models] level sends models through a preset of elastix, and not through [registration]'s.")
     sent = _registrations(study)[-1].arguments
     arguments = {key: sent[key] for key in ("load0", "images", "bone", "preset", "seed")}
     arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}

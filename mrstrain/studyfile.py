@@ -117,6 +117,7 @@ class PlateOf(_Part):
 class Registering(_Part):
     """How images are registered; as the options of `register`."""
 
+    engine: Literal["elastix", "gauss-newton"] = "elastix"
     preset: str = "heel-mr"
     parameters: tuple[str, ...] = ()
     chain: Flag = False
