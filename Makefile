@@ -6,6 +6,7 @@
 #   make lint    ruff, mypy and the import contract
 #   make format  rewrite the sources as ruff formats them
 #   make lock    renew requirements.lock after a change of the dependencies (needs uv; UPGRADE=--upgrade for newer versions)
+#   make docs    the documentation site in ./site (its tools in .venv-docs), refused where a link or a name leads nowhere
 #   make peers   the environment of benchmarks/peers in .venv-peers (2.9 GB; Python 3.11 is what it was tried with)
 #   make clean   remove the environment and the caches
 #
@@ -25,11 +26,11 @@ BIN := $(VENV)/bin
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format lock peers clean
+.PHONY: help setup demo test lint format lock docs peers clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '3,12p' Makefile | sed 's/^# \{0,1\}//'
+	@sed -n '3,13p' Makefile | sed 's/^# \{0,1\}//'
 
 setup: $(VENV)/installed.stamp
 
@@ -67,6 +68,14 @@ lock:
 	$(UV) pip compile pyproject.toml --group dev --universal --python-version 3.11 --generate-hashes \
 		--no-header --no-emit-index-url --no-emit-find-links --quiet $(UPGRADE) -o requirements.lock
 
+docs: .venv-docs/installed.stamp
+	NO_MKDOCS_2_WARNING=1 .venv-docs/$(notdir $(BIN))/mkdocs build --strict --quiet
+
+.venv-docs/installed.stamp: docs/requirements.txt
+	"$(PYTHON)" -m venv --clear .venv-docs
+	.venv-docs/$(notdir $(BIN))/python -m pip install --disable-pip-version-check --quiet -r $<
+	@touch $@
+
 peers: .venv-peers/installed.stamp
 
 .venv-peers/installed.stamp: benchmarks/peers/requirements.txt
@@ -75,4 +84,4 @@ peers: .venv-peers/installed.stamp
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .venv-peers .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist
+	rm -rf $(VENV) .venv-docs .venv-peers site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist

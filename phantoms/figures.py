@@ -40,7 +40,8 @@ def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
         axes.plot(at, bias, color=colour, linestyle="--", marker=".", linewidth=1.2)
     axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
     label_axes(axes, by, "error of the maximal shear")
-    axes.legend(fontsize=9, frameon=False)
+    if axes.get_legend_handles_labels()[0]:  # a small study may have no bin that is large enough
+        axes.legend(fontsize=9, frameon=False)
     return png_bytes(figure)
 
 

@@ -1,0 +1,152 @@
+"""Every tutorial does what it says, from its first block to its last, and the number that it asserts is so."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from sybil import Sybil
+from sybil.parsers.markdown import PythonCodeBlockParser
+
+from dvc.labels import read_labels
+from fe.meshstore import write_tet_mesh
+from mrstrain.cli import app
+from mrstrain.making import phantom
+from mrstrain.studyfile import read_study
+from phantoms.anatomy import Heel
+from phantoms.heel import under_load
+from tests.quick import QUICK
+from tests.test_simulate import dome
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", *DOCS.rglob("*.md")])
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+
+
+def follow(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    """Run the Python blocks of a tutorial one after the other in a folder; the names that they leave."""
+    monkeypatch.chdir(folder)
+    document = Sybil(parsers=[PythonCodeBlockParser()]).parse(DOCS / "tutorials" / page)
+    examples = list(document.examples())
+    assert examples, f"{page} has no Python block"
+    assert any("assert" in example.parsed for example in examples), f"{page} asserts nothing"
+    for example in examples:
+        example.evaluate()
+    return document.namespace
+
+
+def quick_phantom(folder: Path, seed: int) -> Path:
+    """A phantom heel with large voxels under Load1, and parameters that register it in seconds."""
+    phantom(folder, seed=seed, loads=["Load1"], spacing_mm=1.6)
+    (folder / "quick.txt").write_text(QUICK)
+    return folder
+
+
+def write_model(heel: Path, folder: Path, seed: int, share: float) -> None:
+    """A model of bricks as Abaqus writes it, in metres and RAS, that moves by a share of what the phantom does."""
+    labels = read_labels(heel / "tissues.nii.gz", heel / "tissues.csv")
+    bones = [number for number, name in labels.names.items() if name in ("bone", "ankle")]
+    values = labels.labels
+    # Bricks two voxels long, from voxel centre to voxel centre; all corners in the heel.
+    first = np.argwhere(values[:-2:2, :-2:2, :-2:2] > 0) * 2
+    inside = (values[tuple((first[:, None, :] + 2 * CORNERS).T)] > 0).all(axis=0)
+    middle = values[tuple((first + 1).T)]
+    kept = inside & (middle > 0) & ~np.isin(middle, bones)
+    first, tissue = first[kept], middle[kept]
+    corners, which = np.unique((first[:, None, :] + 2 * CORNERS).reshape(-1, 3), axis=0, return_inverse=True)
+    points = labels.grid.points_at(corners.astype(np.float64))
+    u = share * under_load(Heel(seed), "Load1").displacement(points)
+    to_file = np.array([-1e-3, -1e-3, 1e-3])
+    folder.mkdir()
+    lines = ["*HEADING", "a heel", "*NODE"]
+    lines += [f"{n}, {x!r}, {y!r}, {z!r}" for n, (x, y, z) in enumerate((points * to_file).tolist(), start=1)]
+    bricks = which.reshape(-1, 8) + 1
+    for number, name in labels.names.items():
+        of = np.flatnonzero(tissue == number)
+        if len(of):
+            lines += [f"*ELEMENT, TYPE=C3D8, ELSET={name}"]
+            lines += [f"{cell + 1}, " + ", ".join(map(str, bricks[cell])) for cell in of]
+    (folder / "heel.inp").write_text("\n".join(lines) + "\n")
+    rows = [f"{n}, {x!r}, {y!r}, {z!r}" for n, (x, y, z) in enumerate((u * to_file).tolist(), start=1)]
+    (folder / "Load1.csv").write_text("\n".join(["Node Label, U-U1, U-U2, U-U3", *rows]) + "\n")
+
+
+@pytest.fixture(scope="module")
+def heel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return quick_phantom(tmp_path_factory.mktemp("made") / "heel", seed=1)
+
+
+def test_register(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(heel, tmp_path / "heel")
+    shutil.copy(heel / "quick.txt", tmp_path)
+    follow("register.md", tmp_path, monkeypatch)
+
+
+def test_validate(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(heel, tmp_path / "heel")
+    write_model(heel, tmp_path / "abaqus", 1, 0.8)
+    follow("validate.md", tmp_path, monkeypatch)
+
+
+def test_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "quick.txt").write_text(QUICK)
+    follow("preset.md", tmp_path, monkeypatch)
+
+
+def test_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
+    follow("material.md", tmp_path, monkeypatch)
+
+
+@pytest.mark.slow
+def test_cohort(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for seed in (1, 2):
+        subject = tmp_path / f"subject-{seed}"
+        if seed == 1:
+            shutil.copytree(heel, subject)
+        else:
+            quick_phantom(subject, seed)
+        for name, share in (("near", 0.9), ("far", 1.4)):
+            write_model(subject, subject / name, seed, share)
+            (subject / name / "model.toml").write_text('mesh = "heel.inp"\nunit = "m"\nframe = "RAS"\n')
+    follow("cohort.md", tmp_path, monkeypatch)
+
+
+def commands_told() -> list[tuple[str, str]]:
+    """Every `mrstrain ...` line in the code blocks of README and site, with its page."""
+    told = []
+    for page in PAGES:
+        for block in re.findall(r"^```sh\n(.*?)^```", page.read_text(), re.S | re.M):
+            told += [(page.name, line) for line in block.replace("\\\n", " ").splitlines()]
+        told += [(page.name, line.strip()) for line in page.read_text().splitlines() if line.startswith("    ")]
+    return [(page, line.split("#")[0]) for page, line in told if line.startswith("mrstrain ")]
+
+
+def test_every_command_and_option_of_the_pages_is_there() -> None:
+    known = {name: one for name, one in typer.main.get_command(app).commands.items()}  # type: ignore[attr-defined]
+    told = commands_told()
+    assert len(told) > 15
+    for page, line in told:
+        _, name, *words = line.split()
+        assert name in known, (page, line)
+        options = {option for parameter in known[name].params for option in parameter.opts}
+        unknown = {word for word in words if word.startswith("--")} - options
+        assert not unknown, (page, line)
+
+
+def test_study_files_of_the_pages_can_be_read(tmp_path: Path) -> None:
+    blocks = [
+        block
+        for page in PAGES
+        for block in re.findall(r"^```toml\n(.*?)^```", page.read_text(), re.S | re.M)
+        if "[study]" in block
+    ]
+    assert blocks
+    for number, block in enumerate(blocks):
+        (tmp_path / f"{number}.toml").write_text(block)
+        assert read_study(tmp_path / f"{number}.toml").loads
