@@ -28,6 +28,7 @@ _PACKAGES = (
     "vtk",
     "pypardiso",
     "mkl",
+    "ngsolve",
 )
 _BLOCK = 1 << 20
 
