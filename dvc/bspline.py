@@ -118,7 +118,7 @@ class BSpline:
         u, H = np.empty((slabs[-1], 3)), np.empty((slabs[-1], 3, 3))
         coefficients = np.ascontiguousarray(self.coefficients_mm.transpose(0, *(a + 1 for a in order)))
         first, value, slope = zip(
-            *(_along_axis(t, coefficients.shape[a + 1]) for a, t in enumerate(along)), strict=True
+            *(spline_table(t, coefficients.shape[a + 1]) for a, t in enumerate(along)), strict=True
         )
         per_mm = np.ascontiguousarray(self._index_per_mm()[list(order)])
         _on_grid(coefficients, where, slabs, first, value, slope, per_mm, u, H)
@@ -198,7 +198,7 @@ def _evaluated(
 
 
 @njit(cache=True)
-def _basis(f: float) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float]]:
+def spline_basis(f: float) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float]]:
     """Values and slopes of the four cubic B-splines that are not zero at a fraction f of an interval."""
     g = 1.0 - f
     value = (
@@ -227,7 +227,7 @@ def _supported(t: float, count: int) -> bool:
 
 
 @njit(cache=True)
-def _along_axis(t: FloatArray, count: int) -> tuple[IntArray, FloatArray, FloatArray]:
+def spline_table(t: FloatArray, count: int) -> tuple[IntArray, FloatArray, FloatArray]:
     """First control point (-1 where undefined), four values and four slopes for each index along an axis."""
     first = np.full(t.size, -1, np.int64)
     value, slope = np.zeros((t.size, 4)), np.zeros((t.size, 4))
@@ -235,7 +235,7 @@ def _along_axis(t: FloatArray, count: int) -> tuple[IntArray, FloatArray, FloatA
         if _supported(t[i], count):
             below = max(np.floor(t[i]), 1.0)
             first[i] = np.int64(below) - 1
-            v, s = _basis(t[i] - below)
+            v, s = spline_basis(t[i] - below)
             for q in range(4):
                 value[i, q], slope[i, q] = v[q], s[q]
     return first, value, slope
@@ -265,9 +265,9 @@ def _at_indices(
         i, j, k = np.floor(x), np.floor(y), np.floor(z)
         if not mirror:
             i, j, k = max(i, 1.0), max(j, 1.0), max(k, 1.0)
-        a, da = _basis(x - i)
-        b, db = _basis(y - j)
-        c, dc = _basis(z - k)
+        a, da = spline_basis(x - i)
+        b, db = spline_basis(y - j)
+        c, dc = spline_basis(z - k)
         i0, j0, k0 = np.int64(i) - 1, np.int64(j) - 1, np.int64(k) - 1
         for m in range(components):
             total, by_x, by_y, by_z = 0.0, 0.0, 0.0, 0.0

@@ -7,12 +7,10 @@ displacement is that of the tissue relative to its bone; T(X) = R (X + u(X)) + t
 
 from __future__ import annotations
 
-import logging
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -20,23 +18,17 @@ from dvc import elastix
 from dvc.align import Alignment, AlignOn, align, not_aligned
 from dvc.bspline import BSpline
 from dvc.deformation import Composed, Deformation, Within
-from dvc.errors import InputError, ParameterError, RegistrationError
-from dvc.image import Grid, Image, Mask
+from dvc.errors import InputError, ParameterError
+from dvc.gaussnewton import Choice, GaussNewton
+from dvc.image import Image, Mask
+from dvc.nonrigid import by_elastix, by_gauss_newton, without_gaps
 from dvc.presets import Preset, load_preset
 from dvc.resample import fill_missing
 from dvc.shading import without_shading
-from dvc.tissue import tissue_mask, widened
-from dvc.transformfile import bspline_from_elastix
-from dvc.transformwrite import write_elastix_transform
+from dvc.tissue import tissue_mask
 from dvc.worker import Worker
 
 Progress = Callable[[str, float], None]
-
-_log = logging.getLogger("dvc.registration")
-
-_MASK_MARGIN_MM = 3.0
-_CROP_VOXELS = 4
-_LEAST_VOXELS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,19 +38,28 @@ class Settings:
     Attributes
     ----------
     presets : tuple of Preset
-        Non-rigid stages, one after the other; each starts from the coefficients of the one before.
+        Non-rigid stages of elastix, one after the other; each starts from the coefficients of the one before.
     align_on : {"bone", "image", "none"}
         What is aligned rigidly first.
     seed : int
         Seed of every random number.
     threads : int
-        Threads of each worker. Results are equal bit for bit on equal numbers of threads.
+        Threads of each worker. elastix' results are equal bit for bit on equal numbers of threads, those of
+        Gauss-Newton, after the bone's alignment, on any.
+    gauss_newton : GaussNewton, optional
+        Parameters of our own engine, which then takes the place of elastix and the presets.
     """
 
     presets: tuple[Preset, ...] = ()
     align_on: AlignOn = "bone"
     seed: int = 1
     threads: int = 1
+    gauss_newton: GaussNewton | None = None
+
+    @property
+    def engine(self) -> str:
+        """Name of what finds the non-rigid part."""
+        return "elastix" if self.gauss_newton is None else "gauss-newton"
 
     @classmethod
     def of(cls, preset: str = "heel-mr", **others: object) -> Settings:
@@ -84,6 +85,8 @@ class Registration:
     settings : Settings
     seconds : float
         Wall time.
+    choice : Choice or None
+        How strongly Gauss-Newton smoothed, and why; None for elastix.
     """
 
     reference: Image
@@ -94,6 +97,7 @@ class Registration:
     bspline: BSpline
     settings: Settings
     seconds: float
+    choice: Choice | None = None
 
     @property
     def deformation(self) -> Deformation:
@@ -152,7 +156,7 @@ def register(
     """
     began = time.monotonic()
     chosen = settings or Settings.of()
-    if not chosen.presets:
+    if not chosen.presets and chosen.gauss_newton is None:
         raise ParameterError("No registration stage given; name a preset or parameter files.")
     _refuse_other_spacing(chosen.presets)
     tell = progress or (lambda _stage, _fraction: None)
@@ -172,10 +176,16 @@ def register(
         on = None if bone is None else bone.toward_lps()
         alignment = _align(fixed, moving, inside, on, chosen, runner)
         tell("aligning", 1.0)
-        bspline = start
-        for number, preset in enumerate(chosen.presets):
+        bspline, choice = start, None
+        if chosen.gauss_newton is not None:
+            rigid = on if chosen.align_on == "bone" else None
+            bspline, choice = by_gauss_newton(
+                fixed, moving, inside, rigid, alignment, chosen.gauss_newton, start, runner,
+                lambda fraction: tell("registering", fraction),
+            )  # fmt: skip
+        for number, preset in enumerate(chosen.presets if chosen.gauss_newton is None else ()):
             stage = "registering" if len(chosen.presets) == 1 else f"registering, stage {number + 1}"
-            bspline = _nonrigid(
+            bspline = by_elastix(
                 fixed,
                 moving,
                 inside,
@@ -190,7 +200,7 @@ def register(
         if own:
             runner.close()
     assert bspline is not None
-    return Registration(reference, loaded, body, bone, alignment, bspline, chosen, time.monotonic() - began)
+    return Registration(reference, loaded, body, bone, alignment, bspline, chosen, time.monotonic() - began, choice)
 
 
 def _refuse_same(reference: Image, loaded: Image) -> None:
@@ -225,7 +235,7 @@ def _align(
 
     def fit(fixed: Image, moving: Image, where: Mask, seed: int) -> dict[str, tuple[str, ...]]:
         known = Mask(where.grid, where.inside & ~fixed.missing)
-        whole, seen = _without_gaps(moving)
+        whole, seen = without_gaps(moving)
         with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
             return worker.run(
                 "aligning the bone",
@@ -249,19 +259,6 @@ def _seeds(settings: Settings) -> list[int]:
     return [int(s) % 2**30 + 1 for s in drawn]
 
 
-def _without_gaps(image: Image) -> tuple[Image, Mask | None]:
-    """The image with missing voxels filled in, and the mask of those that are known, where any is missing."""
-    missing = image.missing
-    return fill_missing(image), Mask(image.grid, ~missing) if missing.any() else None
-
-
-def _cropped(image: Image, mask: Mask) -> tuple[Image, Mask]:
-    """Both cut to the mask's box and a few voxels around: control points in empty air cost time and find nothing."""
-    box = mask.box(_CROP_VOXELS)
-    grid = image.grid.part(box)
-    return Image(grid, image.values[box]), Mask(grid, mask.inside[box])
-
-
 def _refuse_other_spacing(presets: tuple[Preset, ...]) -> None:
     """Stages add their coefficients up, so their control points must be the same."""
     name = "FinalGridSpacingInPhysicalUnits"
@@ -271,71 +268,3 @@ def _refuse_other_spacing(presets: tuple[Preset, ...]) -> None:
             f"The stages end with different spacings of control points: {sorted(map(' '.join, found))}. Each stage "
             f"starts from the coefficients of the one before, so {name} must be the same in all."
         )
-
-
-def _resolvable(parameters: dict[str, tuple[str, ...]], grid: Grid) -> dict[str, tuple[str, ...]]:
-    """The parameters, with control points no closer than two voxels along any axis of the fixed image.
-
-    Closer ones follow noise: on slices of 6 mm, control points every 4 mm gave a shear of 0.3 where there was none.
-    """
-    name = "FinalGridSpacingInPhysicalUnits"
-    if name not in parameters:
-        return parameters
-    given = np.array([float(v) for v in parameters[name]])
-    asked = np.broadcast_to(given, (3,)) if given.size in (1, 3) else np.full(3, given[0])
-    spacing = np.maximum(asked, _LEAST_VOXELS * grid.spacing_mm)
-    if np.all(spacing <= asked + 1e-9):
-        return parameters
-    told = " x ".join(f"{s:.3g}" for s in spacing)
-    _log.warning(
-        "The unloaded image, %s, is too coarse for control points every %g mm; %s mm are used.", grid, given[0], told
-    )
-    return parameters | {name: tuple(f"{s:.6g}" for s in spacing)}
-
-
-def _nonrigid(
-    reference: Image,
-    loaded: Image,
-    body: Mask,
-    alignment: Alignment,
-    preset: Preset,
-    seed: int,
-    start: BSpline | None,
-    worker: Worker,
-    tell: Callable[[float], None],
-) -> BSpline:
-    if "BSplineTransform" not in preset.transform:
-        raise ParameterError(
-            f'{preset.name}: (Transform "{preset.transform}") is no B-spline; the non-rigid stage needs '
-            '"RecursiveBSplineTransform" or "BSplineTransform".'
-        )
-    fixed = fill_missing(reference)
-    back = alignment.motion.inverse()
-    moved_grid = loaded.grid.moved_by(back.rotation, back.translation_mm)
-    moving, moving_mask = _without_gaps(Image(moved_grid, loaded.values))
-    mask = Mask(reference.grid, widened(body, _MASK_MARGIN_MM).inside & ~reference.missing)
-    fixed, mask = _cropped(fixed, mask)
-    with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
-        initial = None
-        if start is not None:
-            initial = str(write_elastix_transform(Path(folder), start, None, fixed.grid)[0])
-        total = preset.iterations
-        run = preset.complete(seed=seed, combine="Add" if start is not None else "Compose")
-        parameters = _resolvable(run, fixed.grid)
-        found = worker.run(
-            f"registering with {preset.name}",
-            elastix.register,
-            fixed,
-            moving,
-            parameters,
-            mask,
-            moving_mask,
-            initial,
-            folder,
-            watch=lambda: tell(min(1.0, elastix.finished_iterations(Path(folder)) / total)),
-        )
-    tell(1.0)
-    bspline = bspline_from_elastix(found.transform)
-    if not np.isfinite(bspline.coefficients_mm).all():
-        raise RegistrationError(f"{preset.name}: elastix' optimiser diverged (coefficients are not finite).")
-    return bspline.plus(start) if start is not None else bspline

@@ -1,13 +1,15 @@
 """Direct solution of the symmetric, indefinite systems of the solver: the one file that knows which library does it.
 
-PARDISO of Intel's MKL where it runs (x86-64), SciPy's SuperLU elsewhere. A factorisation takes most of a simulation's
-time, so an old one is used as the preconditioner of an iterative solution for as long as that is quicker.
+PARDISO of Intel's MKL where it runs (x86-64); elsewhere NGSolve's sparse Cholesky where it is installed, and SciPy's
+SuperLU where it is not. A factorisation takes most of a simulation's time, so an old one is used as the preconditioner
+of an iterative solution for as long as that is quicker.
 """
 
 from __future__ import annotations
 
 import platform
-from typing import Protocol
+from importlib.util import find_spec
+from typing import Any, Protocol
 
 import numpy as np
 from scipy import sparse
@@ -46,11 +48,19 @@ def factors(indptr: IntArray, indices: IntArray, *, threads: int = 1, library: s
     ----------
     threads : int
         Threads of PARDISO.
-    library : {"pardiso", "superlu"}, optional
+    library : {"pardiso", "ngsolve", "superlu"}, optional
         By default the fastest that this machine has.
     """
-    chosen = library or ("pardiso" if platform.machine().lower() in ("x86_64", "amd64") else "superlu")
-    return _Pardiso(indptr, indices, threads) if chosen == "pardiso" else _SuperLU(indptr, indices)
+    chosen = library or _fastest()
+    if chosen == "pardiso":
+        return _Pardiso(indptr, indices, threads)
+    return _NGSolve(indptr, indices) if chosen == "ngsolve" else _SuperLU(indptr, indices)
+
+
+def _fastest() -> str:
+    if platform.machine().lower() in ("x86_64", "amd64"):
+        return "pardiso"
+    return "ngsolve" if find_spec("ngsolve") is not None else "superlu"
 
 
 class _Pardiso:
@@ -82,6 +92,40 @@ class _Pardiso:
 
     def close(self) -> None:
         self._solver.free_memory(everything=True)
+
+
+class _NGSolve:
+    """L D L^T without pivoting, of the lower triangle; ordered and analysed once."""
+
+    def __init__(self, indptr: IntArray, indices: IntArray) -> None:
+        from ngsolve import la
+
+        size = len(indptr) - 1
+        columns = np.repeat(np.arange(size), np.diff(indptr))  # rows of the upper triangle
+        counted = np.arange(len(indices), dtype=np.float64)
+        self._matrix = la.SparseMatrixd.CreateFromCOO(indices.tolist(), columns.tolist(), counted.tolist(), size, size)
+        self._values = self._matrix.AsVector().FV().NumPy()
+        self._order = self._values.astype(np.int64)  # where the library keeps which entry
+        self._inverse: Any = None
+
+    def factorise(self, data: FloatArray) -> None:
+        self._values[:] = data[self._order]
+        if self._inverse is None:
+            self._inverse = self._matrix.Inverse(inverse="sparsecholesky")
+        else:
+            self._inverse.Update()
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        given, found = self._matrix.CreateColVector(), self._matrix.CreateColVector()
+        given.FV().NumPy()[:] = right
+        found.data = self._inverse * given
+        solution = np.array(found.FV().NumPy())
+        if not np.isfinite(solution).all():
+            raise SingularError("The system cannot be factorised (NGSolve: a pivot is zero).")
+        return solution
+
+    def close(self) -> None:
+        self._inverse = None
 
 
 class _SuperLU:

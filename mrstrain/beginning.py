@@ -57,7 +57,7 @@ class Begun:
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         return [
             *lines,
-            f"Study file: {self.path}. Look at the forces in it; then: mrstrain check {self.path.parent}",
+            f"Study file: {self.path}. Put the forces in; then: mrstrain check {self.path.parent}",
         ]
 
 
@@ -104,13 +104,14 @@ def _look(place: Path) -> Found:
                 found.labels = found.labels or name
         elif _BONE.search(stem):
             found.bone_mask = found.bone_mask or name
-        elif _AGAIN.search(stem):
-            found.repeat = found.repeat or name
         elif _UNLOADED.search(stem):
+            if _AGAIN.search(stem):
+                found.repeat = found.repeat or name
+                continue
             if found.load0 is not None:
                 raise InputError(f"{place}: both {found.load0} and {name} seem to be the unloaded image; rename one.")
             found.load0 = name
-        elif _LOADED.search(stem):
+        elif _LOADED.search(stem) and not _AGAIN.search(stem):
             found.loads[stem] = name
     found.names = _table(place, found.labels)
     found.mesh_names = _table(place, found.mesh_labels)

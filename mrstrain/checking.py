@@ -13,6 +13,7 @@ import numpy as np
 from dvc.errors import InputError, MrstrainError
 from dvc.image import Image, LabelMap
 from dvc.imagefile import read_image
+from dvc.kinematics import plate_axes
 from dvc.labels import fit_mask, read_labels, read_mask
 from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import usable_cores
@@ -91,9 +92,6 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
             labels = tried(lambda: fit_mask(labels, reference.grid, images.labels)) or labels
         if images.bone_mask is None:
             tried(lambda: labels.region(images.bone))
-        for bone in told.mesh.bones:
-            if told.mesh.labels is None:
-                tried(lambda bone=bone: labels.region(bone))  # type: ignore[misc]
     if isinstance(reference, Image):
         notes.insert(0, f"Load0: {reference.grid}")
         for given in (images.bone_mask, images.tissue):
@@ -115,6 +113,8 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         model = tried(lambda: error_model_of(stages[-1].name) if own is None else read_error_model(told.path(own)))
         if model is None:
             notes.append(f"{stages[-1].name} has no error model: results will have no intervals (`mrstrain accuracy`).")
+    if how.engine != "elastix":
+        notes.append(f"The error of the engine {how.engine} has not been measured yet: results will have no intervals.")
     if told.compare.thresholds is not None:
         tried(lambda: read_thresholds(told.path(str(told.compare.thresholds))))
     for name in told.models.sets:
@@ -127,6 +127,19 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         labels = own_labels if isinstance(own_labels, LabelMap) else labels
     if told.models.results and labels is not None:
         tried(lambda: _foreign(told, labels))
+    tried(lambda: plate_axes(-np.asarray(told.plate.normal), told.plate.shear_direction))
+    low, high = told.compare.strains
+    if not 0.0 <= low < high:
+        wrong.append(f"[compare] strains: the range rises from 0 or more; got {low:g} to {high:g}.")
+    if isinstance(labels, LabelMap) and told.mesh.file is None:
+        finer = [] if told.mesh.finer is None else [told.mesh.finer.region]
+        for region in (*told.mesh.bones, *finer):
+            tried(lambda region=region: labels.region(region))  # type: ignore[misc]
+        unknown = set(told.models.fixed) - {"bone", "skin", "cut"}
+        if unknown:
+            wrong.append(
+                f"[models] fixed: a mesh has the surfaces bone, skin and cut; got {', '.join(sorted(unknown))}."
+            )
     planned = tried(lambda: plan(told))
     if planned and not wrong:
         notes += _cost(told, planned, reference, labels, workers or usable_cores())

@@ -13,8 +13,11 @@ import typer
 from mrstrain import modelcommands, studycommands
 from mrstrain.options import (
     Align,
+    Bending,
     Bone,
     BoneLabel,
+    Engine,
+    EngineName,
     Frame,
     Labels,
     MeshFile,
@@ -26,6 +29,7 @@ from mrstrain.options import (
     Shear,
     Tissue,
     Unit,
+    Volume,
 )
 
 app = typer.Typer(
@@ -66,7 +70,10 @@ def register(
     labels: Labels = None,
     names: Names = None,
     align: Annotated[Align, typer.Option(help="What to align rigidly first.")] = Align.BONE,
-    preset: Annotated[str, typer.Option(help="Named registration parameters.")] = "heel-mr",
+    engine: EngineName = Engine.ELASTIX,
+    bending: Bending = None,
+    volume: Volume = None,
+    preset: Annotated[str, typer.Option(help="Named parameters of elastix.")] = "heel-mr",
     parameters: Annotated[
         list[Path] | None, typer.Option(help="elastix parameter file(s) of your own, instead of a preset.")
     ] = None,
@@ -119,6 +126,9 @@ def register(
             labels=labels,
             names=names,
             align=align.value,
+            engine=engine.value,
+            bending=bending,
+            volume=volume,
             preset=preset,
             parameters=parameters or (),
             allow_unknown_parameters=allow_unknown_parameters,
@@ -203,9 +213,11 @@ def demo(
     from mrstrain.progress import live
 
     with live() as progress:
-        lines = run(out, seed=seed, full=full, workers=workers, progress=progress)
-    for line in lines:
+        done = run(out, seed=seed, full=full, workers=workers, progress=progress)
+    for line in done.lines:
         typer.echo(line)
+    if not done.complete:
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import queue
 import time
 import traceback
 import uuid
@@ -13,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, Future, LocalCluster, as_completed, get_worker
+from distributed import Client, Future, LocalCluster, get_worker
+from filelock import FileLock
 
 from dvc.errors import InputError, MrstrainError
 from dvc.worker import usable_cores
@@ -21,7 +23,8 @@ from mrstrain import stages
 from mrstrain.stages import Given
 
 _TELL_EVERY_S = 1.0
-_CONNECT_S = 10.0
+_CONNECT_S, _WORKERS_S = 10.0, 60.0
+_LOOK_EVERY_S, _ALONE_S = 5.0, 120.0
 _SETTINGS = {
     "distributed.worker.daemon": False,  # a stage starts processes of its own
     "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself
@@ -40,7 +43,7 @@ class Cluster:
         self._client = client
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], str] = {}
-        self._finished = as_completed(with_results=False)
+        self._finished: queue.Queue[Future[Any]] = queue.Queue()
         client.subscribe_topic(self._topic, lambda event: watch(*event[1]))
 
     @property
@@ -48,22 +51,36 @@ class Cluster:
         """Stages that run at once."""
         return sum(self._client.nthreads().values())
 
-    def begin(self, name: str, function: str, arguments: Mapping[str, Any]) -> None:
-        """Start a stage as soon as a worker is free."""
+    def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path) -> None:
+        """Start a stage as soon as a worker is free, and nobody else holds its lock."""
         key = f"{name.replace(' ', '-')}-{uuid.uuid4().hex}"
-        future = self._client.submit(_run, self._topic, name, function, dict(arguments), key=key, pure=False)
+        future = self._client.submit(_run, self._topic, name, function, dict(arguments), str(lock), key=key, pure=False)
         self._under_way[future] = name
-        self._finished.add(future)
+        future.add_done_callback(self._finished.put)
 
     def next(self) -> tuple[str, Given | str, float]:
         """Wait for the next stage to end: its name, what it gave or why it failed, and the seconds it took."""
-        future = next(self._finished)
-        name = self._under_way.pop(future)
+        alone_since: float | None = None
+        while True:
+            try:
+                future = self._finished.get(timeout=_LOOK_EVERY_S)
+                break
+            except queue.Empty:
+                left = self._client.status == "running" and self._client.nthreads()
+                alone_since = None if left else alone_since or time.monotonic()
+                if alone_since is not None and time.monotonic() - alone_since > _ALONE_S:
+                    future = next(iter(self._under_way))
+                    return self._under_way.pop(future), "No worker and no scheduler is left that could run it.", 0.0
+        name = self._under_way.pop(future, "")
+        if not name:  # given up before
+            return self.next()
         if future.status == "finished":
             outcome, seconds = future.result()
             return name, outcome, seconds
         error = future.exception() if future.status == "error" else None
-        return name, f"The worker that ran it was lost more than once ({error or future.status}). {_MEMORY}", 0.0
+        if error is None:
+            return name, f"The scheduler was lost, or ended it ({future.status}).", 0.0
+        return name, f"The worker that ran it was lost more than once ({error}). {_MEMORY}", 0.0
 
     @property
     def busy(self) -> bool:
@@ -119,6 +136,12 @@ def cluster(
                 f"No Dask scheduler answers at {scheduler} ({error}). Start one: see docs/cluster.md."
             ) from error
         with client:
+            try:
+                client.wait_for_workers(1, timeout=_WORKERS_S)
+            except TimeoutError as none:
+                raise InputError(
+                    f"The scheduler at {scheduler} has no workers after {_WORKERS_S:.0f} s; see docs/cluster.md."
+                ) from none
             _refuse_unfit(client, scheduler, places)
             made = Cluster(client, watch)
             try:
@@ -142,14 +165,17 @@ def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
     finally:
         for token in tokens:
             token.unlink(missing_ok=True)
-    if not answers:
-        raise InputError(f"The scheduler at {address} has no workers yet: start some (docs/cluster.md).")
     for worker, (version, daemon, seen) in answers.items():
+        threads = client.nthreads().get(worker, 1)
         if version != __version__:
             raise InputError(f"The worker {worker} has mrstrain {version}, and here is {__version__}: use one version.")
         if not seen:
             raise InputError(
                 f"The worker {worker} does not see {places[0]}: a study has to lie on a disk that all share."
+            )
+        if threads > 1:
+            raise InputError(
+                f"The worker {worker} runs {threads} stages at once; each needs a process of its own: --nthreads 1."
             )
         if daemon:
             raise InputError(
@@ -164,8 +190,8 @@ def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:
     return __version__, multiprocessing.current_process().daemon, all(Path(token).exists() for token in tokens)
 
 
-def _run(topic: str, name: str, function: str, arguments: dict[str, Any]) -> tuple[Given | str, float]:
-    """Run a stage in a worker; errors come back as sentences."""
+def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: str) -> tuple[Given | str, float]:
+    """Run a stage in a worker, alone; errors come back as sentences."""
     began, told = time.monotonic(), -_TELL_EVERY_S
     worker = get_worker()
 
@@ -178,7 +204,8 @@ def _run(topic: str, name: str, function: str, arguments: dict[str, Any]) -> tup
 
     tell("begun", 0.0)
     try:
-        outcome: Given | str = getattr(stages, function)(tell, **arguments)
+        with FileLock(lock):
+            outcome: Given | str = getattr(stages, function)(tell, **arguments)
     except MrstrainError as error:
         outcome = str(error)
     except Exception:

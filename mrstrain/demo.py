@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from dvc.errors import OutputError
@@ -17,7 +17,7 @@ from dvc.transformfile import read_transform
 from dvc.whole import write_whole
 from mrstrain.loads import LOADS
 from mrstrain.making import phantom
-from mrstrain.plan import REGISTRATION, plan
+from mrstrain.plan import REGISTRATION
 from mrstrain.running import REPORT, Ran, run
 from mrstrain.runpage import write_run_report
 from mrstrain.studyfile import FILE
@@ -29,6 +29,7 @@ Told = Callable[[str, str, float], None]
 
 _SETS = ("trebbi", "luboz", "akrami")
 _ALL_SETS = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")
+_COARSE = "tissues_to_mesh_coarse"
 _COARSE_MM = 1.2  # voxels of the label map that is meshed
 _FIGURES = ("true_p50", "true_p95", "shear_rmse", "shear_bias", "u_p50_mm", "u_p95_mm")
 _STUDY = """# The demonstration: a phantom heel, whose strain is known at every point (see the folder truth).
@@ -59,6 +60,14 @@ shear_n = {shear_n}
 """
 
 
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What `demo` gave: lines for a person, the report's path last, and whether every stage has a whole result."""
+
+    lines: tuple[str, ...]
+    complete: bool
+
+
 def demo(
     out: Path | str,
     *,
@@ -66,7 +75,7 @@ def demo(
     full: bool = False,
     workers: int | None = None,
     progress: Told | None = None,
-) -> list[str]:
+) -> Shown:
     """Make a heel phantom under four loads, run its study, and compare the measurement with the truth.
 
     Parameters
@@ -83,21 +92,20 @@ def demo(
 
     Returns
     -------
-    list of str
-        What was found, and the report's path, line by line.
+    Shown
 
     Raises
     ------
     OutputError
-        If the folder holds another phantom.
+        If the folder holds another phantom, or files of somebody's own.
     """
     target = Path(out)
     _make(target, seed, full, progress)
     ran = run(target, workers=workers, progress=progress)
     errors = _errors(target, seed, ran)
     _write_table(target / "error.csv", errors)
-    write_run_report(target / "results" / REPORT, ran.study, plan(ran.study), ran.outcomes, ahead=[_section(errors)])
-    return _told(errors, ran)
+    write_run_report(target / "results" / REPORT, ran.study, ran.outcomes, ahead=[_section(errors)])
+    return Shown(tuple(_told(errors, ran)), ran.complete)
 
 
 def _make(target: Path, seed: int, full: bool, progress: Told | None) -> None:
@@ -109,17 +117,27 @@ def _make(target: Path, seed: int, full: bool, progress: Told | None) -> None:
         if old != seed:
             raise OutputError(f"{target} holds the phantom of seed {old}; choose another --out for seed {seed}.")
     else:
+        own = sorted(p.name for p in target.iterdir()) if target.is_dir() else []
+        if (target / FILE).exists() or any(name.startswith(("Load", "tissues", "calcaneus")) for name in own):
+            raise OutputError(f"{target} holds files that the demonstration would replace; choose another --out.")
         phantom(target, seed=seed, progress=progress)
-    to_mesh = "tissues_to_mesh" if full else "tissues_to_mesh_coarse"
+    texts = {size: _text(seed, size) for size in (False, True)}
+    study = target / FILE
+    if study.exists() and study.read_text(encoding="utf-8") not in texts.values():
+        return  # changed by a person: theirs is run
     if not full:
         grid = heel_grid(_COARSE_MM, heel.size)
-        write_labels(target / f"{to_mesh}.nii.gz", labels_to_mesh(heel, labels_of(heel, grid)))
+        write_labels(target / f"{_COARSE}.nii.gz", labels_to_mesh(heel, labels_of(heel, grid)))
+    write_whole(study, texts[full])
+
+
+def _text(seed: int, full: bool) -> str:
+    """The study file of one size."""
     loads = "".join(_LOAD.format(name=load.name, normal_n=load.normal_n, shear_n=load.shear_n or 0.0) for load in LOADS)
-    text = _STUDY.format(
-        seed=seed, loads=loads, edge_mm=2.8 if full else 4.0, to_mesh=to_mesh,
+    return _STUDY.format(
+        seed=seed, loads=loads, edge_mm=2.8 if full else 4.0, to_mesh="tissues_to_mesh" if full else _COARSE,
         sets=json.dumps(_ALL_SETS if full else _SETS),
     )  # fmt: skip
-    write_whole(target / FILE, text)
 
 
 def _errors(target: Path, seed: int, ran: Ran) -> dict[str, tuple[TissueError, ...]]:

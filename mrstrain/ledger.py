@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -33,6 +34,8 @@ class Record(BaseModel):
     files : dict
         What it made, below the study's results, with the size in bytes.
     given : Given
+    made_from : dict
+        Hashes of its input files by their names, and its arguments.
     """
 
     model_config = ConfigDict(
@@ -45,6 +48,7 @@ class Record(BaseModel):
     seconds: float
     files: dict[str, int]
     given: Given
+    made_from: dict[str, Any] = {}
 
     @property
     def identity(self) -> str:
@@ -68,21 +72,24 @@ class Ledger:
         self.folder = out / ".study"
         self._hashes: dict[tuple[str, int, int], str] = {}
 
-    def key(self, stage: Stage, arguments: Mapping[str, object], built_on: Mapping[str, Record]) -> str:
+    def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:
+        """Hashes of a stage's input files, and its arguments without the study's own place.
+
+        A study that is moved as a whole so stays finished.
+        """
+        plain = json.dumps(arguments, sort_keys=True, default=list).replace(str(self.home), "")
+        return {"files": [[path.name, self._hash(path)] for path in stage.files], "arguments": json.loads(plain)}
+
+    def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, Record]) -> str:
         """Hash of what a stage would be made from now; ``built_on`` are the stages whose results it reads."""
         told = versions()
         content = {
             "stage": stage.name,
-            "arguments": self._relative(arguments),
-            "files": [self._hash(path) for path in stage.files],
+            **made_from,
             "built_on": {name: record.identity for name, record in sorted(built_on.items())},
             "versions": {name: told[name] for name in _MATTERS},
         }
-        return hashlib.sha256(json.dumps(content, sort_keys=True, default=list).encode()).hexdigest()
-
-    def _relative(self, arguments: Mapping[str, object]) -> str:
-        """Arguments without the study's own place: a study that is moved as a whole stays finished."""
-        return json.dumps(arguments, sort_keys=True, default=list).replace(str(self.home), "")
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def _hash(self, path: Path) -> str:
         if path.is_dir():
@@ -105,20 +112,36 @@ class Ledger:
         )
         return record if there else None
 
-    def forget(self, stage: Stage) -> None:
-        """Take a stage as not finished; what it had made stays for it to go on from."""
+    def forget(self, stage: Stage, reason: str = "") -> None:
+        """Take a stage as not finished, and note why; what it had made stays for it to go on from."""
         self._place(stage.name).unlink(missing_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if reason:
+            write_whole(self._reason(stage.name), reason)
+        else:
+            self._reason(stage.name).unlink(missing_ok=True)
 
-    def remove(self, stage: Stage) -> None:
+    def reason(self, stage: Stage) -> str:
+        """Why a stage has no result; empty where it was never run."""
+        try:
+            return self._reason(stage.name).read_text(encoding="utf-8")
+        except OSError:
+            return ""
+
+    def lock(self, stage: Stage) -> Path:
+        """A file that whoever runs the stage holds locked: a run that was killed may still be at it on a cluster."""
+        return self.folder / f"{stage.name}.lock"
+
+    def remove(self, stage: Stage, reason: str = "") -> None:
         """Forget a stage and remove what it had made."""
-        self.forget(stage)
+        self.forget(stage, reason)
         for place in stage.gives:
             if place.is_dir():
                 shutil.rmtree(place)
             else:
                 place.unlink(missing_ok=True)
 
-    def keep(self, stage: Stage, key: str, given: Given, seconds: float) -> Record:
+    def keep(self, stage: Stage, key: str, made_from: Mapping[str, Any], given: Given, seconds: float) -> Record:
         """Record that a stage is finished."""
         found = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
         files = {p.relative_to(self.out).as_posix(): p.stat().st_size for p in found if p.is_file()}
@@ -130,3 +153,6 @@ class Ledger:
 
     def _place(self, name: str) -> Path:
         return self.folder / f"{name}.json"
+
+    def _reason(self, name: str) -> Path:
+        return self.folder / f"{name}.failed.txt"

@@ -58,7 +58,7 @@ def model_files(
     Raises
     ------
     InputError
-        If a model is not there, has no file of a measured load, or two have one name.
+        If a model is not there, two have one name, or none has a file of a measured load.
     """
     if not models:
         raise InputError("No model is given: a folder with a file for each load, or a file.")
@@ -70,9 +70,11 @@ def model_files(
         if name in taken:
             raise InputError(f"Two models are called '{name}': give their folders names of their own.")
         if not chosen:
-            raise InputError(
-                f"{place} has no file of a measured load ({', '.join(loads)}), ending in {', '.join(ENDINGS)}."
-            )
+            lacking = f"no file of a measured load ({', '.join(loads)}), ending in {', '.join(ENDINGS)}"
+            if len(models) == 1:
+                raise InputError(f"{place} has {lacking}.")
+            notes.append(f"{name} has {lacking}: it is left out.")
+            continue
         taken.add(name)
         reached = _reached(place)
         reading = _reading(place, usual)
@@ -107,6 +109,19 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
     if place.stem in _reached(place):
         raise InputError(f"{place} is a simulation of {place.stem}, and {loads[0]} was measured.")
     return place.stem, {loads[0]: place}
+
+
+def files_named(place: Path) -> list[Path]:
+    """Files that a model's settings name, and the settings themselves where they do not lie in its folder."""
+    settings = (place if place.is_dir() else place.parent) / SETTINGS
+    if not settings.is_file():
+        return []
+    try:
+        told = tomllib.loads(settings.read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # said where the model is read
+        return [settings]
+    named = [settings.parent / str(told[key]) for key in ("mesh", "to_image") if isinstance(told.get(key), str)]
+    return [settings, *(path for path in named if path.is_file())]
 
 
 def loads_of(place: Path, has_mesh: bool) -> list[str]:

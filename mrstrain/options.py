@@ -17,6 +17,13 @@ class Align(StrEnum):
     NONE = "none"
 
 
+class Engine(StrEnum):
+    """What finds the non-rigid part of a registration."""
+
+    ELASTIX = "elastix"
+    GAUSS_NEWTON = "gauss-newton"
+
+
 class Frame(StrEnum):
     """Frame of coordinates in a mesh or landmark file."""
 
@@ -51,3 +58,9 @@ ModelMesh = Annotated[Path | None, typer.Option(help="Mesh of nodal displacement
 MeshFile = Annotated[Path | None, typer.Option(help="Mesh to put displacement and strain on.")]
 MeshUnit = Annotated[Unit, typer.Option(help="Unit of the mesh's coordinates.")]
 MeshFrame = Annotated[Frame, typer.Option(help="Frame of the mesh's coordinates.")]
+EngineName = Annotated[Engine, typer.Option("--engine", help="What finds the non-rigid part.")]
+Bending = Annotated[
+    float | None,
+    typer.Option(help="gauss-newton: weight of bending, 1/mm. Default: chosen for each pair by cross-validation."),
+]
+Volume = Annotated[float | None, typer.Option(help="gauss-newton: weight of the change of volume, 1/mm3.")]

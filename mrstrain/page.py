@@ -154,6 +154,7 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
             ),
         ]
         spacing = np.asarray(alignment["control_spacing_mm"], dtype=np.float64)
+        rows.append(("Engine of the non-rigid registration", str(alignment["engine"]), ""))
         rows.append(("Spacing of the B-spline's control points", " x ".join(f"{s:.3g}" for s in spacing), "mm"))
     if quality.similarity is not None:
         for said, value in zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True):

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from dvc.errors import MrstrainError
 from mrstrain.ledger import Ledger, Record
 from mrstrain.plan import Stage
 from mrstrain.stages import Given
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from mrstrain.cluster import Cluster
 
 Tell = Callable[[str], None]
+
+_OUT_OF_DATE = "Made from other inputs than the study names now."
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +30,7 @@ class Outcome:
     record : Record or None
         What it made; None where it has no result.
     reason : str
-        Why it has none.
+        Why it has none, or is no result of what the study says now.
     again : bool
         Whether it was there already.
     """
@@ -38,10 +41,17 @@ class Outcome:
     again: bool = False
 
     @property
+    def whole(self) -> bool:
+        """Whether there is a result, complete, and of what the study says now."""
+        return self.record is not None and self.record.given.complete and not self.reason
+
+    @property
     def words(self) -> str:
         """In a word or two, for a table."""
         if self.record is None:
             return "not run" if self.reason.startswith("Not run") else "FAILED"
+        if self.reason:
+            return "OUT OF DATE"
         return "in part" if not self.record.given.complete else "there already" if self.again else "done"
 
 
@@ -65,7 +75,7 @@ class Pipeline:
         self.stages, self.ledger = tuple(stages), ledger
         self._only, self._force = tuple(only), tuple(force)
         self.outcomes: dict[str, Outcome] = {}
-        self._keys: dict[str, str] = {}
+        self._keys: dict[str, tuple[str, Mapping[str, Any]]] = {}
         self._waiting = {stage.name: stage for stage in stages}
 
     def in_order(self) -> dict[str, Outcome]:
@@ -88,26 +98,39 @@ class Pipeline:
                     continue
                 del self._waiting[stage.name]
                 moved = True
-                lacking = self._lacking(stage)
-                if lacking:
-                    self.outcomes[stage.name] = Outcome(stage.name, None, f"Not run: {lacking}")
-                    self.ledger.remove(stage)
+                try:
+                    work = self._settled(stage)
+                except (OSError, MrstrainError) as failure:  # an input that is gone, or may not be read
+                    self.outcomes[stage.name] = Outcome(stage.name, None, str(failure))
                     continue
-                arguments = self._arguments(stage)
-                built_on = {name: r for name in stage.before if (r := self.outcomes[name].record) is not None}
-                key = self.ledger.key(stage, arguments, built_on)
-                kept = self.ledger.finished(stage)
-                if not _among(stage, self._only, default=True):
-                    reason = "Not run: it is not among those asked for." if kept is None else ""
-                    if kept is not None and kept.key != key:
-                        reason = "Made from other inputs than now, and not among those asked for."
-                    self.outcomes[stage.name] = Outcome(stage.name, kept, reason, again=True)
-                elif kept is not None and kept.key == key and not _among(stage, self._force, default=False):
-                    self.outcomes[stage.name] = Outcome(stage.name, kept, again=True)
-                else:
-                    self._keys[stage.name] = key
-                    ready.append((stage, arguments))
+                if work is not None:
+                    ready.append((stage, work))
         return ready
+
+    def _settled(self, stage: Stage) -> Mapping[str, Any] | None:
+        """Give the arguments of a stage that has to be run now; None for one whose outcome is known."""
+        lacking = self._lacking(stage)
+        if lacking:
+            self.outcomes[stage.name] = Outcome(stage.name, None, f"Not run: {lacking}")
+            return None
+        arguments = self._arguments(stage)
+        made_from = self.ledger.made_from(stage, arguments)
+        built_on = {name: r for name in stage.before if (r := self.outcomes[name].record) is not None}
+        key = self.ledger.key(stage, made_from, built_on)
+        kept = self.ledger.finished(stage)
+        same = kept is not None and kept.key == key
+        if not _among(stage, self._only, default=True):
+            reason = self._why_not(stage) if kept is None else "" if same else _OUT_OF_DATE
+            self.outcomes[stage.name] = Outcome(stage.name, kept, reason, again=True)
+        elif kept is not None and same and not kept.given.retry and not _among(stage, self._force, default=False):
+            self.outcomes[stage.name] = Outcome(stage.name, kept, again=True)
+        else:
+            self._keys[stage.name] = key, made_from
+            return arguments
+        return None
+
+    def _why_not(self, stage: Stage) -> str:
+        return self.ledger.reason(stage) or "Not run: it has no result, and is not among those asked for."
 
     def forecast(self) -> dict[str, str]:
         """What a run would do with each stage, without doing it: "done already", "run", or "left out"."""
@@ -123,10 +146,11 @@ class Pipeline:
             else:
                 some = {
                     argument: [value for name, value in of.items() if kept[name] is not None]
-                    for argument, of in stage.some.items()
+                    for argument, of in {**stage.some, **stage.perhaps}.items()
                 }
                 built_on = {name: r for name in stage.before if (r := kept[name]) is not None}
-                same = record.key == self.ledger.key(stage, {**stage.arguments, **some}, built_on)
+                made_from = self.ledger.made_from(stage, {**stage.arguments, **some})
+                same = record.key == self.ledger.key(stage, made_from, built_on) and not record.given.retry
                 told[stage.name] = "done already" if same else "run"
         return told
 
@@ -142,7 +166,7 @@ class Pipeline:
     def _arguments(self, stage: Stage) -> Mapping[str, Any]:
         there = {
             argument: [value for name, value in of.items() if self.outcomes[name].record is not None]
-            for argument, of in stage.some.items()
+            for argument, of in {**stage.some, **stage.perhaps}.items()
         }
         return {**stage.arguments, **there}
 
@@ -154,23 +178,32 @@ class Pipeline:
             if name not in before:
                 tell(f"{name}: {outcome.words}" + (f". {outcome.reason}" if outcome.reason else ""))
         for stage, arguments in ready:
-            if stage.goes_on and not _among(stage, self._force, default=False):
-                self.ledger.forget(stage)
-            else:
-                self.ledger.remove(stage)
-            for place in stage.gives:
-                place.parent.mkdir(parents=True, exist_ok=True)
-            cluster().begin(prefix + stage.name, stage.kind, arguments)
+            try:
+                if stage.goes_on and not _among(stage, self._force, default=False):
+                    self.ledger.forget(stage)
+                else:
+                    self.ledger.remove(stage)
+                for place in stage.gives:
+                    place.parent.mkdir(parents=True, exist_ok=True)
+            except (OSError, MrstrainError) as failure:
+                self.end(stage.name, str(failure), 0.0, tell)
+                continue
+            cluster().begin(prefix + stage.name, stage.kind, arguments, self.ledger.lock(stage))
 
     def end(self, name: str, outcome: Given | str, seconds: float, tell: Tell) -> None:
         """Record how a stage ended that was handed to the cluster."""
         stage = next(stage for stage in self.stages if stage.name == name)
-        if isinstance(outcome, str):
-            self.ledger.remove(stage)  # what an earlier run or half of this one left is no result of these inputs
-            self.outcomes[stage.name] = Outcome(stage.name, None, outcome)
-        else:
-            record = self.ledger.keep(stage, self._keys[stage.name], outcome, seconds)
-            self.outcomes[stage.name] = Outcome(stage.name, record)
+        try:
+            if isinstance(outcome, str):
+                # what an earlier run or half of this one left is no result of these inputs
+                (self.ledger.forget if stage.goes_on else self.ledger.remove)(stage, outcome)
+                self.outcomes[stage.name] = Outcome(stage.name, None, outcome)
+            else:
+                key, made_from = self._keys[stage.name]
+                record = self.ledger.keep(stage, key, made_from, outcome, seconds)
+                self.outcomes[stage.name] = Outcome(stage.name, record)
+        except (OSError, MrstrainError) as failure:
+            self.outcomes[stage.name] = Outcome(stage.name, None, str(failure))
         one = self.outcomes[stage.name]
         tell(f"{stage.name}: {one.words} after {seconds:.0f} s" + (f". {one.reason}" if one.reason else ""))
         if one.record is not None:

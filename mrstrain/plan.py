@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,9 @@ from dvc.errors import InputError
 from fe.published import material_set
 from fe.simulate import LoadStep
 from mrstrain.driving import ENDING
+from mrstrain.modelfiles import files_named
 from mrstrain.registering import REPEAT
-from mrstrain.studyfile import Load, Study
+from mrstrain.studyfile import Load, Study, as_folder
 from validate.levelled import LEVELLED
 
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
@@ -39,6 +40,8 @@ class Stage:
         Stages that it cannot do without.
     some : mapping
         Argument to stages, at least one of which it needs; it gets what each that succeeded is listed with.
+    perhaps : mapping
+        The same of stages without which it does as well.
     gives : tuple of Path
         What it makes, all of it: removed before it is made anew.
     """
@@ -49,6 +52,7 @@ class Stage:
     gives: tuple[Path, ...]
     after: tuple[str, ...] = ()
     some: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    perhaps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
@@ -68,7 +72,8 @@ class Stage:
     @property
     def before(self) -> tuple[str, ...]:
         """Every stage that it waits for."""
-        return tuple(dict.fromkeys((*self.after, *(name for of in self.some.values() for name in of))))
+        chosen = (name for of in (*self.some.values(), *self.perhaps.values()) for name in of)
+        return tuple(dict.fromkeys((*self.after, *chosen)))
 
 
 def plan(study: Study) -> tuple[Stage, ...]:
@@ -102,7 +107,30 @@ def plan(study: Study) -> tuple[Stage, ...]:
                     models[stages[-1].name] = str(folder) + LEVELLED
     if models or study.models.results:
         stages.append(_comparison(study, measured, models))
+    _refuse_mixing(study, stages)
     return tuple(stages)
+
+
+def _refuse_mixing(study: Study, stages: Sequence[Stage]) -> None:
+    """Refuse results outside the results' folder or in one another's, and inputs in it: they would be replaced."""
+    out = study.out.resolve()
+    made: dict[Path, str] = {}
+    for stage in stages:
+        for place in stage.gives:
+            real = place.resolve()
+            if out not in real.parents:
+                raise InputError(f"{stage.name} would write to {real}, which is not below the results {out}.")
+            near = [other for other in made if other == real or other in real.parents or real in other.parents]
+            if near:
+                raise InputError(f"{stage.name} and {made[near[0]]} would both write to {real}: rename one.")
+            made[real] = stage.name
+        for path in stage.files:
+            real = path.resolve()
+            if real == out or out in real.parents or real in out.parents:
+                raise InputError(
+                    f"{path} is an input and lies in the folder of the results ({out}), or that in it: results would "
+                    "replace it. Move it, or give another [study] out."
+                )
 
 
 def _registrations(study: Study) -> list[Stage]:
@@ -116,7 +144,8 @@ def _registrations(study: Study) -> list[Stage]:
     own = [study.path(p) for p in how.parameters]
     error_model = [] if how.error_model is None else [study.path(how.error_model)]
     shared: dict[str, Any] = {
-        "load0": str(load0), "images": aside, "bone": images.bone, "align": how.align, "preset": how.preset,
+        "load0": str(load0), "images": aside, "bone": images.bone, "align": how.align,
+        "engine": how.engine, "preset": how.preset,
         "parameters": [str(p) for p in own], "error_model": str(error_model[0]) if error_model else None,
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "seed": study.study.seed, "threads": 1,
@@ -127,11 +156,12 @@ def _registrations(study: Study) -> list[Stage]:
     def one(load: str, image: str, repeat: bool, after: str | None) -> Stage:
         place = study.path(image)
         more = {
-            "load": str(place), "out": str(folder / load), "repeat": str(folder / REPEAT) if repeat else None,
+            "load": str(place), "out": str(folder / load),
             "after": None if after is None else str(folder / after),
         }  # fmt: skip
-        waits = ([f"register {REPEAT}"] if repeat else []) + ([] if after is None else [f"register {after}"])
-        return Stage(f"register {load}", shared | more, (*files, place), (folder / load,), tuple(waits))
+        waits = () if after is None else (f"register {after}",)
+        floor = {"repeat": {f"register {REPEAT}": str(folder / REPEAT)} if repeat else {}}
+        return Stage(f"register {load}", shared | more, (*files, place), (folder / load,), waits, {}, floor)
 
     stages = [] if images.repeat is None else [one(REPEAT, images.repeat, False, None)]
     last: str | None = None
@@ -164,11 +194,18 @@ def _mesh(study: Study) -> list[Stage]:
 
 def _own(study: Study, one: str) -> tuple[Path, ...]:
     own = [study.path(one)] if one.endswith(".toml") else []
-    return (*own, *([study.path(study.mesh.file)] if study.mesh.file is not None else []))
+    if study.mesh.file is None:
+        return tuple(own)
+    mesh = study.path(study.mesh.file)
+    return (*own, mesh, *(p for p in (mesh.with_suffix(".json"),) if p.is_file()))  # names of regions stand beside it
 
 
 def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
     name = material_set(study.set_given(one)).name
+    try:
+        as_folder(name)
+    except ValueError as wrong:
+        raise InputError(f"The material set '{name}' of {one} needs {wrong}.") from wrong
     arguments = {
         "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
         "loads": [asdict(_step(load, of)) for load, of in study.loads.items()],
@@ -195,6 +232,8 @@ def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
+    if study.registration.parameters or study.registration.engine != "elastix":
+        raise InputError("[models] level sends models through a preset of elastix, and not through [registration]'s.")
     sent = _registrations(study)[-1].arguments
     arguments = {key: sent[key] for key in ("load0", "images", "bone", "preset", "seed")}
     arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}
@@ -220,7 +259,8 @@ def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, 
         "strains": how.strains, "thresholds": None if thresholds is None else str(thresholds),
         "least_ml": how.least_ml, "elsewhere": [str(place) for place in elsewhere],
     }  # fmt: skip
-    files = [p for p in (labels, names, thresholds, *elsewhere) if p is not None]
+    named = [file for place in elsewhere if place.exists() for file in files_named(place)]
+    files = [p for p in (labels, names, thresholds, *elsewhere, *named) if p is not None]
     some: dict[str, Mapping[str, str]] = {"loads": measured}
     if models:
         some["models"] = models

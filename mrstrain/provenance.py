@@ -28,6 +28,7 @@ _PACKAGES = (
     "vtk",
     "pypardiso",
     "mkl",
+    "ngsolve",
 )
 _BLOCK = 1 << 20
 
@@ -62,7 +63,8 @@ def _with_named(path: Path) -> list[Path]:
         if file.suffix.lower() not in (".mhd", ".nhdr", ".txt"):
             continue
         for name in _NAMED.findall(file.read_bytes()[:_BLOCK]):
-            named = file.parent / Path(name.decode(errors="replace").strip()).name
+            told = Path(name.decode(errors="replace").strip())
+            named = next((p for p in (file.parent / told, file.parent / told.name) if p.is_file()), file)
             if named.is_file() and named not in found:
                 found.append(named)
                 waiting.append(named)

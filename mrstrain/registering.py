@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from dvc.align import AlignOn
 from dvc.arrays import FloatArray
 from dvc.bspline import BSpline
-from dvc.errors import InputError, MrstrainError, RegistrationError
+from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
+from dvc.gaussnewton import GaussNewton
 from dvc.image import Image, Mask
 from dvc.imagefile import read_image
 from dvc.landmarks import read_landmarks
@@ -66,6 +67,9 @@ def register(
     labels: Path | str | None = None,
     names: Path | str | None = None,
     align: AlignOn = "bone",
+    engine: str = "elastix",
+    bending: float | None = None,
+    volume: float | None = None,
     preset: str = "heel-mr",
     parameters: Sequence[Path | str] = (),
     allow_unknown_parameters: bool = False,
@@ -100,6 +104,9 @@ def register(
     labels, names : path, optional
         Label map of the tissues on the unloaded image and the table of its names, for statistics by region.
     align : {"bone", "image", "none"}
+    engine : {"elastix", "gauss-newton"}
+        What finds the non-rigid part. The second is our own; ``bending`` (1/mm) and ``volume`` (1/mm3) fix its weights,
+        of which the first is otherwise chosen for each pair. Presets and parameter files are elastix'.
     preset : str
         Named parameters; or ``parameters``, elastix files of your own, applied one after the other.
     chain : bool
@@ -146,7 +153,8 @@ def register(
         raise InputError("Give at least one loaded image.")
     if landmarks is not None and len(loads) != 1:
         raise InputError(f"--landmarks belong to one loaded image; {len(loads)} are given. Register that one alone.")
-    stages = stages_of(preset, parameters, allow_unknown_parameters)
+    own = own_engine(engine, bending, volume, preset, parameters)
+    stages = stages_of(preset, parameters, allow_unknown_parameters) if own is None else ()
     given = [
         Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh, error_model) if p is not None
     ]
@@ -171,13 +179,15 @@ def register(
         )
     images = {name: read_image(path, allow_missing=allow_missing) for name, path in zip(cases, paths, strict=True)}
     # Read now: what is wrong with it must not be found after an hour.
-    model = error_model_of(stages[-1].name) if error_model is None else read_error_model(error_model)
+    model = None if error_model is None else read_error_model(error_model)
+    if model is None and stages:
+        model = error_model_of(stages[-1].name)
     points = None if landmarks is None else read_landmarks(landmarks)[:2]
     make_output(target)
     cores = usable_cores()
     at_once = 1 if chain else min(workers or cores, cores, len(cases))
     each = threads or max(1, cores // at_once)
-    settings = Settings(stages, align, seed, each)
+    settings = Settings(stages, align, seed, each, own)
     record = record_of(
         subject,
         {
@@ -213,6 +223,7 @@ def record_of(
     subject: Subject, files: Mapping[str, list[Path]], settings: Settings, more: Mapping[str, object]
 ) -> dict[str, object]:
     """What a registration is made from; ``more`` are parameters beside the settings."""
+    own = settings.gauss_newton
     return provenance(
         "register",
         {**subject.files, **files},
@@ -222,10 +233,30 @@ def record_of(
             "threads": settings.threads,
             "plate_normal_lps": subject.plate_normal.tolist(),
             "rigid": load_preset("bone-rigid").text,
+            "engine": settings.engine,
+            "gauss_newton": None if own is None else asdict(own),
             "stages": [{"name": s.name, "text": s.text} for s in settings.presets],
             **more,
         },
     )
+
+
+def own_engine(
+    engine: str, bending: float | None, volume: float | None, preset: str, parameters: Sequence[Path | str]
+) -> GaussNewton | None:
+    """Parameters of our own engine where it was asked for; what belongs to the other one is refused."""
+    if engine not in {"elastix", "gauss-newton"}:
+        raise ParameterError(f"No engine '{engine}'; there are elastix and gauss-newton.")
+    if engine == "elastix":
+        if bending is not None or volume is not None:
+            raise ParameterError("--bending and --volume are weights of --engine gauss-newton; elastix has none.")
+        return None
+    if parameters or preset != "heel-mr":
+        raise ParameterError(
+            "Presets and parameter files are elastix'; --engine gauss-newton takes --bending and --volume."
+        )
+    own = GaussNewton(bending=bending)
+    return own if volume is None else replace(own, volume=volume)
 
 
 def stages_of(preset: str, parameters: Sequence[Path | str], allow_unknown: bool = False) -> tuple[Preset, ...]:

@@ -17,7 +17,7 @@ from dvc.transformfile import read_transform
 from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import Worker
 from mrstrain.inputs import read_subject
-from mrstrain.registering import REPEAT, record_of, stages_of
+from mrstrain.registering import REPEAT, own_engine, record_of, stages_of
 from mrstrain.results import Case, write_case
 
 
@@ -31,6 +31,7 @@ def register_one(
     bone: str | Path,
     tissue: Path | None = None,
     align: AlignOn = "bone",
+    engine: str = "elastix",
     preset: str = "heel-mr",
     parameters: Sequence[Path] = (),
     error_model: Path | None = None,
@@ -70,8 +71,11 @@ def register_one(
         shear_direction=shear_direction,
     )
     loaded = read_image(load)
-    settings = Settings(stages_of(preset, parameters), align, seed, threads)
-    model = error_model_of(settings.presets[-1].name) if error_model is None else read_error_model(error_model)
+    own = own_engine(engine, None, None, preset, parameters)
+    settings = Settings(stages_of(preset, parameters) if own is None else (), align, seed, threads, own)
+    model = None if error_model is None else read_error_model(error_model)
+    if model is None and own is None:
+        model = error_model_of(settings.presets[-1].name)
     floor = None if repeat is None else read_noise_floor(repeat / "quality.json")
     start = None if after is None else read_transform(after / "TransformParameters.0.txt")
     if start is not None and not isinstance(start, BSpline):

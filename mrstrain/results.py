@@ -10,6 +10,7 @@ import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation import Deformation, RigidMotion
+from dvc.gaussnewton import Choice
 from dvc.image import Image, LabelMap, Mask
 from dvc.imagewrite import write_image
 from dvc.landmarks import target_registration_error
@@ -142,7 +143,7 @@ def write_case(
         write_itk_transform(partial / "transform.h5", found.bspline, motion)
         bars.write(partial, maps)
 
-    return _written(folder, measured, maps, quality, pictures, _alignment(found), record, more, bars)
+    return _written(folder, measured, maps, quality, pictures, _alignment(found), record, more, bars, found.choice)
 
 
 def write_measured(folder: Path, measured: Measured, record: Mapping[str, object]) -> Case:
@@ -168,11 +169,14 @@ def _written(
     record: Mapping[str, object],
     more: Callable[[Path], None],
     bars: ErrorBars | None = None,
+    choice: Choice | None = None,
 ) -> Case:
     subject = measured.subject
     regions = region_statistics(_regions(measured), maps.by_quantity)
     told = quality.as_dict() | {"alignment": dict(alignment)}
     tables = [page.key_figures(quality, alignment), page.region_table(regions)]
+    if choice is not None:
+        told["regularisation"] = choice.as_dict()
     if bars is not None:
         told["error_of_max_shear"] = bars.as_dict()
         tables += [table for table in (bars.table(),) if table is not None]
@@ -238,5 +242,6 @@ def _alignment(found: Registration) -> dict[str, object]:
         "similarity": plain(alignment.similarity),
         "repeatability_rms_mm": plain(alignment.repeatability_mm),
         "control_spacing_mm": found.bspline.control.spacing_mm.tolist(),
+        "engine": found.settings.engine,
         "seconds": round(found.seconds, 1),
     }

@@ -22,6 +22,7 @@ from mrstrain.studyfile import Study, read_study
 Told = Callable[[str, str, float], None]
 
 LOG, REPORT = "study.log", "report.html"
+_NOTHING = ("nothing",)  # to be run: everything is taken as it is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,23 +41,26 @@ class Ran:
 
     @property
     def complete(self) -> bool:
-        """Whether every stage has a whole result."""
-        return all(o.record is not None and o.record.given.complete for o in self.outcomes.values())
+        """Whether every stage has a whole result of what the study says now."""
+        return all(outcome.whole for outcome in self.outcomes.values())
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
         lines = []
         for name, outcome in self.outcomes.items():
-            if outcome.record is None:
-                lines.append(f"{name}: {outcome.words}. {outcome.reason}")
-            elif not outcome.record.given.complete:
+            if not outcome.whole:
+                told = () if outcome.record is None else outcome.record.given.lines
+                lines += [f"{name}: {outcome.words}. {outcome.reason}".rstrip(), *(f"    {line}" for line in told)]
+            elif outcome.record is not None:
                 lines += [
-                    f"{name}: {line}" for line in outcome.record.given.lines if "ONLY" in line or "not tried" in line
+                    f"{name}: {section.verdict.words}. {' '.join(section.verdict.reasons)}"
+                    for section in outcome.record.given.sections
+                    if section.verdict is not None and section.verdict.level != "trust" and name != "compare"
                 ]
         compared = self.outcomes.get("compare")
         if compared is not None and compared.record is not None:
             lines += compared.record.given.lines
-        again = sum(outcome.again for outcome in self.outcomes.values())
+        again = sum(outcome.again and outcome.record is not None for outcome in self.outcomes.values())
         return [
             *lines,
             f"{len(self.outcomes)} stages, {again} of them there already. Log: {self.study.out / LOG}",
@@ -155,9 +159,9 @@ def run_studies(
             lines[prefix] = line_of(log, stages)
         run_all(pipelines, pool, lines)
         done = []
-        for prefix, study, stages in zip(prefixes, studies, planned, strict=True):
+        for prefix, study in zip(prefixes, studies, strict=True):
             outcomes = pipelines[prefix].in_order()
-            write_run_report(study.out / REPORT, study, stages, outcomes)
+            write_run_report(study.out / REPORT, study, outcomes)
             lines[prefix](f"Report: {study.out / REPORT}")
             done.append(Ran(study, outcomes))
     return done
@@ -172,15 +176,14 @@ def report(study: Path | str | Study) -> Ran:
         If no stage has a result.
     """
     told = study if isinstance(study, Study) else read_study(study)
-    stages, ledger = plan(told), Ledger(told.out, told.place)
-    outcomes = {}
-    for stage in stages:
-        record = ledger.finished(stage)
-        outcomes[stage.name] = Outcome(stage.name, record, "" if record else "Not run: it has no result.", again=True)
+    stages = plan(told)
+    pipeline = Pipeline(stages, Ledger(told.out, told.place), only=_NOTHING)
+    pipeline.settle()
+    outcomes = pipeline.in_order()
     if all(outcome.record is None for outcome in outcomes.values()):
         raise InputError(f"{told.out} has no results yet: `mrstrain run` makes them.")
     with _alone(told.out):
-        write_run_report(told.out / REPORT, told, stages, outcomes)
+        write_run_report(told.out / REPORT, told, outcomes)
     return Ran(told, outcomes)
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from dvc.report import Section, Table, write_report
 from dvc.verdict import Verdict, worst
+from mrstrain.ledger import Record
 from mrstrain.page import flat
 from mrstrain.pipeline import Outcome
-from mrstrain.plan import Stage
 from mrstrain.provenance import provenance, write_json
 from mrstrain.studyfile import Study
 
@@ -18,7 +18,6 @@ from mrstrain.studyfile import Study
 def write_run_report(
     path: Path,
     study: Study,
-    stages: Sequence[Stage],
     outcomes: Mapping[str, Outcome],
     ahead: Sequence[Section] = (),
 ) -> None:
@@ -39,12 +38,14 @@ def write_run_report(
             compared += given.sections
         closing += given.closing
     verdicts = [section.verdict for section in registered if section.verdict is not None]
-    failed = [f"{o.stage} {o.words.lower()}: {o.reason}" for o in outcomes.values() if o.record is None]
+    failed = [f"{o.stage} {o.words.lower()}: {o.reason}" for o in outcomes.values() if o.record is None or o.reason]
     if failed:
         verdicts.append(Verdict("distrust", tuple(failed)))
-    files = list(dict.fromkeys(file for stage in stages for file in stage.files))
-    record = provenance("run", {"inputs": files}, study.model_dump(mode="json", exclude={"place"}))
-    write_json(path.with_name("provenance.json"), record)
+    record = provenance("run", {}, study.model_dump(mode="json", exclude={"place"}))
+    made = {name: o.record for name, o in outcomes.items() if o.record is not None}
+    record["inputs"] = {"inputs": _inputs(made)}
+    parts = {name: {"made_utc": one.made_utc, **one.made_from} for name, one in made.items()}
+    write_json(path.with_name("provenance.json"), record | {"stages": parts})
     write_report(
         path,
         study.study.name,
@@ -53,6 +54,12 @@ def write_run_report(
         closing,
         flat(record),
     )
+
+
+def _inputs(made: Mapping[str, Record]) -> list[dict[str, str]]:
+    """Files that the results were made from, with the hashes that they had then."""
+    seen = dict.fromkeys((name, sha) for one in made.values() for name, sha in one.made_from.get("files", []))
+    return [{"name": name, "sha256": sha} for name, sha in seen]
 
 
 def _verdict(verdicts: Sequence[Verdict]) -> Verdict | None:
@@ -68,7 +75,7 @@ def _stages(outcomes: Mapping[str, Outcome]) -> Section:
     rows = []
     for outcome in outcomes.values():
         record = outcome.record
-        told = outcome.reason if record is None else "\n".join(record.given.lines)
+        told = "\n".join([*([outcome.reason] if outcome.reason else []), *(record.given.lines if record else ())])
         rows.append((outcome.stage, outcome.words, None if record is None else record.seconds, told))
     table = Table(
         "How each stage ended",

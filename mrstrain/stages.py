@@ -32,12 +32,15 @@ class Given:
         What belongs at the report's end: how to read its part.
     complete : bool
         Whether all of it was reached; a model that carried a part of its load was not.
+    retry : bool
+        Whether a part of it failed in a way that may not come again: it is run anew next time.
     """
 
     lines: tuple[str, ...]
     sections: tuple[Section, ...] = ()
     closing: tuple[Section, ...] = ()
     complete: bool = True
+    retry: bool = False
 
 
 def register(tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone: str, **options: Any) -> Given:
@@ -55,7 +58,7 @@ def register(tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone
         tissue=_path(images.get("tissue")),
         parameters=[Path(p) for p in options.pop("parameters")],
         error_model=_path(options.pop("error_model")),
-        repeat=_path(options.pop("repeat")),
+        repeat=_path(next(iter(options.pop("repeat")), None)),
         after=_path(options.pop("after")),
         tell=tell,
         **options,
@@ -94,7 +97,7 @@ def simulate(
         tell(stage, sum(begun.values()) / max(len(begun), 2 if len(loads) > 1 else 1))
 
     done = run(mesh, out=out, sets=[material], loads=steps, workers=1, threads=1, progress=told, **options)
-    return Given(tuple(done.summary()[:-1]), complete=done.complete)
+    return Given(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures))
 
 
 def drive(tell: Tell, *, out: str, mesh: str, dvc: str, material: str, loads: Sequence[str]) -> Given:

@@ -21,7 +21,8 @@ Flag = Annotated[bool, Strict()]
 Vector = tuple[Real, Real, Real]
 
 
-def _named(text: str) -> str:
+def as_folder(text: str) -> str:
+    """A name that becomes a folder, as it is; ValueError where it cannot."""
     if (
         not text
         or text != text.strip()
@@ -38,7 +39,7 @@ def _new(names: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
-Name = Annotated[str, AfterValidator(_named)]
+Name = Annotated[str, AfterValidator(as_folder)]
 Names = Annotated[tuple[str, ...], AfterValidator(_new)]
 
 
@@ -116,6 +117,7 @@ class PlateOf(_Part):
 class Registering(_Part):
     """How images are registered; as the options of `register`."""
 
+    engine: Literal["elastix", "gauss-newton"] = "elastix"
     preset: str = "heel-mr"
     parameters: tuple[str, ...] = ()
     chain: Flag = False

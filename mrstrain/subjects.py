@@ -42,11 +42,14 @@ class Cohort:
         The studies, in the order given.
     ranking : tuple of Standing
         The models over all loads, the nearest first; empty where no subject has a result of all.
+    notes : tuple of str
+        Who is not among those ranked over, and what is unlike between subjects.
     """
 
     out: Path
     ran: tuple[Ran, ...]
     ranking: tuple[Standing, ...]
+    notes: tuple[str, ...]
 
     @property
     def complete(self) -> bool:
@@ -62,7 +65,7 @@ class Cohort:
             + ("" if place == 1 or s.told_apart else "; not told from the first")
             for place, s in enumerate(self.ranking, start=1)
         ]
-        return [*lines, f"Report: {self.out / 'report.html'}"]
+        return [*lines, *self.notes, f"Report: {self.out / 'report.html'}"]
 
 
 def cohort(
@@ -95,6 +98,9 @@ def cohort(
         raise InputError(f"A cohort needs studies, each with a name of its own ([study] name); got {', '.join(names)}.")
     target = Path(out)
     make_output(target)
+    ranges = {study.compare.strains for study in told}
+    if len(ranges) > 1:
+        raise InputError(f"The studies compare over different ranges of strain ([compare] strains): {sorted(ranges)}.")
     ran = run_studies(told, scheduler=scheduler, workers=workers, progress=progress)
     areas = {one.study.study.name: _areas(one.study.out / COMPARISON / "areas.csv") for one in ran}
     rows = [row for of in areas.values() for row in of]
@@ -102,17 +108,18 @@ def cohort(
         raise InputError(
             "No subject was compared with a model: " + "; ".join(line for r in ran for line in r.summary())
         )
-    shares = _shares(areas)
+    shares, notes = _shares(areas)
     try:
         ranking = standings(shares)
-    except InputError:
+    except InputError as none:
         ranking = ()
+        notes.append(str(none))
     _write_tables(target, areas, ranking)
     files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
     record = provenance("cohort", {"studies": files}, {"subjects": names})
     write_json(target / "provenance.json", record)
-    _write_page(target / "report.html", ran, shares, ranking, record)
-    return Cohort(target, tuple(ran), ranking)
+    _write_page(target / "report.html", ran, shares, ranking, notes, record)
+    return Cohort(target, tuple(ran), ranking, tuple(notes))
 
 
 def _areas(path: Path) -> list[dict[str, str]]:
@@ -123,19 +130,35 @@ def _areas(path: Path) -> list[dict[str, str]]:
         return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
 
 
-def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> dict[str, dict[str, float]]:
-    """Model to subject to the area over all loads, over volume and range: the best estimate where there is one."""
+def _judged(model: str) -> bool:
+    return model != NOTHING and not model.endswith(LEVELLED)
+
+
+def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Model to subject to the area over all loads, over volume and range; and what is to be said of it.
+
+    With the measurement's bias taken out where every subject's error is known, else as found for all.
+    """
+    own = {subject: [row for row in rows if _judged(row["model"])] for subject, rows in areas.items()}
+    known = all(not np.isnan(float(row["estimate_ml"])) for rows in own.values() for row in rows)
     shares: dict[str, dict[str, float]] = {}
-    for subject, rows in areas.items():
-        loads = {row["load"] for row in rows} - {_TOTAL}
+    loads = {subject: frozenset(row["load"] for row in rows) - {_TOTAL} for subject, rows in own.items()}
+    for subject, rows in own.items():
         for row in rows:
-            judged = row["model"] != NOTHING and not row["model"].endswith(LEVELLED)
-            if not judged or row["load"] != (_TOTAL if len(loads) > 1 else next(iter(loads))):
+            if row["load"] != (_TOTAL if len(loads[subject]) > 1 else next(iter(loads[subject]))):
                 continue
-            found, best = float(row["ml"]), float(row["estimate_ml"])
-            scale = best / found if found > 0.0 and not np.isnan(best) else 1.0
+            found = float(row["ml"])
+            scale = float(row["estimate_ml"]) / found if known and found > 0.0 else 1.0
             shares.setdefault(row["model"], {})[subject] = scale * float(row["share"])
-    return shares
+    notes = [] if known else ["The measurement's error is not known in every subject: areas are those found."]
+    for subject in areas:
+        lacking = [model for model, of in shares.items() if subject not in of]
+        if lacking:
+            notes.append(f"{subject} is not ranked over: it has no area over all loads of {', '.join(lacking)}.")
+    if len(set(loads.values())) > 1:
+        told = "; ".join(f"{subject}: {', '.join(sorted(of)) or 'none'}" for subject, of in loads.items())
+        notes.append(f"Subjects have different loads, so their means are not alike: {told}.")
+    return shares, notes
 
 
 def _write_tables(target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[Standing]) -> None:
@@ -157,6 +180,7 @@ def _write_page(
     ran: Sequence[Ran],
     shares: Mapping[str, Mapping[str, float]],
     ranking: Sequence[Standing],
+    notes: Sequence[str],
     record: Mapping[str, object],
 ) -> None:
     order = [s.model for s in ranking] or list(shares)
@@ -171,8 +195,8 @@ def _write_page(
             for at, s in enumerate(ranking)
         ),
         "Area between volume-strain curves divided by the tissue's volume and the width of the range of strain. "
-        "Intervals are those of the mean over subjects (Student's t); a model is told from the first where the "
-        "interval of their difference, subject by subject, does not hold zero.",
+        "Intervals of the mean are over subjects (Student's t); those of the difference to the first, subject by "
+        "subject, hold for all models at once (Tukey): a model is told from the first where it does not hold zero.",
     )  # fmt: skip
     names = [one.study.study.name for one in ran]
     by_subject = Table(
@@ -181,7 +205,7 @@ def _write_page(
         tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in names),
     )
     drawn = Picture("Distribution over subjects", said(figures.over_subjects), figures.over_subjects(shares, order))
-    sections = [Section("Models", None, (ranked, by_subject), (drawn,))]
+    sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for one in ran:
         failed = [f"{o.stage}: {o.words}. {o.reason}" for o in one.outcomes.values() if o.record is None]
         verdicts = [

@@ -17,6 +17,7 @@ from tests.blocks import block
 needs_mkl = pytest.mark.skipif(
     importlib.util.find_spec("pypardiso") is None, reason="MKL's PARDISO does not run on this kind of machine"
 )
+needs_ngsolve = pytest.mark.skipif(importlib.util.find_spec("ngsolve") is None, reason="NGSolve is not installed")
 ELEMENTS = ("P1", "MINI", "P2")
 DEGREE = {"P1": 1, "MINI": 5, "P2": 2}
 SOFT, STIFF = Ogden.from_ansys(0.0034, 6.2), Yeoh.of(0.265, 1.923)
@@ -160,15 +161,20 @@ def test_a_bar_pulled_and_pressed_has_the_laws_closed_form(name: str, law) -> No
             assert force == pytest.approx(16.0 * float(law.nominal_stress([stretch])[0]), rel=5e-3)
 
 
-@needs_mkl
-def test_both_libraries_solve_the_same() -> None:
+@pytest.mark.parametrize(
+    "library", [pytest.param("pardiso", marks=needs_mkl), pytest.param("ngsolve", marks=needs_ngsolve)]
+)
+def test_every_library_solves_the_same(library: str) -> None:
     model = model_of("P1")
     left = np.flatnonzero(np.isclose(model.space.nodes_mm[:, 0], 0.0))
-    assembler = Assembler(model, unknowns(left, 0, 1, 2), {})
-    data, right = assembler.tangent(np.zeros(model.unknowns)), np.random.default_rng(0).normal(size=assembler.size)
+    right_side = np.flatnonzero(np.isclose(model.space.nodes_mm[:, 0], 8.0))
+    assembler = Assembler(model, unknowns(left, 0, 1, 2), {0: unknowns(right_side, 0)})
+    assembler.share({0: unknowns(right_side[::2], 0)})
+    state = np.random.default_rng(1).normal(0.0, 0.02, model.unknowns)
+    data, right = assembler.tangent(state), np.random.default_rng(0).normal(size=assembler.size)
     found = []
-    for library in ("pardiso", "superlu"):
-        solver = factors(assembler.indptr, assembler.indices, library=library)
+    for each in (library, "superlu"):
+        solver = factors(assembler.indptr, assembler.indices, library=each)
         solver.factorise(data)
         found.append(solver.solve(right))
         solver.factorise(2.0 * data)  # new values, the same pattern
@@ -177,12 +183,18 @@ def test_both_libraries_solve_the_same() -> None:
     assert found[0] == pytest.approx(found[1], rel=1e-7, abs=1e-9 * np.abs(found[1]).max())
 
 
-def test_superlu_says_when_a_matrix_is_singular() -> None:
+@pytest.mark.parametrize("library", ["superlu", pytest.param("ngsolve", marks=needs_ngsolve)])
+def test_a_library_says_when_a_matrix_is_singular(library: str) -> None:
     model = model_of("P1", layers=1)
     assembler = Assembler(model, np.empty(0, dtype=int), {})
-    data = np.zeros(len(assembler.indices))
+    solver = factors(assembler.indptr, assembler.indices, library=library)
+
+    def solved() -> np.ndarray:
+        solver.factorise(np.zeros(len(assembler.indices)))
+        return solver.solve(np.ones(assembler.size))
+
     with pytest.raises(SingularError, match="cannot be factorised"):
-        factors(assembler.indptr, assembler.indices, library="superlu").factorise(data)
+        solved()
 
 
 def test_an_old_factorisation_serves_a_matrix_close_to_it() -> None:

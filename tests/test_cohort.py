@@ -19,7 +19,8 @@ def test_closed_form():
     assert (second.least, second.greatest) == (0.3, 0.5)
     assert (first.nearest_in, second.nearest_in) == (2, 0)
     assert second.behind == pytest.approx(0.25)
-    assert second.behind_high - second.behind == pytest.approx(12.7062 * 0.05, rel=1e-5)
+    # of two models, Tukey's interval is Student's: the two differences are .2 and .3
+    assert second.behind_high - second.behind == pytest.approx(12.7062 * 0.05, rel=1e-4)
     assert not second.told_apart
 
 
@@ -42,6 +43,17 @@ def test_intervals_hold_as_often_as_they_claim():
         (one,) = standings({"model": values})
         held += one.low <= truth <= one.high
     assert held / 2000 == pytest.approx(0.95, abs=0.015)
+
+
+def test_models_that_are_alike_are_told_apart_by_chance_as_rarely_as_claimed():
+    rng = np.random.default_rng(3)
+    apart = 0
+    for _ in range(400):
+        subjects = rng.uniform(0.2, 0.8, 6)
+        table = subjects + 0.03 * rng.standard_normal((7, 6))
+        found = standings({f"m{k}": {str(i): v for i, v in enumerate(row)} for k, row in enumerate(table)})
+        apart += any(one.told_apart for one in found)
+    assert apart / 400 < 0.06  # plain intervals of each difference: over .35
 
 
 def test_one_subject_has_no_interval():

@@ -43,3 +43,18 @@ def test_the_published_size_has_all_seven_sets(folder):
 def test_another_phantom_in_the_folder_is_refused(folder):
     with pytest.raises(OutputError, match="seed 1"):
         _make(folder, 2, False, None)
+
+
+def test_a_study_of_ones_own_is_not_touched(tmp_path):
+    (tmp_path / "study.toml").write_text("mine")
+    with pytest.raises(OutputError, match="would replace"):
+        _make(tmp_path, 1, False, None)
+    assert (tmp_path / "study.toml").read_text() == "mine"
+
+
+def test_changes_to_its_study_file_are_kept(folder):
+    _make(folder, 1, False, None)
+    changed = (folder / "study.toml").read_text().replace('"luboz", ', "")
+    (folder / "study.toml").write_text(changed)
+    _make(folder, 1, False, None)
+    assert (folder / "study.toml").read_text() == changed

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ class Here:
     def busy(self) -> bool:
         return bool(self._ended)
 
-    def begin(self, name: str, function: str, arguments: dict) -> None:
+    def begin(self, name: str, function: str, arguments: dict, lock: Path) -> None:
         self.ran.append(name)
         out = Path(arguments["out"])
         if name in self.failing:
@@ -139,7 +140,8 @@ def test_what_cannot_do_without_a_failed_one_is_not_run(folder):
     assert outcomes["simulate a"].reason == "Not run: mesh has no result."
     _, outcomes, _ = ran(folder, failing=("mesh", "register a", "register b"), force=("register",))
     assert outcomes["compare"].words == "not run"
-    assert not (folder / "results" / "compare").exists()
+    assert (folder / "results" / "compare").exists()  # nothing that was finished is lost
+    assert ran(folder)[0] == ["register a", "register b", "mesh", "simulate a", "simulate b", "compare"]
 
 
 def test_a_result_of_other_inputs_does_not_outlive_a_failure(folder):
@@ -184,3 +186,63 @@ def test_the_forecast_is_what_is_run(folder):
     (folder / "b.txt").write_text("y")
     assert forecast() == ["register b", "compare"] == ran(folder)[0]
     assert forecast(number=3) == ran(folder, number=3)[0]
+
+
+def test_what_may_be_lacking_is_gone_without(folder):
+    def planned() -> list[Stage]:
+        plain, *others = stages_in(folder)
+        out = str(folder / "results" / "register_b")
+        return [
+            *others,
+            Stage(plain.name, plain.arguments, plain.files, plain.gives, (), {}, {"parts": {"register b": out}}),
+        ]
+
+    def run(failing: tuple[str, ...]) -> tuple[list[str], dict]:
+        cluster = Here(failing)
+        pipeline = Pipeline(planned(), Ledger(folder / "results", folder))
+        run_all({"": pipeline}, lambda: nullcontext(cluster), {"": lambda _: None})
+        return cluster.ran, pipeline.outcomes
+
+    first, outcomes = run(("register b",))
+    assert outcomes["register a"].words == "done"
+    assert first.index("register b") < first.index("register a")
+    assert run(())[0] == ["register b", "register a", "compare"]  # and made anew when it is there
+
+
+def test_a_result_that_may_come_out_better_is_run_again(folder):
+    class Halting(Here):
+        def next(self) -> tuple[str, Given | str, float]:
+            name, given, seconds = super().next()
+            again = name == "simulate a" and isinstance(given, Given)
+            return name, replace(given, complete=False, retry=True) if again else given, seconds
+
+    def run(cluster: Here) -> list[str]:
+        run_all(
+            {"": Pipeline(stages_in(folder), Ledger(folder / "results", folder))},
+            lambda: nullcontext(cluster),
+            {"": lambda _: None},
+        )
+        return cluster.ran
+
+    assert run(Halting()) == ALL
+    assert run(Here()) == ["simulate a", "compare"]
+    assert run(Here()) == []
+
+
+def test_an_input_that_vanishes_fails_its_stage_alone(folder):
+    (folder / "a.txt").unlink()
+    first, outcomes, _ = ran(folder)
+    assert outcomes["register a"].words == "FAILED"
+    assert "a.txt" in outcomes["register a"].reason
+    assert first == ALL[1:]
+
+
+def test_taken_as_they_are_stale_results_are_called_so_and_reasons_are_kept(folder):
+    ran(folder, failing=("register b",))
+    (folder / "a.txt").write_text("z")
+    pipeline = Pipeline(stages_in(folder), Ledger(folder / "results", folder), only=("nothing",))
+    assert pipeline.settle() == []
+    assert pipeline.outcomes["register a"].words == "OUT OF DATE"
+    assert not pipeline.outcomes["register a"].whole
+    assert pipeline.outcomes["register b"].reason == "It broke."
+    assert pipeline.outcomes["mesh"].whole

@@ -14,6 +14,7 @@ from fe.newton import Tolerance
 from fe.plate import Plate
 from fe.simulate import LoadStep, State, simulate
 from tests.blocks import block
+from tests.test_assembly import needs_ngsolve
 
 FAT, SKIN = Ogden.from_ansys(0.0034, 6.2), NeoHooke.of(0.2)
 LAWS = {"skin": SKIN, "fat": FAT}
@@ -107,6 +108,16 @@ def test_a_mirrored_problem_has_the_mirrored_answer(sheared: list[State]) -> Non
 def test_threads_do_not_change_the_digits_that_matter(sheared: list[State]) -> None:
     again = press(dome(), PRESS, threads=2)
     assert np.abs(again[0].u_mm - sheared[0].u_mm).max() < 1e-9
+
+
+@pytest.mark.parametrize("library", ["superlu", pytest.param("ngsolve", marks=needs_ngsolve)])
+def test_another_library_finds_the_same_state(
+    sheared: list[State], library: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fe.linear._fastest", lambda: library)
+    again = press(dome(), [LoadStep("pressed", 2.0), LoadStep("sheared", 2.0, 1.0)])
+    for state, other in zip(sheared, again, strict=False):
+        assert np.abs(other.u_mm - state.u_mm).max() < 1e-6
 
 
 def test_without_tape_the_surface_slides() -> None:

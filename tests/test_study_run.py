@@ -294,7 +294,8 @@ def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
     assert told.images.repeat == "Load0-again.nii.gz"
     assert (told.images.labels, told.images.names) == ("tissues.nii.gz", "tissues.csv")
     assert list(told.loads) == ["Load1", "Load2"]
-    assert told.loads["Load1"].normal_n == 140.0
+    assert told.loads["Load1"].normal_n is None  # forces are never guessed
+    assert any("normal_n is missing" in one for one in check(study).wrong)
     assert told.models.results == ("ansys",)
     assert len(told.models.sets) == 7
 

@@ -120,3 +120,43 @@ def test_a_simulated_load_needs_its_force(tmp_path):
 def test_two_models_of_one_name_are_refused(tmp_path):
     with pytest.raises(InputError, match="rename the folder"):
         plan(read_study(written(tmp_path, WHOLE.replace('["ansys"]', '["other/trebbi"]'))))
+
+
+def test_a_set_whose_name_is_no_folder_is_refused(tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        '["../.."]\ntitle = "x"\nsource = "x"\n["../..".all]\nlaw = "neo-Hooke"\nmu_kpa = 10.0\nnu = 0.49\n'
+    )
+    with pytest.raises(InputError, match="folder"):
+        plan(read_study(written(tmp_path, WHOLE.replace('"luboz"', '"mine.toml"'))))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"tissues.nii.gz"', '"results/tissues.nii.gz"'),
+        ('results = ["ansys"]', 'results = ["results/models/ansys"]'),
+        ('name = "Heel"', 'name = "Heel"\nout = "ansys/here"'),
+    ],
+)
+def test_inputs_and_results_do_not_lie_in_one_another(tmp_path, old, new):
+    assert old in WHOLE
+    with pytest.raises(InputError, match="is an input and lies in the folder of the results"):
+        plan(read_study(written(tmp_path, WHOLE.replace(old, new))))
+
+
+def test_a_model_is_levelled_by_the_preset_that_measured(tmp_path):
+    text = WHOLE + 'level = true\n[registration]\nparameters = ["mine.txt"]\n'
+    with pytest.raises(InputError, match="level"):
+        plan(read_study(written(tmp_path, text)))
+
+
+def test_files_that_inputs_name_are_inputs_too(tmp_path):
+    (tmp_path / "ansys").mkdir()
+    (tmp_path / "heel.cdb").write_text("x")
+    (tmp_path / "ansys" / "model.toml").write_text('mesh = "../heel.cdb"\n')
+    (tmp_path / "own.vtu").write_text("x")
+    (tmp_path / "own.json").write_text("{}")
+    stages = plan(read_study(written(tmp_path, WHOLE + '[mesh]\nfile = "own.vtu"\n')))
+    files = {stage.name: [path.resolve() for path in stage.files] for stage in stages}
+    assert tmp_path / "heel.cdb" in files["compare"]
+    assert tmp_path / "own.json" in files["simulate trebbi"]

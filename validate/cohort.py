@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import studentized_range
 from scipy.stats import t as student
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 
-_LEVEL = 0.975
+_SURE, _LEVEL = 0.95, 0.975
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +32,8 @@ class Standing:
     nearest_in : int
         Subjects in which it is the nearest.
     behind, behind_low, behind_high : float
-        Mean over subjects of its area minus that of the first model, in the same subject, and the interval.
+        Mean over subjects of its area minus that of the first model, in the same subject, and an interval that holds
+        for all pairs of models at once, so that it stays true of the one which the subjects made the first.
     """
 
     model: str
@@ -58,6 +60,10 @@ def standings(shares: Mapping[str, Mapping[str, float]]) -> tuple[Standing, ...]
     Subjects are taken as drawn from one population, independent of each other. Intervals are those of a mean: they
     narrow with more subjects, and hold the error of the measurement as far as it differs from subject to subject.
 
+    Differences have the simultaneous 95 % intervals of Tukey (the honestly significant difference of a design with
+    subjects as blocks: Kutner and others, Applied Linear Statistical Models, section 21.5), which take what subject and
+    model do not explain as of one size for all models.
+
     Parameters
     ----------
     shares : mapping of model to mapping of subject to float
@@ -74,15 +80,15 @@ def standings(shares: Mapping[str, Mapping[str, float]]) -> tuple[Standing, ...]
         raise InputError("No subject has a result of every model, so they cannot be ranked.")
     table = np.array([[shares[n][s] for s in subjects] for n in names])
     order = np.argsort(table.mean(axis=1), kind="stable")
-    first, nearest = table[order[0]], np.argmin(table, axis=0)
+    first, nearest, half = table[order[0]], np.argmin(table, axis=0), _simultaneous(table)
     made = []
     for at in order:
         mean, low, high = _mean(table[at])
-        behind, behind_low, behind_high = _mean(table[at] - first)
+        behind = float((table[at] - first).mean())
         made.append(
             Standing(
                 names[at], len(subjects), mean, low, high, float(table[at].min()), float(table[at].max()),
-                int(np.count_nonzero(nearest == at)), behind, behind_low, behind_high,
+                int(np.count_nonzero(nearest == at)), behind, behind - half, behind + half,
             )
         )  # fmt: skip
     return tuple(made)
@@ -94,3 +100,14 @@ def _mean(values: FloatArray) -> tuple[float, float, float]:
         return mean, float("nan"), float("nan")
     half = float(student.ppf(_LEVEL, count - 1) * values.std(ddof=1) / np.sqrt(count))
     return mean, mean - half, mean + half
+
+
+def _simultaneous(table: FloatArray) -> float:
+    """Half the width of the 95 % intervals of all differences of means of models (k, subjects) at once."""
+    models, subjects = table.shape
+    if models < 2 or subjects < 2:
+        return float("nan")
+    rest = table - table.mean(axis=0) - table.mean(axis=1)[:, None] + table.mean()
+    freedom = (models - 1) * (subjects - 1)
+    spread = np.sqrt((rest**2).sum() / freedom / subjects)
+    return float(studentized_range.ppf(_SURE, models, freedom) * spread)

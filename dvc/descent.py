@@ -1,0 +1,261 @@
+"""One level of a Gauss-Newton registration: its energy, and steps that lower it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.errors import RegistrationError
+from dvc.image import Grid, Image
+from dvc.imageterm import ImagePair, Normal
+from dvc.smoothness import Bending
+from dvc.splinesums import Stiffness
+
+_BLOCKS = 2.5  # blocks between two control points, about
+_LONGEST = 0.45  # of the control spacing: a step of less than that cannot fold by itself
+_HALVINGS = 4
+_SLACK = 1e-3  # the fixed image's gradient is not quite the energy's own: near the end it may rise by as much
+_TOLERANCE, _MOST = 0.1, 60
+_SMALLEST = 1e-6
+_LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
+_FLATTEST = 0.1  # det F below this is taken as this in F^-T
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """Weights of the prior: bending (1/mm), change of volume in soft tissue and strain in bone (1/mm3)."""
+
+    bending: float
+    volume: float
+    rigidity: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """A displacement and all that a step from it needs.
+
+    Attributes
+    ----------
+    coefficients : (3, mi, mj, mk)
+    F, cofactor : (bi, bj, bk, 3, 3)
+        Deformation gradient at the blocks' centres, and the derivative of its determinant.
+    J : (bi, bj, bk)
+        det F.
+    bent : (3, mi, mj, mk)
+        Gradient of the bending energy.
+    images : Normal
+    """
+
+    coefficients: FloatArray
+    F: FloatArray
+    cofactor: FloatArray
+    J: FloatArray
+    bent: FloatArray
+    images: Normal
+
+    @property
+    def variance(self) -> float:
+        """Mean square of the residual over the voxels that were asked for."""
+        return self.images.square / self.images.count
+
+
+class Level:
+    """Two images at one resolution, the control points, and the tissue that the prior is about.
+
+    Parameters
+    ----------
+    fixed, moving : Image
+        Components of the displacement are along the axes of ``fixed``; ``moving`` is where it leads.
+    inside : (ni, nj, nk) bool
+        Voxels of ``fixed`` to compare.
+    soft, bone : (ni, nj, nk) bool
+        Voxels that keep their volume, and voxels that stay rigid.
+    control : Grid
+        Control points, around all of ``fixed``.
+    """
+
+    def __init__(
+        self, fixed: Image, moving: Image, inside: BoolArray, soft: BoolArray, bone: BoolArray, control: Grid
+    ) -> None:
+        block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
+        self.control = control
+        self.pair = ImagePair(fixed, moving, inside, control, block)
+        self.bending = Bending(control)
+        self._soft, self._bone = self.pair.share(soft), self.pair.share(bone)  # mm3 in each block
+        self._rigid = self._bone > 0
+
+    def at(self, coefficients: FloatArray, halves: int = -1) -> State:
+        """The state at a displacement; of the voxels all (-1) or one half (0, 1), as in `ImagePair.normal`."""
+        F = self.pair.blocks.evaluate(coefficients)[1] + np.eye(3)
+        cofactor = cofactors(F)
+        J = np.einsum("...a,...a->...", F[..., 0, :], cofactor[..., 0, :])
+        pulled = cofactor / np.maximum(J, _FLATTEST)[..., None, None]
+        images = self.pair.normal(coefficients, pulled, halves)
+        if images.count == 0 or not np.isfinite(images.square):
+            raise RegistrationError("The registration diverged: the two images no longer have a voxel in common.")
+        return State(coefficients, F, cofactor, J, self.bending.product(coefficients), images)
+
+    def prior(self, state: State, weights: Weights) -> float:
+        """The energy of everything but the images."""
+        strain = _green_lagrange(state.F[self._rigid])
+        return 0.5 * (
+            weights.bending * _dot(state.coefficients, state.bent)
+            + weights.volume * _dot(self._soft, (state.J - 1.0) ** 2)
+            + weights.rigidity * _dot(self._bone[self._rigid], np.einsum("nab,nab->n", strain, strain))
+        )
+
+    def prior_gradient(self, state: State, weights: Weights) -> FloatArray:
+        """Derivative of `prior` by the coefficients."""
+        stress = (weights.volume * self._soft * (state.J - 1.0))[..., None, None] * state.cofactor
+        F = state.F[self._rigid]
+        stress[self._rigid] += (weights.rigidity * self._bone[self._rigid])[:, None, None] * (F @ _green_lagrange(F))
+        return np.asarray(self.pair.blocks.gathered(stress) + weights.bending * state.bent)
+
+    def step(self, state: State, weights: Weights, variance: float, tolerance: float, most: int) -> FloatArray:
+        """The Gauss-Newton step, by conjugate gradients, preconditioned by each control point's own 3 x 3 block."""
+        stiffness: Stiffness = (
+            state.images.matrix / variance,
+            state.cofactor,
+            weights.volume * self._soft,
+            weights.rigidity * self._bone,
+        )
+        force = state.images.force / variance - self.prior_gradient(state, weights)
+        diagonal = self.pair.blocks.diagonal(stiffness)
+        for entry in (0, 3, 5):
+            diagonal[entry] += weights.bending * self.bending.diagonal
+            diagonal[entry] += _SMALLEST * diagonal[entry].max()
+        blocks, bending = self.pair.blocks, self.bending
+
+        def product(c: FloatArray) -> FloatArray:
+            return np.asarray(blocks.product(c, stiffness) + weights.bending * bending.product(c))
+
+        return conjugate_gradients(product, force, _inverted(diagonal), tolerance, most)
+
+    def descend(
+        self,
+        coefficients: FloatArray,
+        weights: Weights,
+        *,
+        steps: int,
+        stop_mm: float,
+        halves: int = -1,
+        tolerance: float = _TOLERANCE,
+        most: int = _MOST,
+    ) -> FloatArray:
+        """Take steps until they are short, no longer lower the energy, or there were enough.
+
+        Parameters
+        ----------
+        coefficients : (3, mi, mj, mk)
+            To start from.
+        weights : Weights
+        steps : int
+            Most steps.
+        stop_mm : float
+            A step that moves soft tissue by less, root mean square, is the last.
+        halves : int
+            Voxels used: all (-1), or one half (0, 1).
+        tolerance, most : float, int
+            Of the conjugate gradients: reduction of the residual, and iterations.
+        """
+        state = self.at(coefficients, halves)
+        for _ in range(steps):
+            variance = max(state.variance, _LEAST_RESIDUAL**2)
+            count = state.images.count
+
+            def energy(at: State, variance: float = variance, count: int = count) -> float:
+                # with the mean over voxels, so that tissue that leaves the picture does not lower it
+                return 0.5 * count * at.variance / variance + self.prior(at, weights)
+
+            before = energy(state)
+            step = self.step(state, weights, variance, tolerance, most)
+            if not np.isfinite(step).all():
+                raise RegistrationError("The registration diverged: a step is not finite.")
+            step *= min(1.0, _LONGEST / max(self._longest(step), _SMALLEST))
+            for _ in range(_HALVINGS):
+                trial = self.at(state.coefficients + step, halves)
+                if energy(trial) <= before + _SLACK * abs(before):
+                    break
+                step *= 0.5
+            else:
+                break
+            state = trial
+            if self._moved_mm(step) < stop_mm:
+                break
+        return state.coefficients
+
+    def _longest(self, step: FloatArray) -> float:
+        """The furthest that a step moves tissue, over the control spacing; air may go where it likes."""
+        moved = self.pair.blocks.evaluate(step)[0][(self._soft > 0) | (self._bone > 0)]
+        return float((np.abs(moved) / self.control.spacing_mm).max(initial=0.0))
+
+    def _moved_mm(self, step: FloatArray) -> float:
+        moved = self.pair.blocks.evaluate(step)[0]
+        square = np.einsum("...a,...a->...", moved, moved)
+        return float(np.sqrt(_dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)))
+
+
+def cofactors(F: FloatArray) -> FloatArray:
+    """Cofactors of matrices (..., 3, 3): cof F = det F F^-T, the derivative of det F."""
+    rows = (np.cross(F[..., 1, :], F[..., 2, :]), np.cross(F[..., 2, :], F[..., 0, :]))
+    return np.stack([*rows, np.cross(F[..., 0, :], F[..., 1, :])], axis=-2)
+
+
+def conjugate_gradients(
+    product: Callable[[FloatArray], FloatArray], force: FloatArray, inverse: FloatArray, tolerance: float, most: int
+) -> FloatArray:
+    """Solve A x = force for a positive definite A given by its product.
+
+    Parameters
+    ----------
+    product : callable
+        A x of x (3, ...).
+    force : (3, ...)
+    inverse : (6, ...)
+        Preconditioner, a symmetric 3 x 3 matrix at each place: xx, xy, xz, yy, yz, zz.
+    tolerance : float
+        Reduction of the residual's preconditioned norm.
+    most : int
+        Iterations at the most.
+    """
+
+    def preconditioned(v: FloatArray) -> FloatArray:
+        xx, xy, xz, yy, yz, zz = inverse
+        x, y, z = v
+        return np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
+
+    x, left = np.zeros_like(force), force.copy()
+    weighted = preconditioned(left)
+    along, norm = weighted.copy(), _dot(left, weighted)
+    enough = tolerance**2 * norm
+    for _ in range(most):
+        if norm <= enough:
+            break
+        pushed = product(along)
+        length = norm / _dot(along, pushed)
+        x += length * along
+        left -= length * pushed
+        weighted = preconditioned(left)
+        before, norm = norm, _dot(left, weighted)
+        along = weighted + norm / before * along
+    return x
+
+
+def _inverted(blocks: FloatArray) -> FloatArray:
+    """Inverses of symmetric positive 3 x 3 matrices (6, ...)."""
+    xx, xy, xz, yy, yz, zz = blocks
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    found = np.stack([a, b, c, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy])
+    return np.asarray(found / (xx * a + xy * b + xz * c))
+
+
+def _green_lagrange(F: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (np.swapaxes(F, -1, -2) @ F - np.eye(3)))
+
+
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    """Inner product, summed in an order that does not depend on threads (as BLAS would)."""
+    return float((a * b).sum())

@@ -1,0 +1,289 @@
+"""Gauss-Newton registration: a cubic B-spline displacement, all voxels, and a prior whose weight the images choose.
+
+Minimised is ``1/(2 s^2) sum r^2 + b/2 int |D^2 u|^2 + v/2 int (J - 1)^2 + w/2 int |E|^2``: residuals r over the voxels
+of a mask with their own variance s^2, the bending of the displacement, the change of volume in soft tissue and the
+strain of the bone. Four levels from coarse to fine, smoothed images first; each step by conjugate gradients that never
+form the Hessian. Nothing is drawn at random, and every sum has a fixed order: the result is the same bit for bit on
+any number of threads. docs/decisions/0009 has the reasons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import solve_banded
+from scipy.ndimage import distance_transform_edt
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.bspline import BSpline
+from dvc.deformation import Deformation
+from dvc.descent import Level, Weights
+from dvc.errors import InputError, ParameterError
+from dvc.image import Grid, Image, Mask
+from dvc.resample import smoothed
+
+# Of each level: smoothing of both images (mm), control spacing over the finest, most steps, the step that ends it (mm).
+_LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 1.0, 5, 0.005))
+_LEAST_VOXELS = 2.0
+_RIM_MM = 1.2  # bone nearer to its surface than that may be tissue in part of a voxel
+_USUAL = 3.0
+_RATIO = np.sqrt(10.0)
+_FEWEST, _MOST = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
+_CHECK_STEPS, _CHECK_TOLERANCE, _CHECK_MOST = 2, 0.03, 120
+_LAST_STEPS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class GaussNewton:
+    """Parameters of the engine.
+
+    Attributes
+    ----------
+    spacing_mm : float
+        Between control points, at the finest level; never less than two voxels.
+    bending : float or None
+        Weight b of the bending, 1/mm; None: chosen for each pair by cross-validation.
+    volume : float
+        Weight v of the change of volume in soft tissue, 1/mm3.
+    rigidity : float
+        Weight w of strain in the bone, 1/mm3.
+
+    Raises
+    ------
+    ParameterError
+        For a spacing that is not above zero, or a weight that is negative or not finite.
+    """
+
+    spacing_mm: float = 3.2
+    bending: float | None = None
+    volume: float = 300.0
+    rigidity: float = 1000.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.spacing_mm) and self.spacing_mm > 0):
+            raise ParameterError(f"Control points need a spacing above 0 mm; got {self.spacing_mm}.")
+        if self.bending is not None and not (np.isfinite(self.bending) and self.bending > 0):
+            raise ParameterError(f"The weight of the bending must be above 0; got {self.bending}.")
+        for name in ("volume", "rigidity"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise ParameterError(f"The weight '{name}' must be 0 or more; got {getattr(self, name)}.")
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The prior's weights that were used, and why.
+
+    Attributes
+    ----------
+    weights : Weights
+    rule : str
+        In words.
+    tried : tuple of (bending, left-out residual)
+        Mean square residual of the half of the voxels that was left out, over that of the best.
+    """
+
+    weights: Weights
+    rule: str
+    tried: tuple[tuple[float, float], ...] = ()
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return {
+            "weights": asdict(self.weights),
+            "rule": self.rule,
+            "tried": [{"bending": b, "left_out_over_best": round(v, 6)} for b, v in self.tried],
+        }
+
+
+def fit(
+    fixed: Image,
+    moving: Image,
+    inside: Mask,
+    body: Mask,
+    bone: Mask | None,
+    options: GaussNewton,
+    start: Deformation | None = None,
+    progress: str | None = None,
+) -> tuple[BSpline, Choice]:
+    """Find the displacement that carries the fixed image to the moving one.
+
+    Parameters
+    ----------
+    fixed, moving : Image
+        Without shading; rigid motion already in the moving image's grid. Missing voxels are left out.
+    inside : Mask
+        Voxels of ``fixed`` that are compared.
+    body : Mask
+        Tissue, bone included, on the same grid.
+    bone : Mask or None
+        Of it, what is rigid.
+    options : GaussNewton
+    start : Deformation, optional
+        First guess, u in mm LPS; where it is not defined its nearest value is taken.
+    progress : str, optional
+        Path of a file that tells the share that is done.
+
+    Returns
+    -------
+    bspline : BSpline
+        Displacement, LPS mm.
+    choice : Choice
+
+    Raises
+    ------
+    InputError
+        If the tissue has no contrast.
+    RegistrationError
+        If it diverges.
+    """
+    tell = _teller(progress)
+    scale = float(np.nanpercentile(fixed.values[body.inside], 75))
+    if not scale > 0:
+        raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
+    pictures = _scaled(fixed, scale), _scaled(moving, scale)
+    core = np.zeros(body.grid.shape, dtype=bool)
+    if bone is not None:
+        core = distance_transform_edt(bone.inside, sampling=bone.grid.spacing_mm) > _RIM_MM
+    weights = Weights(_USUAL if options.bending is None else options.bending, options.volume, options.rigidity)
+    spacing = np.maximum(options.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
+    turned = np.array(fixed.grid.direction)
+    coefficients, control, level = np.zeros(0), None, None
+    for number, (sigma_mm, factor, steps, stop_mm) in enumerate(_LEVELS):
+        guess = start if control is None else BSpline(control, _turned(turned, coefficients))
+        control = control_grid(fixed.grid, factor * spacing)
+        coefficients = (
+            np.zeros((3, *control.shape)) if guess is None else _turned(turned.T, spline_through(guess, control))
+        )
+        level = _level(pictures, inside.inside, body.inside & ~core, core, control, sigma_mm)
+        coefficients = level.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
+        tell((number + 1) / (len(_LEVELS) + 3))
+    assert control is not None
+    assert level is not None
+    choice = Choice(weights, "fixed by the user")
+    if options.bending is None:
+        choice = _choose(
+            level, coefficients, weights, lambda share: tell((len(_LEVELS) + 2 * share) / (len(_LEVELS) + 3))
+        )
+        last_stop_mm = _LEVELS[-1][-1]
+        coefficients = level.descend(coefficients, choice.weights, steps=_LAST_STEPS, stop_mm=last_stop_mm)
+    tell(1.0)
+    return BSpline(control, _turned(turned, coefficients)), choice
+
+
+def _choose(level: Level, coefficients: FloatArray, weights: Weights, tell: Callable[[float], None]) -> Choice:
+    """The weight of the bending by two-fold cross-validation.
+
+    One half of the voxels (a chessboard of small cubes) is fitted, the other half's residual is what counts: noise that
+    was fitted makes it larger, and so does detail that was smoothed away. Weights are tried in steps of a factor of 3.2
+    until the best lies between two others; then the vertex of the parabola through the three, over the weight's
+    logarithm.
+    """
+    found: dict[int, float] = {}
+
+    def left_out(power: int) -> float:
+        if power not in found:
+            tried = replace(weights, bending=_USUAL * _RATIO**power)
+            fitted = level.descend(
+                coefficients, tried, steps=_CHECK_STEPS, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE,
+                most=_CHECK_MOST,
+            )  # fmt: skip
+            found[power] = level.at(fitted, halves=1).variance
+            tell(min(1.0, len(found) / 4))
+        return found[power]
+
+    best = min((-1, 0, 1), key=left_out)
+    while (
+        _FEWEST < best < _MOST
+        and (beyond := min((best - 1, best + 1), key=left_out))
+        and left_out(beyond) < left_out(best)
+    ):
+        best = beyond
+    power = float(best)
+    if _FEWEST < best < _MOST:
+        below, here, above = (left_out(best + d) for d in (-1, 0, 1))
+        power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
+    chosen = replace(weights, bending=float(_USUAL * _RATIO**power))
+    tried = tuple((float(_USUAL * _RATIO**p), found[p] / found[best]) for p in sorted(found))
+    rule = "bending by cross-validation: one half of the voxels fitted, the other half's residual least"
+    return Choice(
+        chosen, rule if _FEWEST < best < _MOST else rule + "; the least lies at the end of what was tried", tried
+    )
+
+
+def _level(
+    pictures: tuple[Image, Image], inside: BoolArray, soft: BoolArray, bone: BoolArray, control: Grid, sigma_mm: float
+) -> Level:
+    """Images smoothed, and every so manyth voxel of them: a smooth image needs no more."""
+    if sigma_mm == 0.0:
+        return Level(*pictures, inside, soft, bone, control)
+    fixed, moving = (_thinned(smoothed(i, sigma_mm), sigma_mm) for i in pictures)
+    every = tuple(slice(None, None, int(n)) for n in _stride(pictures[0].grid, sigma_mm))
+    return Level(fixed, moving, inside[every], soft[every], bone[every], control)
+
+
+def _scaled(image: Image, scale: float) -> Image:
+    return Image(image.grid, image.values / np.float32(scale))
+
+
+def _stride(grid: Grid, sigma_mm: float) -> FloatArray:
+    return np.maximum(np.floor(sigma_mm / grid.spacing_mm + 1e-6), 1.0)
+
+
+def _thinned(image: Image, sigma_mm: float) -> Image:
+    stride = _stride(image.grid, sigma_mm)
+    values = image.values[tuple(slice(None, None, int(n)) for n in stride)]
+    i, j, k = values.shape
+    return Image(Grid((i, j, k), stride * image.grid.spacing_mm, image.grid.origin_mm, image.grid.direction), values)
+
+
+def control_grid(grid: Grid, spacing_mm: FloatArray) -> Grid:
+    """Control points along a grid's axes whose spline is defined at all of its voxels."""
+    size = (np.array(grid.shape) - 1) * grid.spacing_mm
+    cells = np.ceil(size / spacing_mm).astype(int) + 1
+    i, j, k = (int(n) + 3 for n in cells)
+    before = 0.5 * (cells * spacing_mm - size) + spacing_mm
+    return Grid((i, j, k), spacing_mm, grid.points_at(-before / grid.spacing_mm), grid.direction)
+
+
+def spline_through(deformation: Deformation, control: Grid) -> FloatArray:
+    """Coefficients (3, mi, mj, mk), LPS mm, of the spline that has a deformation's displacement at the control points.
+
+    Where it is not defined there, its nearest value is taken; the second difference at the ends is zero.
+
+    Raises
+    ------
+    InputError
+        If it is defined nowhere.
+    """
+    u = deformation.displacement(control.points().reshape(-1, 3)).reshape(*control.shape, 3)
+    unknown = ~np.isfinite(u).all(axis=-1)
+    if unknown.all():
+        raise InputError("The deformation to start from is not defined anywhere in the unloaded image.")
+    if unknown.any():
+        nearest = distance_transform_edt(
+            unknown, sampling=control.spacing_mm, return_distances=False, return_indices=True
+        )
+        u = u[tuple(nearest)]
+    c = np.moveaxis(u, -1, 0)
+    for axis, n in enumerate(control.shape, start=1):
+        bands = np.repeat([[1.0 / 6.0], [4.0 / 6.0], [1.0 / 6.0]], n, axis=1)
+        bands[1, [0, -1]], bands[0, 1], bands[2, -2] = 1.0, 0.0, 0.0
+        lines = np.moveaxis(c, axis, 0)
+        c = np.moveaxis(solve_banded((1, 1), bands, lines.reshape(n, -1)).reshape(lines.shape), 0, axis)
+    return np.ascontiguousarray(c)
+
+
+def _turned(rotation: FloatArray, coefficients: FloatArray) -> FloatArray:
+    x, y, z = coefficients
+    return np.stack([row[0] * x + row[1] * y + row[2] * z for row in rotation])
+
+
+def _teller(path: str | None) -> Callable[[float], None]:
+    def tell(share: float) -> None:
+        if path is not None:
+            Path(path).write_text(f"{share:.3f}")
+
+    return tell
