@@ -59,6 +59,16 @@ def _options(
     pass
 
 
+for _command in (
+    studycommands.init,
+    studycommands.check,
+    studycommands.run,
+    studycommands.cohort,
+    studycommands.demo,
+):
+    app.command()(_command)
+
+
 @app.command()
 def register(
     load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, or a DICOM folder.")],
@@ -200,27 +210,6 @@ def strain(
 
 
 @app.command()
-def demo(
-    out: Out = Path("demo"),
-    seed: Annotated[int, typer.Option(min=1, help="Seed of the phantom.")] = 1,
-    full: Annotated[
-        bool, typer.Option("--full", help="The published size: seven material sets on some 80,000 tetrahedra.")
-    ] = False,
-    workers: Annotated[int | None, typer.Option(min=1, help="Stages at once. Default: one for each core.")] = None,
-) -> None:
-    """A heel phantom with known strain under four loads, taken through a whole study: error by tissue, and a report."""
-    from mrstrain.demo import demo as run
-    from mrstrain.progress import live
-
-    with live() as progress:
-        done = run(out, seed=seed, full=full, workers=workers, progress=progress)
-    for line in done.lines:
-        typer.echo(line)
-    if not done.complete:
-        raise typer.Exit(1)
-
-
-@app.command()
 def phantom(
     out: Out,
     seed: Annotated[int, typer.Option(min=0, help="Of shapes, textures, noise and the foot's motions.")] = 1,
@@ -350,10 +339,6 @@ for _command in (
     modelcommands.level,
     modelcommands.converge,
     modelcommands.fit,
-    studycommands.init,
-    studycommands.check,
-    studycommands.run,
-    studycommands.cohort,
 ):
     app.command()(_command)
 

@@ -86,3 +86,23 @@ def cohort(
         typer.echo(line)
     if not done.complete:
         raise typer.Exit(1)
+
+
+def demo(
+    out: Out = Path("demo"),
+    seed: Annotated[int, typer.Option(min=1, help="Seed of the phantom.")] = 1,
+    full: Annotated[
+        bool, typer.Option("--full", help="The published size: seven material sets on some 80,000 tetrahedra.")
+    ] = False,
+    workers: Annotated[int | None, typer.Option(min=1, help="Stages at once. Default: one for each core.")] = None,
+) -> None:
+    """A heel phantom with known strain under four loads, taken through a whole study: error by tissue, and a report."""
+    from mrstrain.demo import demo as run
+    from mrstrain.progress import live
+
+    with live() as progress:
+        done = run(out, seed=seed, full=full, workers=workers, progress=progress)
+    for line in done.lines:
+        typer.echo(line)
+    if not done.complete:
+        raise typer.Exit(1)
