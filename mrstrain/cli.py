@@ -59,14 +59,14 @@ def _options(
     pass
 
 
-for _command in (
+for _study_command in (
     studycommands.init,
     studycommands.check,
     studycommands.run,
     studycommands.cohort,
     studycommands.demo,
 ):
-    app.command()(_command)
+    app.command()(_study_command)
 
 
 @app.command()
