@@ -14,7 +14,7 @@ from fe.turning import Turning
 
 _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at
-_LEAST_VOLUME = 0.02  # det F at a quadrature point below this is on its way to folding
+_LEAST_VOLUME = 0.002  # no step brings det F at a quadrature point below this: from there the way to folding is short
 _MOST_GROWTH = 3.0  # of the residual in one step
 _WANDERED = 2  # steps in a row that hardly lowered the residual, after which a step is measured before it is made
 _SHARES = (1.0, 0.5, 0.25)
