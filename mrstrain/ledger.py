@@ -146,7 +146,15 @@ class Ledger:
         found = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
         files = {p.relative_to(self.out).as_posix(): p.stat().st_size for p in found if p.is_file()}
         made = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-        record = Record(stage=stage.name, key=key, made_utc=made, seconds=round(seconds, 1), files=files, given=given)
+        record = Record(
+            stage=stage.name,
+            key=key,
+            made_utc=made,
+            seconds=round(seconds, 1),
+            files=files,
+            given=given,
+            made_from=dict(made_from),
+        )
         self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(self._place(stage.name), record.model_dump_json())
         return record

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -246,3 +247,11 @@ def test_taken_as_they_are_stale_results_are_called_so_and_reasons_are_kept(fold
     assert not pipeline.outcomes["register a"].whole
     assert pipeline.outcomes["register b"].reason == "It broke."
     assert pipeline.outcomes["mesh"].whole
+
+
+def test_a_record_tells_what_it_was_made_from(folder):
+    _, outcomes, _ = ran(folder)
+    record = outcomes["mesh"].record
+    assert record.made_from["files"] == [["labels.txt", hashlib.sha256(b"labels").hexdigest()]]
+    assert record.made_from["arguments"]["number"] == 1
+    assert str(folder) not in json.dumps(record.made_from)
