@@ -31,8 +31,9 @@ _LEAST_VOXELS = 2.0
 _RIM_MM = 1.2  # bone nearer to its surface than that may be tissue in part of a voxel
 _USUAL = 3.0
 _RATIO = np.sqrt(10.0)
-_FEWEST, _MOST = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
-_CHECK_STEPS, _CHECK_TOLERANCE, _CHECK_MOST = 2, 0.03, 120
+_LEAST, _GREATEST = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
+_CHECK_STEPS, _CHECK_TOLERANCE, _CHECK_MOST = 2, 0.05, 80
+_MIDDLE = 0.7  # of each edge of the mask's box
 _LAST_STEPS = 2
 
 
@@ -150,30 +151,30 @@ def fit(
     weights = Weights(_USUAL if options.bending is None else options.bending, options.volume, options.rigidity)
     spacing = np.maximum(options.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
     turned = np.array(fixed.grid.direction)
-    coefficients, control, level = np.zeros(0), None, None
+    soft = body.inside & ~core
+    coefficients, control = np.zeros(0), fixed.grid
     for number, (sigma_mm, factor, steps, stop_mm) in enumerate(_LEVELS):
-        guess = start if control is None else BSpline(control, _turned(turned, coefficients))
+        guess = start if number == 0 else BSpline(control, _turned(turned, coefficients))
         control = control_grid(fixed.grid, factor * spacing)
         coefficients = (
             np.zeros((3, *control.shape)) if guess is None else _turned(turned.T, spline_through(guess, control))
         )
-        level = _level(pictures, inside.inside, body.inside & ~core, core, control, sigma_mm)
+        level = _level(pictures, inside.inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
-        tell((number + 1) / (len(_LEVELS) + 3))
-    assert control is not None
-    assert level is not None
+        tell((number + 1) / (len(_LEVELS) + 2))
     choice = Choice(weights, "fixed by the user")
     if options.bending is None:
+        part = _middle(inside.inside)
         choice = _choose(
-            level, coefficients, weights, lambda share: tell((len(_LEVELS) + 2 * share) / (len(_LEVELS) + 3))
+            Level(*pictures, inside.inside & part, soft & part, core & part, control), coefficients, weights
         )
-        last_stop_mm = _LEVELS[-1][-1]
-        coefficients = level.descend(coefficients, choice.weights, steps=_LAST_STEPS, stop_mm=last_stop_mm)
+        tell((len(_LEVELS) + 1) / (len(_LEVELS) + 2))
+        coefficients = level.descend(coefficients, choice.weights, steps=_LAST_STEPS, stop_mm=_LEVELS[-1][-1])
     tell(1.0)
     return BSpline(control, _turned(turned, coefficients)), choice
 
 
-def _choose(level: Level, coefficients: FloatArray, weights: Weights, tell: Callable[[float], None]) -> Choice:
+def _choose(level: Level, coefficients: FloatArray, weights: Weights) -> Choice:
     """The weight of the bending by two-fold cross-validation.
 
     One half of the voxels (a chessboard of small cubes) is fitted, the other half's residual is what counts: noise that
@@ -191,26 +192,31 @@ def _choose(level: Level, coefficients: FloatArray, weights: Weights, tell: Call
                 most=_CHECK_MOST,
             )  # fmt: skip
             found[power] = level.at(fitted, halves=1).variance
-            tell(min(1.0, len(found) / 4))
         return found[power]
 
-    best = min((-1, 0, 1), key=left_out)
-    while (
-        _FEWEST < best < _MOST
-        and (beyond := min((best - 1, best + 1), key=left_out))
-        and left_out(beyond) < left_out(best)
-    ):
-        best = beyond
-    power = float(best)
-    if _FEWEST < best < _MOST:
+    best = 0
+    while (nearby := min((p for p in (best, best - 1, best + 1) if _LEAST <= p <= _GREATEST), key=left_out)) != best:
+        best = nearby
+    power, rule = float(best), "bending by cross-validation: half of the voxels fitted, the other half's residual least"
+    if _LEAST < best < _GREATEST:
         below, here, above = (left_out(best + d) for d in (-1, 0, 1))
         power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
+    else:
+        rule += "; it is least at the end of what is tried"
     chosen = replace(weights, bending=float(_USUAL * _RATIO**power))
-    tried = tuple((float(_USUAL * _RATIO**p), found[p] / found[best]) for p in sorted(found))
-    rule = "bending by cross-validation: one half of the voxels fitted, the other half's residual least"
-    return Choice(
-        chosen, rule if _FEWEST < best < _MOST else rule + "; the least lies at the end of what was tried", tried
-    )
+    return Choice(chosen, rule, tuple((float(_USUAL * _RATIO**p), found[p] / found[best]) for p in sorted(found)))
+
+
+def _middle(inside: BoolArray) -> BoolArray:
+    """The middle of a mask's box, a third of its volume: enough to choose a weight, in a third of the time."""
+    part = np.zeros_like(inside)
+    sides = []
+    for axis in range(3):
+        at = np.flatnonzero(inside.any(axis=tuple(a for a in range(3) if a != axis)))
+        margin = int(0.5 * (1.0 - _MIDDLE) * (at[-1] - at[0] + 1))
+        sides.append(slice(at[0] + margin, at[-1] + 1 - margin))
+    part[tuple(sides)] = True
+    return part
 
 
 def _level(

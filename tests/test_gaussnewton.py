@@ -24,6 +24,8 @@ from dvc.kinematics import StrainField
 from dvc.registration import Settings, register
 from dvc.smoothness import Bending
 from dvc.splinesums import SplineSums
+from dvc.transformfile import read_transform
+from dvc.transformwrite import write_elastix_transform
 from mrstrain.registering import register as run
 
 GRID = Grid((40, 44, 36), np.array([1.0, 1.0, 1.2]), np.array([-20.0, 5.0, 3.0]))
@@ -306,6 +308,15 @@ def test_a_pressed_heel_is_measured(registered, small_pair):
     assert u_mm < FAT_MM
     assert shear_error(small_pair, registered.bspline, "bone")[0] < BONE
     assert registered.choice.weights.bending == 4.0
+
+
+def test_its_spline_goes_through_an_elastix_file_unchanged(registered, small_pair, tmp_path):
+    motion, grid = registered.alignment.motion, small_pair.reference.grid
+    last = write_elastix_transform(tmp_path, registered.bspline, motion, grid)[-1]
+    X = small_pair.labels.region("fat").points()[::50]
+    np.testing.assert_allclose(
+        read_transform(last).displacement(X), registered.total.displacement(X), atol=1e-6, equal_nan=True
+    )
 
 
 def test_a_start_is_corrected_against_the_images(small_pair, registered, worker):
