@@ -64,6 +64,7 @@ nu = 0.4999
     for name, modulus in (("fat-soft", 6.0), ("fat-middle", 11.0), ("fat-stiff", 20.0), ("tendon", 25.0))
 )
 SETS = ["trebbi", "akrami", "erdemir", "luboz", "zwam"]
+BONES = ("bone", "ankle")
 LOBULES_MM = 6.0
 MARGIN_MM = 12.0
 SNR = 25.0
@@ -203,6 +204,7 @@ def scores(study: Path, hidden: Path, labels: LabelMap) -> dict[str, object]:
             e.tissue: {"true_p50": e.true_p50, "true_p95": e.true_p95, "rmse": e.shear_rmse, "bias": e.shear_bias,
                        "u_p50_mm": e.u_p50_mm, "u_p95_mm": e.u_p95_mm}
             for e in of
+            if e.tissue not in BONES  # the model has none: what of it the mesh covers is the border's staircase
         }  # fmt: skip
         models = [read_result(s, results / "models" / s / f"{load}.vtu") for s in SETS]
         one = compare(load, model.deformation, models, names, bones=("bone",), normal=np.array([0.0, 0.0, -1.0]))
