@@ -9,6 +9,7 @@ any number of threads. docs/decisions/0009 has the reasons.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -71,6 +72,13 @@ class GaussNewton:
         for name in ("volume", "rigidity"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ParameterError(f"The weight '{name}' must be 0 or more; got {getattr(self, name)}.")
+
+    @property
+    def text(self) -> str:
+        """Every number that decides the result, as JSON: what an error model or a record names the engine by."""
+        rule = {"usual": _USUAL, "ratio": _RATIO, "powers": [_LEAST, _GREATEST], "steps": [_CHECK_STEPS, _LAST_STEPS]}
+        told = {"levels": _LEVELS, "bone_rim_mm": _RIM_MM, "least_voxels": _LEAST_VOXELS, "rule": rule}
+        return json.dumps({"engine": "gauss-newton", **asdict(self), **told})
 
 
 @dataclass(frozen=True, slots=True)

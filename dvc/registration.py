@@ -22,13 +22,16 @@ from dvc.errors import InputError, ParameterError
 from dvc.gaussnewton import Choice, GaussNewton
 from dvc.image import Image, Mask
 from dvc.nonrigid import by_elastix, by_gauss_newton, without_gaps
-from dvc.presets import Preset, load_preset
+from dvc.presets import Preset, load_preset, preset_or_file
 from dvc.resample import fill_missing
 from dvc.shading import without_shading
 from dvc.tissue import tissue_mask
 from dvc.worker import Worker
 
 Progress = Callable[[str, float], None]
+
+GAUSS_NEWTON = "gauss-newton"
+"""Name of our own engine, where elastix has presets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +62,24 @@ class Settings:
     @property
     def engine(self) -> str:
         """Name of what finds the non-rigid part."""
-        return "elastix" if self.gauss_newton is None else "gauss-newton"
+        return "elastix" if self.gauss_newton is None else GAUSS_NEWTON
+
+    @property
+    def name(self) -> str:
+        """What an error model is known by: the engine gauss-newton, or the last preset of elastix."""
+        return GAUSS_NEWTON if self.gauss_newton is not None else self.presets[-1].name
+
+    @property
+    def text(self) -> str:
+        """All parameters of the non-rigid part, as written."""
+        return self.gauss_newton.text if self.gauss_newton is not None else "\n".join(p.text for p in self.presets)
 
     @classmethod
-    def of(cls, preset: str = "heel-mr", **others: object) -> Settings:
-        """Settings with a named preset."""
-        return replace(cls(presets=(load_preset(preset),)), **others)  # type: ignore[arg-type]
+    def of(cls, name: str = "heel-mr", **others: object) -> Settings:
+        """Settings by name: "gauss-newton", a preset of elastix, or the path of a parameter file (.txt)."""
+        if name == GAUSS_NEWTON:
+            return replace(cls(gauss_newton=GaussNewton()), **others)  # type: ignore[arg-type]
+        return replace(cls(presets=(preset_or_file(name),)), **others)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

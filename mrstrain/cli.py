@@ -291,7 +291,8 @@ def twin(
 def accuracy(
     out: Out,
     preset: Annotated[
-        list[str] | None, typer.Option(help="Preset to judge, or an elastix parameter file (.txt); repeat for several.")
+        list[str] | None,
+        typer.Option(help="Preset of elastix, its parameter file (.txt), or gauss-newton; repeatable."),
     ] = None,
     spacing: Annotated[list[float] | None, typer.Option(help="Edge of the voxels, mm; repeat for several.")] = None,
     slice_spacing: Annotated[
@@ -310,7 +311,7 @@ def accuracy(
         int | None, typer.Option(min=1, help="Registrations at once. Default: one for each core.")
     ] = None,
 ) -> None:
-    """Error of a preset on phantoms: by tissue, place, strain, noise and resolution. Goes on where it stopped.
+    """Error of a preset or engine on phantoms: by tissue, place, strain, noise, resolution. Goes on where it stopped.
 
     Without options 110 registrations: heel-mr, seven motions and eight waves, voxels of 0.8 mm at SNR 25, 12 and 50,
     of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr these alone (default 0.8 mm, 25).

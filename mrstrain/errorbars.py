@@ -138,13 +138,8 @@ def _held(table: ErrorTable) -> str:
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
     """The error model of what was used; InputError with the reason where there is none."""
-    stages = found.settings.presets
-    if not stages:
-        raise InputError(
-            "The error of the engine gauss-newton has not been measured yet; --engine elastix has intervals."
-        )
-    used = stages[-1]
-    if len(stages) > 1:
+    used = found.settings
+    if len(used.presets) > 1:
         raise InputError("The error of several stages, one after the other, has not been measured.")
     if given is None:
         raise InputError(f"The error of {used.name} has not been measured; `mrstrain accuracy` does that.")

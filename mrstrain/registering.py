@@ -15,8 +15,8 @@ from dvc.gaussnewton import GaussNewton
 from dvc.image import Image, Mask
 from dvc.imagefile import read_image
 from dvc.landmarks import read_landmarks
-from dvc.presets import Preset, load_preset, read_parameter_file
-from dvc.registration import Registration, Settings
+from dvc.presets import load_preset, read_parameter_file
+from dvc.registration import GAUSS_NEWTON, Registration, Settings
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
 from dvc.uncertainty import ErrorModel, error_model_of, read_error_model
@@ -153,8 +153,9 @@ def register(
         raise InputError("Give at least one loaded image.")
     if landmarks is not None and len(loads) != 1:
         raise InputError(f"--landmarks belong to one loaded image; {len(loads)} are given. Register that one alone.")
-    own = own_engine(engine, bending, volume, preset, parameters)
-    stages = stages_of(preset, parameters, allow_unknown_parameters) if own is None else ()
+    settings = settings_of(
+        engine, preset, parameters, bending=bending, volume=volume, allow_unknown=allow_unknown_parameters
+    )
     given = [
         Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh, error_model) if p is not None
     ]
@@ -180,14 +181,13 @@ def register(
     images = {name: read_image(path, allow_missing=allow_missing) for name, path in zip(cases, paths, strict=True)}
     # Read now: what is wrong with it must not be found after an hour.
     model = None if error_model is None else read_error_model(error_model)
-    if model is None and stages:
-        model = error_model_of(stages[-1].name)
     points = None if landmarks is None else read_landmarks(landmarks)[:2]
     make_output(target)
     cores = usable_cores()
     at_once = 1 if chain else min(workers or cores, cores, len(cases))
     each = threads or max(1, cores // at_once)
-    settings = Settings(stages, align, seed, each, own)
+    settings = replace(settings, align_on=align, seed=seed, threads=each)
+    model = model or error_model_of(settings.name)
     record = record_of(
         subject,
         {
@@ -241,29 +241,30 @@ def record_of(
     )
 
 
-def own_engine(
-    engine: str, bending: float | None, volume: float | None, preset: str, parameters: Sequence[Path | str]
-) -> GaussNewton | None:
-    """Parameters of our own engine where it was asked for; what belongs to the other one is refused."""
-    if engine not in {"elastix", "gauss-newton"}:
-        raise ParameterError(f"No engine '{engine}'; there are elastix and gauss-newton.")
+def settings_of(
+    engine: str,
+    preset: str,
+    parameters: Sequence[Path | str] = (),
+    *,
+    bending: float | None = None,
+    volume: float | None = None,
+    allow_unknown: bool = False,
+) -> Settings:
+    """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused."""
+    if engine not in {"elastix", GAUSS_NEWTON}:
+        raise ParameterError(f"No engine '{engine}'; there are elastix and {GAUSS_NEWTON}.")
     if engine == "elastix":
         if bending is not None or volume is not None:
-            raise ParameterError("--bending and --volume are weights of --engine gauss-newton; elastix has none.")
-        return None
+            raise ParameterError(f"--bending and --volume are weights of --engine {GAUSS_NEWTON}; elastix has none.")
+        if parameters:
+            return Settings(tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters))
+        return Settings.of(preset)
     if parameters or preset != "heel-mr":
         raise ParameterError(
-            "Presets and parameter files are elastix'; --engine gauss-newton takes --bending and --volume."
+            f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
         )
     own = GaussNewton(bending=bending)
-    return own if volume is None else replace(own, volume=volume)
-
-
-def stages_of(preset: str, parameters: Sequence[Path | str], allow_unknown: bool = False) -> tuple[Preset, ...]:
-    """The preset, or parameter files of one's own, applied one after the other."""
-    if parameters:
-        return tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters)
-    return (load_preset(preset),)
+    return Settings(gauss_newton=own if volume is None else replace(own, volume=volume))
 
 
 class _Run:

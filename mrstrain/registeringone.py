@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from dvc.align import AlignOn
@@ -10,14 +11,13 @@ from dvc.bspline import BSpline
 from dvc.errors import InputError
 from dvc.imagefile import read_image
 from dvc.quality import read_noise_floor
-from dvc.registration import Settings
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform
 from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import Worker
 from mrstrain.inputs import read_subject
-from mrstrain.registering import REPEAT, own_engine, record_of, stages_of
+from mrstrain.registering import REPEAT, record_of, settings_of
 from mrstrain.results import Case, write_case
 
 
@@ -71,11 +71,8 @@ def register_one(
         shear_direction=shear_direction,
     )
     loaded = read_image(load)
-    own = own_engine(engine, None, None, preset, parameters)
-    settings = Settings(stages_of(preset, parameters) if own is None else (), align, seed, threads, own)
-    model = None if error_model is None else read_error_model(error_model)
-    if model is None and own is None:
-        model = error_model_of(settings.presets[-1].name)
+    settings = replace(settings_of(engine, preset, parameters), align_on=align, seed=seed, threads=threads)
+    model = error_model_of(settings.name) if error_model is None else read_error_model(error_model)
     floor = None if repeat is None else read_noise_floor(repeat / "quality.json")
     start = None if after is None else read_transform(after / "TransformParameters.0.txt")
     if start is not None and not isinstance(start, BSpline):

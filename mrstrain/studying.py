@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from dvc.errors import InputError, MrstrainError, OutputError
-from dvc.presets import load_preset, preset_or_file
+from dvc.presets import load_preset
+from dvc.registration import GAUSS_NEWTON, Settings
 from dvc.whole import write_whole
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.inputs import make_output
@@ -53,6 +54,8 @@ SEEDS = (1, 2)
 
 # What makes the images: a study goes on only with runs made by the same.
 _MAKING = {"anatomy.py", "bodies.py", "flow.py", "heel.py", "motions.py", "mri.py", "study.py"}
+# Our own engine, which has no release number as elastix has.
+_ENGINE = {"gaussnewton.py", "descent.py", "imageterm.py", "smoothness.py", "splinesums.py", "nonrigid.py"}
 _SECONDS = 75.0  # of one run on one core, as measured: 3,500 iterations, whatever the voxel
 _MEGABYTES = 5.0  # of one run's samples, as measured at 0.8 mm
 
@@ -189,11 +192,11 @@ def _finished(folder: Path) -> dict[str, Samples]:
 
 
 def _check(case: Case) -> None:
-    preset = preset_or_file(case.preset)
-    if "BSplineTransform" not in preset.transform:
-        raise InputError(
-            f"{preset.name} finds no B-spline ({preset.transform}); a study judges non-rigid registration."
-        )
+    for preset in Settings.of(case.preset).presets:
+        if "BSplineTransform" not in preset.transform:
+            raise InputError(
+                f"{preset.name} finds no B-spline ({preset.transform}); a study judges non-rigid registration."
+            )
     heel_grid(case.spacing_mm)
     if case.wavelength_mm is not None and not case.wavelength_mm >= 2.0 * max(case.spacing_mm):
         raise InputError(f"{case.motion}: a wave needs at least two voxels of {max(case.spacing_mm):g} mm.")
@@ -212,9 +215,13 @@ def _check(case: Case) -> None:
 def _key(case: Case) -> str:
     """What a run's result depends on beside its case."""
     told = versions()
-    text = preset_or_file(case.preset).text + load_preset("bone-rigid").text
-    sources = "".join(file.read_text() for file in sorted(files("phantoms").iterdir(), key=str) if file.name in _MAKING)
+    text = Settings.of(case.preset).text + load_preset("bone-rigid").text
+    sources = _sources("phantoms", _MAKING) + (_sources("dvc", _ENGINE) if case.preset == GAUSS_NEWTON else "")
     return hashlib.sha256((text + told["mrstrain"] + told["itk-elastix"] + sources).encode()).hexdigest()
+
+
+def _sources(package: str, names: set[str]) -> str:
+    return "".join(file.read_text() for file in sorted(files(package).iterdir(), key=str) if file.name in names)
 
 
 def _refuse_small_disk(folder: Path, count: int) -> None:
@@ -272,7 +279,7 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
             seeds = sorted({r.case.seed for r in plain})
             motions = ", ".join(dict.fromkeys(r.case.motion for r in plain))
             source = f"{len(plain)} registrations of phantom heels, seeds {seeds}, motions {motions}"
-            fit_error_model(some, preset_or_file(preset).text, source).write(
+            fit_error_model(some, Settings.of(preset).text, source).write(
                 target / f"error_model_{Path(preset).stem}.json"
             )
     record = provenance(
@@ -281,7 +288,7 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
         {
             "cases": [r.case.name for r in runs],
             "failures": dict(failures),
-            "presets": {p: preset_or_file(p).text for p in presets},
+            "presets": {p: Settings.of(p).text for p in presets},
             "seconds_of_registration": {r.case.name: round(r.seconds, 1) for r in runs},
         },
     )

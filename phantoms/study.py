@@ -19,7 +19,6 @@ from dvc.errors import InputError
 from dvc.image import LabelMap, Mask
 from dvc.kinematics import StrainField
 from dvc.noise import signal_to_noise
-from dvc.presets import preset_or_file
 from dvc.registration import Settings, register
 from dvc.resample import shows
 from dvc.uncertainty import to_surface_mm
@@ -43,7 +42,7 @@ class Case:
     Attributes
     ----------
     preset : str
-        Name of a preset, or path of an elastix parameter file (.txt).
+        Name of a preset of elastix, path of a parameter file (.txt), or "gauss-newton".
     spacing_mm : (3,)
         Of the voxels, mm.
     snr : float
@@ -227,7 +226,7 @@ def measure(
         where = covering(grid, foot.apply(bone.points()))
         loaded = scan(heel, where, motion, foot, snr=case.snr, number=number + 1)
     # A wave moves the bone too: nothing there to align on.
-    settings = Settings((preset_or_file(case.preset),), "none" if wave else "bone", threads=worker.threads)
+    settings = Settings.of(case.preset, align_on="none" if wave else "bone", threads=worker.threads)
     found = register(
         reference,
         loaded,

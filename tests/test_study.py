@@ -299,9 +299,10 @@ def test_a_failed_run_is_told_and_the_others_go_on(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
-def test_a_run_is_that_of_its_case(worker: Worker) -> None:
+@pytest.mark.parametrize("preset", ["heel-mr", "gauss-newton"])
+def test_a_run_is_that_of_its_case(preset: str, worker: Worker) -> None:
     """Still: the truth is zero and what is found is noise; the same case gives the same samples."""
-    case = replace(CASE, motion="still")
+    case = replace(CASE, preset=preset, motion="still")
     one, two = (measure(case, worker, nullcontext(), lambda _: None) for _ in range(2))
     np.testing.assert_array_equal(one.shear, two.shear)
     assert not one.true_shear.any()
