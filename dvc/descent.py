@@ -75,14 +75,23 @@ class Level:
         Voxels that keep their volume, and voxels that stay rigid.
     control : Grid
         Control points, around all of ``fixed``.
+    rim_mm : float
+        Along the ends of ``moving``, which is not used there.
     """
 
     def __init__(
-        self, fixed: Image, moving: Image, inside: BoolArray, soft: BoolArray, bone: BoolArray, control: Grid
+        self,
+        fixed: Image,
+        moving: Image,
+        inside: BoolArray,
+        soft: BoolArray,
+        bone: BoolArray,
+        control: Grid,
+        rim_mm: float = 0.0,
     ) -> None:
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
         self.control = control
-        self.pair = ImagePair(fixed, moving, inside, control, block)
+        self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm)
         self.bending = Bending(control)
         self._soft, self._bone = self.pair.share(soft), self.pair.share(bone)  # mm3 in each block
         self._rigid = self._bone > 0

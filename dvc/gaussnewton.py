@@ -29,6 +29,7 @@ from dvc.resample import smoothed
 # Of each level: smoothing of both images (mm), control spacing over the finest, most steps, the step that ends it (mm).
 _LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 1.0, 5, 0.005))
 _LEAST_VOXELS = 2.0
+_BLURRED = 2.0  # standard deviations: nearer to its ends a blurred image shows what it was padded with
 _RIM_MM = 1.2  # bone nearer to its surface than that may be tissue in part of a voxel
 _USUAL = 3.0
 _RATIO = np.sqrt(10.0)
@@ -77,8 +78,9 @@ class GaussNewton:
     def text(self) -> str:
         """Every number that decides the result, as JSON: what an error model or a record names the engine by."""
         rule = {"usual": _USUAL, "ratio": _RATIO, "powers": [_LEAST, _GREATEST], "steps": [_CHECK_STEPS, _LAST_STEPS]}
-        told = {"levels": _LEVELS, "bone_rim_mm": _RIM_MM, "least_voxels": _LEAST_VOXELS, "rule": rule}
-        return json.dumps({"engine": "gauss-newton", **asdict(self), **told})
+        rims = {"blurred": _BLURRED, "bone_rim_mm": _RIM_MM}
+        told = {"engine": "gauss-newton", "levels": _LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
+        return json.dumps(asdict(self) | told)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +237,7 @@ def _level(
         return Level(*pictures, inside, soft, bone, control)
     fixed, moving = (_thinned(smoothed(i, sigma_mm), sigma_mm) for i in pictures)
     every = tuple(slice(None, None, int(n)) for n in _stride(pictures[0].grid, sigma_mm))
-    return Level(fixed, moving, inside[every], soft[every], bone[every], control)
+    return Level(fixed, moving, inside[every], soft[every], bone[every], control, _BLURRED * sigma_mm)
 
 
 def _scaled(image: Image, scale: float) -> Image:

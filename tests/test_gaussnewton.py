@@ -17,11 +17,12 @@ from dvc.bspline import BSpline
 from dvc.deformation import Affine, evaluate_on_grid
 from dvc.descent import Level, Weights, cofactors, conjugate_gradients
 from dvc.errors import InputError, ParameterError
-from dvc.gaussnewton import GaussNewton, control_grid, fit, spline_through
+from dvc.gaussnewton import GaussNewton, _level, control_grid, fit, spline_through
 from dvc.image import Grid, Image, Mask
 from dvc.imagewrite import write_image, write_mask
 from dvc.kinematics import StrainField
 from dvc.registration import Settings, register
+from dvc.resample import smoothed
 from dvc.smoothness import Bending
 from dvc.splinesums import SplineSums
 from dvc.transformfile import read_transform
@@ -261,6 +262,26 @@ def test_what_bends_is_smoothed_less_than_what_does_not():
 
     assert 0.3 < chosen(1.0) < 5.0  # found to 0.17 mm root mean square at a weight of 1, to 0.20 at 10
     assert chosen(0.0) > 20.0  # found to 0.04 mm at 30, to 0.12 at 1
+
+
+def test_where_a_blurred_image_shows_its_padding_it_is_not_used():
+    """At the true motion the residual is nothing, up to the end of what the second scan shows."""
+    motion = Affine(np.eye(3), np.array([1.0, -2.0, 3.0]))
+    fixed, moving = pair_of(motion)
+    end = GRID.shape[2] - 8
+    moving = Image(TURNED.part((slice(None), slice(None), slice(0, end))), moving.values[:, :, :end])
+    control = control_grid(GRID, np.full(3, 6.0))
+    true = spline_through(motion, control)
+    inside = everything().inside
+
+    def residual(level: Level) -> float:
+        return level.at(true).variance
+
+    nothing = np.zeros_like(inside)
+    used = residual(_level((fixed, moving), inside, inside, nothing, control, 1.6))
+    padded = residual(Level(smoothed(fixed, 1.6), smoothed(moving, 1.6), inside, inside, nothing, control))
+    assert used < 1e-5
+    assert padded > 20.0 * used
 
 
 def test_missing_voxels_count_for_nothing():
