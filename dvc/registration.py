@@ -75,7 +75,7 @@ class Settings:
         return self.gauss_newton.text if self.gauss_newton is not None else "\n".join(p.text for p in self.presets)
 
     @classmethod
-    def of(cls, name: str = "heel-mr", **others: object) -> Settings:
+    def of(cls, name: str = GAUSS_NEWTON, **others: object) -> Settings:
         """Settings by name: "gauss-newton", a preset of elastix, or the path of a parameter file (.txt)."""
         if name == GAUSS_NEWTON:
             return replace(cls(gauss_newton=GaussNewton()), **others)  # type: ignore[arg-type]
@@ -147,7 +147,7 @@ def register(
     tissue : Mask, optional
         Body on the reference grid, bone included; found by a threshold where it is not given.
     settings : Settings, optional
-        Preset heel-mr, seed 1, one thread by default.
+        The engine gauss-newton, seed 1, one thread by default.
     start : BSpline, optional
         Result of another load to start from: its coefficients are the first guess, which the registration
         then corrects against these two images, so no error is carried on.

@@ -67,10 +67,10 @@ def register(
     labels: Path | str | None = None,
     names: Path | str | None = None,
     align: AlignOn = "bone",
-    engine: str = "elastix",
+    engine: str | None = None,
     bending: float | None = None,
     volume: float | None = None,
-    preset: str = "heel-mr",
+    preset: str | None = None,
     parameters: Sequence[Path | str] = (),
     allow_unknown_parameters: bool = False,
     chain: bool = False,
@@ -104,11 +104,12 @@ def register(
     labels, names : path, optional
         Label map of the tissues on the unloaded image and the table of its names, for statistics by region.
     align : {"bone", "image", "none"}
-    engine : {"elastix", "gauss-newton"}
-        What finds the non-rigid part. The second is our own; ``bending`` (1/mm) and ``volume`` (1/mm3) fix its weights,
-        of which the first is otherwise chosen for each pair. Presets and parameter files are elastix'.
-    preset : str
-        Named parameters; or ``parameters``, elastix files of your own, applied one after the other.
+    engine : {"gauss-newton", "elastix"}, optional
+        What finds the non-rigid part: our own, unless a preset or parameter files of elastix are given. ``bending``
+        (1/mm) and ``volume`` (1/mm3) fix our own engine's weights; the first is otherwise chosen for each pair.
+    preset : str, optional
+        Named parameters of elastix, heel-mr by default; or ``parameters``, files of your own, applied one after the
+        other.
     chain : bool
         Start each load from the result of the one before, in the order given.
     repeat : path, optional
@@ -242,15 +243,20 @@ def record_of(
 
 
 def settings_of(
-    engine: str,
-    preset: str,
+    engine: str | None,
+    preset: str | None,
     parameters: Sequence[Path | str] = (),
     *,
     bending: float | None = None,
     volume: float | None = None,
     allow_unknown: bool = False,
 ) -> Settings:
-    """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused."""
+    """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused.
+
+    Where none is asked for: elastix if a preset or parameter files are given, else our own.
+    """
+    if engine is None:
+        engine = "elastix" if preset or parameters else GAUSS_NEWTON
     if engine not in {"elastix", GAUSS_NEWTON}:
         raise ParameterError(f"No engine '{engine}'; there are elastix and {GAUSS_NEWTON}.")
     if engine == "elastix":
@@ -258,8 +264,8 @@ def settings_of(
             raise ParameterError(f"--bending and --volume are weights of --engine {GAUSS_NEWTON}; elastix has none.")
         if parameters:
             return Settings(tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters))
-        return Settings.of(preset)
-    if parameters or preset != "heel-mr":
+        return Settings.of(preset or "heel-mr")
+    if parameters or preset:
         raise ParameterError(
             f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
         )

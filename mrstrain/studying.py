@@ -94,7 +94,7 @@ class Study:
 
 
 def cases_of(
-    presets: Sequence[str] = ("heel-mr",),
+    presets: Sequence[str] = (GAUSS_NEWTON,),
     conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
     motions: Sequence[str] = (*MOTIONS, *WAVES),
     seeds: Sequence[int] = SEEDS,

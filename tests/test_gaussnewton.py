@@ -21,6 +21,7 @@ from dvc.gaussnewton import GaussNewton, _level, control_grid, fit, spline_throu
 from dvc.image import Grid, Image, Mask
 from dvc.imagewrite import write_image, write_mask
 from dvc.kinematics import StrainField
+from dvc.presets import load_preset
 from dvc.registration import Settings, register
 from dvc.resample import smoothed
 from dvc.smoothness import Bending
@@ -28,6 +29,7 @@ from dvc.splinesums import SplineSums
 from dvc.transformfile import read_transform
 from dvc.transformwrite import write_elastix_transform
 from mrstrain.registering import register as run
+from mrstrain.registering import settings_of
 
 GRID = Grid((40, 44, 36), np.array([1.0, 1.0, 1.2]), np.array([-20.0, 5.0, 3.0]))
 
@@ -386,7 +388,7 @@ def written(tmp_path_factory, small_pair) -> Path:
     write_mask(folder / "bone.nii.gz", small_pair.bone)
     results = run(
         folder / "Load0.nii.gz", [folder / "Load1.nii.gz"], out=folder / "out", bone=folder / "bone.nii.gz",
-        engine="gauss-newton", threads=1,
+        threads=1,
     )  # fmt: skip
     assert not results.failures
     return folder
@@ -427,3 +429,16 @@ def test_what_belongs_to_the_other_engine_is_refused_first(written, tmp_path, gi
             **given,
         )  # fmt: skip
     assert not (tmp_path / "o").exists()
+
+
+def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_path):
+    (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
+    assert settings_of(None, None).gauss_newton == GaussNewton()
+    assert settings_of(None, None, bending=2.0).gauss_newton == GaussNewton(bending=2.0)
+    for engine, preset, files, name in (
+        (None, "heel-mr", [], "heel-mr"),
+        ("elastix", None, [], "heel-mr"),
+        (None, None, [tmp_path / "mine.txt"], "mine.txt"),
+    ):
+        chosen = settings_of(engine, preset, files)
+        assert (chosen.engine, chosen.name) == ("elastix", name)
