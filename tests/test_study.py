@@ -20,7 +20,7 @@ from dvc.image import Grid, LabelMap
 from dvc.uncertainty import POOLED
 from dvc.worker import Worker
 from mrstrain import accuracy
-from mrstrain.studying import cases_of
+from mrstrain.studying import cases_of, expected_minutes
 from phantoms.accuracy import error_rows, floor_rows, resolution_rows, wavelength_recovered
 from phantoms.anatomy import TISSUES, Heel
 from phantoms.errormodel import coverage_rows, fit_error_model
@@ -188,6 +188,12 @@ def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
     assert len({c.name for c in cases}) == len(cases) < 120
     assert not any(9000 <= c.seed <= 9999 for c in cases)  # set aside for published figures
     assert {"still", "sliding", "Load1", "wave-8"} <= {c.motion for c in cases}
+
+
+def test_the_time_told_beforehand_is_that_of_the_engine() -> None:
+    ours, elastix = (expected_minutes([replace(CASE, preset=p)] * 10, 2) for p in ("gauss-newton", "heel-mr"))
+    assert 1.0 < ours < 0.6 * elastix < 6.0
+    assert expected_minutes([CASE] * 10, 1) == pytest.approx(2.0 * elastix)
 
 
 @pytest.mark.slow
