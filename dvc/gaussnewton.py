@@ -31,7 +31,8 @@ _LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 
 _LEAST_VOXELS = 2.0
 _BLURRED = 2.0  # standard deviations: nearer to its ends a blurred image shows what it was padded with
 _RIM_MM = 1.2  # bone nearer to its surface than that may be tissue in part of a voxel
-_USUAL = 3.0
+USUAL_BENDING = 3.0
+"""Weight of the bending, 1/mm, that strongly loaded pairs get, about."""
 _RATIO = np.sqrt(10.0)
 _LEAST, _GREATEST = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
 _CHECK_STEPS, _CHECK_TOLERANCE, _CHECK_MOST = 2, 0.05, 80
@@ -77,7 +78,12 @@ class GaussNewton:
     @property
     def text(self) -> str:
         """Every number that decides the result, as JSON: what an error model or a record names the engine by."""
-        rule = {"usual": _USUAL, "ratio": _RATIO, "powers": [_LEAST, _GREATEST], "steps": [_CHECK_STEPS, _LAST_STEPS]}
+        rule = {
+            "usual": USUAL_BENDING,
+            "ratio": _RATIO,
+            "powers": [_LEAST, _GREATEST],
+            "steps": [_CHECK_STEPS, _LAST_STEPS],
+        }
         rims = {"blurred": _BLURRED, "bone_rim_mm": _RIM_MM}
         told = {"engine": "gauss-newton", "levels": _LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
         return json.dumps(asdict(self) | told)
@@ -158,7 +164,7 @@ def fit(
     core = np.zeros(body.grid.shape, dtype=bool)
     if bone is not None:
         core = distance_transform_edt(bone.inside, sampling=bone.grid.spacing_mm) > _RIM_MM
-    weights = Weights(_USUAL if options.bending is None else options.bending, options.volume, options.rigidity)
+    weights = Weights(USUAL_BENDING if options.bending is None else options.bending, options.volume, options.rigidity)
     spacing = np.maximum(options.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
     turned = np.array(fixed.grid.direction)
     soft = body.inside & ~core
@@ -172,7 +178,7 @@ def fit(
         level = _level(pictures, inside.inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
         tell((number + 1) / (len(_LEVELS) + 2))
-    choice = Choice(weights, "fixed by the user")
+    choice = Choice(weights, "fixed beforehand")
     if options.bending is None:
         part = _middle(inside.inside)
         choice = _choose(
@@ -196,7 +202,7 @@ def _choose(level: Level, coefficients: FloatArray, weights: Weights) -> Choice:
 
     def left_out(power: int) -> float:
         if power not in found:
-            tried = replace(weights, bending=_USUAL * _RATIO**power)
+            tried = replace(weights, bending=USUAL_BENDING * _RATIO**power)
             fitted = level.descend(
                 coefficients, tried, steps=_CHECK_STEPS, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE,
                 most=_CHECK_MOST,
@@ -213,8 +219,10 @@ def _choose(level: Level, coefficients: FloatArray, weights: Weights) -> Choice:
         power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
     else:
         rule += "; it is least at the end of what is tried"
-    chosen = replace(weights, bending=float(_USUAL * _RATIO**power))
-    return Choice(chosen, rule, tuple((float(_USUAL * _RATIO**p), found[p] / found[best]) for p in sorted(found)))
+    chosen = replace(weights, bending=float(USUAL_BENDING * _RATIO**power))
+    return Choice(
+        chosen, rule, tuple((float(USUAL_BENDING * _RATIO**p), found[p] / found[best]) for p in sorted(found))
+    )
 
 
 def _middle(inside: BoolArray) -> BoolArray:

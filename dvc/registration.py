@@ -19,7 +19,7 @@ from dvc.align import Alignment, AlignOn, align, not_aligned
 from dvc.bspline import BSpline
 from dvc.deformation import Composed, Deformation, Within
 from dvc.errors import InputError, ParameterError
-from dvc.gaussnewton import Choice, GaussNewton
+from dvc.gaussnewton import USUAL_BENDING, Choice, GaussNewton
 from dvc.image import Image, Mask
 from dvc.nonrigid import by_elastix, by_gauss_newton, without_gaps
 from dvc.presets import Preset, load_preset, preset_or_file
@@ -73,6 +73,13 @@ class Settings:
     def text(self) -> str:
         """All parameters of the non-rigid part, as written."""
         return self.gauss_newton.text if self.gauss_newton is not None else "\n".join(p.text for p in self.presets)
+
+    def of_repeat(self) -> Settings:
+        """For a repeat scan: a weight chosen for it alone would smooth away the noise that it is to show."""
+        own = self.gauss_newton
+        if own is None or own.bending is not None:
+            return self
+        return replace(self, gauss_newton=replace(own, bending=USUAL_BENDING))
 
     @classmethod
     def of(cls, name: str = GAUSS_NEWTON, **others: object) -> Settings:

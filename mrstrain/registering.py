@@ -308,7 +308,7 @@ class _Run:
                     self.images[name],
                     bone=self.subject.bone,
                     tissue=self.body,
-                    settings=self.settings,
+                    settings=self.settings.of_repeat() if name == REPEAT else self.settings,
                     start=start,
                     worker=worker,
                     progress=lambda stage, fraction: self._told(name, stage, fraction),

@@ -88,16 +88,16 @@ def register_one(
         },
     )
     body = subject.tissue or tissue_mask(subject.reference)
+    is_repeat = out.name == REPEAT
     with Worker(threads) as worker:
         found = register_pair(
             subject.reference,
             loaded,
             bone=subject.bone,
             tissue=body,
-            settings=settings,
+            settings=settings.of_repeat() if is_repeat else settings,
             start=start,
             worker=worker,
             progress=tell,
         )
-    is_repeat = out.name == REPEAT
     return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model)

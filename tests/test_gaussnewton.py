@@ -16,11 +16,13 @@ from scipy.spatial.transform import Rotation
 from dvc.bspline import BSpline
 from dvc.deformation import Affine, evaluate_on_grid
 from dvc.descent import Level, Weights, cofactors, conjugate_gradients
-from dvc.errors import InputError, ParameterError
-from dvc.gaussnewton import GaussNewton, _level, control_grid, fit, spline_through
+from dvc.errors import InputError, ParameterError, RegistrationError
+from dvc.gaussnewton import USUAL_BENDING, GaussNewton, _level, control_grid, fit, spline_through
 from dvc.image import Grid, Image, Mask
+from dvc.imagefile import read_image
 from dvc.imagewrite import write_image, write_mask
 from dvc.kinematics import StrainField
+from dvc.labels import read_mask
 from dvc.presets import load_preset
 from dvc.registration import Settings, register
 from dvc.resample import smoothed
@@ -30,6 +32,7 @@ from dvc.transformfile import read_transform
 from dvc.transformwrite import write_elastix_transform
 from mrstrain.registering import register as run
 from mrstrain.registering import settings_of
+from mrstrain.registeringone import register_one
 
 GRID = Grid((40, 44, 36), np.array([1.0, 1.0, 1.2]), np.array([-20.0, 5.0, 3.0]))
 
@@ -429,6 +432,38 @@ def test_what_belongs_to_the_other_engine_is_refused_first(written, tmp_path, gi
             **given,
         )  # fmt: skip
     assert not (tmp_path / "o").exists()
+
+
+def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkeypatch):
+    """Chosen for a pair without strain the weight is the greatest, and the floor would be far below a load's noise."""
+    used = {}
+
+    def never(reference, loaded, *, settings, **_):
+        used[float(loaded.values[0, 0, 0])] = settings.gauss_newton
+        raise RegistrationError("enough")
+
+    for module in ("registering", "registeringone"):
+        monkeypatch.setattr(f"mrstrain.{module}.register_pair", never)
+    load0, load1 = read_image(written / "Load0.nii.gz"), read_image(written / "Load1.nii.gz")
+    for number, name in ((1.0, "Load1"), (2.0, "again")):
+        values = load1.values.copy()
+        values[0, 0, 0] = number
+        write_image(tmp_path / f"{name}.nii.gz", Image(load1.grid, values))
+    write_mask(tmp_path / "labels.nii.gz", read_mask(written / "bone.nii.gz", load0.grid))
+    with pytest.raises(RegistrationError):
+        run(
+            written / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "o", bone=written / "bone.nii.gz",
+            repeat=tmp_path / "again.nii.gz", workers=1, threads=1,
+        )  # fmt: skip
+    assert used == {1.0: GaussNewton(), 2.0: GaussNewton(bending=USUAL_BENDING)}
+    used.clear()
+    with pytest.raises(RegistrationError):
+        register_one(
+            written / "Load0.nii.gz", tmp_path / "again.nii.gz", out=tmp_path / "repeat",
+            labels=tmp_path / "labels.nii.gz", names=None, bone=written / "bone.nii.gz",
+        )  # fmt: skip
+    assert used == {2.0: GaussNewton(bending=USUAL_BENDING)}
+    assert Settings.of("heel-mr").of_repeat() == Settings.of("heel-mr")
 
 
 def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_path):
