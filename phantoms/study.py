@@ -48,7 +48,8 @@ class Case:
     snr : float
         Fat's signal over the noise's standard deviation.
     motion : str
-        "still", "smooth", "sliding", "Load1" to "Load4", or "wave-L" with a wavelength L in mm.
+        "still" (registered as a repeat scan is), "smooth", "sliding", "Load1" to "Load4", or "wave-L" with a
+        wavelength L in mm.
     seed : int
         Of the heel, its images and the foot's motion.
     """
@@ -227,6 +228,8 @@ def measure(
         loaded = scan(heel, where, motion, foot, snr=case.snr, number=number + 1)
     # A wave moves the bone too: nothing there to align on.
     settings = Settings.of(case.preset, align_on="none" if wave else "bone", threads=worker.threads)
+    if motion is None:
+        settings = settings.of_repeat()
     found = register(
         reference,
         loaded,

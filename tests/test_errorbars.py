@@ -132,10 +132,11 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     assert "other parameters" in error_bars(found, subject, maps, own).told
 
 
-def test_the_preset_for_heels_comes_with_its_error() -> None:
-    stored = error_model_of("heel-mr")
+@pytest.mark.parametrize("name", ["gauss-newton", "heel-mr"])
+def test_our_own_engine_and_the_preset_for_heels_come_with_their_error(name: str) -> None:
+    stored = error_model_of(name)
     assert stored is not None
-    assert stored.parameters_sha256 == hashlib.sha256(load_preset("heel-mr").text.encode()).hexdigest()
+    assert stored.parameters_sha256 == hashlib.sha256(Settings.of(name).text.encode()).hexdigest()
     table = stored.table_for(np.full(3, 0.8), 25.0)
     bias, sd = table.expected("fat", np.array([0.02, 0.3]), np.array([6.0, 0.5], dtype=np.float32))
     assert bias[0] > 0.005  # noise lifts small shears
