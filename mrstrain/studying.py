@@ -148,22 +148,24 @@ def accuracy(
     Raises
     ------
     InputError
-        For a case that cannot be: voxel, noise, motion or preset. Before anything runs.
+        For a case that cannot be: voxel, noise, motion or preset; for two parameter files of one name, here or in an
+        earlier call. Before anything runs.
     OutputError
         If the folder cannot be written to, or the disk has too little room.
     MrstrainError
         If every run failed.
     """
     wanted = list(cases_of() if cases is None else cases)
-    if not wanted or len({c.name for c in wanted}) < len(wanted):
+    if not wanted or len(set(wanted)) < len(wanted):
         raise InputError("A study needs at least one case, and each only once.")
     for case in wanted:
         _check(case)
     target = Path(out)
-    make_output(target)
     runs = target / "runs"
-    runs.mkdir(exist_ok=True)
     found = _finished(runs)
+    _refuse_one_name_for_two([*(samples.case for samples in found.values()), *wanted])
+    make_output(target)
+    runs.mkdir(exist_ok=True)
     left = [case for case in wanted if case.name not in found]
     _refuse_small_disk(target, len(left))
     at_once = max(1, min(workers or usable_cores(), len(left)))
@@ -189,6 +191,18 @@ def _finished(folder: Path) -> dict[str, Samples]:
         if samples is not None:
             found[samples.case.name] = samples
     return found
+
+
+def _refuse_one_name_for_two(cases: Sequence[Case]) -> None:
+    """Runs and error models are kept under the preset's or file's name: one of two would pass for the other."""
+    named: dict[str, str] = {}
+    for case in cases:
+        other = named.setdefault(Path(case.preset).stem, case.preset)
+        if other != case.preset:
+            raise InputError(
+                f"{other} and {case.preset} would share the name '{Path(other).stem}' in this study: rename one, or "
+                "judge it in another --out."
+            )
 
 
 def _check(case: Case) -> None:
