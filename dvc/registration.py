@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dvc import elastix
-from dvc.align import Alignment, AlignOn, align, not_aligned
+from dvc.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.bspline import BSpline
 from dvc.deformation import Composed, Deformation, Within
 from dvc.errors import InputError, ParameterError
@@ -68,6 +68,12 @@ class Settings:
     def name(self) -> str:
         """What an error model is known by: the engine gauss-newton, or the last preset of elastix."""
         return GAUSS_NEWTON if self.gauss_newton is not None else self.presets[-1].name
+
+    @property
+    def needs_one_contrast(self) -> bool:
+        """Whether what is brighter than its neighbours must be so in both images; not for mutual information."""
+        metrics = [metric for preset in self.presets for metric in preset.parameters.get("Metric", ())]
+        return not any("MutualInformation" in metric for metric in metrics)
 
     @property
     def text(self) -> str:
@@ -165,7 +171,8 @@ def register(
     InputError
         If the two images are the same, or a mask is missing or empty.
     RegistrationError
-        If the bone cannot be found in the loaded image, or elastix fails; with elastix' reason.
+        If the bone cannot be found in the loaded image, if the contrast of the two images is turned round and is not
+        to be followed by mutual information, or if elastix fails; with elastix' reason.
     WorkerError
         If the process that runs elastix dies.
     """
@@ -190,6 +197,8 @@ def register(
         inside = body.toward_lps()
         on = None if bone is None else bone.toward_lps()
         alignment = _align(fixed, moving, inside, on, chosen, runner)
+        if chosen.align_on == "none" and chosen.needs_one_contrast:  # a rigid alignment refuses it by itself
+            refuse_turned_contrast(fixed, moving, inside, alignment.motion)
         tell("aligning", 1.0)
         bspline, choice = start, None
         if chosen.gauss_newton is not None:
