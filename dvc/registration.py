@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -182,7 +183,7 @@ def register(
         raise ParameterError("No registration stage given; name a preset or parameter files.")
     _refuse_other_spacing(chosen.presets)
     tell = progress or (lambda _stage, _fraction: None)
-    _refuse_same(reference, loaded)
+    refuse_one_image_twice([("The unloaded image", reference), ("the loaded one", loaded)])
     body = tissue if tissue is not None else tissue_mask(reference)
     _check_masks(reference, body, bone, chosen.align_on)
     own = worker is None
@@ -227,12 +228,20 @@ def register(
     return Registration(reference, loaded, body, bone, alignment, bspline, chosen, time.monotonic() - began, choice)
 
 
-def _refuse_same(reference: Image, loaded: Image) -> None:
-    if reference.grid.same_as(loaded.grid) and np.array_equal(reference.values, loaded.values, equal_nan=True):
-        raise InputError(
-            "The loaded image is the unloaded one: every voxel is equal. Check the file names; two scans, even of "
-            "a resting foot, differ by their noise."
-        )
+def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:
+    """Refuse scans of which two are the same image, told by the names given with them.
+
+    Raises
+    ------
+    InputError
+        Naming the two.
+    """
+    for (one, image), (other, second) in combinations(images, 2):
+        if image.grid.same_as(second.grid) and np.array_equal(image.values, second.values, equal_nan=True):
+            raise InputError(
+                f"{one} and {other} are the same image: every voxel is equal. Check the file names; two scans, even "
+                "of a resting foot, differ by their noise."
+            )
 
 
 def _check_masks(reference: Image, body: Mask, bone: Mask | None, on: AlignOn) -> None:
