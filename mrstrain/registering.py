@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from dvc.align import AlignOn
 from dvc.arrays import FloatArray
 from dvc.bspline import BSpline
@@ -16,12 +18,19 @@ from dvc.image import Image, Mask
 from dvc.imagefile import read_image
 from dvc.landmarks import read_landmarks
 from dvc.presets import load_preset, read_parameter_file
-from dvc.registration import GAUSS_NEWTON, Registration, Settings
+from dvc.registration import GAUSS_NEWTON, Registration, Settings, refuse_one_image_twice
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
 from dvc.uncertainty import ErrorModel, error_model_of, read_error_model
 from dvc.worker import Worker, each_in_workers, usable_cores
-from mrstrain.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
+from mrstrain.inputs import (
+    Subject,
+    case_names,
+    make_output,
+    read_subject,
+    refuse_small_disk,
+    refuse_touching_inputs,
+)
 from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
 from mrstrain.results import Case, write_case
@@ -29,6 +38,7 @@ from mrstrain.results import Case, write_case
 Told = Callable[[str, str, float], None]
 REPEAT = "repeat"
 """Name of a repeat scan's results."""
+_BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plate's axes
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +193,11 @@ def register(
     # Read now: what is wrong with it must not be found after an hour.
     model = None if error_model is None else read_error_model(error_model)
     points = None if landmarks is None else read_landmarks(landmarks)[:2]
+    refuse_one_image_twice(
+        [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
+    )
+    needed = _BYTES_PER_VOXEL * int(np.prod(subject.reference.grid.shape)) * len(cases)
+    refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
     make_output(target)
     cores = usable_cores()
     at_once = 1 if chain else min(workers or cores, cores, len(cases))
@@ -262,6 +277,10 @@ def settings_of(
     if engine == "elastix":
         if bending is not None or volume is not None:
             raise ParameterError(f"--bending and --volume are weights of --engine {GAUSS_NEWTON}; elastix has none.")
+        if parameters and preset:
+            raise ParameterError(
+                f"Give the preset {preset} or parameter files, not both: only one of them would be used."
+            )
         if parameters:
             return Settings(tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters))
         return Settings.of(preset or "heel-mr")

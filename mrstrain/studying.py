@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import shutil
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -14,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.errors import InputError, MrstrainError, OutputError
+from dvc.errors import InputError, MrstrainError
 from dvc.presets import load_preset
 from dvc.registration import GAUSS_NEWTON, Settings
 from dvc.whole import write_whole
 from dvc.worker import Worker, each_in_workers, usable_cores
-from mrstrain.inputs import make_output
+from mrstrain.inputs import make_output, refuse_small_disk
 from mrstrain.provenance import provenance, versions, write_json
 from mrstrain.studypage import write_study_report
 from phantoms.accuracy import (
@@ -149,24 +148,26 @@ def accuracy(
     Raises
     ------
     InputError
-        For a case that cannot be: voxel, noise, motion or preset. Before anything runs.
+        For a case that cannot be: voxel, noise, motion or preset; for two parameter files of one name, here or in an
+        earlier call. Before anything runs.
     OutputError
         If the folder cannot be written to, or the disk has too little room.
     MrstrainError
         If every run failed.
     """
     wanted = list(cases_of() if cases is None else cases)
-    if not wanted or len({c.name for c in wanted}) < len(wanted):
+    if not wanted or len(set(wanted)) < len(wanted):
         raise InputError("A study needs at least one case, and each only once.")
     for case in wanted:
         _check(case)
     target = Path(out)
-    make_output(target)
     runs = target / "runs"
-    runs.mkdir(exist_ok=True)
     found = _finished(runs)
+    _refuse_one_name_for_two([*(samples.case for samples in found.values()), *wanted])
     left = [case for case in wanted if case.name not in found]
-    _refuse_small_disk(target, len(left))
+    refuse_small_disk(target, len(left) * _MEGABYTES * 1e6 + 20e6, "the study needs", ", or a smaller study")
+    make_output(target)
+    runs.mkdir(exist_ok=True)
     at_once = max(1, min(workers or usable_cores(), len(left)))
     if tell_plan is not None:
         tell_plan(
@@ -190,6 +191,18 @@ def _finished(folder: Path) -> dict[str, Samples]:
         if samples is not None:
             found[samples.case.name] = samples
     return found
+
+
+def _refuse_one_name_for_two(cases: Sequence[Case]) -> None:
+    """Runs and error models are kept under the preset's or file's name: one of two would pass for the other."""
+    named: dict[str, str] = {}
+    for case in cases:
+        other = named.setdefault(Path(case.preset).stem, case.preset)
+        if other != case.preset:
+            raise InputError(
+                f"{other} and {case.preset} would share the name '{Path(other).stem}' in this study: rename one, or "
+                "judge it in another --out."
+            )
 
 
 def _check(case: Case) -> None:
@@ -223,15 +236,6 @@ def _key(case: Case) -> str:
 
 def _sources(package: str, names: set[str]) -> str:
     return "".join(file.read_text() for file in sorted(files(package).iterdir(), key=str) if file.name in names)
-
-
-def _refuse_small_disk(folder: Path, count: int) -> None:
-    needed, free = count * _MEGABYTES * 1e6 + 20e6, shutil.disk_usage(folder).free
-    if free < needed:
-        raise OutputError(
-            f"{folder}: the study needs about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. Free "
-            "some, choose another --out, or a smaller study."
-        )
 
 
 def _run_all(

@@ -16,6 +16,7 @@ from dvc.presets import load_preset
 from dvc.registration import Settings
 from dvc.strainmaps import StrainMaps
 from dvc.uncertainty import POOLED, ErrorModel, ErrorTable, error_model_of
+from dvc.verdict import Verdict
 from mrstrain.errorbars import error_bars
 from mrstrain.inputs import Subject
 
@@ -86,7 +87,7 @@ def test_where_the_error_is_not_known_the_reason_is_told(
     assert bars.uncertainty is None
     assert says in bars.told
     assert bars.as_dict() == {"known": False, "reason": bars.told}
-    bars.write(tmp_path, maps)
+    bars.write(tmp_path, maps, Verdict("trust"))
     assert not list(tmp_path.iterdir())
     assert bars.table() is None
 

@@ -304,6 +304,30 @@ def test_a_failed_run_is_told_and_the_others_go_on(monkeypatch: pytest.MonkeyPat
     assert "the optimiser diverged" in (tmp_path / "report.html").read_text()
 
 
+def test_two_parameter_files_of_one_name_are_never_taken_for_each_other(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("mrstrain.studying.measure", lambda case, *_: samples(case))
+    cases = []
+    for folder, iterations in (("a", 100), ("b", 200)):
+        file = tmp_path / folder / "mine.txt"
+        file.parent.mkdir()
+        file.write_text(f'(Transform "BSplineTransform")\n(MaximumNumberOfIterations {iterations})\n')
+        cases.append(replace(CASE, preset=str(file)))
+    both = r"a/mine\.txt and .*b/mine\.txt"
+    with pytest.raises(InputError, match=both):
+        accuracy(tmp_path / "out", cases=cases)
+    assert not (tmp_path / "out").exists()
+    accuracy(tmp_path / "out", cases=cases[:1], workers=1)
+    kept = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()}
+    for second in (cases[1], replace(cases[1], motion="Load2")):  # their error models would share a file as well
+        with pytest.raises(InputError, match=both):
+            accuracy(tmp_path / "out", cases=[second], workers=1)
+    assert {p: p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()} == kept
+    Path(cases[0].preset).unlink()  # its runs are no longer counted
+    assert not accuracy(tmp_path / "out", cases=[cases[1]], workers=1).failures
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["heel-mr", "gauss-newton"])
 def test_a_run_is_that_of_its_case(preset: str, worker: Worker) -> None:
