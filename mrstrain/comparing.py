@@ -40,7 +40,7 @@ from validate.curves import RANGE, Area
 from validate.levelled import LEVELLED
 from validate.location import LEAST_ML, Overlap, read_thresholds
 from validate.mapping import ALL
-from validate.misfit import misfits
+from validate.misfit import displacement_slip, misfits
 from validate.sources import FeResult
 
 Told = Callable[[str, str, float], None]
@@ -154,6 +154,7 @@ def compare(
     measurements = measurements_in(Path(dvc), loads)
     usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame, to_image)
     places = [Path(m) for m in models]
+    strange: list[str] = []
     files, notes = model_files([m.load for m in measurements], places, usual)
     every = [file for of in files.values() for file in of]
     given = [
@@ -166,7 +167,7 @@ def compare(
             raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
     # Every file is looked at before anything is computed, and read again in its turn: together they fill the memory.
     for load, of in files.items():
-        notes += [f"{load}: {told}" for file in of for told in misfits(file.read(tissues.grid), tissues, bones)]
+        strange += [f"{load}: {told}" for file in of for told in misfits(file.read(tissues.grid), tissues, bones)]
     make_output(target)
     _clear(target, list(files))
     common = None if mesh is None else read_tet_mesh(mesh)
@@ -197,6 +198,7 @@ def compare(
             load, measured, results, tissues, bones=bones, normal=-axes[:, 0], mesh=common,
             table=measurement.table, strains=strains, thresholds=levels, least_ml=least_ml,
         )  # fmt: skip
+        strange += [f"{load}: {slip}" for name in one.found.models if (slip := displacement_slip(one.found, name))]
         drawn = pictures_of(one, measured, results, tissues, bones, axes, strains, colours)
         with whole_folder(target / load) as folder:
             _write_fields(folder / "fields.vtu", one)
@@ -207,6 +209,7 @@ def compare(
             write_json(folder / "provenance.json", record)
         done.append(one)
         told.append((one, measurement, drawn, viewer_of(one, measured, results, tissues, bones, measurement.folder)))
+    notes += strange
     notes += [
         f"{m.load}: the bone's motion was not taken out of this measurement: displacements are not the tissue's alone."
         for m in measurements
