@@ -145,11 +145,19 @@ def page_sections(
     totals: Sequence[Area],
     noise: Sequence[str],
     notes: Sequence[str],
+    strange: Sequence[str],
     strains: tuple[float, float],
 ) -> list[Section]:
-    """The report's parts: models and loads first, then each load."""
-    done = [one for one, _, _, _ in shown]
-    sections = [Section("Models and loads", None, (_areas(done, totals, strains),), (), (*noise, *notes))]
+    """The report's parts: models and loads first, with what is ``strange`` about a model, then each load."""
+    heads = {
+        one.load: one.load
+        if measurement.verdict is None or measurement.verdict.level == "trust"
+        else f"{one.load} ({measurement.verdict.words.lower()})"
+        for one, measurement, _, _ in shown
+    }
+    slips = Verdict("caution", tuple(strange)) if strange else None
+    table = _areas([one for one, _, _, _ in shown], heads, totals, strains)
+    sections = [Section("Models and loads", slips, (table,), (), (*noise, *notes))]
     for one, measurement, drawn, viewer in shown:
         verdict = measurement.verdict
         pictures = {stem: Picture(title, said(draw), drawn[stem]) for stem, (title, draw) in _TITLES.items()}
@@ -186,7 +194,9 @@ def shown(area: Area) -> str:
     return f"{area.best_ml:.2f}" + (f" ({area.low_ml:.2f} to {area.high_ml:.2f})" if known else "")
 
 
-def _areas(done: Sequence[Comparison], totals: Sequence[Area], strains: tuple[float, float]) -> Table:
+def _areas(
+    done: Sequence[Comparison], heads: Mapping[str, str], totals: Sequence[Area], strains: tuple[float, float]
+) -> Table:
     areas = {(a.model, a.load): a for one in done for a in one.areas if a.tissue == ALL}
     sums = {a.model: a for a in totals}
     names = [*sums, *dict.fromkeys(model for model, _ in areas if model not in sums)]
@@ -197,7 +207,7 @@ def _areas(done: Sequence[Comparison], totals: Sequence[Area], strains: tuple[fl
     nothing = rows.pop(NOTHING)
     return Table(
         f"Area between the volume-strain curves of soft tissue, strains {strains[0]:g} to {strains[1]:g}, mL",
-        ("model", *(one.load for one in done), "all loads"),
+        ("model", *(heads[one.load] for one in done), "all loads"),
         tuple(rows.values()),
         "The nearest model first. Where the measurement's error is known, the area is the median over truths that "
         "could lie behind it, with a 95 % interval; areas as found, and by tissue, stand below and in areas.csv. "

@@ -52,7 +52,7 @@ class ModelFile:
             )
         except ExtentError as failure:
             raise ExtentError(f"{failure} The image: {box_told(*grid.bounds_mm())} (LPS mm).") from failure
-        check_overlap(result, grid)
+        check_overlap(self.path, result.mesh, grid)
         return result
 
 

@@ -18,7 +18,7 @@ from validate.misfit import displacement_slip, misfits
 
 
 def pressed() -> Mapped:
-    """A block pressed by 0.4 mm along x and sheared by 0.25 mm along y, thinner in z: no cell changes its volume much."""
+    """A block pressed by 0.4 mm along x and sheared by 0.25 mm along y; its cells hardly change their volume."""
     found = mapped(cube(), labels(), ["bone"], sheared(0.0), {})
     x, y, z = (found.points_mm / SIDE).T
     u = np.stack([-0.4 * x, 0.25 * x + 0.1 * y * x, 0.12 * (z - 0.4) * x], axis=1)

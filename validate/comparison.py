@@ -166,10 +166,11 @@ def compare(
     return Comparison(load, found, tuple(areas), tuple(overlaps), tuple(rows), tuple(travels), told, strains)
 
 
-def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], Area, tuple[str, ...]]:
+def total(done: Sequence[Comparison], distrusted: Sequence[str] = ()) -> tuple[tuple[Area, ...], Area, tuple[str, ...]]:
     """Areas over all loads of the models that have every one, the nearest first; of `NOTHING`; and what can be told.
 
     Loads are measured one by one, so their errors are taken as independent. The share is the mean of the loads' shares.
+    What is told says of the ``distrusted`` loads that their registration is not to be trusted.
     """
     everywhere = [name for name in done[0].found.models if all(name in one.found.models for one in done)]
     bands_of = [one.bands[ALL] for one in done if ALL in one.bands]
@@ -194,9 +195,16 @@ def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], Area, tuple[str
                 f"Under {one.load} hardly any tissue is measured above the range's lower end: areas do not judge."
             )
         elif ALL in one.bands:
-            told.append(_told(f"under {one.load}", one.ranked(), one.bands[ALL]))
+            sentence = _told(f"under {one.load}", one.ranked(), one.bands[ALL])
+            doubt = " Its registration is not to be trusted." if one.load in distrusted else ""
+            told.append(sentence + doubt if sentence else "")
     if len(done) > 1 and everywhere and whole is not None and not all(one.hardly_strained for one in done):
-        told.insert(0, _told("over all loads", [a for a in rows if not a.model.endswith(LEVELLED)], whole))
+        sentence = _told("over all loads", [a for a in rows if not a.model.endswith(LEVELLED)], whole)
+        counted = [one.load for one in done if one.load in distrusted]
+        doubt = (
+            f" The registration of {', '.join(counted)}, which counts in it, is not to be trusted." if counted else ""
+        )
+        told.insert(0, sentence + doubt if sentence else "")
     return tuple(rows), nothing, tuple(sentence for sentence in told if sentence)
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import permutations, product
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from dvc.errors import GeometryError
 from dvc.image import LabelMap
-from dvc.mesh import box_told
+from dvc.mesh import TetMesh, box_told
 from validate.mapping import Mapped, tissues_of
 from validate.sources import FeResult
 
@@ -23,31 +24,45 @@ _UNIT = 1000.0
 _ALIKE = 0.02
 
 
+def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence[str]) -> float:
+    """Share of the smaller one's volume in which a mesh and the labelled soft tissue overlap.
+
+    Raises
+    ------
+    GeometryError
+        If it is under 85 %: the mesh is somewhere else.
+    """
+    soft = [number for number, name in labels.names.items() if name not in bones]
+    tissue = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=False)
+    inside = np.isin(tissue, [labels.names[number] for number in soft])
+    labelled = np.isin(labels.labels, soft)
+    smaller = min(mesh.volumes_mm3.sum(), np.count_nonzero(labelled) * labels.grid.voxel_volume_mm3)
+    overlap = float(mesh.volumes_mm3[inside].sum() / smaller)
+    if overlap < _LEAST_OVERLAP:
+        there = labels.grid.points(labelled)
+        raise GeometryError(
+            f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: "
+            f"{box_told(*mesh.bounds_mm)}; labelled soft tissue: "
+            f"{box_told(there.min(axis=0), there.max(axis=0))} (LPS mm). It is turned, mirrored or moved against the "
+            "image, or its label map is another's: check unit and frame, or give the map to the image's frame."
+        )
+    return overlap
+
+
 def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[str]:
     """Check a model against the label map, and tell in sentences what is strange.
 
     Raises
     ------
     GeometryError
-        If model and labelled soft tissue share less than 85 % of the smaller one's volume: it is somewhere else.
+        As `check_in_tissue`.
     """
     mesh, told = result.mesh, []
+    overlap = check_in_tissue(result.path, mesh, labels, bones)
     tissue = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=False)
     names = [name for name in labels.names.values() if name not in bones]
     soft = np.isin(tissue, names)
     volume = mesh.volumes_mm3
-    labelled = sum(np.count_nonzero(labels.labels == n) for n, name in labels.names.items() if name in names)
-    smaller = min(float(volume.sum()), labelled * labels.grid.voxel_volume_mm3)
-    overlap = float(volume[soft].sum()) / smaller
-    if overlap < _LEAST_OVERLAP:
-        there = labels.grid.points(np.isin(labels.labels, [n for n, name in labels.names.items() if name in names]))
-        raise GeometryError(
-            f"{result.path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: "
-            f"{box_told(*mesh.bounds_mm)}; labelled soft tissue: "
-            f"{box_told(there.min(axis=0), there.max(axis=0))} (LPS mm). It is turned, mirrored or moved "
-            "against the image, or its label map is another's: check unit and frame, or give the map to the image's "
-            "frame."
-        )
     if overlap < _GOOD_OVERLAP:
         told.append(f"{result.name}: {overlap:.0%} of the model lies in the labelled soft tissue; is its frame right?")
     of_mesh = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=True)
