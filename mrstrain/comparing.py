@@ -25,7 +25,7 @@ from mrstrain.methods import methods
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.page import flat
 from mrstrain.provenance import provenance, versions, write_json
-from validate.comparison import Comparison, total
+from validate.comparison import ALL_LOADS, Comparison, total
 from validate.comparison import compare as compare_load
 from validate.curves import RANGE, Area
 from validate.levelled import LEVELLED
@@ -246,14 +246,15 @@ def compare(
         )
     notes += _covered(done)
     levels = {m.load: "" if m.verdict is None else m.verdict.level for m in compared}
-    totals, nothing, noise = total(done, [load for load, level in levels.items() if level == "distrust"])
+    summed = total(done, [load for load, level in levels.items() if level == "distrust"])
     whole = verdict_on(compared)
-    levels[nothing.load] = "" if whole is None else whole.level
-    write_tables(target, done, [*totals, nothing], strains, levels)
+    levels[ALL_LOADS] = "" if whole is None else whole.level
+    write_tables(target, done, [*summed.areas, summed.nothing], strains, levels)
     write_json(
         target / "comparison.json",
         {
-            "total_area_ml": {a.model: a.best_ml for a in totals}, "told_apart": list(noise), "notes": notes,
+            "total_area_ml": {a.model: a.best_ml for a in summed.areas}, "told_apart": list(summed.told),
+            "not_told_apart": summed.not_told_apart, "notes": notes,
             "coverage_ml": {one.load: one.found.coverage() for one in done},
             "verdict": _plain(verdict), "verdict_by_load": {m.load: _plain(m.verdict) for m in compared},
         } | record,
@@ -265,11 +266,13 @@ def compare(
         error_known=any(one.bands for one in done), version=versions()["mrstrain"],
     )  # fmt: skip
     beside = [note for note in notes if note not in doubts]  # these stand in the verdict
-    sections = page_sections(told, [*totals, nothing], noise, beside, strange, strains)
+    sections = page_sections(told, summed, beside, strange, strains)
     closing = closing_sections(thresholds_used, done_how)
     write_report(target / "report.html", "Models against the measurement", verdict, sections, closing, flat(record))
     tell("compare", "comparing", 1.0)
-    return Compared(target, tuple(done), totals, noise, tuple(notes), verdict, tuple(sections), tuple(closing))
+    return Compared(
+        target, tuple(done), summed.areas, summed.told, tuple(notes), verdict, tuple(sections), tuple(closing)
+    )
 
 
 def _plain(verdict: Verdict | None) -> dict[str, object] | None:
