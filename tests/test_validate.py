@@ -206,7 +206,7 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
             ).drawn()
         )
         draws = TruthDraws(points, truth + 0.01 + noise, tissue, distance, error_table(0.01, 0.04), seed)
-        band = bands(draws.many(200), models, volumes, everywhere, 1.3)[ALL]
+        band = bands(draws.many(200), models, volumes, everywhere, 1.3, draws.narrowed)[ALL]
         _, low, high, _ = band.interval("far")
         held_by_equal.append(band.interval("equal")[1] == 0.0)
         held.append(low <= true_area["far"] <= high)
@@ -219,6 +219,34 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
     assert seen > 0.9
     assert noisy < 0.2
     assert wrong == 0.0
+
+
+SPREADS = {
+    "concentrated": lambda share: np.full(len(share), 0.35),
+    "narrow": lambda share: 0.33 + 0.04 * share,
+    "ramp": lambda share: 0.2 + 0.4 * share,
+    "exponential": lambda share: -0.25 * np.log(1.0 - 0.999 * share),
+}
+
+
+@pytest.mark.parametrize("spread", SPREADS)
+def test_a_perfect_model_is_not_ruled_out_however_strain_is_spread(spread: str) -> None:
+    mesh = cube(10)
+    points, volumes = mesh.centroids_mm, mesh.volumes_mm3 / 1000.0
+    truth = SPREADS[spread](np.argsort(np.argsort(points @ [1.0, 1e-3, 1e-6])) / len(points))
+    models = {"equal": truth, "off": truth - 0.12}
+    true = area_between(truth, models["off"], volumes)
+    tissue, distance, everywhere = ["fat"] * len(points), np.ones(len(points)), {ALL: np.ones(len(points), dtype=bool)}
+    flat, held, from_zero = np.full(len(points), 0.5), [], []
+    for seed in range(8):
+        noise = 0.5 - TruthDraws(points, flat, tissue, distance, error_table(0.0, 0.04), 100 + seed).drawn()
+        draws = TruthDraws(points, truth + noise, tissue, distance, error_table(0.0, 0.04), seed)
+        band = bands(draws.many(100), models, volumes, everywhere, 1.3, draws.narrowed)[ALL]
+        held.append(band.interval("equal")[1] == 0.0)
+        low, high = band.interval("off")[1:3]
+        from_zero.append(low == 0.0 or not low <= true <= high)
+    assert np.mean(held) > 0.85
+    assert np.mean(from_zero) < 0.25  # and a wrong model still is told to be wrong, by as much as it is
 
 
 def test_models_behind_the_nearest_that_noise_cannot_order_are_named_too() -> None:
@@ -311,7 +339,8 @@ def test_a_biased_measurement_ranks_by_what_lies_behind_it() -> None:
         mesh.centroids_mm, truth - 0.07, ["fat"] * len(truth), np.ones(len(truth)), error_table(-0.07, 0.02)
     )
     models = {"copy": truth - 0.07, "right": truth}
-    band = bands(draws.many(200), models, volumes, {ALL: np.ones(len(truth), dtype=bool)}, 1.0)[ALL]
+    everywhere = {ALL: np.ones(len(truth), dtype=bool)}
+    band = bands(draws.many(200), models, volumes, everywhere, 1.0, draws.narrowed)[ALL]
     assert area_between(truth - 0.07, models["copy"], volumes) < area_between(truth - 0.07, truth, volumes)
     assert band.interval("right")[0] < band.interval("copy")[0]
     assert band.surely_below("right", "copy")

@@ -309,5 +309,6 @@ def _bands(
         found.volumes_ml[common],
         {name: where[common] for name, where in tissues.items()},
         table.factor,
+        draws.narrowed,
         strains,
     )
