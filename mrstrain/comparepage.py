@@ -236,13 +236,14 @@ def _tissues(one: Comparison) -> Table:
 def _location(one: Comparison) -> Table:
     rows = tuple(
         (o.model, o.threshold, _ranged(o.measured_ml, o.measured_low_ml, o.measured_high_ml), o.model_ml,
-         f"{o.measured_clusters} / {o.model_clusters}", _ranged(o.dice, o.dice_low, o.dice_high),
+         f"{o.measured_clusters} / {o.model_clusters}", f"{_ranged(o.measured_mean)} / {_ranged(o.model_mean)}",
+         _ranged(o.dice, o.dice_low, o.dice_high),
          _ranged(o.centroids_mm, o.centroids_low_mm, o.centroids_high_mm), o.largest_mm,
          _ranged(o.hausdorff95_mm, o.hausdorff95_low_mm, o.hausdorff95_high_mm))
         for o in one.overlaps
     )  # fmt: skip
     perfect: dict[float, tuple[Cell, ...]] = {
-        o.threshold: ("perfect", o.threshold, "", "", "", _ranged(o.dice_perfect),
+        o.threshold: ("perfect", o.threshold, "", "", "", "", _ranged(o.dice_perfect),
                       _ranged(o.centroids_perfect_mm), "", _ranged(o.hausdorff95_perfect_mm))
         for o in one.overlaps
         if not np.isnan(o.measured_low_ml)
@@ -256,11 +257,12 @@ def _location(one: Comparison) -> Table:
     )
     return Table(
         "Tissue above a strain: how much, and where",
-        ("model", "above", "measured, mL", "model, mL", "clusters", "Dice", "centroids, mm", "largest, mm",
-         "Hausdorff, mm"),
+        ("model", "above", "measured, mL", "model, mL", "clusters", "mean shear", "Dice", "centroids, mm",
+         "largest, mm", "Hausdorff, mm"),
         rows,
-        known + "Clusters are connected parts, measured / model's; distances of the centroids of all that lies above, "
-        "and of the largest clusters; Hausdorff distance at its 95th percentile.",
+        known + "In clusters, connected parts of at least the least volume: their number and mean shear, measured / "
+        "model's; distances of the centroids of all together, and of the largest; Hausdorff distance at its 95th "
+        "percentile.",
         tuple(perfect.values()),
     )  # fmt: skip
 

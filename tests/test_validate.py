@@ -99,6 +99,30 @@ def test_clusters_are_connected_and_large_enough() -> None:
     assert clusters(shear > 0.9, shear, volumes, points, neighbours(mesh)) == []
 
 
+def test_a_speck_far_away_moves_nothing_and_clusters_tell_their_mean() -> None:
+    mesh = cube(12)
+    points, volumes, touching = mesh.centroids_mm, mesh.volumes_mm3 / 1000.0, neighbours(mesh)
+    slab = points[:, 0] < 5.0
+    measured = np.where(slab, 0.4 + 0.04 * points[:, 0], 0.1)
+    model = np.where(points[:, 0] < 20.0 / 3.0, 0.5, 0.1)
+    clean = overlap("m", "l", 0.3, measured, model, volumes, points, touching)
+    # by volume a linear field has the mean of its middle
+    assert clean.measured_mean == pytest.approx(0.5, abs=1e-9)
+    assert clean.model_mean == pytest.approx(0.5)
+    assert (clean.measured_ml, clean.model_ml) == pytest.approx((2.0, 8.0 / 3.0))
+    assert clean.dice == pytest.approx(2.0 * 2.0 / (2.0 + 8.0 / 3.0))
+    assert clean.centroids_mm == pytest.approx(5.0 / 6.0)
+    far = measured.copy()
+    far[np.argmax(points[:, 0])] = 2.9
+    assert overlap("m", "l", 0.3, far, model, volumes, points, touching) == clean
+    assert overlap("m", "l", 0.3, far, model, volumes, points, touching, 0.0) != clean
+    told = with_intervals([clean], [far] * 4, {"m": model}, volumes, points, touching, 0.1, 1.0)[0]
+    assert (told.dice_low, told.dice_high) == pytest.approx((clean.dice, clean.dice))
+    assert told.measured_high_ml == pytest.approx(2.0)
+    none = overlap("m", "l", 3.0, measured, model, volumes, points, touching)
+    assert np.isnan(none.measured_mean)
+
+
 def test_agreement_has_its_closed_forms() -> None:
     random = np.random.default_rng(0)
     x, noise = random.normal(0.3, 0.1, 100_000), random.normal(0.0, 0.05, 100_000)
@@ -298,7 +322,7 @@ def test_intervals_of_location_hold_the_truth_and_a_perfect_model_is_not_ruled_o
         noise = 0.5 - TruthDraws(points, flat, tissue, distance, error_table(0.0, 0.03), 100 + seed).drawn()
         draws = TruthDraws(points, truth + 0.02 + noise, tissue, distance, error_table(0.02, 0.03), seed)
         found = [overlap(n, "l", 0.35, truth + 0.02 + noise, m, volumes, points, touching) for n, m in models.items()]
-        equal, apart = with_intervals(found, list(draws.many(60)), models, volumes, points, 1.3)
+        equal, apart = with_intervals(found, list(draws.many(60)), models, volumes, points, touching, 0.1, 1.3)
         assert (equal.model, apart.model) == ("equal", "apart")
         held.append(
             (
@@ -311,7 +335,7 @@ def test_intervals_of_location_hold_the_truth_and_a_perfect_model_is_not_ruled_o
         )
     assert (np.mean(held, axis=0) > 0.85).all(), np.mean(held, axis=0)
     # a truth without tissue above the threshold has no place: fewer than half of the draws are not told
-    none, _ = with_intervals(found, [truth, *[0.1 * truth] * 9], models, volumes, points, 1.0)
+    none, _ = with_intervals(found, [truth, *[0.1 * truth] * 9], models, volumes, points, touching, 0.1, 1.0)
     assert np.isnan(none.centroids_low_mm)
     assert none.measured_low_ml == 0.0
 
