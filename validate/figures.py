@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from dvc.arrays import FloatArray
 from dvc.deformation import Deformation
 from dvc.figures import REGION_COLOURS
-from dvc.regions import volume_above
 from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet
 from validate.curves import Band
@@ -39,21 +38,15 @@ def volume_strain(
     figure, panels = _panels(len(tissues))
     at = np.linspace(0.0, 1.5 * strains[1], _POINTS)
     for axes, tissue in zip(panels, tissues, strict=True):
-        where = found.common & ((found.tissue == tissue) | (tissue not in found.tissues))
-        volumes = found.volumes_ml[where]
         if tissue in bands:
             band = bands[tissue]
             axes.fill_between(band.strains, band.low_ml, band.high_ml, color=_BAND, linewidth=0, label="95 % of truths")
-        axes.plot(
-            at,
-            volume_above(found.measured.max_shear[where], volumes, at),
-            color="black",
-            linewidth=2.2,
-            label="measured",
-        )
-        for name, field in found.models.items():
-            colour = REGION_COLOURS[colours.index(name) % (len(REGION_COLOURS) - 1)]
-            axes.plot(at, volume_above(field.max_shear[where], volumes, at), color=colour, linewidth=1.5, label=name)
+        for name, above in found.curves(tissue, at).items():
+            if name == "measured":
+                axes.plot(at, above, color="black", linewidth=2.2, label=name)
+            else:
+                colour = REGION_COLOURS[colours.index(name) % (len(REGION_COLOURS) - 1)]
+                axes.plot(at, above, color=colour, linewidth=1.5, label=name)
         for edge in strains:
             axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
         axes.set_title(tissue, color=INK, **FONT)
@@ -87,10 +80,14 @@ def slices(
     defined. Where the measurement does not reach a node, it is drawn with the displacement of the nearest one. Letters
     name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
+    return slice_sheet(found.mesh, slice_panels(found, measured, displacements), axes, point_mm)
+
+
+def slice_panels(found: Mapped, measured: Deformation, displacements: Mapping[str, FloatArray]) -> list[Slice]:
+    """What `slices` draws: the measurement, then each model, with displacements (n, 3) at the mesh's nodes."""
     u = filled_from_nearest(measured.displacement(found.mesh.points_mm), found.mesh.points_mm)
     panels = [Slice("measured", u, found.measured.max_shear)]
-    panels += [Slice(name, displacements[name], field.max_shear) for name, field in found.models.items()]
-    return slice_sheet(found.mesh, panels, axes, point_mm)
+    return panels + [Slice(name, displacements[name], field.max_shear) for name, field in found.models.items()]
 
 
 def scatter(found: Mapped) -> bytes:
