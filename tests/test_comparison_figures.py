@@ -13,7 +13,7 @@ import pytest
 from dvc.deformation import Affine
 from dvc.image import Grid, LabelMap
 from dvc.kinematics import plate_axes
-from mrstrain.comparepage import lowest_bone_point
+from mrstrain.comparepage import lowest_bone_point, pictures_of
 from mrstrain.comparing import compare
 from tests.test_compare_command import LOADS, given, rows, study, with_errors
 from tests.test_validate import SIDE, cube, error_table, labels, max_shear, result, sheared
@@ -92,6 +92,19 @@ def test_the_lowest_point_of_bone_is_that_of_a_spur_along_the_outward_normal(
     axes = plate_axes(-np.array(normal), (0.0, -1.0, 0.0))
     found = lowest_bone_point(LabelMap(grid, bone, {1: "bone"}), ["bone"], axes)
     assert found == pytest.approx([5.0, 12.0, height])
+
+
+@pytest.mark.parametrize(("aside", "words"), [(0.0, "goes through the bone's"), (30.0, "lies beside the mesh")])
+def test_the_slices_caption_says_where_it_lies(aside: float, words: str) -> None:
+    mesh, bone = cube(4), labels()
+    model = result("half", mesh, sheared(0.2))
+    one = compare_load("Load1", sheared(0.4), [model], bone, bones=["bone"], normal=X)
+    grid = replace(bone.grid, origin_mm=bone.grid.origin_mm + [0.0, 0.0, aside])
+    axes = plate_axes(-X, (0.0, 1.0, 0.0))
+    drawn = pictures_of(
+        one, sheared(0.4), [model], replace(bone, grid=grid), ["bone"], axes, (0.2, 0.5), ["half"]
+    )  # fmt: skip
+    assert words in drawn["slices"].caption
 
 
 def test_curves_and_slices_are_drawn_of_each_field_itself() -> None:
