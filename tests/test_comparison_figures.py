@@ -99,7 +99,7 @@ def test_the_slices_caption_says_where_it_lies(aside: float, words: str) -> None
     mesh, bone = cube(4), labels()
     model = result("half", mesh, sheared(0.2))
     one = compare_load("Load1", sheared(0.4), [model], bone, bones=["bone"], normal=X)
-    grid = replace(bone.grid, origin_mm=bone.grid.origin_mm + [0.0, 0.0, aside])
+    grid = replace(bone.grid, origin_mm=bone.grid.origin_mm + np.array([0.0, 0.0, aside]))
     axes = plate_axes(-X, (0.0, 1.0, 0.0))
     drawn = pictures_of(
         one, sheared(0.4), [model], replace(bone, grid=grid), ["bone"], axes, (0.2, 0.5), ["half"]
