@@ -40,7 +40,7 @@ class TruthDraws:
     ) -> None:
         self._random = np.random.default_rng(seed)
         self._shear = shear
-        names = np.asarray(tissue)
+        names = self._names = np.asarray(tissue)
         self._expected = []
         for run in range(len(table.runs)):
             bias, sd = np.empty(len(shear)), np.empty(len(shear))
@@ -57,6 +57,22 @@ class TruthDraws:
         """A truth (n,): shear found less a registration's bias, less a Gaussian field of its deviation; not below 0."""
         bias, sd = self._expected[self._random.integers(len(self._expected))]
         return np.maximum(self._shear - bias - sd * self._noise.drawn(), 0.0)
+
+    def narrowed(self, truth: FloatArray) -> FloatArray:
+        """A truth drawn (n,) whose spread in each tissue is that of the found shear less the noise, not plus it.
+
+        About the tissue's mean m: m + (x - m) (1 - 2 s^2 / v)^(1/2), with v the variance of x and s^2 the mean square
+        of the noise's deviation, which is in x once as found and once as drawn; uniform where the noise could have made
+        all of the spread.
+        """
+        noise = np.mean([sd**2 for _, sd in self._expected], axis=0)
+        narrow = np.empty(len(truth))
+        for name in np.unique(self._names):
+            here = self._names == name
+            mean, spread = truth[here].mean(), truth[here].var()
+            kept = max(spread - 2.0 * noise[here].mean(), 0.0) / spread if spread > 0.0 else 0.0
+            narrow[here] = mean + np.sqrt(kept) * (truth[here] - mean)
+        return narrow
 
     def many(self, count: int) -> Iterator[FloatArray]:
         """So many truths, each drawn when it is asked for."""

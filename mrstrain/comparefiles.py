@@ -19,7 +19,6 @@ from dvc.deformation import evaluate_on_grid
 from dvc.image import Image, LabelMap
 from dvc.imagewrite import write_image
 from dvc.kinematics import StrainField
-from dvc.regions import volume_above
 from dvc.whole import whole_file, write_whole
 from validate.agreement import Agreement, Travel
 from validate.comparison import Comparison
@@ -92,7 +91,6 @@ def write_tables(
     for one in done:
         found = one.found
         for tissue in (ALL, *found.tissues):
-            where = found.common & ((found.tissue == tissue) | (tissue == ALL))
             if tissue in one.bands:
                 band = one.bands[tissue]
                 for name, edge in (("measured, low", band.low_ml), ("measured, high", band.high_ml)):
@@ -100,8 +98,7 @@ def write_tables(
                         (one.load, tissue, name, s, v)
                         for s, v in zip(at.tolist(), np.interp(at, band.strains, edge).tolist(), strict=True)
                     ]
-            for name, field in {"measured": found.measured, **found.models}.items():
-                above = volume_above(field.max_shear[where], found.volumes_ml[where], at)
+            for name, above in found.curves(tissue, at).items():
                 curves += [(one.load, tissue, name, s, v) for s, v in zip(at.tolist(), above.tolist(), strict=True)]
     told = [(*row, levels.get(str(row[0]), "")) for row in curves]
     write_whole(

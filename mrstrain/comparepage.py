@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -26,11 +26,7 @@ from validate.sources import FeResult
 
 _AROUND = 4  # voxels around the tissue in the viewer
 _PANELS = 4  # tissues whose curves are drawn, all soft tissue first
-_TITLES: dict[str, tuple[str, Callable[..., bytes]]] = {
-    "curves": ("Volume above a strain", figures.volume_strain),
-    "slices": ("Where the strain lies", figures.slices),
-    "agreement": ("Cell by cell", figures.scatter),
-}
+_AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
 _CLOSING = Section(
     "How to read this",
     paragraphs=(
@@ -72,19 +68,31 @@ def pictures_of(
     axes: FloatArray,
     strains: tuple[float, float],
     colours: Sequence[str],
-) -> dict[str, bytes]:
+) -> dict[str, Picture]:
     """Draw a load's figures, by the stem of their files; ``colours`` names the models in the order of their colours."""
     found = one.found
     displacements = {r.name: _at_nodes(r, found.mesh.points_mm) for r in results}
     told = [name for name in found.tissues if any(a.tissue == name for a in one.areas)]
-    drawn = {"curves": figures.volume_strain(found, one.bands, strains, (ALL, *told)[:_PANELS], colours)}
+    curves = figures.volume_strain(found, one.bands, strains, (ALL, *told)[:_PANELS], colours)
     point = lowest_bone_point(labels, bones, axes)
     across = (found.mesh.points_mm - point) @ axes[:, 2]
-    if not across.min() < 0.0 < across.max():  # the bone lies beside the mesh
+    through = "It goes through the bone's lowest point."
+    if not across.min() < 0.0 < across.max():
         point = found.mesh.bounds_mm.mean(axis=0)
-    drawn["slices"] = figures.slices(found, measured, displacements, axes, point)
-    drawn["agreement"] = figures.scatter(found)
-    return drawn
+        through = "The bone's lowest point lies beside the mesh: the slice goes through the mesh's middle instead."
+    slices = figures.slices(found, measured, displacements, axes, point)
+    apart = said(figures.differences)
+    return {
+        "curves": Picture("Volume above a strain", said(figures.volume_strain), curves),
+        "slices": Picture("Where the strain lies", f"{said(figures.slices)} {through}", slices),
+        "agreement": Picture("Maximal shear, cell by cell", said(figures.scatter), figures.scatter(found)),
+        "differences_shear": Picture(
+            "Differences of maximal shear", apart, figures.differences(found, one.agreements, "max_shear")
+        ),
+        "differences_u": Picture(
+            "Differences of the displacement's length", apart, figures.differences(found, one.agreements, "u_mm")
+        ),
+    }
 
 
 def lowest_bone_point(labels: LabelMap, bones: Sequence[str], axes: FloatArray) -> FloatArray:
@@ -141,7 +149,7 @@ def viewer_of(
 
 
 def page_sections(
-    shown: Sequence[tuple[Comparison, Judged, Mapping[str, bytes], Viewer]],
+    shown: Sequence[tuple[Comparison, Judged, Mapping[str, Picture], Viewer]],
     summed: Total,
     notes: Sequence[str],
     strange: Sequence[str],
@@ -159,7 +167,6 @@ def page_sections(
     sections = [Section("Models and loads", slips, (table,), (), (*summed.told, *notes))]
     for one, measurement, drawn, viewer in shown:
         verdict = measurement.verdict
-        pictures = {stem: Picture(title, said(draw), drawn[stem]) for stem, (title, draw) in _TITLES.items()}
         covered = one.found.coverage()
         told = (
             f"Compared: {covered['common']:.1f} mL of the mesh's {covered['mesh']:.1f} mL of soft tissue; the "
@@ -167,13 +174,14 @@ def page_sections(
         )
         judged = () if verdict is None else (f"Its registration is judged: {verdict.words}.",)
         doubtful = verdict if verdict is not None and verdict.level != "trust" else None
-        first = tuple(pictures[stem] for stem in ("curves", "slices"))
+        first = tuple(drawn[stem] for stem in ("curves", "slices"))
+        cells = tuple(picture for stem, picture in drawn.items() if stem not in ("curves", "slices"))
         sections.append(
             Section(
                 one.load, doubtful, (_tissues(one), _location(one), _travel(one)), first, (told, *judged), (viewer,)
             )
         )
-        sections.append(Section(f"{one.load}, cell by cell", None, (_agreement(one),), (pictures["agreement"],)))
+        sections.append(Section(f"{one.load}, cell by cell", None, (_agreement(one), _by_distance(one)), cells))
     return sections
 
 
@@ -236,13 +244,14 @@ def _tissues(one: Comparison) -> Table:
 def _location(one: Comparison) -> Table:
     rows = tuple(
         (o.model, o.threshold, _ranged(o.measured_ml, o.measured_low_ml, o.measured_high_ml), o.model_ml,
-         f"{o.measured_clusters} / {o.model_clusters}", _ranged(o.dice, o.dice_low, o.dice_high),
+         f"{o.measured_clusters} / {o.model_clusters}", f"{_ranged(o.measured_mean)} / {_ranged(o.model_mean)}",
+         _ranged(o.dice, o.dice_low, o.dice_high),
          _ranged(o.centroids_mm, o.centroids_low_mm, o.centroids_high_mm), o.largest_mm,
          _ranged(o.hausdorff95_mm, o.hausdorff95_low_mm, o.hausdorff95_high_mm))
         for o in one.overlaps
     )  # fmt: skip
     perfect: dict[float, tuple[Cell, ...]] = {
-        o.threshold: ("perfect", o.threshold, "", "", "", _ranged(o.dice_perfect),
+        o.threshold: ("perfect", o.threshold, "", "", "", "", _ranged(o.dice_perfect),
                       _ranged(o.centroids_perfect_mm), "", _ranged(o.hausdorff95_perfect_mm))
         for o in one.overlaps
         if not np.isnan(o.measured_low_ml)
@@ -256,11 +265,12 @@ def _location(one: Comparison) -> Table:
     )
     return Table(
         "Tissue above a strain: how much, and where",
-        ("model", "above", "measured, mL", "model, mL", "clusters", "Dice", "centroids, mm", "largest, mm",
-         "Hausdorff, mm"),
+        ("model", "above", "measured, mL", "model, mL", "clusters", "mean shear", "Dice", "centroids, mm",
+         "largest, mm", "Hausdorff, mm"),
         rows,
-        known + "Clusters are connected parts, measured / model's; distances of the centroids of all that lies above, "
-        "and of the largest clusters; Hausdorff distance at its 95th percentile.",
+        known + "In clusters, connected parts of at least the least volume: their number and mean shear, measured / "
+        "model's; distances of the centroids of all together, and of the largest; Hausdorff distance at its 95th "
+        "percentile.",
         tuple(perfect.values()),
     )  # fmt: skip
 
@@ -273,21 +283,34 @@ def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
 
 
 def _agreement(one: Comparison) -> Table:
-    rows = tuple(
-        (a.model, {"max_shear": "shear", "u_mm": "u, mm"}[a.quantity], a.part, a.measured_mean,
-         a.model_mean, a.slope, a.intercept, a.r2, a.rmse, a.concordance, a.bias, a.lower, a.upper)
-        for a in one.agreements
-        if a.part == ALL or a.part in one.found.tissues
-    )  # fmt: skip
+    rows = _rows_of(one, [ALL, *one.found.tissues])
     return Table(
         "Agreement cell by cell",
-        ("model", "quantity", "tissue", "measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias",
-         "limits from", "to"),
+        ("model", "quantity", "tissue", *_AGREED),
         rows,
         "Of maximal shear and displacement u: means, regression of the model on the measurement, Lin's concordance, "
         "Bland and Altman's limits. Of displacements: lengths, but for regression and concordance (the three "
-        "components together) and RMSE (of the difference). By distance to bone in agreement.csv. All as found, "
+        "components together) and RMSE (of the difference). All as found, "
         "without intervals: the error model tells of maximal shear, and there is none of displacement.",
+    )  # fmt: skip
+
+
+def _by_distance(one: Comparison) -> Table:
+    known = (ALL, *one.found.tissues)
+    return Table(
+        "Agreement by distance to bone",
+        ("model", "quantity", "where", *_AGREED),
+        _rows_of(one, [a.part for a in one.agreements if a.part not in known]),
+        "In all soft tissue, as above.",
+    )
+
+
+def _rows_of(one: Comparison, parts: Sequence[str]) -> tuple[tuple[Cell, ...], ...]:
+    return tuple(
+        (a.model, {"max_shear": "shear", "u_mm": "u, mm"}[a.quantity], a.part, a.measured_mean,
+         a.model_mean, a.slope, a.intercept, a.r2, a.rmse, a.concordance, a.bias, a.lower, a.upper)
+        for a in one.agreements
+        if a.part in parts
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.kinematics import plate_axes
 from dvc.labels import read_labels
-from dvc.report import Section, write_report
+from dvc.report import Picture, Section, write_report
 from dvc.verdict import Verdict
 from dvc.viewer import Viewer
 from dvc.whole import whole_folder
@@ -205,7 +205,7 @@ def compare(
     )  # fmt: skip
     colours = list(dict.fromkeys(file.name for file in every))
     done: list[Comparison] = []
-    told: list[tuple[Comparison, Measurement, dict[str, bytes], Viewer]] = []
+    told: list[tuple[Comparison, Measurement, dict[str, Picture], Viewer]] = []
     for number, measurement in enumerate(compared):
         load = measurement.load
         tell("compare", "comparing", number / len(files))
@@ -218,8 +218,8 @@ def compare(
         drawn = pictures_of(one, measured, results, tissues, bones, axes, strains, colours)
         with whole_folder(target / load) as folder:
             write_fields(folder / "fields.vtu", one)
-            for stem, png in drawn.items():
-                (folder / f"{stem}.png").write_bytes(png)
+            for stem, picture in drawn.items():
+                (folder / f"{stem}.png").write_bytes(picture.png)
             if on_image:
                 write_on_image(folder, results, tissues)
             write_json(folder / "provenance.json", record | {"verdict": _plain(measurement.verdict)})

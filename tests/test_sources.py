@@ -224,11 +224,27 @@ def test_a_gmsh_file_whose_nodes_stand_in_another_order_is_refused(tmp_path: Pat
         read_result("heel", mesh)
 
 
+def with_middles(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quadratic tetrahedra of linear ones: nodes in the middles of the edges, in CalculiX's order."""
+    pairs = np.sort(cells[:, [(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]], axis=2)
+    edges, number = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
+    middles = points[edges].mean(axis=1)
+    return np.concatenate([points, middles]), np.hstack([cells, len(points) + number.reshape(-1, 6)])
+
+
 @pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX (ccx) is not installed")
-def test_a_file_of_calculix_itself_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["C3D4", "C3D10", "C3D8"])
+def test_a_file_of_calculix_itself_is_read(tmp_path: Path, kind: str) -> None:
     points, cells = block()
+    if kind == "C3D10":
+        points, cells = with_middles(points, cells)
+    if kind == "C3D8":
+        low = points.min(axis=0)
+        index = {tuple(np.rint((p - low) / 5.0).astype(int)): n for n, p in enumerate(points)}
+        around = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
+        cells = np.array([[index[tuple(np.add(c, a))] for a in around] for c in np.ndindex(2, 2, 2)])
     lines = ["*NODE, NSET=NALL"] + [f"{n + 1}, {x}, {y}, {z}" for n, (x, y, z) in enumerate(points.tolist())]
-    lines += ["*ELEMENT, TYPE=C3D4, ELSET=EALL"]
+    lines += [f"*ELEMENT, TYPE={kind}, ELSET=EALL"]
     lines += [f"{i + 1}, " + ", ".join(str(n + 1) for n in cell) for i, cell in enumerate(cells)]
     lines += ["*MATERIAL, NAME=M", "*ELASTIC", "1., 0.3", "*SOLID SECTION, ELSET=EALL, MATERIAL=M", "*STEP", "*STATIC"]
     rim = ((points == points.min(axis=0)) | (points == points.max(axis=0))).any(axis=1)

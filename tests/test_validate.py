@@ -99,6 +99,30 @@ def test_clusters_are_connected_and_large_enough() -> None:
     assert clusters(shear > 0.9, shear, volumes, points, neighbours(mesh)) == []
 
 
+def test_a_speck_far_away_moves_nothing_and_clusters_tell_their_mean() -> None:
+    mesh = cube(12)
+    points, volumes, touching = mesh.centroids_mm, mesh.volumes_mm3 / 1000.0, neighbours(mesh)
+    slab = points[:, 0] < 5.0
+    measured = np.where(slab, 0.4 + 0.04 * points[:, 0], 0.1)
+    model = np.where(points[:, 0] < 20.0 / 3.0, 0.5, 0.1)
+    clean = overlap("m", "l", 0.3, measured, model, volumes, points, touching)
+    # by volume a linear field has the mean of its middle
+    assert clean.measured_mean == pytest.approx(0.5, abs=1e-9)
+    assert clean.model_mean == pytest.approx(0.5)
+    assert (clean.measured_ml, clean.model_ml) == pytest.approx((2.0, 8.0 / 3.0))
+    assert clean.dice == pytest.approx(2.0 * 2.0 / (2.0 + 8.0 / 3.0))
+    assert clean.centroids_mm == pytest.approx(5.0 / 6.0)
+    far = measured.copy()
+    far[np.argmax(points[:, 0])] = 2.9
+    assert overlap("m", "l", 0.3, far, model, volumes, points, touching) == clean
+    assert overlap("m", "l", 0.3, far, model, volumes, points, touching, 0.0) != clean
+    told = with_intervals([clean], [far] * 4, {"m": model}, volumes, points, touching, 0.1, 1.0)[0]
+    assert (told.dice_low, told.dice_high) == pytest.approx((clean.dice, clean.dice))
+    assert told.measured_high_ml == pytest.approx(2.0)
+    none = overlap("m", "l", 3.0, measured, model, volumes, points, touching)
+    assert np.isnan(none.measured_mean)
+
+
 def test_agreement_has_its_closed_forms() -> None:
     random = np.random.default_rng(0)
     x, noise = random.normal(0.3, 0.1, 100_000), random.normal(0.0, 0.05, 100_000)
@@ -206,7 +230,7 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
             ).drawn()
         )
         draws = TruthDraws(points, truth + 0.01 + noise, tissue, distance, error_table(0.01, 0.04), seed)
-        band = bands(draws.many(200), models, volumes, everywhere, 1.3)[ALL]
+        band = bands(draws.many(200), models, volumes, everywhere, 1.3, draws.narrowed)[ALL]
         _, low, high, _ = band.interval("far")
         held_by_equal.append(band.interval("equal")[1] == 0.0)
         held.append(low <= true_area["far"] <= high)
@@ -219,6 +243,34 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
     assert seen > 0.9
     assert noisy < 0.2
     assert wrong == 0.0
+
+
+SPREADS = {
+    "concentrated": lambda share: np.full(len(share), 0.35),
+    "narrow": lambda share: 0.33 + 0.04 * share,
+    "ramp": lambda share: 0.2 + 0.4 * share,
+    "exponential": lambda share: -0.25 * np.log(1.0 - 0.999 * share),
+}
+
+
+@pytest.mark.parametrize("spread", SPREADS)
+def test_a_perfect_model_is_not_ruled_out_however_strain_is_spread(spread: str) -> None:
+    mesh = cube(10)
+    points, volumes = mesh.centroids_mm, mesh.volumes_mm3 / 1000.0
+    truth = SPREADS[spread](np.argsort(np.argsort(points @ [1.0, 1e-3, 1e-6])) / len(points))
+    models = {"equal": truth, "off": truth - 0.12}
+    true = area_between(truth, models["off"], volumes)
+    tissue, distance, everywhere = ["fat"] * len(points), np.ones(len(points)), {ALL: np.ones(len(points), dtype=bool)}
+    flat, held, from_zero = np.full(len(points), 0.5), [], []
+    for seed in range(8):
+        noise = 0.5 - TruthDraws(points, flat, tissue, distance, error_table(0.0, 0.04), 100 + seed).drawn()
+        draws = TruthDraws(points, truth + noise, tissue, distance, error_table(0.0, 0.04), seed)
+        band = bands(draws.many(100), models, volumes, everywhere, 1.3, draws.narrowed)[ALL]
+        held.append(band.interval("equal")[1] == 0.0)
+        low, high = band.interval("off")[1:3]
+        from_zero.append(low == 0.0 or not low <= true <= high)
+    assert np.mean(held) > 0.85
+    assert np.mean(from_zero) < 0.25  # and a wrong model still is told to be wrong, by as much as it is
 
 
 def test_models_behind_the_nearest_that_noise_cannot_order_are_named_too() -> None:
@@ -270,7 +322,7 @@ def test_intervals_of_location_hold_the_truth_and_a_perfect_model_is_not_ruled_o
         noise = 0.5 - TruthDraws(points, flat, tissue, distance, error_table(0.0, 0.03), 100 + seed).drawn()
         draws = TruthDraws(points, truth + 0.02 + noise, tissue, distance, error_table(0.02, 0.03), seed)
         found = [overlap(n, "l", 0.35, truth + 0.02 + noise, m, volumes, points, touching) for n, m in models.items()]
-        equal, apart = with_intervals(found, list(draws.many(60)), models, volumes, points, 1.3)
+        equal, apart = with_intervals(found, list(draws.many(60)), models, volumes, points, touching, 0.1, 1.3)
         assert (equal.model, apart.model) == ("equal", "apart")
         held.append(
             (
@@ -283,7 +335,7 @@ def test_intervals_of_location_hold_the_truth_and_a_perfect_model_is_not_ruled_o
         )
     assert (np.mean(held, axis=0) > 0.85).all(), np.mean(held, axis=0)
     # a truth without tissue above the threshold has no place: fewer than half of the draws are not told
-    none, _ = with_intervals(found, [truth, *[0.1 * truth] * 9], models, volumes, points, 1.0)
+    none, _ = with_intervals(found, [truth, *[0.1 * truth] * 9], models, volumes, points, touching, 0.1, 1.0)
     assert np.isnan(none.centroids_low_mm)
     assert none.measured_low_ml == 0.0
 
@@ -311,7 +363,8 @@ def test_a_biased_measurement_ranks_by_what_lies_behind_it() -> None:
         mesh.centroids_mm, truth - 0.07, ["fat"] * len(truth), np.ones(len(truth)), error_table(-0.07, 0.02)
     )
     models = {"copy": truth - 0.07, "right": truth}
-    band = bands(draws.many(200), models, volumes, {ALL: np.ones(len(truth), dtype=bool)}, 1.0)[ALL]
+    everywhere = {ALL: np.ones(len(truth), dtype=bool)}
+    band = bands(draws.many(200), models, volumes, everywhere, 1.0, draws.narrowed)[ALL]
     assert area_between(truth - 0.07, models["copy"], volumes) < area_between(truth - 0.07, truth, volumes)
     assert band.interval("right")[0] < band.interval("copy")[0]
     assert band.surely_below("right", "copy")

@@ -163,7 +163,7 @@ def compare(
     if table is not None:
         overlaps = with_intervals(
             overlaps, truths, {name: field.max_shear[common] for name, field in found.models.items()},
-            found.volumes_ml[common], found.points_mm[common], table.factor,
+            found.volumes_ml[common], found.points_mm[common], touching[common][:, common], least_ml, table.factor,
         )  # fmt: skip
     rows = [row for name in models for row in agreements(found, name, load)]
     travels = [travel(found, r.name, load, r.deformation, measured, normal) for r in results]
@@ -309,5 +309,6 @@ def _bands(
         found.volumes_ml[common],
         {name: where[common] for name, where in tissues.items()},
         table.factor,
+        draws.narrowed,
         strains,
     )

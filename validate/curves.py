@@ -7,7 +7,7 @@ unit); divided by the tissue's volume and the width of the range it is the mean 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,7 @@ DRAWS = 200
 
 _GRID = 301
 _SURE = 0.975
+_EVERY = 4  # draws, of which one is made a perfect model
 
 
 def area_between(
@@ -63,7 +64,7 @@ class Area:
     low_ml, high_ml : float
         95 % interval from the measurement's uncertainty.
     floor_ml : float
-        What a perfect model would be given: the median area between two truths drawn.
+        What a perfect model would be given by noise alone; see `Band`.
     """
 
     model: str
@@ -94,7 +95,8 @@ class Band:
     areas_ml : mapping of model to (draws,)
         Area to each truth drawn.
     floor_ml : float
-        Median area between one truth drawn and the next.
+        What a perfect model would be given: the median area between a truth drawn, made narrower as `bands` tells, and
+        the next one.
     widening : float
         By which intervals of draws are widened; see `dvc.uncertainty.ErrorTable`.
     """
@@ -127,6 +129,7 @@ def bands(
     volumes_ml: FloatArray,
     tissues: Mapping[str, np.ndarray],
     widening: float,
+    narrowed: Callable[[FloatArray], FloatArray],
     strains: tuple[float, float] = RANGE,
 ) -> dict[str, Band]:
     """Bands of the measured curve by tissue, from truths drawn for all cells at once.
@@ -140,8 +143,16 @@ def bands(
     volumes_ml : (n,)
     tissues : mapping of name to (n,) bool
     widening : float
+    narrowed : callable
+        Makes a truth drawn (n,) as narrow as a perfect model is: `dvc.truths.TruthDraws.narrowed`.
     strains : (low, high)
         Range of the areas; the band begins at 0 and ends at one and a half times its upper end.
+
+    Notes
+    -----
+    A truth drawn is what was found, which carries noise, less noise. Where strain is spread over little more than the
+    noise, and the error model does not know it, truths drawn are wider than the truth and all alike: two of them would
+    tell too small an area for a perfect model, whose curve is steeper than theirs.
     """
     low, high = strains
     inner = np.linspace(low, high, _GRID)
@@ -153,18 +164,20 @@ def bands(
     }
     drawn: dict[str, list[FloatArray]] = {name: [] for name in tissues}
     areas: dict[str, dict[str, list[float]]] = {name: {model: [] for model in models} for name in tissues}
-    last: dict[str, FloatArray] = {}
+    perfect: dict[str, FloatArray] = {}
     floors: dict[str, list[float]] = {name: [] for name in tissues}
-    for truth in truths:
+    for number, truth in enumerate(truths):
         for name, inside in tissues.items():
             both = volume_above(truth[inside], volumes_ml[inside], np.concatenate([outer, inner]))
             curve = both[len(outer) :]
             drawn[name].append(both[: len(outer)])
             for model, found in curves[name].items():
                 areas[name][model].append(float(np.trapezoid(np.abs(found - curve), dx=step)))
-            if name in last:
-                floors[name].append(float(np.trapezoid(np.abs(last[name] - curve), dx=step)))
-            last[name] = curve
+            if name in perfect:
+                floors[name].append(float(np.trapezoid(np.abs(perfect.pop(name) - curve), dx=step)))
+        if number % _EVERY == 0:
+            narrow = narrowed(truth)
+            perfect = {n: volume_above(narrow[inside], volumes_ml[inside], inner) for n, inside in tissues.items()}
     result = {}
     for name, inside in tissues.items():
         least, _, most = widened(np.array(drawn[name]), widening)

@@ -8,10 +8,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
-from dvc.arrays import FloatArray
+from dvc.arrays import BoolArray, FloatArray
 from dvc.uncertainty import widened
-from validate.location import Overlap, Part, centroids_apart, dice, hausdorff95
+from validate.location import Overlap, Part, centroids_apart, dice, hausdorff95, in_clusters
 
 DRAWS = 60
 """Truths drawn for the figures of location of a load: the first of those drawn for the curves."""
@@ -31,6 +32,8 @@ def with_intervals(
     models: Mapping[str, FloatArray],
     volumes_ml: FloatArray,
     points_mm: FloatArray,
+    touching: sparse.csr_matrix,
+    least_ml: float,
     widening: float,
 ) -> list[Overlap]:
     """Overlaps with 95 % intervals from truths drawn, and with what a perfect model would be given.
@@ -45,6 +48,10 @@ def with_intervals(
         Maximal shear in the same cells.
     volumes_ml, points_mm : (n,), (n, 3)
         Of these cells.
+    touching : (n, n)
+        Which of these cells share a face.
+    least_ml : float
+        Volume of the smallest cluster that counts.
     widening : float
         By which intervals of draws are widened; see `dvc.uncertainty.ErrorTable`.
 
@@ -54,22 +61,26 @@ def with_intervals(
     adds to a distance. An interval that reaches it goes on to 1, or to 0 mm, as a perfect model's has to. Distances
     are told where at least half of the truths have tissue above the threshold.
     """
+
+    def part(above: BoolArray) -> Part:
+        return Part(in_clusters(above, volumes_ml, touching, least_ml), volumes_ml, points_mm)
+
     told: list[Overlap] = []
     for threshold in dict.fromkeys(o.threshold for o in overlaps):
-        parts = [Part(truth > threshold, volumes_ml, points_mm) for truth in truths]
-        volume = _interval([part.volume_ml for part in parts], widening)
+        parts = [part(truth > threshold) for truth in truths]
+        volume = _interval([drawn.volume_ml for drawn in parts], widening)
         perfect = {
             figure: _interval([of(a, b) for a, b in zip(parts[1:], parts, strict=False)], 1.0)[1]
             for figure, of in _FIGURES.items()
         }
         for one in (o for o in overlaps if o.threshold == threshold):
-            model = Part(models[one.model] > threshold, volumes_ml, points_mm)
+            model = part(models[one.model] > threshold)
             given: dict[str, Any] = {
                 "measured_low_ml": volume[0],
                 "measured_high_ml": min(volume[2], float(volumes_ml.sum())),
             }
             for figure, of in _FIGURES.items():
-                low, _, high = _interval([of(part, model) for part in parts], widening)
+                low, _, high = _interval([of(drawn, model) for drawn in parts], widening)
                 if of is dice:
                     high = 1.0 if high >= perfect[figure] else high
                 elif low <= perfect[figure]:

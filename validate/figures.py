@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from dvc.arrays import FloatArray
 from dvc.deformation import Deformation
 from dvc.figures import REGION_COLOURS
-from dvc.regions import volume_above
 from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet
+from validate.agreement import Agreement
 from validate.curves import Band
-from validate.mapping import Mapped, filled_from_nearest
+from validate.mapping import ALL, Mapped, filled_from_nearest
 
 _POINTS = 601
 _COLUMNS = 3
@@ -39,21 +39,15 @@ def volume_strain(
     figure, panels = _panels(len(tissues))
     at = np.linspace(0.0, 1.5 * strains[1], _POINTS)
     for axes, tissue in zip(panels, tissues, strict=True):
-        where = found.common & ((found.tissue == tissue) | (tissue not in found.tissues))
-        volumes = found.volumes_ml[where]
         if tissue in bands:
             band = bands[tissue]
             axes.fill_between(band.strains, band.low_ml, band.high_ml, color=_BAND, linewidth=0, label="95 % of truths")
-        axes.plot(
-            at,
-            volume_above(found.measured.max_shear[where], volumes, at),
-            color="black",
-            linewidth=2.2,
-            label="measured",
-        )
-        for name, field in found.models.items():
-            colour = REGION_COLOURS[colours.index(name) % (len(REGION_COLOURS) - 1)]
-            axes.plot(at, volume_above(field.max_shear[where], volumes, at), color=colour, linewidth=1.5, label=name)
+        for name, above in found.curves(tissue, at).items():
+            if name == "measured":
+                axes.plot(at, above, color="black", linewidth=2.2, label=name)
+            else:
+                colour = REGION_COLOURS[colours.index(name) % (len(REGION_COLOURS) - 1)]
+                axes.plot(at, above, color=colour, linewidth=1.5, label=name)
         for edge in strains:
             axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
         axes.set_title(tissue, color=INK, **FONT)
@@ -81,16 +75,20 @@ def slices(
     axes: FloatArray,
     point_mm: FloatArray,
 ) -> bytes:
-    """Maximal shear on the slice through the bone's lowest point, measured and simulated, where tissue is under load.
+    """Maximal shear on a slice, measured and simulated, where tissue is under load.
 
     The slice holds the plate's normal and the direction of shear; the same cells in one colour scale. Grey is not
     defined. Where the measurement does not reach a node, it is drawn with the displacement of the nearest one. Letters
     name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
+    return slice_sheet(found.mesh, slice_panels(found, measured, displacements), axes, point_mm)
+
+
+def slice_panels(found: Mapped, measured: Deformation, displacements: Mapping[str, FloatArray]) -> list[Slice]:
+    """What `slices` draws: the measurement, then each model, with displacements (n, 3) at the mesh's nodes."""
     u = filled_from_nearest(measured.displacement(found.mesh.points_mm), found.mesh.points_mm)
     panels = [Slice("measured", u, found.measured.max_shear)]
-    panels += [Slice(name, displacements[name], field.max_shear) for name, field in found.models.items()]
-    return slice_sheet(found.mesh, panels, axes, point_mm)
+    return panels + [Slice(name, displacements[name], field.max_shear) for name, field in found.models.items()]
 
 
 def scatter(found: Mapped) -> bytes:
@@ -99,17 +97,11 @@ def scatter(found: Mapped) -> bytes:
     On the line both agree.
     """
     names = list(found.models)
-    rows, columns = -(-len(names) // _COLUMNS), min(len(names), _COLUMNS)
-    width = WIDTH_IN if columns > 1 else 0.62 * WIDTH_IN
-    figure = Figure(figsize=(width, rows * (width / columns)), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure, spots = _by_model(len(names))
     where = found.common
     x, volumes = found.measured.max_shear[where], found.volumes_ml[where]
     most = max(0.1, *(float(np.quantile(f.max_shear[where], 0.995)) for f in (found.measured, *found.models.values())))
-    spots = figure.subplots(rows, columns, squeeze=False).ravel()
-    for spot in spots[len(names) :]:
-        spot.set_visible(False)
-    for spot, name in zip(spots, names, strict=False):
+    for spot, name in zip(spots, names, strict=True):
         spot.hist2d(
             x, found.models[name].max_shear[where], bins=_BINS, range=((0.0, most), (0.0, most)), weights=volumes,
             norm="log", cmap="Blues",
@@ -119,6 +111,40 @@ def scatter(found: Mapped) -> bytes:
         spot.set_aspect("equal")
         label_axes(spot, "measured", "simulated")
     return png_bytes(figure)
+
+
+def differences(found: Mapped, rows: Sequence[Agreement], quantity: str) -> bytes:
+    """Bland and Altman's plot: simulated minus measured over the mean of both, cell by cell (darker is more volume).
+
+    The line is the mean difference, dashed are the limits of agreement: 1.96 standard deviations to either side.
+    """
+    told = {row.model: row for row in rows if (row.quantity, row.part) == (quantity, ALL)}
+    names = [name for name in found.models if name in told]
+    figure, spots = _by_model(max(1, len(names)))
+    where = found.common
+    for spot, name in zip(spots, names, strict=False):
+        x, y = (
+            field.max_shear[where] if quantity == "max_shear" else np.linalg.norm(field.u_mm[where], axis=1)
+            for field in (found.measured, found.models[name])
+        )
+        spot.hist2d(0.5 * (x + y), y - x, bins=_BINS, weights=found.volumes_ml[where], norm="log", cmap="Blues")
+        for height, style in ((told[name].bias, "-"), (told[name].lower, "--"), (told[name].upper, "--")):
+            spot.axhline(height, color=INK, linewidth=0.9, linestyle=style)
+        spot.set_title(name, color=INK, **FONT)
+        unit = "" if quantity == "max_shear" else ", mm"
+        label_axes(spot, f"mean of both{unit}", f"simulated - measured{unit}")
+    return png_bytes(figure)
+
+
+def _by_model(count: int) -> tuple[Figure, list[Axes]]:
+    rows, columns = -(-count // _COLUMNS), min(count, _COLUMNS)
+    width = WIDTH_IN if columns > 1 else 0.62 * WIDTH_IN
+    figure = Figure(figsize=(width, rows * (width / columns)), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    spots = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for spot in spots[count:]:
+        spot.set_visible(False)
+    return figure, spots[:count]
 
 
 def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[str]) -> bytes:

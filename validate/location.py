@@ -106,9 +106,21 @@ def clusters(
     return sorted(found, key=lambda c: -c.volume_ml)
 
 
+def in_clusters(
+    above: BoolArray, volumes_ml: FloatArray, touching: sparse.csr_matrix, least_ml: float = LEAST_ML
+) -> BoolArray:
+    """Those of the cells ``above`` (n,) that lie in a cluster of at least a volume."""
+    cells = np.flatnonzero(above)
+    kept = np.zeros(len(above), dtype=bool)
+    if len(cells):
+        _, number = connected_components(touching[cells][:, cells], directed=False)
+        kept[cells] = np.bincount(number, volumes_ml[cells])[number] >= least_ml
+    return kept
+
+
 @dataclass(frozen=True, slots=True)
 class Overlap:
-    """Where a model and the measurement put tissue above a threshold.
+    """Where a model and the measurement put tissue above a threshold, in clusters of at least the least volume.
 
     Attributes
     ----------
@@ -116,13 +128,15 @@ class Overlap:
     threshold : float
         Maximal shear.
     measured_ml, model_ml : float
-        Volume above it.
+        Volume of the clusters; all that lies above, specks too, is in the volume-strain curves.
     measured_clusters, model_clusters : int
-        Connected parts of at least the least volume.
+        How many.
+    measured_mean, model_mean : float
+        Mean maximal shear in them, by volume; NaN where there is none.
     dice : float
         Twice the common volume over the sum of both.
     centroids_mm : float
-        Distance of the centroids of all that lies above.
+        Distance of the centroids of all clusters together.
     largest_mm : float
         The same of the largest cluster of each.
     hausdorff95_mm : float
@@ -139,6 +153,8 @@ class Overlap:
     model_ml: float
     measured_clusters: int
     model_clusters: int
+    measured_mean: float
+    model_mean: float
     dice: float
     centroids_mm: float
     largest_mm: float
@@ -168,22 +184,23 @@ def overlap(
     least_ml: float = LEAST_ML,
 ) -> Overlap:
     """Compare what lies above a threshold in two fields (n,) on the same cells; figures without a meaning are NaN."""
-    both = [Part(shear > threshold, volumes_ml, points_mm) for shear in (measured, simulated)]
-    found = [
-        clusters(part.above, shear, volumes_ml, points_mm, touching, least_ml)
-        for part, shear in zip(both, (measured, simulated), strict=True)
-    ]
+    fields = (measured, simulated)
+    found = [clusters(shear > threshold, shear, volumes_ml, points_mm, touching, least_ml) for shear in fields]
+    above = [in_clusters(shear > threshold, volumes_ml, touching, least_ml) for shear in fields]
+    both = [Part(cells, volumes_ml, points_mm) for cells in above]
+    means = [part.mean_of(shear) for part, shear in zip(both, fields, strict=True)]
     largest = float("nan")
     if all(found):
         largest = float(np.linalg.norm(found[0][0].centroid_mm - found[1][0].centroid_mm))
     return Overlap(
         model, load, threshold, both[0].volume_ml, both[1].volume_ml, len(found[0]), len(found[1]),
-        dice(both[0], both[1]), centroids_apart(both[0], both[1]), largest, hausdorff95(both[0], both[1]),
+        means[0], means[1], dice(both[0], both[1]), centroids_apart(both[0], both[1]), largest,
+        hausdorff95(both[0], both[1]),
     )  # fmt: skip
 
 
 class Part:
-    """Cells above a threshold, and what their place is told by.
+    """Cells in clusters above a threshold, and what their place is told by.
 
     Attributes
     ----------
@@ -206,6 +223,11 @@ class Part:
         if not self.above.any():
             return np.full(3, np.nan)
         return np.asarray(self._volumes[self.above] @ self._points[self.above] / self.volume_ml)
+
+    def mean_of(self, values: FloatArray) -> float:
+        """Mean of values (n,) by volume; NaN for no cell."""
+        inside = self.above
+        return float(self._volumes[inside] @ values[inside] / self.volume_ml) if inside.any() else float("nan")
 
     def shared_ml(self, other: Part) -> float:
         """Volume common to both."""

@@ -14,6 +14,7 @@ from dvc.errors import InputError
 from dvc.image import LabelMap
 from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
+from dvc.regions import volume_above
 
 ALL = "all soft tissue"
 """All tissue that is compared, together."""
@@ -82,6 +83,12 @@ class Mapped:
         """Names, the largest first."""
         names = np.unique(self.tissue)
         return sorted((str(n) for n in names), key=lambda n: -self.volumes_ml[self.tissue == n].sum())
+
+    def curves(self, tissue: str, strains: FloatArray) -> dict[str, FloatArray]:
+        """Volume (mL) of a tissue (or `ALL`) above each strain (k,), "measured" and by model, in the common cells."""
+        where = self.common & ((self.tissue == tissue) | (tissue == ALL))
+        fields = {"measured": self.measured, **self.models}
+        return {n: volume_above(f.max_shear[where], self.volumes_ml[where], strains) for n, f in fields.items()}
 
     def coverage(self) -> dict[str, float]:
         """Volume (mL) of the mesh, of what each field defines of it, and of what is common to all."""
