@@ -172,6 +172,31 @@ def _aligned(reference, loaded, bone, worker):
     return align(without_shading(reference), without_shading(loaded), bone, fit, on="bone", seed=1)
 
 
+def test_row_9_a_bone_along_which_fits_slide_is_not_located():
+    """A rod of uniform signal looks the same all along: two fits differ by what they happen to end at."""
+    grid = Grid((30, 30, 40), np.full(3, 2.0), np.array([-29.0, -29.0, -39.0]))
+    X = grid.points()
+    rod = np.linalg.norm(X[..., :2], axis=-1) < 9.0
+    image = Image(grid, np.where(rod, 100.0, 40.0).astype(np.float32))
+    bone = Mask(grid, rod & (np.abs(X[..., 2]) < 16.0))
+
+    def sliding_by(slide_mm: float):
+        def fit(_fixed, _moving, _mask, seed: int) -> dict[str, tuple[str, ...]]:
+            slid = slide_mm if seed == 2 else 0.0  # the second fit's seed
+            numbers = (*["0"] * 5, str(slid))
+            return {
+                "Transform": ("EulerTransform",),
+                "TransformParameters": numbers,
+                "CenterOfRotationPoint": ("0",) * 3,
+            }
+
+        return align(image, image, bone, fit, on="bone", seed=1)
+
+    assert sliding_by(0.4).repeatability_mm == pytest.approx(0.4)
+    with pytest.raises(RegistrationError, match=r"differ by 0\.60 mm .* the bone is not located"):
+        sliding_by(0.6)
+
+
 def test_row_9_an_image_without_the_bone_is_refused(small_pair, worker):
     random = np.random.default_rng(5)
     noise = gaussian_filter(random.normal(size=small_pair.loaded.grid.shape), 2.0).astype(np.float32)
