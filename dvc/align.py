@@ -10,7 +10,7 @@ midway between the two is the result, and their spread the alignment's own measu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -74,6 +74,12 @@ class Alignment:
     similarity: float
     repeatability_mm: float
     bone_shift_mm: FloatArray
+
+    def turned(self, rotation: FloatArray) -> Alignment:
+        """The same alignment of two images that are both turned about the world's origin."""
+        R, motion = rotation, self.motion
+        same = RigidMotion(R @ motion.rotation @ R.T, R @ motion.translation_mm)
+        return replace(self, motion=same, bone_shift_mm=R @ self.bone_shift_mm)
 
 
 def not_aligned(reference: Image, loaded: Image, mask: Mask) -> Alignment:

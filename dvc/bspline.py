@@ -83,6 +83,11 @@ class BSpline:
             )
         object.__setattr__(self, "coefficients_mm", coefficients)
 
+    def turned(self, rotation: FloatArray) -> BSpline:
+        """The same displacement of a body that is turned, with its control points, about the world's origin."""
+        turned = np.einsum("ij,j...->i...", rotation, self.coefficients_mm)
+        return BSpline(self.control.moved_by(rotation, np.zeros(3)), turned)
+
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the valid region."""
         indices = self.control.indices_of(np.asarray(points_mm, dtype=np.float64))

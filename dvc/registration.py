@@ -12,11 +12,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dvc import elastix
 from dvc.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
+from dvc.arrays import FloatArray
 from dvc.bspline import BSpline
 from dvc.deformation import Composed, Deformation, Within
 from dvc.errors import InputError, ParameterError
@@ -30,6 +33,7 @@ from dvc.tissue import tissue_mask
 from dvc.worker import Worker
 
 Progress = Callable[[str, float], None]
+_Scan = TypeVar("_Scan", Image, Mask)
 
 GAUSS_NEWTON = "gauss-newton"
 """Name of our own engine, where elastix has presets."""
@@ -204,6 +208,12 @@ def register(
         tell("aligning", 0.4)
         inside = body.toward_lps()
         on = None if bone is None else bone.toward_lps()
+        # elastix draws samples from a box along the world's axes, which of an oblique image holds a part or nothing:
+        # what follows is done in a world whose axes are those of the unloaded image.
+        turn = Rotation.from_matrix(fixed.grid.direction).as_matrix()
+        fixed, moving, inside = _turned(fixed, turn.T), _turned(moving, turn.T), _turned(inside, turn.T)
+        on = None if on is None else _turned(on, turn.T)
+        start = None if start is None else start.turned(turn.T)
         alignment = _align(fixed, moving, inside, on, chosen, runner)
         if chosen.align_on == "none" and chosen.needs_one_contrast:  # a rigid alignment refuses it by itself
             refuse_turned_contrast(fixed, moving, inside, alignment.motion)
@@ -232,7 +242,12 @@ def register(
         if own:
             runner.close()
     assert bspline is not None
+    alignment, bspline = alignment.turned(turn), bspline.turned(turn)
     return Registration(reference, loaded, body, bone, alignment, bspline, chosen, time.monotonic() - began, choice)
+
+
+def _turned(scan: _Scan, rotation: FloatArray) -> _Scan:
+    return replace(scan, grid=scan.grid.moved_by(rotation, np.zeros(3)))
 
 
 def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:

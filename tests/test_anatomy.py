@@ -92,6 +92,17 @@ def test_tissue_has_texture_to_follow(heel: Heel, tissue_points: np.ndarray, nam
     assert voxels.std() > FAT_SIGNAL / 25.0
 
 
+def test_larger_lobules_make_a_coarser_texture(tissue_points: np.ndarray) -> None:
+    """Correlation of fat's signal over 1 mm; both ends of each step in fat."""
+    found = []
+    for size in (3.0, 6.0, 12.0):
+        heel = Heel(1, lobule_mm=size)
+        ends = tissue_points, tissue_points + np.array([0.0, 1.0, 0.0])
+        fat = (heel.tissue_at(ends[0]) == 2) & (heel.tissue_at(ends[1]) == 2)
+        found.append(float(np.corrcoef(*(heel.intensity_at(e[fat]) for e in ends))[0, 1]))
+    assert found[0] + 0.05 < found[1] < found[2] - 0.05
+
+
 def test_seeds_differ(heel: Heel, tissue_points: np.ndarray) -> None:
     other = Heel(seed=2)
     changed = np.mean(other.tissue_at(tissue_points) != heel.tissue_at(tissue_points))

@@ -98,6 +98,25 @@ def test_rows_say_what_the_samples_hold() -> None:
     assert not any(r.tissue == "skin" for r in rows)
 
 
+def test_rows_by_border_hold_what_lies_there_and_the_95th_percentile_is_of_the_size_of_the_error() -> None:
+    """An error of -0.1 within 1 mm of a border, half as much within 2 mm, and nothing beyond."""
+    run = samples(CASE)
+    size = np.select([run.to_border_mm < 1.0, run.to_border_mm < 2.0], [0.1, 0.05], 0.0)
+    run = replace(run, true_shear=run.true_shear + np.float32(0.2))
+    run = replace(run, shear=(run.true_shear - size).astype(np.float32))
+    rows = [r for r in error_rows([run]) if r.tissue == "fat"]
+    by_border = {(r.low, r.high): r for r in rows if r.by == "distance to a border, mm"}
+    for (low, high), row in by_border.items():
+        assert row.samples == np.count_nonzero((run.to_border_mm >= low) & (run.to_border_mm < high))
+    near, next_to = (next(r for (low, high), r in by_border.items() if low <= at < high) for at in (0.5, 1.5))
+    assert (near.high, next_to.low, next_to.high) == (1.0, 1.0, 2.0)
+    assert (near.shear_bias, next_to.shear_bias) == pytest.approx((-0.1, -0.05), abs=1e-6)
+    whole = next(r for r in rows if r.by == "all")
+    share = np.mean(run.to_border_mm < 1.0)
+    assert share > 0.05  # so the 95th percentile of the sizes lies there; that of signed errors would be 0
+    assert whole.shear_p95 == pytest.approx(0.1, abs=1e-6)
+
+
 def test_floor_and_resolution_come_from_their_own_runs() -> None:
     still, waves = replace(CASE, motion="still"), [replace(CASE, motion=f"wave-{w}") for w in (8, 16)]
     runs = [samples(CASE), samples(still), *(samples(w) for w in waves)]

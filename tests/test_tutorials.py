@@ -12,6 +12,7 @@ import typer
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 
+from dvc.imagewrite import write_image, write_mask
 from dvc.labels import read_labels
 from fe.meshstore import write_tet_mesh
 from mrstrain.cli import app
@@ -79,6 +80,19 @@ def write_model(heel: Path, folder: Path, seed: int, share: float) -> None:
 @pytest.fixture(scope="module")
 def heel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return quick_phantom(tmp_path_factory.mktemp("made") / "heel", seed=1)
+
+
+def test_the_lines_of_the_readme(
+    tiny_pair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_image(tmp_path / "Load0.nii.gz", tiny_pair.reference)
+    write_image(tmp_path / "Load1.nii.gz", tiny_pair.loaded)
+    write_mask(tmp_path / "calcaneus.nii.gz", tiny_pair.bone)
+    monkeypatch.chdir(tmp_path)
+    (block,) = Sybil(parsers=[PythonCodeBlockParser()]).parse(ROOT / "README.md").examples()
+    block.evaluate()
+    assert capsys.readouterr().out.strip() in ("Trust", "Use with care", "Do not trust")
+    assert (tmp_path / "results" / "Load1" / "max_shear.nii.gz").is_file()
 
 
 def test_register(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
