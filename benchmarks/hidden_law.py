@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ from phantoms.anatomy import Heel
 from phantoms.heel import covering, drawn_motion, heel_grid, labels_of, labels_to_mesh, scan
 from phantoms.score import errors_by_tissue
 from phantoms.twin import found_back
-from validate.comparison import compare, total
+from validate.comparison import ALL_LOADS, compare, total
 from validate.levelled import carried_on
 from validate.mapping import ALL
 from validate.sources import read_result
@@ -102,6 +103,8 @@ def main() -> None:
     found = scores(study, hidden, labels)
     given.out.write_text(json.dumps({"versions": versions(), "seed": given.seed} | found, indent=1) + "\n")
     print(told(found))
+    wrong = misjudged(found)
+    assert not wrong, f"neither the true order nor called noise: {wrong}"
 
 
 def hidden_model(work: Path, heel: Heel, labels: LabelMap, seed: int) -> Path:
@@ -210,7 +213,7 @@ def scores(study: Path, hidden: Path, labels: LabelMap) -> dict[str, object]:
         one = compare(load, model.deformation, models, names, bones=("bone",), normal=np.array([0.0, 0.0, -1.0]))
         true.append(one)
         comparisons[load] = {a.model: a.ml for a in one.areas if a.tissue == ALL}
-    comparisons["all loads"] = {a.model: a.ml for a in total(true)[0]}
+    comparisons[ALL_LOADS] = {a.model: a.ml for a in total(true).areas}
     measured: dict[str, dict[str, list[float]]] = {}
     with (results / "comparison" / "areas.csv").open() as file:
         for row in csv.DictReader(file):
@@ -218,8 +221,22 @@ def scores(study: Path, hidden: Path, labels: LabelMap) -> dict[str, object]:
                 measured.setdefault(row["load"], {})[row["model"]] = [
                     float(row[k]) for k in ("ml", "estimate_ml", "low_ml", "high_ml")
                 ]
-    said = json.loads((results / "comparison" / "comparison.json").read_text())["told_apart"]
-    return {"error": errors, "true_area_ml": comparisons, "measured_area_ml": measured, "told_apart": said}
+    said = json.loads((results / "comparison" / "comparison.json").read_text())
+    told_apart = {key: said[key] for key in ("told_apart", "not_told_apart")}
+    return {"error": errors, "true_area_ml": comparisons, "measured_area_ml": measured} | told_apart
+
+
+def misjudged(found) -> list[str]:
+    """Pairs whose measured order is not the true one, and which the measurement did not call noise either."""
+    wrong = []
+    for load, true in found["true_area_ml"].items():
+        measured = found["measured_area_ml"][load]
+        ranked = sorted(true, key=lambda model: measured[model][1])
+        noise = {tuple(pair) for pair in found["not_told_apart"][load]}
+        wrong += [
+            f"{load}: {a} before {b}" for a, b in combinations(ranked, 2) if true[a] > true[b] and (a, b) not in noise
+        ]
+    return wrong
 
 
 def _in(model, labels: LabelMap) -> np.ndarray:

@@ -124,10 +124,15 @@ def lung_transforms(data: Path) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
+    parser.add_argument("--by", default="gauss-newton", help="the engine gauss-newton, or a preset of elastix")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    settings = Settings.of("heel-mr", align_on="image", threads=usable_cores())
-    results: dict[str, object] = {"versions": versions(), "lung transforms": lung_transforms(given.data)}
+    settings = Settings.of(given.by, align_on="image", threads=usable_cores())
+    results: dict[str, object] = {
+        "by": given.by,
+        "versions": versions(),
+        "lung transforms": lung_transforms(given.data),
+    }
     print("lung transforms", json.dumps(results["lung transforms"], indent=1))
     with Worker(settings.threads) as worker:
         for name, run in (

@@ -22,6 +22,7 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation import Deformation, RigidMotion
 from dvc.errors import InputError, RegistrationError
 from dvc.image import Grid, Image, Mask
+from dvc.quality import local_correlation
 from dvc.resample import carry, fill_missing, smoothed
 from dvc.transformfile import rigid_from_elastix
 
@@ -41,6 +42,11 @@ _LARGEST_SPREAD_MM = 0.5
 _LEAST_COVERED = 0.75
 _INVERTED_TRIES = 7
 _CLEARLY = 0.1
+
+_OTHER_MEASURE = (
+    "the two images have different contrast (water against fat, say). Correlation cannot follow that; mutual "
+    'information could: a parameter file with (Metric "AdvancedMattesMutualInformation")'
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +80,25 @@ def not_aligned(reference: Image, loaded: Image, mask: Mask) -> Alignment:
     """The alignment that leaves both images where their headers put them."""
     similarity = _similarity(reference, loaded, mask, RigidMotion.identity())
     return Alignment(RigidMotion.identity(), "none", similarity, similarity, float("nan"), np.zeros(3))
+
+
+def refuse_turned_contrast(reference: Image, loaded: Image, tissue: Mask, motion: RigidMotion) -> None:
+    """Refuse images whose contrast is turned round in the tissue, for what registers by correlation.
+
+    Two images of one contrast correlate locally by more than zero even 15 mm apart (phantoms: 0.03 to 0.84), those
+    of turned contrast by as much below zero.
+
+    Raises
+    ------
+    RegistrationError
+        If they do; it names the measure that could follow.
+    """
+    _, found = local_correlation(reference, carry(loaded, reference.grid, motion.apply), tissue)
+    if found < -_CLEARLY:
+        raise RegistrationError(
+            f"The local correlation of the two images in the tissue is {found:.2f} before the non-rigid registration, "
+            f"below zero: {_OTHER_MEASURE}, for --parameters."
+        )
 
 
 def align(reference: Image, loaded: Image, mask: Mask, fit: RigidFit, *, on: AlignOn, seed: int) -> Alignment:
@@ -196,9 +221,8 @@ def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highe
     told = f"The rigid alignment on the {on} failed: {found} ({_LOWEST_SIMILARITY} is needed)."
     if inverted > max(_LOWEST_SIMILARITY, highest + _CLEARLY):
         return (
-            f"{told} With the contrast turned round it is {inverted:.2f}: the two images have different contrast "
-            "(water against fat, say). Correlation cannot follow that; mutual information could: a parameter file "
-            'with (Metric "AdvancedMattesMutualInformation"), with --align none where the images share a frame.'
+            f"{told} With the contrast turned round it is {inverted:.2f}: {_OTHER_MEASURE}, with --align none where "
+            "the images share a frame."
         )
     return (
         f"{told} Check that both images show the same foot, that the mask covers the bone on the unloaded image, "

@@ -75,6 +75,8 @@ class Level:
         Voxels that keep their volume, and voxels that resist strain: bone, if need be skin.
     control : Grid
         Control points, around all of ``fixed``.
+    rim_mm : float
+        Along the ends of ``moving``, which is not used there.
     factors : (ni, nj, nk, splines, 4), optional
         At the voxels, as in `SplineSums`: the displacement is then a sum of splines.
     rough : sequence of (float, float)
@@ -89,12 +91,13 @@ class Level:
         soft: BoolArray,
         stiff: BoolArray,
         control: Grid,
+        rim_mm: float = 0.0,
         factors: FloatArray | None = None,
         rough: Sequence[tuple[float, float]] = ((1.0, 0.0),),
     ) -> None:
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
         self.control = control
-        self.pair = ImagePair(fixed, moving, inside, control, block, factors)
+        self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm, factors)
         self.roughness = Roughness(control, rough)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0

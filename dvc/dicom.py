@@ -230,7 +230,11 @@ def _picked(folder: Path, stacks: dict[str, list[_Slice]], series: str | None) -
         problem = f"the folder holds {what}; one is needed"
     else:
         problem = f"series='{series}' fits {len(matching)} of the DICOM series in this folder"
-    raise InputError(f"{folder}: {problem}. Pick one with series=, by the name at the start of a line:\n{listing}")
+    raise InputError(
+        f"{folder}: {problem}. Move the files of one into a folder of its own, or write it to a file: in Python, "
+        f'dvc.write_image("one.nii.gz", dvc.read_image("{folder}", series=NAME)) with a NAME out of this list:\n'
+        f"{listing}"
+    )
 
 
 def _described(stack: list[_Slice]) -> str:

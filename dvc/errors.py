@@ -22,6 +22,10 @@ class GeometryError(InputError):
     """Images, masks or meshes that do not share a frame, or do not overlap."""
 
 
+class ExtentError(GeometryError):
+    """A mesh of no body part's size: its unit is another than was said."""
+
+
 class ParameterError(InputError):
     """A registration parameter that elastix does not know, or a value out of range."""
 

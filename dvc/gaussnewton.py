@@ -9,6 +9,7 @@ any number of threads. docs/decisions/0009 has the reasons.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,10 +29,12 @@ from dvc.resample import smoothed
 # Of each level: smoothing of both images (mm), control spacing over the finest, most steps, the step that ends it (mm).
 LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 1.0, 5, 0.005))
 _LEAST_VOXELS = 2.0
+_BLURRED = 2.0  # standard deviations: nearer to its ends a blurred image shows what it was padded with
 _RIM_MM = 1.2  # bone nearer to its surface than that may be tissue in part of a voxel
-USUAL = 3.0
+USUAL_BENDING = 3.0
+"""Weight of the bending, 1/mm, that strongly loaded pairs get, about."""
 _RATIO = np.sqrt(10.0)
-_BENDING = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
+_POWERS = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
 _CHECK_STEPS, _CHECK_TOLERANCE, _CHECK_MOST = 2, 0.05, 80
 _MIDDLE = 0.7  # of each edge of the mask's box
 _LAST_STEPS = 2
@@ -71,6 +74,19 @@ class GaussNewton:
         for name in ("volume", "rigidity"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ParameterError(f"The weight '{name}' must be 0 or more; got {getattr(self, name)}.")
+
+    @property
+    def text(self) -> str:
+        """Every number that decides the result, as JSON: what an error model or a record names the engine by."""
+        rule = {
+            "usual": USUAL_BENDING,
+            "ratio": _RATIO,
+            "powers": _POWERS,
+            "steps": [_CHECK_STEPS, _LAST_STEPS],
+        }
+        rims = {"blurred": _BLURRED, "bone_rim_mm": _RIM_MM}
+        told = {"engine": "gauss-newton", "levels": LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
+        return json.dumps(asdict(self) | told)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +170,7 @@ def fit(
     core = np.zeros(body.grid.shape, dtype=bool)
     if bone is not None:
         core = distance_transform_edt(bone.inside, sampling=bone.grid.spacing_mm) > _RIM_MM
-    weights = Weights(USUAL if options.bending is None else options.bending, options.volume, options.rigidity)
+    weights = Weights(USUAL_BENDING if options.bending is None else options.bending, options.volume, options.rigidity)
     spacing = np.maximum(options.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
     axes = np.array(fixed.grid.direction)
     soft = body.inside & ~core
@@ -168,7 +184,7 @@ def fit(
         level = _level(pictures, inside.inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
         tell((number + 1) / (len(LEVELS) + 2))
-    choice = Choice(weights, "fixed by the user")
+    choice = Choice(weights, "fixed beforehand")
     if options.bending is None:
         part = _middle(inside.inside)
         choice = choose(
@@ -185,7 +201,7 @@ def choose(
     coefficients: FloatArray,
     weights: Weights,
     name: str = "bending",
-    powers: tuple[int, int] = _BENDING,
+    powers: tuple[int, int] = _POWERS,
 ) -> Choice:
     """One of the weights by two-fold cross-validation, around the value that it has.
 
@@ -241,7 +257,7 @@ def _level(
         return Level(*pictures, inside, soft, bone, control)
     fixed, moving = (_thinned(smoothed(i, sigma_mm), sigma_mm) for i in pictures)
     every = tuple(slice(None, None, int(n)) for n in _stride(pictures[0].grid, sigma_mm))
-    return Level(fixed, moving, inside[every], soft[every], bone[every], control)
+    return Level(fixed, moving, inside[every], soft[every], bone[every], control, _BLURRED * sigma_mm)
 
 
 def scaled(image: Image, scale: float) -> Image:

@@ -61,6 +61,8 @@ class ImagePair:
         Control points, along the axes of ``fixed`` and around all of it.
     block : three int
         Voxels of a block along each axis; normal matrices, gain and strain are held by block.
+    rim_mm : float
+        So far from its ends and gaps the moving image is not used: blurred there, it shows what lies beyond.
     factors : (ni, nj, nk, splines, 4), optional
         At the voxels, as in `SplineSums`. Strain is then taken at the first voxel of each block, which lies in one
         tissue; without, at the block's centre.
@@ -73,6 +75,7 @@ class ImagePair:
         inside: BoolArray,
         control: Grid,
         block: IntArray,
+        rim_mm: float = 0.0,
         factors: FloatArray | None = None,
     ) -> None:
         self.grid, self.block = fixed.grid, block
@@ -81,8 +84,7 @@ class ImagePair:
         self._fixed = np.ascontiguousarray(fill_missing(fixed).values)
         filled = fill_missing(moving).values
         self._moving = np.ascontiguousarray(spline_filter(filled, order=3, mode="mirror", output=np.float32))
-        gaps = moving.missing
-        self._gaps = binary_dilation(gaps, iterations=2) if gaps.any() else gaps
+        self._gaps = _gaps(moving, rim_mm)
         # Index of the moving image at s mm along the fixed image's axes: start + per_mm s.
         self._start = moving.grid.indices_of(self.grid.origin_mm)
         ends = moving.grid.indices_of(self.grid.origin_mm + self.grid.direction.T)
@@ -143,6 +145,17 @@ class ImagePair:
         )  # fmt: skip
         square, count = sums.sum(axis=0)
         return Normal(matrix, self.sums.closed(half), float(square), int(count))
+
+
+def _gaps(image: Image, rim_mm: float) -> BoolArray:
+    """Voxels that cannot be used: missing ones, their neighbours, and a rim around them and along the image's ends."""
+    rim = np.rint(rim_mm / image.grid.spacing_mm).astype(int)
+    used = np.zeros(image.grid.shape, dtype=bool)
+    used[tuple(slice(n, size - n) for n, size in zip(rim, used.shape, strict=True))] = True
+    missing = image.missing
+    if missing.any():
+        used &= ~binary_dilation(missing, iterations=max(2, int(rim.max())))
+    return ~used
 
 
 @njit(cache=True)

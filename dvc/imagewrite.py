@@ -29,6 +29,7 @@ import numpy.typing as npt
 from dvc.errors import InputError, OutputError
 from dvc.image import Grid, Image, LabelMap, Mask
 from dvc.nifti import LPS_FROM_RAS
+from dvc.verdict import Verdict
 from dvc.whole import whole_file, write_whole
 
 StrPath = str | PathLike[str]
@@ -101,6 +102,7 @@ def write_vectors(
     *,
     unit: str,
     configuration: str = "reference",
+    verdict: Verdict | None = None,
 ) -> None:
     """Write several values per voxel in single precision, and what they mean in a JSON file beside it.
 
@@ -120,6 +122,8 @@ def write_vectors(
     frame : "LPS", or "invariant" for components that no frame changes
     unit : "mm", "1", ...
     configuration : "reference" or "deformed": where the voxels are
+    verdict : Verdict, optional
+        Whether the values may be trusted; told in the JSON file.
 
     Raises
     ------
@@ -140,7 +144,7 @@ def write_vectors(
         raise InputError(f"{place}: configuration '{configuration}'; it is reference or deformed.")
     vector = frame == "LPS" and len(components) == 3
     _write(place, grid, array.astype(np.float32, copy=False), vector=vector)
-    told = {
+    told: dict[str, object] = {
         "file": place.name,
         "meaning": meaning,
         "components": list(components),
@@ -149,6 +153,8 @@ def write_vectors(
         "configuration": configuration,
         "missing": "NaN",
     }
+    if verdict is not None:
+        told["verdict"] = verdict.as_dict()
     write_whole(_beside(place, ".json"), json.dumps(told, indent=2) + "\n")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
-from dvc.errors import GeometryError, InputError
+from dvc.errors import ExtentError, GeometryError, InputError
 
 _log = logging.getLogger("dvc.mesh")
 
@@ -196,25 +196,38 @@ def checked_indices(what: str, index: npt.ArrayLike, count: int, width: int | No
     return array
 
 
+def box_told(low: FloatArray, high: FloatArray) -> str:
+    """A box by its lower and upper corner (3,), as people read it.
+
+    Examples
+    --------
+    >>> box_told(np.array([-15.0, 0.0, 0.01]), np.array([5.0, 120.4, 0.06]))
+    '-15 to 5 x 0 to 120 x 0.01 to 0.06'
+    """
+    edges = [[f"{v:.0f}" if abs(v) >= 10.0 else f"{v:.3g}" for v in pair] for pair in zip(low, high, strict=True)]
+    return " x ".join(f"{a} to {b}" for a, b in edges)
+
+
 def check_extent(points_mm: FloatArray) -> None:
     """Refuse a mesh that is not the size of a body part in mm.
 
     Raises
     ------
-    GeometryError
+    ExtentError
         If its longest side is under 1 mm or over 5 m.
     """
     extent = float(np.ptp(points_mm, axis=0).max())
+    spans = f"It spans {box_told(points_mm.min(axis=0), points_mm.max(axis=0))} (mm as read)."
     if extent < _SMALLEST_EXTENT_MM:
-        raise GeometryError(
+        raise ExtentError(
             f"The mesh is {extent:.3g} mm across, and a mesh in mm is not that small: its coordinates are "
-            "probably in metres. If so, say unit='m' (--mesh-unit m; compare: --model-unit m)."
+            f"probably in metres. {spans} If so, say unit='m' (--mesh-unit m; compare: --model-unit m)."
         )
     if extent > _LARGEST_EXTENT_MM:
-        raise GeometryError(
+        raise ExtentError(
             f"The mesh is {extent / 1000:.4g} m across, and no body part is that large: its coordinates are "
-            "probably in mm and not in metres, or finer. Say unit='mm' (--mesh-unit mm; compare: --model-unit mm), "
-            "or scale them to mm."
+            f"probably in mm and not in metres, or finer. {spans} Say unit='mm' (--mesh-unit mm; compare: "
+            "--model-unit mm), or scale them to mm."
         )
 
 

@@ -18,7 +18,11 @@ import numpy as np
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.meshfile import MM_PER_UNIT, TO_LPS, MeshFile, silenced
+from dvc.verdict import LEVELS, Verdict
 from dvc.whole import whole_file, write_whole
+
+VERDICT_FIELD = "verdict_0_trust_1_use_with_care_2_do_not_trust"
+"""Name of the field data that tell a measurement's verdict in a VTU file."""
 
 
 def write_on_mesh(
@@ -26,6 +30,7 @@ def write_on_mesh(
     mesh: MeshFile,
     point_data: Mapping[str, FloatArray],
     cell_data: Mapping[str, FloatArray],
+    verdict: Verdict | None = None,
 ) -> dict[str, int]:
     """Write results on the user's own mesh as a VTU file (binary), in the mesh file's own frame and unit.
 
@@ -41,6 +46,8 @@ def write_on_mesh(
         are three scalars, not a vector). A name that ends in ``_mm`` is a length: it is converted to the
         mesh's unit, and so is the ending of its name. NaN stays NaN. The nodes' own numbers are added as
         ``node``.
+    verdict : Verdict, optional
+        Whether the results may be trusted: field data of the name `VERDICT_FIELD`.
 
     Returns
     -------
@@ -77,10 +84,14 @@ def write_on_mesh(
     )
     with whole_file(path) as part, silenced():
         meshio.vtu.write(part, whole, binary=True)
+        if verdict is not None:
+            _add_verdict(part, verdict)
     return undefined
 
 
-def write_nodal_displacements(path: str | os.PathLike[str], mesh: MeshFile, u_mm: FloatArray) -> int:
+def write_nodal_displacements(
+    path: str | os.PathLike[str], mesh: MeshFile, u_mm: FloatArray, verdict: Verdict | None = None
+) -> int:
     """Write the displacement of every node of the user's mesh as CSV, ready as boundary conditions.
 
     The columns are ``node,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm``, or ``x_m`` and so on for a mesh in metres: the
@@ -95,6 +106,8 @@ def write_nodal_displacements(path: str | os.PathLike[str], mesh: MeshFile, u_mm
         The user's mesh.
     u_mm : (n, 3)
         Displacement at ``mesh.points_mm``, LPS mm; NaN where the measurement is not defined.
+    verdict : Verdict, optional
+        Whether they may be trusted; told in the JSON file.
 
     Returns
     -------
@@ -117,7 +130,7 @@ def write_nodal_displacements(path: str | os.PathLike[str], mesh: MeshFile, u_mm
     undefined = np.asarray(np.isnan(own_u).any(axis=1))
     columns = ["node", *(f"{axis}_{mesh.unit}" for axis in ("x", "y", "z", "ux", "uy", "uz"))]
     has_numbers = mesh.path.suffix.lower() in {".inp", ".msh"}
-    declared = {
+    declared: dict[str, object] = {
         "mesh": mesh.path.name,
         "frame": mesh.frame,
         "unit": mesh.unit,
@@ -126,6 +139,8 @@ def write_nodal_displacements(path: str | os.PathLike[str], mesh: MeshFile, u_mm
         "nodes": len(u),
         "nodes_without_displacement": int(np.count_nonzero(undefined)),
     }
+    if verdict is not None:
+        declared["verdict"] = verdict.as_dict()
     with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(columns)
@@ -134,6 +149,14 @@ def write_nodal_displacements(path: str | os.PathLike[str], mesh: MeshFile, u_mm
             rows.writerow([int(node), *numbers, *([""] * 3 if missing else [])])
     write_whole(path.with_suffix(".json"), json.dumps(declared, indent=2) + "\n")
     return int(np.count_nonzero(undefined))
+
+
+def _add_verdict(vtu: Path, verdict: Verdict) -> None:
+    """Put the verdict into a VTU file; meshio writes no field data, and reads none that are text."""
+    level = LEVELS.index(verdict.level)
+    array = f'<DataArray type="Int8" Name="{VERDICT_FIELD}" NumberOfTuples="1" format="ascii">{level}</DataArray>'
+    grid = b"<UnstructuredGrid>"
+    vtu.write_bytes(vtu.read_bytes().replace(grid, grid + f"<FieldData>{array}</FieldData>".encode(), 1))
 
 
 def _own_points(mesh: MeshFile) -> FloatArray:

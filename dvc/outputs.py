@@ -14,21 +14,26 @@ from dvc.kinematics import StrainField
 from dvc.meshfile import MeshFile
 from dvc.meshwrite import write_nodal_displacements, write_on_mesh
 from dvc.strainmaps import TENSOR_COMPONENTS, StrainMaps
+from dvc.verdict import Verdict
 
 _DISPLACEMENT = "displacement of tissue relative to its bone: u(X) = x - X at the voxels of the unloaded image"
 _GREEN_LAGRANGE = "Green-Lagrange strain E = (F^T F - I) / 2"
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-def write_maps(folder: Path, maps: StrainMaps, plate_axes: FloatArray | None = None) -> None:
+def write_maps(
+    folder: Path, maps: StrainMaps, plate_axes: FloatArray | None = None, verdict: Verdict | None = None
+) -> None:
     """Write displacement and strain maps as NIfTI on the reference grid, with their meaning in JSON beside.
 
     Parameters
     ----------
     plate_axes : (3, 3), optional
         Columns n (plate normal), s (shear), t (`dvc.kinematics.plate_axes`); the strain in these axes is written too.
+    verdict : Verdict, optional
+        Of a measurement; told in the JSON files.
     """
-    write_displacement(folder, maps.grid, maps.displacement_mm)
+    write_displacement(folder, maps.grid, maps.displacement_mm, verdict)
     write_vectors(
         folder / "green_lagrange.nii.gz",
         maps.grid,
@@ -36,6 +41,7 @@ def write_maps(folder: Path, maps: StrainMaps, plate_axes: FloatArray | None = N
         TENSOR_COMPONENTS,
         _GREEN_LAGRANGE,
         unit="1",
+        verdict=verdict,
     )
     if plate_axes is not None:
         write_vectors(
@@ -47,16 +53,19 @@ def write_maps(folder: Path, maps: StrainMaps, plate_axes: FloatArray | None = N
             f"columns of {np.round(plate_axes, 6).tolist()} in LPS",
             "invariant",
             unit="1",
+            verdict=verdict,
         )
     write_image(folder / "max_shear.nii.gz", Image(maps.grid, maps.max_shear))
     write_image(folder / "jacobian.nii.gz", Image(maps.grid, maps.jacobian))
     write_mask(folder / "valid.nii.gz", Mask(maps.grid, maps.valid))
 
 
-def write_displacement(folder: Path, grid: Grid, displacement_mm: Float32Array) -> None:
+def write_displacement(folder: Path, grid: Grid, displacement_mm: Float32Array, verdict: Verdict | None = None) -> None:
     """Write the displacement as NIfTI and as NRRD, LPS mm."""
     for name in ("displacement.nrrd", "displacement.nii.gz"):  # the JSON beside them names the last
-        write_vectors(folder / name, grid, displacement_mm, ("x", "y", "z"), _DISPLACEMENT, "LPS", unit="mm")
+        write_vectors(
+            folder / name, grid, displacement_mm, ("x", "y", "z"), _DISPLACEMENT, "LPS", unit="mm", verdict=verdict
+        )
 
 
 def in_axes(tensor: Float32Array, axes: FloatArray) -> Float32Array:
@@ -71,7 +80,9 @@ def in_axes(tensor: Float32Array, axes: FloatArray) -> Float32Array:
     return np.stack([turned[..., i, j] for i, j in _UPPER], axis=-1)
 
 
-def write_mesh_results(folder: Path, mesh: MeshFile, deformation: Deformation) -> dict[str, int]:
+def write_mesh_results(
+    folder: Path, mesh: MeshFile, deformation: Deformation, verdict: Verdict | None = None
+) -> dict[str, int]:
     """Displacement and strain at the nodes and in the cells of a user's mesh.
 
     Returns
@@ -98,8 +109,9 @@ def write_mesh_results(folder: Path, mesh: MeshFile, deformation: Deformation) -
             "max_shear": in_cells.max_shear,
             "jacobian": in_cells.jacobian,
         },
+        verdict,
     )
-    missing = write_nodal_displacements(folder / "nodal_displacements.csv", mesh, u)
+    missing = write_nodal_displacements(folder / "nodal_displacements.csv", mesh, u, verdict)
     return {
         "nodes": len(u),
         "nodes_without_value": missing,

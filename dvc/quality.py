@@ -106,7 +106,7 @@ class Quality:
         errors = self.landmark_errors_mm
         floor = self.noise_floor
         return {
-            "verdict": {"level": self.verdict.level, "reasons": list(self.verdict.reasons)},
+            "verdict": self.verdict.as_dict(),
             "local_similarity": None
             if self.similarity is None
             else dict(zip(("before", "after_rigid", "after_all"), map(plain, self.similarity), strict=True)),

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from dvc.arrays import FloatArray
 from dvc.errors import GeometryError, InputError
 from dvc.image import LabelMap
+from dvc.verdict import Verdict
 from dvc.whole import write_whole
 
 SHEAR_THRESHOLDS = (0.2, 0.3, 0.4, 0.5)
@@ -175,10 +176,11 @@ def _row(
     )
 
 
-def write_regions_csv(path: Path, rows: Sequence[RegionRow]) -> None:
+def write_regions_csv(path: Path, rows: Sequence[RegionRow], verdict: Verdict | None = None) -> None:
     """Write rows as a table: one line each, full precision, NaN where there is no value.
 
     A column ``volume_above_0.2_ml`` stands for each threshold of any row; empty for quantities without it.
+    With a verdict its words (`Verdict.words`) stand in a last column.
     The file appears under its name only when it is complete.
 
     Raises
@@ -190,13 +192,15 @@ def write_regions_csv(path: Path, rows: Sequence[RegionRow]) -> None:
     numbers = ("mean", "sd", "median", "p5", "p90", "p95", "p99", "max")
     header = ["region", "quantity", "voxels", "volume_ml", "defined_voxels", "defined_fraction", *numbers]
     header += [f"volume_above_{t:g}_ml" for t in thresholds]
+    told = [] if verdict is None else [verdict.words]
+    header += ["verdict"] if told else []
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
     for row in rows:
         cells: list[object] = [row.region, row.quantity, row.voxels, row.volume_ml, row.defined_voxels]
         cells += [row.defined_fraction, *(getattr(row, name) for name in numbers)]
-        cells += [row.volume_above_ml.get(t, "") for t in thresholds]
+        cells += [*(row.volume_above_ml.get(t, "") for t in thresholds), *told]
         writer.writerow([_plain(cell) for cell in cells])
     write_whole(path, text.getvalue())
 

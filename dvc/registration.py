@@ -9,26 +9,30 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
 from dvc import elastix
-from dvc.align import Alignment, AlignOn, align, not_aligned
+from dvc.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.bspline import BSpline
 from dvc.deformation import Composed, Deformation, Within
 from dvc.errors import InputError, ParameterError
-from dvc.gaussnewton import Choice, GaussNewton
+from dvc.gaussnewton import USUAL_BENDING, Choice, GaussNewton
 from dvc.image import Image, Mask
 from dvc.nonrigid import by_elastix, by_gauss_newton, without_gaps
-from dvc.presets import Preset, load_preset
+from dvc.presets import Preset, load_preset, preset_or_file
 from dvc.resample import fill_missing
 from dvc.shading import without_shading
 from dvc.tissue import tissue_mask
 from dvc.worker import Worker
 
 Progress = Callable[[str, float], None]
+
+GAUSS_NEWTON = "gauss-newton"
+"""Name of our own engine, where elastix has presets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +63,37 @@ class Settings:
     @property
     def engine(self) -> str:
         """Name of what finds the non-rigid part."""
-        return "elastix" if self.gauss_newton is None else "gauss-newton"
+        return "elastix" if self.gauss_newton is None else GAUSS_NEWTON
+
+    @property
+    def name(self) -> str:
+        """What an error model is known by: the engine gauss-newton, or the last preset of elastix."""
+        return GAUSS_NEWTON if self.gauss_newton is not None else self.presets[-1].name
+
+    @property
+    def needs_one_contrast(self) -> bool:
+        """Whether what is brighter than its neighbours must be so in both images; not for mutual information."""
+        metrics = [metric for preset in self.presets for metric in preset.parameters.get("Metric", ())]
+        return not any("MutualInformation" in metric for metric in metrics)
+
+    @property
+    def text(self) -> str:
+        """All parameters of the non-rigid part, as written."""
+        return self.gauss_newton.text if self.gauss_newton is not None else "\n".join(p.text for p in self.presets)
+
+    def of_repeat(self) -> Settings:
+        """For a repeat scan: a weight chosen for it alone would smooth away the noise that it is to show."""
+        own = self.gauss_newton
+        if own is None or own.bending is not None:
+            return self
+        return replace(self, gauss_newton=replace(own, bending=USUAL_BENDING))
 
     @classmethod
-    def of(cls, preset: str = "heel-mr", **others: object) -> Settings:
-        """Settings with a named preset."""
-        return replace(cls(presets=(load_preset(preset),)), **others)  # type: ignore[arg-type]
+    def of(cls, name: str = GAUSS_NEWTON, **others: object) -> Settings:
+        """Settings by name: "gauss-newton", a preset of elastix, or the path of a parameter file (.txt)."""
+        if name == GAUSS_NEWTON:
+            return replace(cls(gauss_newton=GaussNewton()), **others)  # type: ignore[arg-type]
+        return replace(cls(presets=(preset_or_file(name),)), **others)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +161,7 @@ def register(
     tissue : Mask, optional
         Body on the reference grid, bone included; found by a threshold where it is not given.
     settings : Settings, optional
-        Preset heel-mr, seed 1, one thread by default.
+        The engine gauss-newton, seed 1, one thread by default.
     start : BSpline, optional
         Result of another load to start from: its coefficients are the first guess, which the registration
         then corrects against these two images, so no error is carried on.
@@ -150,7 +179,8 @@ def register(
     InputError
         If the two images are the same, or a mask is missing or empty.
     RegistrationError
-        If the bone cannot be found in the loaded image, or elastix fails; with elastix' reason.
+        If the bone cannot be found in the loaded image, if the contrast of the two images is turned round and is not
+        to be followed by mutual information, or if elastix fails; with elastix' reason.
     WorkerError
         If the process that runs elastix dies.
     """
@@ -160,7 +190,7 @@ def register(
         raise ParameterError("No registration stage given; name a preset or parameter files.")
     _refuse_other_spacing(chosen.presets)
     tell = progress or (lambda _stage, _fraction: None)
-    _refuse_same(reference, loaded)
+    refuse_one_image_twice([("The unloaded image", reference), ("the loaded one", loaded)])
     body = tissue if tissue is not None else tissue_mask(reference)
     _check_masks(reference, body, bone, chosen.align_on)
     own = worker is None
@@ -175,6 +205,8 @@ def register(
         inside = body.toward_lps()
         on = None if bone is None else bone.toward_lps()
         alignment = _align(fixed, moving, inside, on, chosen, runner)
+        if chosen.align_on == "none" and chosen.needs_one_contrast:  # a rigid alignment refuses it by itself
+            refuse_turned_contrast(fixed, moving, inside, alignment.motion)
         tell("aligning", 1.0)
         bspline, choice = start, None
         if chosen.gauss_newton is not None:
@@ -203,12 +235,20 @@ def register(
     return Registration(reference, loaded, body, bone, alignment, bspline, chosen, time.monotonic() - began, choice)
 
 
-def _refuse_same(reference: Image, loaded: Image) -> None:
-    if reference.grid.same_as(loaded.grid) and np.array_equal(reference.values, loaded.values, equal_nan=True):
-        raise InputError(
-            "The loaded image is the unloaded one: every voxel is equal. Check the file names; two scans, even of "
-            "a resting foot, differ by their noise."
-        )
+def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:
+    """Refuse scans of which two are the same image, told by the names given with them.
+
+    Raises
+    ------
+    InputError
+        Naming the two.
+    """
+    for (one, image), (other, second) in combinations(images, 2):
+        if image.grid.same_as(second.grid) and np.array_equal(image.values, second.values, equal_nan=True):
+            raise InputError(
+                f"{one} and {other} are the same image: every voxel is equal. Check the file names; two scans, even "
+                "of a resting foot, differ by their noise."
+            )
 
 
 def _check_masks(reference: Image, body: Mask, bone: Mask | None, on: AlignOn) -> None:

@@ -21,13 +21,14 @@ from dvc.borders import BorderedSpline, Borders
 from dvc.bspline import BSpline
 from dvc.deformation import Deformation
 from dvc.descent import Level, Weights
-from dvc.gaussnewton import LEVELS, USUAL, Choice, GaussNewton, choose, fit, scaled, turned
+from dvc.gaussnewton import LEVELS, USUAL_BENDING, Choice, GaussNewton, choose, fit, scaled, turned
 from dvc.image import Image, LabelMap, Mask
 
 _SKIN = "skin"
-_SKIN_POWERS = -5, 4  # of the square root of ten, times the usual weight: 0.01 to 300
+_SKIN_WEIGHT = 3.0  # of its strain, 1/mm3, to begin with
+_SKIN_POWERS = -5, 4  # of the square root of ten, times that: 0.01 to 300
 _STEPS = 3
-_BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm4
+_BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
 
 
 def fit_with_borders(
@@ -59,7 +60,7 @@ def fit_with_borders(
     choice : Choice
         Its weight "rigidity" is the skin's, k.
     """
-    weights = Weights(USUAL if options.bending is None else options.bending, options.volume, USUAL)
+    weights = Weights(USUAL_BENDING if options.bending is None else options.bending, options.volume, _SKIN_WEIGHT)
     smooth, _ = fit(
         fixed, moving, inside, body, bone, replace(options, bending=weights.bending), start=start, progress=progress
     )
@@ -73,13 +74,13 @@ def fit_with_borders(
     rough = ((1.0, 0.0), (_BENDING * borders.reach_mm**2, _SQUARE))
 
     def level(part: BoolArray) -> Level:
-        return Level(*pictures, inside.inside & part, soft & part, skin & part, control, factors, rough)
+        return Level(*pictures, inside.inside & part, soft & part, skin & part, control, factors=factors, rough=rough)
 
     whole, slab = level(np.ones_like(soft)), level(_slab(inside.inside))
     stop_mm = LEVELS[-1][-1]
     found: FloatArray = np.concatenate([turned(axes.T, smooth.coefficients_mm), np.zeros((3, *control.shape))])
     found = whole.descend(found, weights, steps=_STEPS, stop_mm=stop_mm)
-    choice, in_skin = Choice(weights, "bending fixed by the user"), Choice(weights, "")
+    choice, in_skin = Choice(weights, "bending fixed beforehand"), Choice(weights, "")
     if skin.any():
         in_skin = choose(slab, found, weights, "rigidity", _SKIN_POWERS)
         choice = replace(choice, weights=in_skin.weights)

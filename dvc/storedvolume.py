@@ -196,7 +196,8 @@ def pick_volume(path: Path, count: int, volume: int | None, what: str = "volumes
         if count == 1:
             return 0
         raise ImageFileError(
-            f"{path}: the file holds {count} {what}; one is needed. Say which with volume=0 to {count - 1}."
+            f"{path}: the file holds {count} {what}; one is needed. Take it out into a file of its own: in Python, "
+            f'dvc.write_image("one.nii.gz", dvc.read_image("{path}", volume=N)) with N from 0 to {count - 1}.'
         )
     if not 0 <= volume < count:
         raise ImageFileError(f"{path}: volume={volume} was asked for; the file holds volumes 0 to {count - 1}.")

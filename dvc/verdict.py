@@ -10,6 +10,8 @@ from dvc.errors import InputError
 
 Level = Literal["trust", "caution", "distrust"]
 
+LEVELS: tuple[Level, ...] = get_args(Level)
+"""From the best to the worst."""
 _WORDS: dict[Level, str] = {"trust": "Trust", "caution": "Use with care", "distrust": "Do not trust"}
 
 
@@ -38,8 +40,8 @@ class Verdict:
     reasons: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.level not in get_args(Level):
-            raise InputError(f"A verdict is one of {list(get_args(Level))}; got '{self.level}'.")
+        if self.level not in LEVELS:
+            raise InputError(f"A verdict is one of {list(LEVELS)}; got '{self.level}'.")
         if self.level != "trust" and not self.reasons:
             raise InputError(f"The verdict '{self.level}' needs a reason; give at least one sentence.")
 
@@ -47,6 +49,10 @@ class Verdict:
     def words(self) -> str:
         """The level as people read it: "Trust", "Use with care", "Do not trust"."""
         return _WORDS[self.level]
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return {"level": self.level, "reasons": list(self.reasons)}
 
 
 def worst(verdicts: Iterable[Verdict]) -> Verdict:
@@ -65,7 +71,6 @@ def worst(verdicts: Iterable[Verdict]) -> Verdict:
     given = list(verdicts)
     if not given:
         raise InputError("There is no verdict to choose the worst of; judge at least one result first.")
-    order = get_args(Level)
-    level = max((v.level for v in given), key=order.index)
+    level = max((v.level for v in given), key=LEVELS.index)
     reasons = dict.fromkeys(r for v in given if v.level == level for r in v.reasons)
     return Verdict(level, tuple(reasons))

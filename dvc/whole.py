@@ -61,9 +61,15 @@ def whole_folder(final: Path) -> Iterator[Path]:
             yield partial
             if final.exists():
                 old = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".old", dir=final.parent))
-                final.replace(old / final.name)
-                partial.replace(final)
-                shutil.rmtree(old, ignore_errors=True)
+                try:
+                    final.replace(old / final.name)
+                    partial.replace(final)
+                except OSError:
+                    if not final.exists():
+                        (old / final.name).replace(final)
+                    raise
+                finally:
+                    shutil.rmtree(old, ignore_errors=True)
             else:
                 partial.replace(final)
         finally:

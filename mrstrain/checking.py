@@ -23,7 +23,7 @@ from mrstrain.ledger import Ledger
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.pipeline import Pipeline
 from mrstrain.plan import Stage, plan
-from mrstrain.registering import REPEAT, stages_of
+from mrstrain.registering import REPEAT, settings_of
 from mrstrain.studyfile import Study, read_study
 from validate.location import read_thresholds
 
@@ -107,14 +107,12 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
             if isinstance(reference, Image) and _same(reference, image):
                 wrong.append(f"{name} is the unloaded image: every voxel is equal.")
     how = told.registration
-    stages = tried(lambda: stages_of(how.preset, [told.path(p) for p in how.parameters]))
-    if stages:
+    settings = tried(lambda: settings_of(how.engine, how.preset, [told.path(p) for p in how.parameters]))
+    if settings:
         own = how.error_model
-        model = tried(lambda: error_model_of(stages[-1].name) if own is None else read_error_model(told.path(own)))
+        model = tried(lambda: error_model_of(settings.name) if own is None else read_error_model(told.path(own)))
         if model is None:
-            notes.append(f"{stages[-1].name} has no error model: results will have no intervals (`mrstrain accuracy`).")
-    if how.engine != "elastix":
-        notes.append(f"The error of the engine {how.engine} has not been measured yet: results will have no intervals.")
+            notes.append(f"{settings.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
     if told.compare.thresholds is not None:
         tried(lambda: read_thresholds(told.path(str(told.compare.thresholds))))
     for name in told.models.sets:

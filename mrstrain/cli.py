@@ -16,7 +16,6 @@ from mrstrain.options import (
     Bending,
     Bone,
     BoneLabel,
-    Engine,
     EngineName,
     Frame,
     Labels,
@@ -26,6 +25,7 @@ from mrstrain.options import (
     Names,
     Out,
     Plate,
+    Preset,
     Shear,
     Tissue,
     Unit,
@@ -80,10 +80,10 @@ def register(
     labels: Labels = None,
     names: Names = None,
     align: Annotated[Align, typer.Option(help="What to align rigidly first.")] = Align.BONE,
-    engine: EngineName = Engine.ELASTIX,
+    engine: EngineName = None,
     bending: Bending = None,
     volume: Volume = None,
-    preset: Annotated[str, typer.Option(help="Named parameters of elastix.")] = "heel-mr",
+    preset: Preset = None,
     parameters: Annotated[
         list[Path] | None, typer.Option(help="elastix parameter file(s) of your own, instead of a preset.")
     ] = None,
@@ -136,7 +136,7 @@ def register(
             labels=labels,
             names=names,
             align=align.value,
-            engine=engine.value,
+            engine=None if engine is None else engine.value,
             bending=bending,
             volume=volume,
             preset=preset,
@@ -291,7 +291,8 @@ def twin(
 def accuracy(
     out: Out,
     preset: Annotated[
-        list[str] | None, typer.Option(help="Preset to judge, or an elastix parameter file (.txt); repeat for several.")
+        list[str] | None,
+        typer.Option(help="Preset of elastix, its parameter file (.txt), or gauss-newton; repeatable."),
     ] = None,
     spacing: Annotated[list[float] | None, typer.Option(help="Edge of the voxels, mm; repeat for several.")] = None,
     slice_spacing: Annotated[
@@ -310,11 +311,12 @@ def accuracy(
         int | None, typer.Option(min=1, help="Registrations at once. Default: one for each core.")
     ] = None,
 ) -> None:
-    """Error of a preset on phantoms: by tissue, place, strain, noise and resolution. Goes on where it stopped.
+    """Error of a preset or engine on phantoms: by tissue, place, strain, noise, resolution. Goes on where it stopped.
 
-    Without options 110 registrations: heel-mr, seven motions and eight waves, voxels of 0.8 mm at SNR 25, 12 and 50,
-    of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr these alone (default 0.8 mm, 25).
+    Without options 110 registrations: gauss-newton, seven motions and eight waves, voxels of 0.8 mm at SNR 25, 12 and
+    50, of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr these alone (default 0.8 mm, 25).
     """
+    from dvc.registration import GAUSS_NEWTON
     from mrstrain.progress import live
     from mrstrain.studying import CONDITIONS, MOTIONS, SEEDS, WAVES, cases_of
     from mrstrain.studying import accuracy as run
@@ -322,7 +324,7 @@ def accuracy(
     conditions = CONDITIONS
     if spacing or snr or slice_spacing:
         conditions = tuple(((s, s, slice_spacing or s), r) for s in spacing or [0.8] for r in snr or [25.0])
-    cases = cases_of(preset or ("heel-mr",), conditions, motion or (*MOTIONS, *WAVES), seed or SEEDS)
+    cases = cases_of(preset or (GAUSS_NEWTON,), conditions, motion or (*MOTIONS, *WAVES), seed or SEEDS)
     with live() as progress:
         study = run(out, cases=cases, workers=workers, tell_plan=typer.echo, progress=progress)
     for line in study.summary():

@@ -18,7 +18,7 @@ from dvc.verdict import Verdict
 from dvc.viewer import Viewer, Volume
 from mrstrain.page import said
 from validate import figures
-from validate.comparison import NOTHING, Comparison
+from validate.comparison import NOTHING, Comparison, Total
 from validate.curves import Area
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
@@ -142,14 +142,21 @@ def viewer_of(
 
 def page_sections(
     shown: Sequence[tuple[Comparison, Judged, Mapping[str, bytes], Viewer]],
-    totals: Sequence[Area],
-    noise: Sequence[str],
+    summed: Total,
     notes: Sequence[str],
+    strange: Sequence[str],
     strains: tuple[float, float],
 ) -> list[Section]:
-    """The report's parts: models and loads first, then each load."""
-    done = [one for one, _, _, _ in shown]
-    sections = [Section("Models and loads", None, (_areas(done, totals, strains),), (), (*noise, *notes))]
+    """The report's parts: models and loads first, with what is ``strange`` about a model, then each load."""
+    heads = {
+        one.load: one.load
+        if measurement.verdict is None or measurement.verdict.level == "trust"
+        else f"{one.load} ({measurement.verdict.words.lower()})"
+        for one, measurement, _, _ in shown
+    }
+    slips = Verdict("caution", tuple(strange)) if strange else None
+    table = _areas([one for one, _, _, _ in shown], heads, summed, strains)
+    sections = [Section("Models and loads", slips, (table,), (), (*summed.told, *notes))]
     for one, measurement, drawn, viewer in shown:
         verdict = measurement.verdict
         pictures = {stem: Picture(title, said(draw), drawn[stem]) for stem, (title, draw) in _TITLES.items()}
@@ -186,20 +193,23 @@ def shown(area: Area) -> str:
     return f"{area.best_ml:.2f}" + (f" ({area.low_ml:.2f} to {area.high_ml:.2f})" if known else "")
 
 
-def _areas(done: Sequence[Comparison], totals: Sequence[Area], strains: tuple[float, float]) -> Table:
+def _areas(done: Sequence[Comparison], heads: Mapping[str, str], summed: Total, strains: tuple[float, float]) -> Table:
     areas = {(a.model, a.load): a for one in done for a in one.areas if a.tissue == ALL}
-    sums = {a.model: a for a in totals}
+    sums = {a.model: a for a in (*summed.areas, summed.nothing)}
     names = [*sums, *dict.fromkeys(model for model, _ in areas if model not in sums)]
     rows: dict[str, tuple[Cell, ...]] = {}
     for name in names:
         cells = ["–" if (area := areas.get((name, one.load))) is None else shown(area) for one in done]
-        rows[name] = (name, *cells, shown(sums[name]) if name in sums else "–")
+        place = summed.place(name)
+        told = "–" if place is None else "–".join(str(p) for p in dict.fromkeys(place))
+        rows[name] = (name, told, *cells, shown(sums[name]) if name in sums else "–")
     nothing = rows.pop(NOTHING)
     return Table(
         f"Area between the volume-strain curves of soft tissue, strains {strains[0]:g} to {strains[1]:g}, mL",
-        ("model", *(one.load for one in done), "all loads"),
+        ("model", "place", *(heads[one.load] for one in done), "all loads"),
         tuple(rows.values()),
-        "The nearest model first. Where the measurement's error is known, the area is the median over truths that "
+        "The nearest model over all loads first; a place is a range where the measurement does not tell which of "
+        "several models is nearer. Where the measurement's error is known, the area is the median over truths that "
         "could lie behind it, with a 95 % interval; areas as found, and by tissue, stand below and in areas.csv. "
         "Levelled models come last, with their area as found. Below the line: the area of a model that predicts no "
         "strain at all.",

@@ -32,6 +32,7 @@ from dvc.uncertainty import (
     to_surface_mm,
     uncertainty_of,
 )
+from dvc.verdict import Verdict
 from dvc.whole import write_whole
 from mrstrain.inputs import Subject
 from mrstrain.page import said
@@ -67,8 +68,11 @@ class ErrorBars:
         voxel = table.spacing_mm.tolist()
         return {"known": True, "source": self.told, "voxel_mm": voxel, "snr": round(table.snr, 1)}
 
-    def write(self, folder: Path, maps: StrainMaps) -> None:
-        """Write ``sigma_max_shear.nii.gz``, ``intervals.csv`` and the ``error_model.json`` used, if there are any."""
+    def write(self, folder: Path, maps: StrainMaps, verdict: Verdict) -> None:
+        """Write ``sigma_max_shear.nii.gz``, ``intervals.csv`` and the ``error_model.json`` used, if there are any.
+
+        The registration's verdict stands beside every interval: of one that failed they tell nothing.
+        """
         if self.uncertainty is None:
             return
         if self.model is not None:
@@ -76,9 +80,10 @@ class ErrorBars:
         write_image(folder / "sigma_max_shear.nii.gz", Image(maps.grid, self.uncertainty.sigma))
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([f.name for f in fields(Interval)])
+        writer.writerow([*(f.name for f in fields(Interval)), "verdict"])
         writer.writerows(
-            [f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)] for row in self.uncertainty.intervals
+            [*(f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)), verdict.words]
+            for row in self.uncertainty.intervals
         )
         write_whole(folder / "intervals.csv", text.getvalue())
 
@@ -138,13 +143,8 @@ def _held(table: ErrorTable) -> str:
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
     """The error model of what was used; InputError with the reason where there is none."""
-    stages = found.settings.presets
-    if not stages:
-        raise InputError(
-            "The error of the engine gauss-newton has not been measured yet; --engine elastix has intervals."
-        )
-    used = stages[-1]
-    if len(stages) > 1:
+    used = found.settings
+    if len(used.presets) > 1:
         raise InputError("The error of several stages, one after the other, has not been measured.")
     if given is None:
         raise InputError(f"The error of {used.name} has not been measured; `mrstrain accuracy` does that.")

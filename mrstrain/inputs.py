@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -172,6 +173,25 @@ def refuse_touching_inputs(out: Path, case_folders: Sequence[str], inputs: Seque
                 raise OutputError(
                     f"{out / case} would be replaced, and the input {path} lies in it. Choose another --out."
                 )
+
+
+def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") -> None:
+    """Refuse an output folder, made or not yet made, on a disk with too little room for ``needed`` bytes.
+
+    Parameters
+    ----------
+    what : str
+        "the set needs", say.
+    instead : str
+        More that can be done about it, as it follows "choose another --out".
+    """
+    there = next(place for place in (out.resolve(), *out.resolve().parents) if place.exists())
+    free = shutil.disk_usage(there).free
+    if free < needed:
+        raise OutputError(
+            f"{out}: {what} about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. Free some, choose "
+            f"another --out{instead}."
+        )
 
 
 def make_output(out: Path) -> None:

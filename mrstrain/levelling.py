@@ -50,7 +50,8 @@ def level(
     labels: Path | str | None = None,
     names: Path | str | None = None,
     loads: Sequence[str] = (),
-    preset: str = "heel-mr",
+    engine: str | None = None,
+    preset: str | None = None,
     model_mesh: Path | str | None = None,
     model_unit: str = "mm",
     model_frame: str = "LPS",
@@ -73,8 +74,8 @@ def level(
         As in `register`; the bone is needed.
     loads : sequence of str
         Names of the loads; all of the model's files by default.
-    preset : str
-        That of the measurement.
+    engine, preset : str, optional
+        Those of the measurement, as in `register`.
     model_mesh, model_unit, model_frame
         As in `compare`.
     workers : int
@@ -126,6 +127,7 @@ def level(
         "level",
         {**subject.files, "models": [f.path for of in files.values() for f in of]},
         {
+            "engine": engine,
             "preset": preset,
             "seed": seed,
             "bone_label": bone_label,
@@ -139,8 +141,8 @@ def level(
     series = register(
         load0, [target / work / "images" / f"{load}.nii.gz" for load in results],
         out=target / work / "registered", bone=bone,
-        bone_label=bone_label, tissue=tissue, labels=labels, names=names, preset=preset, workers=workers, seed=seed,
-        progress=progress,
+        bone_label=bone_label, tissue=tissue, labels=labels, names=names, engine=engine,
+        preset=preset, workers=workers, seed=seed, progress=progress,
     )  # fmt: skip
     write_whole(target / name / SETTINGS, IN_IMAGE)
     for load, result in results.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from dvc.deformation import RigidMotion
-from dvc.errors import InputError, OutputError
-from dvc.image import Grid, Image, LabelMap, Mask
+from dvc.errors import InputError
+from dvc.image import Image, LabelMap, Mask
 from dvc.imagewrite import write_image, write_labels, write_mask
 from dvc.outputs import write_maps
 from dvc.regions import region_statistics, write_regions_csv
 from dvc.strainmaps import StrainMaps, strain_maps
 from dvc.whole import whole_folder
-from mrstrain.inputs import make_output
+from mrstrain.inputs import make_output, refuse_small_disk
 from mrstrain.provenance import provenance, write_json
 from phantoms.anatomy import Heel
 from phantoms.heel import (
@@ -112,8 +111,9 @@ def phantom(
     if not motions:
         raise InputError(f"Name at least one load out of {', '.join(LOADS)}.")
     target = Path(out)
+    needed = _BYTES_PER_VOXEL * int(np.prod(grid.shape)) * (len(motions) + 2)
+    refuse_small_disk(target, needed, "the set needs", ", larger voxels or fewer loads")
     make_output(target)
-    _refuse_small_disk(target, grid, len(motions) + 2)
     tell = progress or (lambda *_: None)
     steps, done = 2 + 2 * len(motions), 0
 
@@ -173,16 +173,6 @@ def phantom(
     write_json(target / "phantom.json", record)
     tell("phantom", _STAGE, 1.0)
     return PhantomSet(target, images)
-
-
-def _refuse_small_disk(folder: Path, grid: Grid, images: int) -> None:
-    needed = _BYTES_PER_VOXEL * int(np.prod(grid.shape)) * images
-    free = shutil.disk_usage(folder).free
-    if free < needed:
-        raise OutputError(
-            f"{folder}: the set needs about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. "
-            "Free some, choose another --out, larger voxels or fewer loads."
-        )
 
 
 def _write_truth(folder: Path, maps: StrainMaps, labels: LabelMap, record: dict[str, object]) -> None:

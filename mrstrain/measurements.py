@@ -11,7 +11,7 @@ from dvc.deformation import Deformation
 from dvc.displacementfile import read_displacement
 from dvc.errors import InputError
 from dvc.uncertainty import ErrorTable, read_error_model
-from dvc.verdict import Verdict
+from dvc.verdict import Verdict, worst
 
 _FIELD, _REPEAT = "displacement.nii.gz", "repeat"  # a repeat scan is no load
 
@@ -78,3 +78,22 @@ def measurements_in(place: Path, loads: Sequence[str] = ()) -> list[Measurement]
             aligned_on = str(told.get("alignment", {}).get("on", ""))
         found.append(Measurement(folder.resolve().name, folder, table, verdict, aligned_on))
     return found
+
+
+def verdict_on(measurements: Sequence[Measurement], strange: Sequence[str] = ()) -> Verdict | None:
+    """The verdict on a comparison with measurements: the worst of theirs, and of what is ``strange`` about models.
+
+    All reasons for less than trust are told, the worst first; trust is said to be in the measurement, and not in the
+    models. None where no measurement has a verdict and nothing is strange.
+    """
+    given = [Verdict("caution", tuple(strange))] if strange else []
+    for one in measurements:
+        if one.verdict is not None:
+            what = "is not to be trusted" if one.verdict.level == "distrust" else "is to be used with care"
+            told = tuple(f"{one.load}: its registration {what}: {reason}" for reason in one.verdict.reasons)
+            given.append(Verdict(one.verdict.level, () if one.verdict.level == "trust" else told))
+    if not given:
+        return None
+    reasons = {level: [r for v in given if v.level == level for r in v.reasons] for level in ("distrust", "caution")}
+    sound = f"The measurement: {len(given)} registrations are sound. The models are judged below."
+    return Verdict(worst(given).level, (*reasons["distrust"], *reasons["caution"]) or (sound,))

@@ -101,18 +101,35 @@ def _measured(measured: Mapping[str, Path]) -> str:
 
 def _registration(record: Record) -> str:
     given, versions = record.get("parameters", {}), record.get("versions", {})
-    stages = given.get("stages") or []
-    if record.get("command") != "register" or not stages:
+    stages, own = given.get("stages") or [], given.get("gauss_newton")
+    if record.get("command") != "register" or not (stages or own):
         return "the displacement was taken as it was given."
     align = {
         "bone": "The loaded image was aligned with the unloaded one rigidly on the bone, and then",
         "image": "The loaded image was aligned with the unloaded one rigidly on the whole image, and then",
     }.get(str(given.get("align")), "The loaded image was, without rigid alignment,")
+    elastix = f"elastix (Klein 2010, Shamonin 2014; itk-elastix {versions.get('itk-elastix', '?')})"
+    ours = f"mrstrain {versions.get('mrstrain', '?')}"
+    how = (
+        f"with {elastix} through {ours}: {'; then '.join(_stage(stage) for stage in stages)}"
+        if not own
+        else f"with the Gauss-Newton engine of {ours}: {_weights(own)}"
+    )
+    if own and given.get("align") != "none":
+        how += f"; rigid alignment with {elastix}"
     return (
-        f"{align} registered non-rigidly with elastix (Klein 2010, Shamonin 2014; itk-elastix "
-        f"{versions.get('itk-elastix', '?')}) through mrstrain {versions.get('mrstrain', '?')}: "
-        f"{'; then '.join(_stage(stage) for stage in stages)}; seed {given.get('seed')}. Images were read and "
+        f"{align} registered non-rigidly {how}; seed {given.get('seed')}. Images were read and "
         f"written with SimpleITK {versions.get('SimpleITK', '?')} (Lowekamp 2013)."
+    )
+
+
+def _weights(own: Record) -> str:
+    bending = own.get("bending")
+    weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
+    return (
+        f"a cubic B-spline with control points every {own.get('spacing_mm'):g} mm, least squares over all voxels, and "
+        f"penalties on bending (weight {weight}), on change of volume in soft tissue ({own.get('volume'):g}/mm3) and "
+        f"on strain of the bone ({own.get('rigidity'):g}/mm3)"
     )
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.errors import InputError
+from dvc.errors import ExtentError, InputError
 from dvc.image import Grid
+from dvc.mesh import box_told
 from mrstrain.inputs import read_matrix
 from validate.sources import FeResult, check_overlap, read_result
 
@@ -45,8 +46,13 @@ class ModelFile:
     def read(self, grid: Grid) -> FeResult:
         """The result, which has to lie in the image on this grid; errors as `read_result` and `check_overlap`."""
         how = self.reading
-        result = read_result(self.name, self.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image)
-        check_overlap(result, grid)
+        try:
+            result = read_result(
+                self.name, self.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image
+            )
+        except ExtentError as failure:
+            raise ExtentError(f"{failure} The image: {box_told(*grid.bounds_mm())} (LPS mm).") from failure
+        check_overlap(self.path, result.mesh, grid)
         return result
 
 

@@ -58,7 +58,11 @@ ModelMesh = Annotated[Path | None, typer.Option(help="Mesh of nodal displacement
 MeshFile = Annotated[Path | None, typer.Option(help="Mesh to put displacement and strain on.")]
 MeshUnit = Annotated[Unit, typer.Option(help="Unit of the mesh's coordinates.")]
 MeshFrame = Annotated[Frame, typer.Option(help="Frame of the mesh's coordinates.")]
-EngineName = Annotated[Engine, typer.Option("--engine", help="What finds the non-rigid part.")]
+EngineName = Annotated[
+    Engine | None,
+    typer.Option("--engine", help="What finds the non-rigid part. Default: gauss-newton; with --preset, elastix."),
+]
+Preset = Annotated[str | None, typer.Option(help="Named parameters of elastix, such as heel-mr.")]
 Bending = Annotated[
     float | None,
     typer.Option(help="gauss-newton: weight of bending, 1/mm. Default: chosen for each pair by cross-validation."),

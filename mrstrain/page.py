@@ -32,7 +32,7 @@ _CLOSING = (
             "A verdict judges the registration, not the tissue. It cannot see everything: inside a uniform region, and "
             "along a smooth skin, an image does not show how tissue slides. Small shears are lifted by noise; a repeat "
             "scan without load (--repeat) tells by how much. Strain that jumps at a border of tissues is smeared over "
-            "about one spacing of the control points (4 mm for heel-mr). Scanner distortion and creep between scans "
+            "about one spacing of the control points (3 to 5 mm). Scanner distortion and creep between scans "
             "are not seen at all.",
             "A noise floor is what a repeat scan shows where there is no strain. MAER is the mean over voxels of the "
             "mean absolute value of the six strain components, SDER the standard deviation of the same.",

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from dvc.align import AlignOn
 from dvc.arrays import FloatArray
 from dvc.bspline import BSpline
@@ -15,13 +17,20 @@ from dvc.gaussnewton import GaussNewton
 from dvc.image import Image, Mask
 from dvc.imagefile import read_image
 from dvc.landmarks import read_landmarks
-from dvc.presets import Preset, load_preset, read_parameter_file
-from dvc.registration import Registration, Settings
+from dvc.presets import load_preset, read_parameter_file
+from dvc.registration import GAUSS_NEWTON, Registration, Settings, refuse_one_image_twice
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
 from dvc.uncertainty import ErrorModel, error_model_of, read_error_model
 from dvc.worker import Worker, each_in_workers, usable_cores
-from mrstrain.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
+from mrstrain.inputs import (
+    Subject,
+    case_names,
+    make_output,
+    read_subject,
+    refuse_small_disk,
+    refuse_touching_inputs,
+)
 from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
 from mrstrain.results import Case, write_case
@@ -29,6 +38,7 @@ from mrstrain.results import Case, write_case
 Told = Callable[[str, str, float], None]
 REPEAT = "repeat"
 """Name of a repeat scan's results."""
+_BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plate's axes
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +77,10 @@ def register(
     labels: Path | str | None = None,
     names: Path | str | None = None,
     align: AlignOn = "bone",
-    engine: str = "elastix",
+    engine: str | None = None,
     bending: float | None = None,
     volume: float | None = None,
-    preset: str = "heel-mr",
+    preset: str | None = None,
     parameters: Sequence[Path | str] = (),
     allow_unknown_parameters: bool = False,
     chain: bool = False,
@@ -104,11 +114,12 @@ def register(
     labels, names : path, optional
         Label map of the tissues on the unloaded image and the table of its names, for statistics by region.
     align : {"bone", "image", "none"}
-    engine : {"elastix", "gauss-newton"}
-        What finds the non-rigid part. The second is our own; ``bending`` (1/mm) and ``volume`` (1/mm3) fix its weights,
-        of which the first is otherwise chosen for each pair. Presets and parameter files are elastix'.
-    preset : str
-        Named parameters; or ``parameters``, elastix files of your own, applied one after the other.
+    engine : {"gauss-newton", "elastix"}, optional
+        What finds the non-rigid part: our own, unless a preset or parameter files of elastix are given. ``bending``
+        (1/mm) and ``volume`` (1/mm3) fix our own engine's weights; the first is otherwise chosen for each pair.
+    preset : str, optional
+        Named parameters of elastix, heel-mr by default; or ``parameters``, files of your own, applied one after the
+        other.
     chain : bool
         Start each load from the result of the one before, in the order given.
     repeat : path, optional
@@ -153,8 +164,9 @@ def register(
         raise InputError("Give at least one loaded image.")
     if landmarks is not None and len(loads) != 1:
         raise InputError(f"--landmarks belong to one loaded image; {len(loads)} are given. Register that one alone.")
-    own = own_engine(engine, bending, volume, preset, parameters)
-    stages = stages_of(preset, parameters, allow_unknown_parameters) if own is None else ()
+    settings = settings_of(
+        engine, preset, parameters, bending=bending, volume=volume, allow_unknown=allow_unknown_parameters
+    )
     given = [
         Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh, error_model) if p is not None
     ]
@@ -180,14 +192,18 @@ def register(
     images = {name: read_image(path, allow_missing=allow_missing) for name, path in zip(cases, paths, strict=True)}
     # Read now: what is wrong with it must not be found after an hour.
     model = None if error_model is None else read_error_model(error_model)
-    if model is None and stages:
-        model = error_model_of(stages[-1].name)
     points = None if landmarks is None else read_landmarks(landmarks)[:2]
+    refuse_one_image_twice(
+        [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
+    )
+    needed = _BYTES_PER_VOXEL * int(np.prod(subject.reference.grid.shape)) * len(cases)
+    refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
     make_output(target)
     cores = usable_cores()
     at_once = 1 if chain else min(workers or cores, cores, len(cases))
     each = threads or max(1, cores // at_once)
-    settings = Settings(stages, align, seed, each, own)
+    settings = replace(settings, align_on=align, seed=seed, threads=each)
+    model = model or error_model_of(settings.name)
     record = record_of(
         subject,
         {
@@ -241,29 +257,39 @@ def record_of(
     )
 
 
-def own_engine(
-    engine: str, bending: float | None, volume: float | None, preset: str, parameters: Sequence[Path | str]
-) -> GaussNewton | None:
-    """Parameters of our own engine where it was asked for; what belongs to the other one is refused."""
-    if engine not in {"elastix", "gauss-newton"}:
-        raise ParameterError(f"No engine '{engine}'; there are elastix and gauss-newton.")
+def settings_of(
+    engine: str | None,
+    preset: str | None,
+    parameters: Sequence[Path | str] = (),
+    *,
+    bending: float | None = None,
+    volume: float | None = None,
+    allow_unknown: bool = False,
+) -> Settings:
+    """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused.
+
+    Where none is asked for: elastix if a preset or parameter files are given, else our own.
+    """
+    if engine is None:
+        engine = "elastix" if preset or parameters else GAUSS_NEWTON
+    if engine not in {"elastix", GAUSS_NEWTON}:
+        raise ParameterError(f"No engine '{engine}'; there are elastix and {GAUSS_NEWTON}.")
     if engine == "elastix":
         if bending is not None or volume is not None:
-            raise ParameterError("--bending and --volume are weights of --engine gauss-newton; elastix has none.")
-        return None
-    if parameters or preset != "heel-mr":
+            raise ParameterError(f"--bending and --volume are weights of --engine {GAUSS_NEWTON}; elastix has none.")
+        if parameters and preset:
+            raise ParameterError(
+                f"Give the preset {preset} or parameter files, not both: only one of them would be used."
+            )
+        if parameters:
+            return Settings(tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters))
+        return Settings.of(preset or "heel-mr")
+    if parameters or preset:
         raise ParameterError(
-            "Presets and parameter files are elastix'; --engine gauss-newton takes --bending and --volume."
+            f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
         )
     own = GaussNewton(bending=bending)
-    return own if volume is None else replace(own, volume=volume)
-
-
-def stages_of(preset: str, parameters: Sequence[Path | str], allow_unknown: bool = False) -> tuple[Preset, ...]:
-    """The preset, or parameter files of one's own, applied one after the other."""
-    if parameters:
-        return tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters)
-    return (load_preset(preset),)
+    return Settings(gauss_newton=own if volume is None else replace(own, volume=volume))
 
 
 class _Run:
@@ -301,7 +327,7 @@ class _Run:
                     self.images[name],
                     bone=self.subject.bone,
                     tissue=self.body,
-                    settings=self.settings,
+                    settings=self.settings.of_repeat() if name == REPEAT else self.settings,
                     start=start,
                     worker=worker,
                     progress=lambda stage, fraction: self._told(name, stage, fraction),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from dvc.align import AlignOn
@@ -10,14 +11,13 @@ from dvc.bspline import BSpline
 from dvc.errors import InputError
 from dvc.imagefile import read_image
 from dvc.quality import read_noise_floor
-from dvc.registration import Settings
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform
 from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import Worker
 from mrstrain.inputs import read_subject
-from mrstrain.registering import REPEAT, own_engine, record_of, stages_of
+from mrstrain.registering import REPEAT, record_of, settings_of
 from mrstrain.results import Case, write_case
 
 
@@ -31,8 +31,8 @@ def register_one(
     bone: str | Path,
     tissue: Path | None = None,
     align: AlignOn = "bone",
-    engine: str = "elastix",
-    preset: str = "heel-mr",
+    engine: str | None = None,
+    preset: str | None = None,
     parameters: Sequence[Path] = (),
     error_model: Path | None = None,
     plate_normal: Sequence[float] | None = None,
@@ -71,11 +71,8 @@ def register_one(
         shear_direction=shear_direction,
     )
     loaded = read_image(load)
-    own = own_engine(engine, None, None, preset, parameters)
-    settings = Settings(stages_of(preset, parameters) if own is None else (), align, seed, threads, own)
-    model = None if error_model is None else read_error_model(error_model)
-    if model is None and own is None:
-        model = error_model_of(settings.presets[-1].name)
+    settings = replace(settings_of(engine, preset, parameters), align_on=align, seed=seed, threads=threads)
+    model = error_model_of(settings.name) if error_model is None else read_error_model(error_model)
     floor = None if repeat is None else read_noise_floor(repeat / "quality.json")
     start = None if after is None else read_transform(after / "TransformParameters.0.txt")
     if start is not None and not isinstance(start, BSpline):
@@ -91,16 +88,16 @@ def register_one(
         },
     )
     body = subject.tissue or tissue_mask(subject.reference)
+    is_repeat = out.name == REPEAT
     with Worker(threads) as worker:
         found = register_pair(
             subject.reference,
             loaded,
             bone=subject.bone,
             tissue=body,
-            settings=settings,
+            settings=settings.of_repeat() if is_repeat else settings,
             start=start,
             worker=worker,
             progress=tell,
         )
-    is_repeat = out.name == REPEAT
     return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model)

@@ -141,7 +141,7 @@ def write_case(
         write_image(partial / "registered.nii.gz", Image(grid, registered))
         write_elastix_transform(partial, found.bspline, motion, grid)
         write_itk_transform(partial / "transform.h5", found.bspline, motion)
-        bars.write(partial, maps)
+        bars.write(partial, maps, quality.verdict)
 
     return _written(folder, measured, maps, quality, pictures, _alignment(found), record, more, bars, found.choice)
 
@@ -181,10 +181,10 @@ def _written(
         told["error_of_max_shear"] = bars.as_dict()
         tables += [table for table in (bars.table(),) if table is not None]
     with whole_folder(folder) as partial:
-        write_maps(partial, maps, subject.axes)
-        write_regions_csv(partial / "regions.csv", regions)
+        write_maps(partial, maps, subject.axes, quality.verdict)
+        write_regions_csv(partial / "regions.csv", regions, quality.verdict)
         if subject.mesh is not None:
-            told["mesh"] = write_mesh_results(partial, subject.mesh, measured.deformation)
+            told["mesh"] = write_mesh_results(partial, subject.mesh, measured.deformation, quality.verdict)
         more(partial)
         write_json(partial / "quality.json", told)
         write_json(partial / "provenance.json", record)

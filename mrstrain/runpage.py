@@ -37,7 +37,7 @@ def write_run_report(
         else:
             compared += given.sections
         closing += given.closing
-    verdicts = [section.verdict for section in registered if section.verdict is not None]
+    verdicts = [section.verdict for section in (*registered, *compared[:1]) if section.verdict is not None]
     failed = [f"{o.stage} {o.words.lower()}: {o.reason}" for o in outcomes.values() if o.record is None or o.reason]
     if failed:
         verdicts.append(Verdict("distrust", tuple(failed)))

@@ -117,8 +117,8 @@ class PlateOf(_Part):
 class Registering(_Part):
     """How images are registered; as the options of `register`."""
 
-    engine: Literal["elastix", "gauss-newton"] = "elastix"
-    preset: str = "heel-mr"
+    engine: Literal["gauss-newton", "elastix"] | None = None
+    preset: str | None = None
     parameters: tuple[str, ...] = ()
     chain: Flag = False
     align: Literal["bone", "image"] = "bone"

@@ -19,7 +19,6 @@ from dvc.errors import InputError
 from dvc.image import LabelMap, Mask
 from dvc.kinematics import StrainField
 from dvc.noise import signal_to_noise
-from dvc.presets import preset_or_file
 from dvc.registration import Settings, register
 from dvc.resample import shows
 from dvc.uncertainty import to_surface_mm
@@ -43,13 +42,14 @@ class Case:
     Attributes
     ----------
     preset : str
-        Name of a preset, or path of an elastix parameter file (.txt).
+        Name of a preset of elastix, path of a parameter file (.txt), or "gauss-newton".
     spacing_mm : (3,)
         Of the voxels, mm.
     snr : float
         Fat's signal over the noise's standard deviation.
     motion : str
-        "still", "smooth", "sliding", "Load1" to "Load4", or "wave-L" with a wavelength L in mm.
+        "still" (registered as a repeat scan is), "smooth", "sliding", "Load1" to "Load4", or "wave-L" with a
+        wavelength L in mm.
     seed : int
         Of the heel, its images and the foot's motion.
     """
@@ -227,7 +227,9 @@ def measure(
         where = covering(grid, foot.apply(bone.points()))
         loaded = scan(heel, where, motion, foot, snr=case.snr, number=number + 1)
     # A wave moves the bone too: nothing there to align on.
-    settings = Settings((preset_or_file(case.preset),), "none" if wave else "bone", threads=worker.threads)
+    settings = Settings.of(case.preset, align_on="none" if wave else "bone", threads=worker.threads)
+    if motion is None:
+        settings = settings.of_repeat()
     found = register(
         reference,
         loaded,

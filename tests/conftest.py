@@ -47,6 +47,14 @@ def small_pair():
 
 
 @pytest.fixture(scope="session")
+def tiny_pair():
+    """The same at 2.5 mm, where seconds count."""
+    from phantoms.heel import heel_pair
+
+    return heel_pair(seed=3, shape=(40, 46, 42), spacing_mm=2.5, load=0.6)
+
+
+@pytest.fixture(scope="session")
 def worker():
     """One process that runs elastix for all tests: its first use costs many seconds."""
     from dvc.worker import Worker

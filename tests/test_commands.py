@@ -15,10 +15,15 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 
+from dvc.deformation import RigidMotion
 from dvc.errors import InputError, OutputError
 from dvc.image import Image
 from dvc.imagefile import read_image
 from dvc.imagewrite import write_image, write_labels, write_mask
+from dvc.kinematics import StrainField
+from dvc.meshwrite import VERDICT_FIELD
+from dvc.quality import local_correlation
+from dvc.resample import carry
 from dvc.transformfile import read_transform
 from dvc.uncertainty import POOLED, ErrorModel, ErrorTable
 from mrstrain.registering import register
@@ -145,6 +150,44 @@ def test_the_measured_displacement_is_relative_to_the_bone(results, study, small
     assert np.median(moved) > 1.5
 
 
+def test_results_on_the_mesh_are_those_of_the_written_transform(results, study):
+    """Its bone's motion taken out; strain needs no such care."""
+    folder = study / "out" / "Load1"
+    alignment = json.loads((folder / "quality.json").read_text())["alignment"]
+    bone = RigidMotion(np.array(alignment["rotation"]), np.array(alignment["translation_lps_mm"]))
+    written = meshio.read(folder / "mesh.vtu")
+    whole = read_transform(folder / "TransformParameters.1.txt")
+    for places, values in (
+        (written.points, written.point_data),
+        (written.points[written.cells[0].data].mean(axis=1), {n: v[0] for n, v in written.cell_data.items()}),
+    ):
+        total, H = whole.evaluate(places)
+        u = bone.inverse().apply(places + total) - places
+        assert 0.1 < np.linalg.norm(u, axis=1).max() < np.linalg.norm(total, axis=1).min()
+        np.testing.assert_allclose(values["displacement_mm"], u, atol=1e-5)
+        strain = StrainField.from_gradient(H)
+        np.testing.assert_allclose(values["green_lagrange"].reshape(-1, 3, 3), strain.green_lagrange, atol=1e-5)
+        np.testing.assert_allclose(values["max_shear"], strain.max_shear, atol=1e-5)
+        np.testing.assert_allclose(values["jacobian"], strain.jacobian, atol=1e-5)
+    with (folder / "nodal_displacements.csv").open() as file:
+        rows = [[float(r[f"u{axis}_mm"]) for axis in "xyz"] for r in csv.DictReader(file)]
+    np.testing.assert_allclose(rows, written.point_data["displacement_mm"], atol=1e-6)
+
+
+def test_the_aligned_image_is_nearer_to_the_unloaded_one_and_the_registered_nearer_still(results, study, small_pair):
+    folder = study / "out" / "Load1"
+    as_scanned = carry(small_pair.loaded, small_pair.reference.grid)
+    aligned, registered = (
+        read_image(folder / f"{name}.nii.gz", allow_missing=True).values for name in ("aligned", "registered")
+    )
+    fat = small_pair.labels.region("fat")
+    before, rigid, after = (
+        local_correlation(small_pair.reference, v, fat)[1] for v in (as_scanned, aligned, registered)
+    )
+    assert before + 0.1 < rigid
+    assert rigid + 0.02 < after
+
+
 def test_quality_landmarks_noise_floor_and_verdict_are_told_everywhere(results, study):
     told = json.loads((study / "out" / "Load1" / "quality.json").read_text())
     assert told["landmarks"]["count"] > 3
@@ -152,7 +195,17 @@ def test_quality_landmarks_noise_floor_and_verdict_are_told_everywhere(results, 
     words = results.cases[0].verdict.words
     assert words in (study / "out" / "report.html").read_text()
     assert any(words in line for line in results.summary())
-    assert told["verdict"]["level"] == results.cases[0].verdict.level
+    verdict = results.cases[0].verdict
+    assert told["verdict"] == {"level": verdict.level, "reasons": list(verdict.reasons)}
+    folder = study / "out" / "Load1"
+    names = ("displacement", "green_lagrange", "green_lagrange_plate", "nodal_displacements")
+    for name in names:
+        assert json.loads((folder / f"{name}.json").read_text())["verdict"] == told["verdict"], name
+    for name in ("regions", "intervals"):
+        with (folder / f"{name}.csv").open() as file:
+            assert {row["verdict"] for row in csv.DictReader(file)} == {words}, name
+    (level,) = meshio.read(folder / "mesh.vtu").field_data[VERDICT_FIELD]
+    assert ("trust", "caution", "distrust")[level] == verdict.level
 
 
 def test_the_report_is_one_file_that_fetches_nothing(results, study):

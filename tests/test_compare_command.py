@@ -163,7 +163,8 @@ def test_without_an_error_no_difference_counts_as_seen(study: Path) -> None:
     done = compare(study / "measured", [study / "right", study / "half"], **given(study))
     assert done.noise == ()
     assert np.isnan(done.totals[0].low_ml)
-    assert all(one.within_noise("right", "half") for one in done.comparisons)
+    assert all(one.not_told_apart() == (("right", "half"),) for one in done.comparisons)
+    assert "<td>1–2</td>" in (study / "out" / "report.html").read_text()
     with_errors(study, 0.0, 5.0)  # a measurement that knows nothing
     done = compare(study / "measured", [study / "right", study / "half"], **given(study))
     assert "The measurement does not tell these apart from it by the area: half." in done.noise[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +23,7 @@ from pydicom.uid import (
 )
 from scipy.spatial.transform import Rotation
 
+import dvc
 from dvc.errors import ImageFileError, InputError
 from dvc.imagefile import read_image
 
@@ -196,7 +198,7 @@ def test_uneven_and_tilted_stacks_are_refused(tmp_path: Path) -> None:
             read_image(tmp_path / name)
 
 
-def test_mixed_series_are_listed_and_chosen_from(tmp_path: Path) -> None:
+def test_mixed_series_are_listed_and_chosen_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = _series(tmp_path / "s")
     for k in range(_SLICES):
         _write(folder, k, name=f"other{k}.dcm", SeriesInstanceUID=_OTHER, EchoTime="50", RescaleSlope="2")
@@ -207,6 +209,11 @@ def test_mixed_series_are_listed_and_chosen_from(tmp_path: Path) -> None:
     assert "222222: 8 slices of 5 x 6, echo time 50 ms" in message
     assert "Doe" not in message
     assert "12345" not in message
+    command = re.search(r"dvc\.write_image\(.*\)\)", message)
+    assert command is not None
+    monkeypatch.chdir(tmp_path)
+    eval(command[0], {"dvc": dvc, "NAME": "222222"})  # the next step that is told works as it stands
+    np.testing.assert_array_equal(read_image("one.nii.gz").values, 2 * _STORED)
     np.testing.assert_array_equal(read_image(folder, series="111111").values, _STORED)
     np.testing.assert_array_equal(read_image(folder, series=_OTHER).values, 2 * _STORED)
     for wrong in ("333333", "8.498", "/1"):

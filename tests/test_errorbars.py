@@ -10,10 +10,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dvc.gaussnewton import GaussNewton
 from dvc.image import Grid, Image, LabelMap, Mask
 from dvc.presets import load_preset
+from dvc.registration import Settings
 from dvc.strainmaps import StrainMaps
 from dvc.uncertainty import POOLED, ErrorModel, ErrorTable, error_model_of
+from dvc.verdict import Verdict
 from mrstrain.errorbars import error_bars
 from mrstrain.inputs import Subject
 
@@ -43,7 +46,7 @@ def given(with_labels: bool = True, with_bone: bool = True):
     subject = Subject(image, bone, None, names, None, np.array([0.0, 0.0, -1.0]), None)
     shear = np.where(inside, 0.1, np.nan).astype(np.float32)
     maps = StrainMaps(GRID, inside, np.zeros((*GRID.shape, 3)), np.zeros((*GRID.shape, 6)), shear, np.ones(GRID.shape))
-    settings = SimpleNamespace(presets=(load_preset("heel-mr"),), seed=1)
+    settings = Settings.of("heel-mr")
     return SimpleNamespace(settings=settings, tissue=Mask(GRID, inside), reference=image, loaded=image), subject, maps
 
 
@@ -84,7 +87,7 @@ def test_where_the_error_is_not_known_the_reason_is_told(
     assert bars.uncertainty is None
     assert says in bars.told
     assert bars.as_dict() == {"known": False, "reason": bars.told}
-    bars.write(tmp_path, maps)
+    bars.write(tmp_path, maps, Verdict("trust"))
     assert not list(tmp_path.iterdir())
     assert bars.table() is None
 
@@ -109,21 +112,32 @@ def test_the_noisier_image_counts() -> None:
 
 def test_several_stages_have_no_known_error() -> None:
     found, subject, maps = given()
-    found.settings.presets = (load_preset("heel-mr"), load_preset("heel-mr"))
+    found.settings = Settings((load_preset("heel-mr"), load_preset("heel-mr")))
     assert "several stages" in error_bars(found, subject, maps, model()).told
 
 
 def test_a_preset_without_a_model_is_told() -> None:
     found, subject, maps = given()
-    found.settings.presets = (load_preset("bone-rigid"),)
+    found.settings = Settings.of("bone-rigid")
     bars = error_bars(found, subject, maps, error_model_of("bone-rigid"))
     assert "bone-rigid has not been measured" in bars.told
 
 
-def test_the_preset_for_heels_comes_with_its_error() -> None:
-    stored = error_model_of("heel-mr")
+def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
+    found, subject, maps = given()
+    found.settings = Settings.of("gauss-newton")
+    own = model("gauss-newton", text=found.settings.text)
+    assert error_bars(found, subject, maps, own).uncertainty is not None
+    assert "that of heel-mr" in error_bars(found, subject, maps, model()).told
+    found.settings = Settings(gauss_newton=GaussNewton(bending=2.0))
+    assert "other parameters" in error_bars(found, subject, maps, own).told
+
+
+@pytest.mark.parametrize("name", ["gauss-newton", "heel-mr"])
+def test_our_own_engine_and_the_preset_for_heels_come_with_their_error(name: str) -> None:
+    stored = error_model_of(name)
     assert stored is not None
-    assert stored.parameters_sha256 == hashlib.sha256(load_preset("heel-mr").text.encode()).hexdigest()
+    assert stored.parameters_sha256 == hashlib.sha256(Settings.of(name).text.encode()).hexdigest()
     table = stored.table_for(np.full(3, 0.8), 25.0)
     bias, sd = table.expected("fat", np.array([0.02, 0.3]), np.array([6.0, 0.5], dtype=np.float32))
     assert bias[0] > 0.005  # noise lifts small shears

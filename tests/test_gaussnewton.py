@@ -16,17 +16,23 @@ from scipy.spatial.transform import Rotation
 from dvc.bspline import BSpline
 from dvc.deformation import Affine, evaluate_on_grid
 from dvc.descent import Level, Weights, cofactors, conjugate_gradients
-from dvc.errors import InputError, ParameterError
-from dvc.gaussnewton import GaussNewton, control_grid, fit, spline_through
+from dvc.errors import InputError, ParameterError, RegistrationError
+from dvc.gaussnewton import USUAL_BENDING, GaussNewton, _level, control_grid, fit, spline_through
 from dvc.image import Grid, Image, Mask
+from dvc.imagefile import read_image
 from dvc.imagewrite import write_image, write_mask
 from dvc.kinematics import StrainField
+from dvc.labels import read_mask
+from dvc.presets import load_preset
 from dvc.registration import Settings, register
+from dvc.resample import smoothed
 from dvc.smoothness import Bending
 from dvc.splinesums import SplineSums
 from dvc.transformfile import read_transform
 from dvc.transformwrite import write_elastix_transform
 from mrstrain.registering import register as run
+from mrstrain.registering import settings_of
+from mrstrain.registeringone import register_one
 
 GRID = Grid((40, 44, 36), np.array([1.0, 1.0, 1.2]), np.array([-20.0, 5.0, 3.0]))
 
@@ -263,6 +269,26 @@ def test_what_bends_is_smoothed_less_than_what_does_not():
     assert chosen(0.0) > 20.0  # found to 0.04 mm at 30, to 0.12 at 1
 
 
+def test_where_a_blurred_image_shows_its_padding_it_is_not_used():
+    """At the true motion the residual is nothing, up to the end of what the second scan shows."""
+    motion = Affine(np.eye(3), np.array([1.0, -2.0, 3.0]))
+    fixed, moving = pair_of(motion)
+    end = GRID.shape[2] - 8
+    moving = Image(TURNED.part((slice(None), slice(None), slice(0, end))), moving.values[:, :, :end])
+    control = control_grid(GRID, np.full(3, 6.0))
+    true = spline_through(motion, control)
+    inside = everything().inside
+
+    def residual(level: Level) -> float:
+        return level.at(true).variance
+
+    nothing = np.zeros_like(inside)
+    used = residual(_level((fixed, moving), inside, inside, nothing, control, 1.6))
+    padded = residual(Level(smoothed(fixed, 1.6), smoothed(moving, 1.6), inside, inside, nothing, control))
+    assert used < 1e-5
+    assert padded > 20.0 * used
+
+
 def test_missing_voxels_count_for_nothing():
     fixed, moving = pair_of(Affine(np.eye(3), SHIFT))
     hole, gap = fixed.values.copy(), moving.values.copy()
@@ -319,15 +345,22 @@ def test_its_spline_goes_through_an_elastix_file_unchanged(registered, small_pai
     )
 
 
-def test_a_start_is_corrected_against_the_images(small_pair, registered, worker):
-    off = BSpline(registered.bspline.control, 0.7 * registered.bspline.coefficients_mm)
-    again = register(
-        small_pair.reference, small_pair.loaded, bone=small_pair.bone, settings=OURS, worker=worker, start=off
-    )
-    inside = small_pair.labels.region("fat").inside
-    grid = small_pair.reference.grid
-    first, second = (evaluate_on_grid(b, grid, inside)[0] for b in (registered.bspline, again.bspline))
-    assert np.median(np.linalg.norm(second - first, axis=1)) < 0.1
+def test_a_start_is_where_it_begins_and_is_corrected_against_the_images(worker):
+    """Images of one texture, 19 mm apart: two wavelengths and more, which no search from nothing finds."""
+    far = np.array([14.0, -10.0, 9.0])
+    fixed, near = pair_of(Affine(np.eye(3), SHIFT), 0.05)
+    moving = Image(TURNED.moved_by(np.eye(3), far), near.values)
+    options = Settings(gauss_newton=GaussNewton(5.0, 3.0, 0.0), align_on="none")
+    control = control_grid(GRID, np.full(3, 5.0))
+    start = BSpline(control, spline_through(Affine(np.eye(3), far), control))
+    X = GRID.points(everything().inside)
+
+    def off(begun_at: BSpline | None) -> float:
+        found = register(fixed, moving, tissue=everything(), settings=options, start=begun_at, worker=worker)
+        return rms(found.bspline.displacement(X) - SHIFT - far)
+
+    assert off(start) < 0.25 * np.linalg.norm(SHIFT)
+    assert off(None) > 3.0
 
 
 def test_any_number_of_threads_gives_the_same_bits(tmp_path):
@@ -365,7 +398,7 @@ def written(tmp_path_factory, small_pair) -> Path:
     write_mask(folder / "bone.nii.gz", small_pair.bone)
     results = run(
         folder / "Load0.nii.gz", [folder / "Load1.nii.gz"], out=folder / "out", bone=folder / "bone.nii.gz",
-        engine="gauss-newton", threads=1,
+        threads=1,
     )  # fmt: skip
     assert not results.failures
     return folder
@@ -396,6 +429,7 @@ def test_no_error_bars_are_made_up(written):
     [
         ({"engine": "gauss-newton", "preset": "bone-rigid"}, "elastix"),
         ({"engine": "elastix", "bending": 3.0}, "gauss-newton"),
+        ({"preset": "heel-mr", "parameters": ["mine.txt"]}, "not both"),
         ({"engine": "ants"}, "there are elastix and gauss-newton"),
     ],
 )
@@ -406,3 +440,48 @@ def test_what_belongs_to_the_other_engine_is_refused_first(written, tmp_path, gi
             **given,
         )  # fmt: skip
     assert not (tmp_path / "o").exists()
+
+
+def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkeypatch):
+    """Chosen for a pair without strain the weight is the greatest, and the floor would be far below a load's noise."""
+    used = {}
+
+    def never(reference, loaded, *, settings, **_):
+        used[float(loaded.values[0, 0, 0])] = settings.gauss_newton
+        raise RegistrationError("enough")
+
+    for module in ("registering", "registeringone"):
+        monkeypatch.setattr(f"mrstrain.{module}.register_pair", never)
+    load0, load1 = read_image(written / "Load0.nii.gz"), read_image(written / "Load1.nii.gz")
+    for number, name in ((1.0, "Load1"), (2.0, "again")):
+        values = load1.values.copy()
+        values[0, 0, 0] = number
+        write_image(tmp_path / f"{name}.nii.gz", Image(load1.grid, values))
+    write_mask(tmp_path / "labels.nii.gz", read_mask(written / "bone.nii.gz", load0.grid))
+    with pytest.raises(RegistrationError):
+        run(
+            written / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "o", bone=written / "bone.nii.gz",
+            repeat=tmp_path / "again.nii.gz", workers=1, threads=1,
+        )  # fmt: skip
+    assert used == {1.0: GaussNewton(), 2.0: GaussNewton(bending=USUAL_BENDING)}
+    used.clear()
+    with pytest.raises(RegistrationError):
+        register_one(
+            written / "Load0.nii.gz", tmp_path / "again.nii.gz", out=tmp_path / "repeat",
+            labels=tmp_path / "labels.nii.gz", names=None, bone=written / "bone.nii.gz",
+        )  # fmt: skip
+    assert used == {2.0: GaussNewton(bending=USUAL_BENDING)}
+    assert Settings.of("heel-mr").of_repeat() == Settings.of("heel-mr")
+
+
+def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_path):
+    (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
+    assert settings_of(None, None).gauss_newton == GaussNewton()
+    assert settings_of(None, None, bending=2.0).gauss_newton == GaussNewton(bending=2.0)
+    for engine, preset, files, name in (
+        (None, "heel-mr", [], "heel-mr"),
+        ("elastix", None, [], "heel-mr"),
+        (None, None, [tmp_path / "mine.txt"], "mine.txt"),
+    ):
+        chosen = settings_of(engine, preset, files)
+        assert (chosen.engine, chosen.name) == ("elastix", name)

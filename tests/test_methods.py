@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
+from dvc.gaussnewton import GaussNewton
 from dvc.presets import load_preset
 from mrstrain.methods import methods
 
@@ -65,6 +67,24 @@ def test_figures_and_papers_are_those_of_the_records(tmp_path: Path) -> None:
         "Bland JM",
     ):
         assert text.count(paper) == 1, paper
+
+
+def test_our_own_engine_is_told_with_its_weights(tmp_path: Path) -> None:
+    for name, bending, weight in (("a", None, "chosen for each pair by cross-validation"), ("b", 2.5, "weight 2.5/mm")):
+        place = measured(tmp_path / name, "Load1")
+        record = json.loads((place / "provenance.json").read_text())
+        record["parameters"] |= {"stages": [], "gauss_newton": asdict(GaussNewton(bending=bending))}
+        (place / "provenance.json").write_text(json.dumps(record))
+        text = told({"Load1": place}, {"ansys": tmp_path / "Load1.csv"})
+        for said in (
+            "Gauss-Newton engine of mrstrain 9.8.7",
+            "every 3.2 mm",
+            weight,
+            "300/mm3",
+            "alignment with elastix",
+        ):
+            assert said in text, said
+        assert "taken as it was given" not in text.split("Results of other")[0]
 
 
 def test_what_is_not_known_is_not_claimed(tmp_path: Path) -> None:

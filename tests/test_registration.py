@@ -19,6 +19,7 @@ from dvc.presets import Preset, load_preset
 from dvc.registration import Settings, register
 from dvc.resample import carry, shows
 from dvc.shading import without_shading
+from dvc.tissue import tissue_mask
 from phantoms.heel import heel_pair
 
 COARSE_MM = 0.1  # at voxels of 1.6 mm; the full size, 0.8 mm, is held to 0.05 mm and 0.05 degrees below
@@ -177,6 +178,28 @@ def test_row_27_inverted_contrast_is_refused_and_the_measure_that_could_is_named
     turned = Image(small_pair.loaded.grid, small_pair.loaded.values.max() - small_pair.loaded.values)
     with pytest.raises(RegistrationError, match="AdvancedMattesMutualInformation"):
         register(small_pair.reference, turned, bone=small_pair.bone, settings=quick(), worker=worker)
+
+
+@pytest.mark.parametrize("air_too", [True, False])
+@pytest.mark.parametrize("settings", [Settings.of(), quick()], ids=["gauss-newton", "elastix"])
+def test_row_27_without_alignment_too(settings, air_too, small_pair, worker):
+    loaded, back = small_pair.loaded, small_pair.foot_motion.inverse()
+    grid = loaded.grid.moved_by(back.rotation, back.translation_mm)
+    inside = np.ones(grid.shape, dtype=bool) if air_too else tissue_mask(loaded).inside
+    turned = Image(grid, np.where(inside, loaded.values.max() - loaded.values, loaded.values))
+    with pytest.raises(RegistrationError, match=r"below zero: .*AdvancedMattesMutualInformation"):
+        register(small_pair.reference, turned, settings=replace(settings, align_on="none"), worker=worker)
+
+
+def test_row_27_mutual_information_follows_turned_contrast(small_pair, worker):
+    turned = Image(small_pair.loaded.grid, small_pair.loaded.values.max() - small_pair.loaded.values)
+    settings = replace(quick(Metric=("AdvancedMattesMutualInformation",)), align_on="none")
+    found = register(small_pair.reference, turned, settings=settings, worker=worker)
+    fat = small_pair.labels.region("fat").points()[::7]
+    total = found.total.displacement(fat)
+    truth = Composed([small_pair.deformation, small_pair.foot_motion]).displacement(fat)
+    # 3 mm without any registration
+    assert np.nanmedian(np.linalg.norm(total - truth, axis=1)) < 1.0
 
 
 def test_row_8_identical_images_are_refused(small_pair):

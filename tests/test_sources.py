@@ -171,13 +171,14 @@ def test_surfaces_and_regions_come_along(tmp_path: Path) -> None:
 
 def test_what_does_not_lie_in_the_image_is_refused_with_what_would(tmp_path: Path) -> None:
     grid = Grid((40, 40, 40), np.ones(3), np.array([-10.0, -35.0, 25.0]), np.eye(3))
-    check_overlap(read_result("heel", written(tmp_path, "vtu")["path"]), grid)
+    place = written(tmp_path, "vtu")["path"]
+    check_overlap(place, read_result("heel", place).mesh, grid)
     lost = read_result("heel", written(tmp_path, "vtu", 1.0, (-1, -1, 1))["path"])
     with pytest.raises(GeometryError, match=r"Model: -15 to -5 .*image: -10 to 30 .*the other of LPS and RAS"):
-        check_overlap(lost, grid)
+        check_overlap(place, lost.mesh, grid)
     big = read_result("heel", written(tmp_path, "vtu", 0.1)["path"])  # centimetres
     with pytest.raises(GeometryError, match="Give the map"):
-        check_overlap(big, Grid((9, 9, 9), np.ones(3), np.array([100.0, 0.0, 0.0]), np.eye(3)))
+        check_overlap(place, big.mesh, Grid((9, 9, 9), np.ones(3), np.array([100.0, 0.0, 0.0]), np.eye(3)))
 
 
 def test_what_is_no_result_is_refused(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from dvc.image import Grid, LabelMap
 from dvc.uncertainty import POOLED
 from dvc.worker import Worker
 from mrstrain import accuracy
-from mrstrain.studying import cases_of
+from mrstrain.studying import cases_of, expected_minutes
 from phantoms.accuracy import error_rows, floor_rows, resolution_rows, wavelength_recovered
 from phantoms.anatomy import TISSUES, Heel
 from phantoms.errormodel import coverage_rows, fit_error_model
@@ -190,6 +190,12 @@ def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
     assert {"still", "sliding", "Load1", "wave-8"} <= {c.motion for c in cases}
 
 
+def test_the_time_told_beforehand_is_that_of_the_engine() -> None:
+    ours, elastix = (expected_minutes([replace(CASE, preset=p)] * 10, 2) for p in ("gauss-newton", "heel-mr"))
+    assert 1.0 < ours < 0.6 * elastix < 6.0
+    assert expected_minutes([CASE] * 10, 1) == pytest.approx(2.0 * elastix)
+
+
 @pytest.mark.slow
 def test_study_measures_writes_and_goes_on(tmp_path: Path) -> None:
     """Two runs; then a third alone is made, and the page tells of all."""
@@ -298,10 +304,35 @@ def test_a_failed_run_is_told_and_the_others_go_on(monkeypatch: pytest.MonkeyPat
     assert "the optimiser diverged" in (tmp_path / "report.html").read_text()
 
 
+def test_two_parameter_files_of_one_name_are_never_taken_for_each_other(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("mrstrain.studying.measure", lambda case, *_: samples(case))
+    cases = []
+    for folder, iterations in (("a", 100), ("b", 200)):
+        file = tmp_path / folder / "mine.txt"
+        file.parent.mkdir()
+        file.write_text(f'(Transform "BSplineTransform")\n(MaximumNumberOfIterations {iterations})\n')
+        cases.append(replace(CASE, preset=str(file)))
+    both = r"a/mine\.txt and .*b/mine\.txt"
+    with pytest.raises(InputError, match=both):
+        accuracy(tmp_path / "out", cases=cases)
+    assert not (tmp_path / "out").exists()
+    accuracy(tmp_path / "out", cases=cases[:1], workers=1)
+    kept = {p: p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()}
+    for second in (cases[1], replace(cases[1], motion="Load2")):  # their error models would share a file as well
+        with pytest.raises(InputError, match=both):
+            accuracy(tmp_path / "out", cases=[second], workers=1)
+    assert {p: p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()} == kept
+    Path(cases[0].preset).unlink()  # its runs are no longer counted
+    assert not accuracy(tmp_path / "out", cases=[cases[1]], workers=1).failures
+
+
 @pytest.mark.slow
-def test_a_run_is_that_of_its_case(worker: Worker) -> None:
+@pytest.mark.parametrize("preset", ["heel-mr", "gauss-newton"])
+def test_a_run_is_that_of_its_case(preset: str, worker: Worker) -> None:
     """Still: the truth is zero and what is found is noise; the same case gives the same samples."""
-    case = replace(CASE, motion="still")
+    case = replace(CASE, preset=preset, motion="still")
     one, two = (measure(case, worker, nullcontext(), lambda _: None) for _ in range(2))
     np.testing.assert_array_equal(one.shear, two.shear)
     assert not one.true_shear.any()

@@ -14,7 +14,7 @@ from dvc.truths import TruthDraws
 from dvc.uncertainty import POOLED, ErrorTable
 from tests.blocks import block
 from validate.agreement import agreement, sole_under_plate
-from validate.comparison import compare
+from validate.comparison import Comparison, compare, total
 from validate.curves import area_between, bands
 from validate.doubt import with_intervals
 from validate.location import Threshold, clusters, neighbours, overlap, read_thresholds
@@ -219,6 +219,39 @@ def test_intervals_of_areas_hold_the_truth_and_noise_is_called_so() -> None:
     assert seen > 0.9
     assert noisy < 0.2
     assert wrong == 0.0
+
+
+def test_models_behind_the_nearest_that_noise_cannot_order_are_named_too() -> None:
+    mesh, strains = cube(8), (0.2, 0.8)
+    # measured .431; one model below it and one above it by the same .117, which noise alone puts in order
+    results = [result(name, mesh, sheared(gamma)) for name, gamma in (("below", 0.6), ("right", 0.79), ("above", 0.98))]
+
+    def compared(sd: float) -> list[Comparison]:
+        return [
+            compare(
+                load, sheared(0.8), results, labels(), bones=["bone"], normal=np.array([1.0, 0.0, 0.0]),
+                table=error_table(0.0, sd), strains=strains,
+            )
+            for load in ("Load1", "Load2")
+        ]  # fmt: skip
+
+    done = compared(0.02)
+    summed = total(done)
+    first, second, third = (a.model for a in summed.areas)
+    assert (first, {second, third}) == ("right", {"below", "above"})
+    for told in summed.told:
+        order = told.split("apart: ")[1]
+        assert set(order.rstrip(".").split(" and ")) == {"below", "above"}
+        assert "right. It is told apart from all others. Further down, neighbours" in told
+    assert summed.not_told_apart["all loads"] == ((second, third),)
+    assert {frozenset(pair) for one in done for pair in one.not_told_apart()} == {frozenset(("below", "above"))}
+    assert [summed.place(name) for name in (first, second, third, "nobody")] == [(1, 1), (2, 3), (2, 3), None]
+    # a measurement that knows nothing tells none apart, and a sure one tells all
+    assert [total(compared(5.0)).place(name) for name in ("right", "below")] == [(1, 3), (1, 3)]
+    sure = total(compared(1e-4))
+    assert sure.not_told_apart["all loads"] == ()
+    assert all("Further down" not in told for told in sure.told)
+    assert sorted(sure.place(name) for name in ("right", "below", "above")) == [(1, 1), (2, 2), (3, 3)]
 
 
 def test_intervals_of_location_hold_the_truth_and_a_perfect_model_is_not_ruled_out() -> None:

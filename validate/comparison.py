@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -27,6 +28,12 @@ _STRAINED = 0.01
 
 NOTHING = "no deformation"
 """A model that predicts no strain anywhere: what areas are to be seen beside, and outside the order."""
+
+
+Pairs = tuple[tuple[str, str], ...]
+"""Of models, each in the order of their areas."""
+
+ALL_LOADS = "all loads"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,12 +80,9 @@ class Comparison:
         models = (a for a in self.areas if a.tissue == tissue and a.model != NOTHING and not a.model.endswith(LEVELLED))
         return sorted(models, key=lambda a: a.best_ml)
 
-    def within_noise(self, model: str, other: str, tissue: str = ALL) -> bool:
-        """Whether the measurement cannot tell which of two models is nearer; also where its error is not known."""
-        if tissue not in self.bands:
-            return True
-        band = self.bands[tissue]
-        return not (band.surely_below(model, other) or band.surely_below(other, model))
+    def not_told_apart(self) -> Pairs:
+        """Pairs of models of which the measurement cannot tell which is nearer; all where its error is not known."""
+        return _not_told_apart(self.ranked(), None if self.hardly_strained else self.bands.get(ALL))
 
 
 def compare(
@@ -166,10 +170,41 @@ def compare(
     return Comparison(load, found, tuple(areas), tuple(overlaps), tuple(rows), tuple(travels), told, strains)
 
 
-def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], Area, tuple[str, ...]]:
-    """Areas over all loads of the models that have every one, the nearest first; of `NOTHING`; and what can be told.
+@dataclass(frozen=True, slots=True, eq=False)
+class Total:
+    """Models over all loads.
+
+    Attributes
+    ----------
+    areas : tuple of Area
+        Of the models that have every load, the nearest first; levelled ones last.
+    nothing : Area
+        Of `NOTHING`.
+    told : tuple of str
+        Which models the measurement tells apart, over all loads and under each.
+    not_told_apart : mapping of load to Pairs
+        As in `Comparison`; those over all loads under `ALL_LOADS`.
+    """
+
+    areas: tuple[Area, ...]
+    nothing: Area
+    told: tuple[str, ...]
+    not_told_apart: Mapping[str, Pairs]
+
+    def place(self, model: str) -> tuple[int, int] | None:
+        """First and last place over all loads that a model may have; None for one that is not in the order."""
+        names = [a.model for a in _in_order(self.areas)]
+        if model not in names:
+            return None
+        place, pairs = 1 + names.index(model), self.not_told_apart[ALL_LOADS]
+        return place - sum(b == model for _, b in pairs), place + sum(a == model for a, _ in pairs)
+
+
+def total(done: Sequence[Comparison], distrusted: Sequence[str] = ()) -> Total:
+    """Areas over all loads, and what can be told.
 
     Loads are measured one by one, so their errors are taken as independent. The share is the mean of the loads' shares.
+    What is told says of the ``distrusted`` loads that their registration is not to be trusted.
     """
     everywhere = [name for name in done[0].found.models if all(name in one.found.models for one in done)]
     bands_of = [one.bands[ALL] for one in done if ALL in one.bands]
@@ -184,7 +219,7 @@ def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], Area, tuple[str
         parts = [a for one in done for a in one.areas if a.tissue == ALL and a.model == name]
         estimated = whole.interval(name) if whole is not None and not name.endswith(LEVELLED) else ()
         share = float(np.mean([a.share for a in parts]))
-        rows.append(Area(name, "all loads", ALL, sum(a.ml for a in parts), share, *estimated))
+        rows.append(Area(name, ALL_LOADS, ALL, sum(a.ml for a in parts), share, *estimated))
     nothing = rows.pop()
     rows.sort(key=lambda a: (a.model.endswith(LEVELLED), a.best_ml))
     told = []
@@ -194,22 +229,51 @@ def total(done: Sequence[Comparison]) -> tuple[tuple[Area, ...], Area, tuple[str
                 f"Under {one.load} hardly any tissue is measured above the range's lower end: areas do not judge."
             )
         elif ALL in one.bands:
-            told.append(_told(f"under {one.load}", one.ranked(), one.bands[ALL]))
+            sentence = _told(f"under {one.load}", one.ranked(), one.bands[ALL])
+            doubt = " Its registration is not to be trusted." if one.load in distrusted else ""
+            told.append(sentence + doubt if sentence else "")
     if len(done) > 1 and everywhere and whole is not None and not all(one.hardly_strained for one in done):
-        told.insert(0, _told("over all loads", [a for a in rows if not a.model.endswith(LEVELLED)], whole))
-    return tuple(rows), nothing, tuple(sentence for sentence in told if sentence)
+        sentence = _told("over all loads", _in_order(rows), whole)
+        counted = [one.load for one in done if one.load in distrusted]
+        doubt = (
+            f" The registration of {', '.join(counted)}, which counts in it, is not to be trusted." if counted else ""
+        )
+        told.insert(0, sentence + doubt if sentence else "")
+    judged = None if all(one.hardly_strained for one in done) else whole
+    pairs = {ALL_LOADS: _not_told_apart(_in_order(rows), judged)} | {one.load: one.not_told_apart() for one in done}
+    return Total(tuple(rows), nothing, tuple(sentence for sentence in told if sentence), pairs)
+
+
+def _in_order(areas: Sequence[Area]) -> list[Area]:
+    """Those that are ranked: a levelled model's area is of another kind."""
+    return [a for a in areas if not a.model.endswith(LEVELLED)]
+
+
+def _not_told_apart(ranked: Sequence[Area], band: Band | None) -> Pairs:
+    """Pairs, in order, of which neither is surely the nearer; all where nothing is known."""
+    pairs = combinations([a.model for a in ranked], 2)
+    return tuple((a, b) for a, b in pairs if band is None or not (band.surely_below(a, b) or band.surely_below(b, a)))
 
 
 def _told(where: str, ranked: Sequence[Area], band: Band) -> str:
-    """Which model is nearest, and which others the measurement cannot tell from it; nothing for one model."""
+    """Which model is nearest, and which others the measurement cannot tell from it; nothing for one model.
+
+    Of the others, neighbours in the order that are not told apart are named as well.
+    """
     if len(ranked) < 2:
         return ""
+    pairs = _not_told_apart(ranked, band)
     first, *others = (a.model for a in ranked)
-    near = [name for name in others if not band.surely_below(first, name)]
-    return f"Nearest {where}, by the area: {first}. " + (
-        f"The measurement does not tell these apart from it by the area: {', '.join(near)}."
-        if near
-        else "It is told apart from all others."
+    near = [b for a, b in pairs if a == first]
+    alike = [f"{a} and {b}" for a, b in pairwise(others) if (a, b) in pairs]
+    return (
+        f"Nearest {where}, by the area: {first}. "
+        + (
+            f"The measurement does not tell these apart from it by the area: {', '.join(near)}."
+            if near
+            else "It is told apart from all others."
+        )
+        + (f" Further down, neighbours that it does not tell apart: {'; '.join(alike)}." if alike else "")
     )
 
 

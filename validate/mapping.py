@@ -100,6 +100,22 @@ def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray
     return filled
 
 
+def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
+    """Refuse bones that the label map does not have.
+
+    Raises
+    ------
+    InputError
+        Naming the labels there are.
+    """
+    for name in bones:
+        if name not in labels.names.values():
+            raise InputError(
+                f"The label map has no '{name}'; it has {', '.join(labels.names.values())}. Bones are named with "
+                "--bone, labels by the table --names."
+            )
+
+
 def sampled(deformation: Deformation, points_mm: FloatArray) -> Field:
     """A deformation at points (n, 3)."""
     u, H = deformation.evaluate(points_mm)
@@ -132,12 +148,7 @@ def mapped(
     InputError
         If a bone is not in the label map, or measurement and models have no tissue in common.
     """
-    for name in bones:
-        if name not in labels.names.values():
-            raise InputError(
-                f"The label map has no '{name}'; it has {', '.join(labels.names.values())}. Bones are named with "
-                "--bone, labels by the table --names."
-            )
+    check_bones(labels, bones)
     points = mesh.centroids_mm
     tissue = tissues_of(mesh, labels, points)
     soft = ~np.isin(tissue, list(bones))

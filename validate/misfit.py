@@ -3,19 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import permutations, product
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from dvc.errors import GeometryError
 from dvc.image import LabelMap
-from validate.mapping import tissues_of
+from dvc.mesh import TetMesh, box_told
+from validate.mapping import Mapped, tissues_of
 from validate.sources import FeResult
 
 _LEAST_OVERLAP, _GOOD_OVERLAP = 0.85, 0.95
 _SAME_TISSUE = 0.8
 _NEAR_BONE_MM, _AT_REST_MM = 1.5, 1.0
 _VOLUME_CHANGE = 0.15
+_ALONG, _TURNED = 0.7, 0.5
+_UNIT = 1000.0
+_ALIKE = 0.02
+
+
+def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence[str]) -> float:
+    """Share of the smaller one's volume in which a mesh and the labelled soft tissue overlap.
+
+    Raises
+    ------
+    GeometryError
+        If it is under 85 %: the mesh is somewhere else.
+    """
+    soft = [number for number, name in labels.names.items() if name not in bones]
+    tissue = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=False)
+    inside = np.isin(tissue, [labels.names[number] for number in soft])
+    labelled = np.isin(labels.labels, soft)
+    smaller = min(mesh.volumes_mm3.sum(), np.count_nonzero(labelled) * labels.grid.voxel_volume_mm3)
+    overlap = float(mesh.volumes_mm3[inside].sum() / smaller)
+    if overlap < _LEAST_OVERLAP:
+        there = labels.grid.points(labelled)
+        raise GeometryError(
+            f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: "
+            f"{box_told(*mesh.bounds_mm)}; labelled soft tissue: "
+            f"{box_told(there.min(axis=0), there.max(axis=0))} (LPS mm). It is turned, mirrored or moved against the "
+            "image, or its label map is another's: check unit and frame, or give the map to the image's frame."
+        )
+    return overlap
 
 
 def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[str]:
@@ -24,22 +55,14 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[st
     Raises
     ------
     GeometryError
-        If model and labelled soft tissue share less than 85 % of the smaller one's volume: it is somewhere else.
+        As `check_in_tissue`.
     """
     mesh, told = result.mesh, []
+    overlap = check_in_tissue(result.path, mesh, labels, bones)
     tissue = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=False)
     names = [name for name in labels.names.values() if name not in bones]
     soft = np.isin(tissue, names)
     volume = mesh.volumes_mm3
-    labelled = sum(np.count_nonzero(labels.labels == n) for n, name in labels.names.items() if name in names)
-    smaller = min(float(volume.sum()), labelled * labels.grid.voxel_volume_mm3)
-    overlap = float(volume[soft].sum()) / smaller
-    if overlap < _LEAST_OVERLAP:
-        raise GeometryError(
-            f"{result.path}: only {overlap:.0%} of the model lies in the labelled soft tissue. It is turned, "
-            "mirrored or moved against the image, or its label map is another's: check unit and frame, or give the "
-            "map to the image's frame."
-        )
     if overlap < _GOOD_OVERLAP:
         told.append(f"{result.name}: {overlap:.0%} of the model lies in the labelled soft tissue; is its frame right?")
     of_mesh = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=True)
@@ -69,3 +92,55 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[st
             "are displacements in the frame and unit of the coordinates, and these the unloaded ones?"
         )
     return told
+
+
+def displacement_slip(found: Mapped, name: str) -> str:
+    """Tell where a model's displacement only fits what was measured in another order of axes, frame or unit.
+
+    Parameters
+    ----------
+    found : Mapped
+        Displacements u of the measurement and v of the model in the same cells, weighted by their volumes.
+    name : str
+        Of the model.
+
+    Returns
+    -------
+    str
+        A sentence that names the slip; empty where there is none, or none that can be told.
+
+    Notes
+    -----
+    Direction and size are judged apart, as a model that is too stiff or too soft is no slip. Direction is the cosine
+    <u, v> / (|u| |v|) over all cells: a slip is told where one of the 48 orders and signs of the components reaches 0.7
+    and the components as given have less than half of that. A sign or an exchange that hardly changes the
+    displacement is not told. Size is |v| / |u|: a slip of unit is told where it is nearer to 1000 or to 1/1000 than
+    to 1.
+    """
+    where = found.common
+    weight = found.volumes_ml[where] / found.volumes_ml[where].sum()
+    u, v = found.measured.u_mm[where], found.models[name].u_mm[where]
+    size, of_model = (float(np.sqrt(weight @ (w**2).sum(axis=1))) for w in (u, v))
+    if min(size, of_model) == 0.0:
+        return ""
+    shared = np.einsum("n,ni,nj->ij", weight, u, v) / (size * of_model)
+    as_given, told = float(np.trace(shared)), []
+    cosines = {
+        (order, signs): float(np.array(signs) @ shared[range(3), order])
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    }
+    most = max(cosines.values())
+    if most >= _ALONG and as_given < _TURNED * most:
+        alike = (axes for axes, cosine in cosines.items() if cosine > most - _ALIKE)
+        order, signs = min(alike, key=lambda axes: sum(o != n for n, o in enumerate(axes[0])) + axes[1].count(-1.0))
+        axes = " ".join(("-" if sign < 0.0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
+        axes += " (the other of LPS and RAS)" if axes == "-x -y z" else ""
+        told.append(
+            f"fits far better with its components taken as {axes} (cosine {most:.2f}, as given {as_given:.2f}): is it "
+            "in the frame and order of axes of the coordinates?"
+        )
+    if abs(np.log(of_model / size)) > 0.5 * np.log(_UNIT):
+        unit = "in metres" if of_model < size else "1000 times too large"
+        told.append(f"is {of_model / size:.2g} times as large as the measured one: is it {unit}?")
+    return f"{name}: its displacement {', and '.join(told)}" if told else ""

@@ -18,7 +18,7 @@ from dvc.arrays import FloatArray
 from dvc.deformation import Affine
 from dvc.errors import GeometryError, InputError
 from dvc.image import Grid
-from dvc.mesh import TetMesh
+from dvc.mesh import TetMesh, box_told
 from dvc.meshfile import MM_PER_UNIT, TO_LPS, MeshFile, read_mesh
 from dvc.onmesh import OnMesh
 from validate.split import linear_tetrahedra
@@ -208,15 +208,15 @@ def _from_table(place: Path, source: MeshFile) -> FloatArray:
     return u
 
 
-def check_overlap(result: FeResult, grid: Grid) -> None:
-    """Refuse a model that does not lie in the image.
+def check_overlap(path: Path, mesh: TetMesh, grid: Grid) -> None:
+    """Refuse a mesh that does not lie in the image.
 
     Raises
     ------
     GeometryError
         With both boxes, and with what would bring the model there, if a unit or a frame does.
     """
-    points = result.mesh.points_mm
+    points = mesh.points_mm
     if np.mean(grid.contains(points)) >= _INSIDE:
         return
     fitting = []
@@ -225,11 +225,7 @@ def check_overlap(result: FeResult, grid: Grid) -> None:
             fitting.append(f"{size} and {turned}")
     low, high = grid.bounds_mm()
     raise GeometryError(
-        f"{result.path} does not lie in the image. Model: {_box(points.min(axis=0), points.max(axis=0))}; image: "
-        f"{_box(low, high)} (LPS mm). "
+        f"{path} does not lie in the image. Model: {box_told(points.min(axis=0), points.max(axis=0))}; image: "
+        f"{box_told(low, high)} (LPS mm). "
         + (f"It would with {fitting[0]}." if fitting else "Give the map to the image's frame (--to-image).")
     )
-
-
-def _box(low: FloatArray, high: FloatArray) -> str:
-    return " x ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True))

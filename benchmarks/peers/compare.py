@@ -42,7 +42,7 @@ HERE = Path(__file__).parent
 PEERS_PYTHON = ROOT / ".venv-peers" / "bin" / "python"
 OURS = [sys.executable, "-m"]
 PEERS: dict[str, tuple[list[str], list[str]]] = {  # command, and what follows FOLDER THREADS
-    "heel-mr": ([*OURS, "benchmarks.peers.with_mrstrain"], []),
+    **{name: ([*OURS, "benchmarks.peers.with_mrstrain"], [name]) for name in ("gauss-newton", "heel-mr")},
     "elastix default, as acquired": ([*OURS, "benchmarks.peers.with_elastix"], ["as-acquired"]),
     "elastix default": ([*OURS, "benchmarks.peers.with_elastix"], []),
     **{

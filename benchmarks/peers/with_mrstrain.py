@@ -1,6 +1,6 @@
-"""mrstrain with its preset heel-mr: the scans as acquired, body and bone; the foot's motion it finds for itself.
+"""mrstrain by its own engine or a preset: the scans as acquired, body and bone; the foot's motion it finds for itself.
 
-Runs in mrstrain's environment, as ``python -m benchmarks.peers.with_mrstrain FOLDER THREADS``.
+Runs in mrstrain's environment, as ``python -m benchmarks.peers.with_mrstrain FOLDER THREADS NAME``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def main() -> None:
     bone, body = (
         Mask(mask.grid, mask.values > 0) for mask in (read_image(folder / f"{name}.mha") for name in ("bone", "body"))
     )
-    settings = Settings.of("heel-mr", threads=threads)
+    settings = Settings.of(sys.argv[3], threads=threads)
     found = register(reference, loaded, bone=bone, tissue=body, settings=settings)
     write_elastix_transform(folder, found.bspline, None, reference.grid)[0].rename(folder / "found.txt")
 
