@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import RegistrationError
 from dvc.image import Grid, Image
 from dvc.imageterm import ImagePair, Normal
-from dvc.smoothness import Bending
+from dvc.smoothness import Roughness
 from dvc.splinesums import Stiffness
 
 _BLOCKS = 2.5  # blocks between two control points, about
@@ -26,7 +26,7 @@ _FLATTEST = 0.1  # det F below this is taken as this in F^-T
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Weights of the prior: bending (1/mm), change of volume in soft tissue and strain in bone (1/mm3)."""
+    """Weights of the prior: bending (1/mm), change of volume in soft tissue and strain in what is stiff (1/mm3)."""
 
     bending: float
     volume: float
@@ -39,12 +39,12 @@ class State:
 
     Attributes
     ----------
-    coefficients : (3, mi, mj, mk)
+    coefficients : (3 splines, mi, mj, mk)
     F, cofactor : (bi, bj, bk, 3, 3)
         Deformation gradient at the blocks' centres, and the derivative of its determinant.
     J : (bi, bj, bk)
         det F.
-    bent : (3, mi, mj, mk)
+    bent : (3 splines, mi, mj, mk)
         Gradient of the bending energy.
     images : Normal
     """
@@ -71,12 +71,16 @@ class Level:
         Components of the displacement are along the axes of ``fixed``; ``moving`` is where it leads.
     inside : (ni, nj, nk) bool
         Voxels of ``fixed`` to compare.
-    soft, bone : (ni, nj, nk) bool
-        Voxels that keep their volume, and voxels that stay rigid.
+    soft, stiff : (ni, nj, nk) bool
+        Voxels that keep their volume, and voxels that resist strain: bone, if need be skin.
     control : Grid
         Control points, around all of ``fixed``.
     rim_mm : float
         Along the ends of ``moving``, which is not used there.
+    factors : (ni, nj, nk, splines, 4), optional
+        At the voxels, as in `SplineSums`: the displacement is then a sum of splines.
+    rough : sequence of (float, float)
+        Of each spline, how its bending and its square count beside the first one's bending.
     """
 
     def __init__(
@@ -85,16 +89,18 @@ class Level:
         moving: Image,
         inside: BoolArray,
         soft: BoolArray,
-        bone: BoolArray,
+        stiff: BoolArray,
         control: Grid,
         rim_mm: float = 0.0,
+        factors: FloatArray | None = None,
+        rough: Sequence[tuple[float, float]] = ((1.0, 0.0),),
     ) -> None:
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
         self.control = control
-        self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm)
-        self.bending = Bending(control)
-        self._soft, self._bone = self.pair.share(soft), self.pair.share(bone)  # mm3 in each block
-        self._rigid = self._bone > 0
+        self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm, factors)
+        self.roughness = Roughness(control, rough)
+        self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
+        self._resists = self._stiff > 0
 
     def at(self, coefficients: FloatArray, halves: int = -1) -> State:
         """The state at a displacement; of the voxels all (-1) or one half (0, 1), as in `ImagePair.normal`."""
@@ -105,22 +111,24 @@ class Level:
         images = self.pair.normal(coefficients, pulled, halves)
         if images.count == 0 or not np.isfinite(images.square):
             raise RegistrationError("The registration diverged: the two images no longer have a voxel in common.")
-        return State(coefficients, F, cofactor, J, self.bending.product(coefficients), images)
+        return State(coefficients, F, cofactor, J, self.roughness.product(coefficients), images)
 
     def prior(self, state: State, weights: Weights) -> float:
         """The energy of everything but the images."""
-        strain = _green_lagrange(state.F[self._rigid])
+        strain = _green_lagrange(state.F[self._resists])
         return 0.5 * (
             weights.bending * _dot(state.coefficients, state.bent)
             + weights.volume * _dot(self._soft, (state.J - 1.0) ** 2)
-            + weights.rigidity * _dot(self._bone[self._rigid], np.einsum("nab,nab->n", strain, strain))
+            + weights.rigidity * _dot(self._stiff[self._resists], np.einsum("nab,nab->n", strain, strain))
         )
 
     def prior_gradient(self, state: State, weights: Weights) -> FloatArray:
         """Derivative of `prior` by the coefficients."""
         stress = (weights.volume * self._soft * (state.J - 1.0))[..., None, None] * state.cofactor
-        F = state.F[self._rigid]
-        stress[self._rigid] += (weights.rigidity * self._bone[self._rigid])[:, None, None] * (F @ _green_lagrange(F))
+        F = state.F[self._resists]
+        stress[self._resists] += (weights.rigidity * self._stiff[self._resists])[:, None, None] * (
+            F @ _green_lagrange(F)
+        )
         return np.asarray(self.pair.blocks.gathered(stress) + weights.bending * state.bent)
 
     def step(self, state: State, weights: Weights, variance: float, tolerance: float, most: int) -> FloatArray:
@@ -129,19 +137,21 @@ class Level:
             state.images.matrix / variance,
             state.cofactor,
             weights.volume * self._soft,
-            weights.rigidity * self._bone,
+            weights.rigidity * self._stiff,
         )
         force = state.images.force / variance - self.prior_gradient(state, weights)
         diagonal = self.pair.blocks.diagonal(stiffness)
-        for entry in (0, 3, 5):
-            diagonal[entry] += weights.bending * self.bending.diagonal
-            diagonal[entry] += _SMALLEST * diagonal[entry].max()
-        blocks, bending = self.pair.blocks, self.bending
+        for spline, rough in enumerate(self.roughness.diagonals):
+            for entry in (6 * spline, 6 * spline + 3, 6 * spline + 5):
+                diagonal[entry] += weights.bending * rough
+                diagonal[entry] += _SMALLEST * diagonal[entry].max()
+        blocks, roughness = self.pair.blocks, self.roughness
 
         def product(c: FloatArray) -> FloatArray:
-            return np.asarray(blocks.product(c, stiffness) + weights.bending * bending.product(c))
+            return np.asarray(blocks.product(c, stiffness) + weights.bending * roughness.product(c))
 
-        return conjugate_gradients(product, force, _inverted(diagonal), tolerance, most)
+        inverse = np.concatenate([_inverted(own) for own in np.split(diagonal, len(diagonal) // 6)])
+        return conjugate_gradients(product, force, inverse, tolerance, most)
 
     def descend(
         self,
@@ -158,7 +168,7 @@ class Level:
 
         Parameters
         ----------
-        coefficients : (3, mi, mj, mk)
+        coefficients : (3 splines, mi, mj, mk)
             To start from.
         weights : Weights
         steps : int
@@ -198,7 +208,7 @@ class Level:
 
     def _longest(self, step: FloatArray) -> float:
         """The furthest that a step moves tissue, over the control spacing; air may go where it likes."""
-        moved = self.pair.blocks.evaluate(step)[0][(self._soft > 0) | (self._bone > 0)]
+        moved = self.pair.blocks.evaluate(step)[0][(self._soft > 0) | (self._stiff > 0)]
         return float((np.abs(moved) / self.control.spacing_mm).max(initial=0.0))
 
     def _moved_mm(self, step: FloatArray) -> float:
@@ -221,10 +231,10 @@ def conjugate_gradients(
     Parameters
     ----------
     product : callable
-        A x of x (3, ...).
-    force : (3, ...)
-    inverse : (6, ...)
-        Preconditioner, a symmetric 3 x 3 matrix at each place: xx, xy, xz, yy, yz, zz.
+        A x of x (3 n, ...).
+    force : (3 n, ...)
+    inverse : (6 n, ...)
+        Preconditioner, n symmetric 3 x 3 matrices at each place: xx, xy, xz, yy, yz, zz.
     tolerance : float
         Reduction of the residual's preconditioned norm.
     most : int
@@ -232,9 +242,14 @@ def conjugate_gradients(
     """
 
     def preconditioned(v: FloatArray) -> FloatArray:
-        xx, xy, xz, yy, yz, zz = inverse
-        x, y, z = v
-        return np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
+        out = np.empty_like(v)
+        for n in range(len(v) // 3):
+            xx, xy, xz, yy, yz, zz = inverse[6 * n : 6 * n + 6]
+            x, y, z = v[3 * n : 3 * n + 3]
+            out[3 * n] = xx * x + xy * y + xz * z
+            out[3 * n + 1] = xy * x + yy * y + yz * z
+            out[3 * n + 2] = xz * x + yz * y + zz * z
+        return out
 
     x, left = np.zeros_like(force), force.copy()
     weighted = preconditioned(left)

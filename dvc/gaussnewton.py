@@ -27,14 +27,14 @@ from dvc.image import Grid, Image, Mask
 from dvc.resample import smoothed
 
 # Of each level: smoothing of both images (mm), control spacing over the finest, most steps, the step that ends it (mm).
-_LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 1.0, 5, 0.005))
+LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 1.0, 5, 0.005))
 _LEAST_VOXELS = 2.0
 _BLURRED = 2.0  # standard deviations: nearer to its ends a blurred image shows what it was padded with
 _RIM_MM = 1.2  # bone nearer to its surface than that may be tissue in part of a voxel
 USUAL_BENDING = 3.0
 """Weight of the bending, 1/mm, that strongly loaded pairs get, about."""
 _RATIO = np.sqrt(10.0)
-_LEAST, _GREATEST = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
+_POWERS = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
 _CHECK_STEPS, _CHECK_TOLERANCE, _CHECK_MOST = 2, 0.05, 80
 _MIDDLE = 0.7  # of each edge of the mask's box
 _LAST_STEPS = 2
@@ -81,11 +81,11 @@ class GaussNewton:
         rule = {
             "usual": USUAL_BENDING,
             "ratio": _RATIO,
-            "powers": [_LEAST, _GREATEST],
+            "powers": _POWERS,
             "steps": [_CHECK_STEPS, _LAST_STEPS],
         }
         rims = {"blurred": _BLURRED, "bone_rim_mm": _RIM_MM}
-        told = {"engine": "gauss-newton", "levels": _LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
+        told = {"engine": "gauss-newton", "levels": LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
         return json.dumps(asdict(self) | told)
 
 
@@ -100,19 +100,25 @@ class Choice:
         In words.
     tried : tuple of (bending, left-out residual)
         Mean square residual of the half of the voxels that was left out, over that of the best.
+    tried_in_skin : tuple of (rigidity, left-out residual)
+        Likewise for the weight of strain in the skin, where borders of tissues are known.
     """
 
     weights: Weights
     rule: str
     tried: tuple[tuple[float, float], ...] = ()
+    tried_in_skin: tuple[tuple[float, float], ...] = ()
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
-        return {
+        told: dict[str, object] = {
             "weights": asdict(self.weights),
             "rule": self.rule,
             "tried": [{"bending": b, "left_out_over_best": round(v, 6)} for b, v in self.tried],
         }
+        if self.tried_in_skin:
+            told["tried_in_skin"] = [{"rigidity": w, "left_out_over_best": round(v, 6)} for w, v in self.tried_in_skin]
+        return told
 
 
 def fit(
@@ -160,38 +166,44 @@ def fit(
     scale = float(np.nanpercentile(fixed.values[body.inside], 75))
     if not scale > 0:
         raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
-    pictures = _scaled(fixed, scale), _scaled(moving, scale)
+    pictures = scaled(fixed, scale), scaled(moving, scale)
     core = np.zeros(body.grid.shape, dtype=bool)
     if bone is not None:
         core = distance_transform_edt(bone.inside, sampling=bone.grid.spacing_mm) > _RIM_MM
     weights = Weights(USUAL_BENDING if options.bending is None else options.bending, options.volume, options.rigidity)
     spacing = np.maximum(options.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
-    turned = np.array(fixed.grid.direction)
+    axes = np.array(fixed.grid.direction)
     soft = body.inside & ~core
     coefficients, control = np.zeros(0), fixed.grid
-    for number, (sigma_mm, factor, steps, stop_mm) in enumerate(_LEVELS):
-        guess = start if number == 0 else BSpline(control, _turned(turned, coefficients))
+    for number, (sigma_mm, factor, steps, stop_mm) in enumerate(LEVELS):
+        guess = start if number == 0 else BSpline(control, turned(axes, coefficients))
         control = control_grid(fixed.grid, factor * spacing)
         coefficients = (
-            np.zeros((3, *control.shape)) if guess is None else _turned(turned.T, spline_through(guess, control))
+            np.zeros((3, *control.shape)) if guess is None else turned(axes.T, spline_through(guess, control))
         )
         level = _level(pictures, inside.inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
-        tell((number + 1) / (len(_LEVELS) + 2))
+        tell((number + 1) / (len(LEVELS) + 2))
     choice = Choice(weights, "fixed beforehand")
     if options.bending is None:
         part = _middle(inside.inside)
-        choice = _choose(
+        choice = choose(
             Level(*pictures, inside.inside & part, soft & part, core & part, control), coefficients, weights
         )
-        tell((len(_LEVELS) + 1) / (len(_LEVELS) + 2))
-        coefficients = level.descend(coefficients, choice.weights, steps=_LAST_STEPS, stop_mm=_LEVELS[-1][-1])
+        tell((len(LEVELS) + 1) / (len(LEVELS) + 2))
+        coefficients = level.descend(coefficients, choice.weights, steps=_LAST_STEPS, stop_mm=LEVELS[-1][-1])
     tell(1.0)
-    return BSpline(control, _turned(turned, coefficients)), choice
+    return BSpline(control, turned(axes, coefficients)), choice
 
 
-def _choose(level: Level, coefficients: FloatArray, weights: Weights) -> Choice:
-    """The weight of the bending by two-fold cross-validation.
+def choose(
+    level: Level,
+    coefficients: FloatArray,
+    weights: Weights,
+    name: str = "bending",
+    powers: tuple[int, int] = _POWERS,
+) -> Choice:
+    """One of the weights by two-fold cross-validation, around the value that it has.
 
     One half of the voxels (a chessboard of small cubes) is fitted, the other half's residual is what counts: noise that
     was fitted makes it larger, and so does detail that was smoothed away. Weights are tried in steps of a factor of 3.2
@@ -199,10 +211,12 @@ def _choose(level: Level, coefficients: FloatArray, weights: Weights) -> Choice:
     logarithm.
     """
     found: dict[int, float] = {}
+    usual = getattr(weights, name)
+    least, greatest = powers
 
     def left_out(power: int) -> float:
         if power not in found:
-            tried = replace(weights, bending=USUAL_BENDING * _RATIO**power)
+            tried = replace(weights, **{name: usual * _RATIO**power})
             fitted = level.descend(
                 coefficients, tried, steps=_CHECK_STEPS, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE,
                 most=_CHECK_MOST,
@@ -211,18 +225,16 @@ def _choose(level: Level, coefficients: FloatArray, weights: Weights) -> Choice:
         return found[power]
 
     best = 0
-    while (nearby := min((p for p in (best, best - 1, best + 1) if _LEAST <= p <= _GREATEST), key=left_out)) != best:
+    while (nearby := min((p for p in (best, best - 1, best + 1) if least <= p <= greatest), key=left_out)) != best:
         best = nearby
-    power, rule = float(best), "bending by cross-validation: half of the voxels fitted, the other half's residual least"
-    if _LEAST < best < _GREATEST:
+    power, rule = float(best), f"{name} by cross-validation: half of the voxels fitted, the other half's residual least"
+    if least < best < greatest:
         below, here, above = (left_out(best + d) for d in (-1, 0, 1))
         power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
     else:
         rule += "; it is least at the end of what is tried"
-    chosen = replace(weights, bending=float(USUAL_BENDING * _RATIO**power))
-    return Choice(
-        chosen, rule, tuple((float(USUAL_BENDING * _RATIO**p), found[p] / found[best]) for p in sorted(found))
-    )
+    chosen = replace(weights, **{name: float(usual * _RATIO**power)})
+    return Choice(chosen, rule, tuple((float(usual * _RATIO**p), found[p] / found[best]) for p in sorted(found)))
 
 
 def _middle(inside: BoolArray) -> BoolArray:
@@ -248,7 +260,8 @@ def _level(
     return Level(fixed, moving, inside[every], soft[every], bone[every], control, _BLURRED * sigma_mm)
 
 
-def _scaled(image: Image, scale: float) -> Image:
+def scaled(image: Image, scale: float) -> Image:
+    """The image over a brightness."""
     return Image(image.grid, image.values / np.float32(scale))
 
 
@@ -300,7 +313,8 @@ def spline_through(deformation: Deformation, control: Grid) -> FloatArray:
     return np.ascontiguousarray(c)
 
 
-def _turned(rotation: FloatArray, coefficients: FloatArray) -> FloatArray:
+def turned(rotation: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Coefficients (3, ...) of a displacement in rotated axes; sums in a fixed order, as BLAS would not do it."""
     x, y, z = coefficients
     return np.stack([row[0] * x + row[1] * y + row[2] * z for row in rotation])
 

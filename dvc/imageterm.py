@@ -63,10 +63,20 @@ class ImagePair:
         Voxels of a block along each axis; normal matrices, gain and strain are held by block.
     rim_mm : float
         So far from its ends and gaps the moving image is not used: blurred there, it shows what lies beyond.
+    factors : (ni, nj, nk, splines, 4), optional
+        At the voxels, as in `SplineSums`. Strain is then taken at the first voxel of each block, which lies in one
+        tissue; without, at the block's centre.
     """
 
     def __init__(
-        self, fixed: Image, moving: Image, inside: BoolArray, control: Grid, block: IntArray, rim_mm: float = 0.0
+        self,
+        fixed: Image,
+        moving: Image,
+        inside: BoolArray,
+        control: Grid,
+        block: IntArray,
+        rim_mm: float = 0.0,
+        factors: FloatArray | None = None,
     ) -> None:
         self.grid, self.block = fixed.grid, block
         missing = fixed.missing
@@ -83,15 +93,23 @@ class ImagePair:
         at = control.indices_of(self.grid.origin_mm)
         per_voxel = self.grid.spacing_mm / control.spacing_mm
         count = -(-np.array(self.grid.shape) // block)
-        self.sums = SplineSums(
-            control, [a + s * np.arange(n) for a, s, n in zip(at, per_voxel, self.grid.shape, strict=True)], self.inside
-        )
-        middles = [s * ((np.arange(n) + 0.5) * b - 0.5) for s, n, b in zip(per_voxel, count, block, strict=True)]
-        self.blocks = SplineSums(control, [a + m for a, m in zip(at, middles, strict=True)], self.share(inside) > 0)
+        along = [a + s * np.arange(n) for a, s, n in zip(at, per_voxel, self.grid.shape, strict=True)]
+        self.sums = SplineSums(control, along, self.inside, factors)
+        self._first: tuple[slice, ...] | None = None
+        if factors is None:
+            middles = [s * ((np.arange(n) + 0.5) * b - 0.5) for s, n, b in zip(per_voxel, count, block, strict=True)]
+            self.blocks = SplineSums(control, [a + m for a, m in zip(at, middles, strict=True)], self.share(inside) > 0)
+        else:
+            compared = self.share(inside) > 0
+            self._first = tuple(slice(None, None, int(b)) for b in block)
+            firsts = [a[f] for a, f in zip(along, self._first, strict=True)]
+            self.blocks = SplineSums(control, firsts, compared, np.ascontiguousarray(factors[self._first]))
         self._carried = np.zeros(self.grid.shape, dtype=np.float32)
 
     def share(self, where: BoolArray) -> FloatArray:
-        """Volume of each block that lies in ``where``, mm3."""
+        """Volume of each block that lies in ``where``, mm3; with factors, all of it where its first voxel does."""
+        if self._first is not None:
+            return np.asarray(where[self._first] * float(np.prod(self.block)) * self.grid.voxel_volume_mm3)
         whole = [-(-n // b) * b for n, b in zip(where.shape, self.block, strict=True)]
         padded = np.pad(where, [(0, w - n) for w, n in zip(whole, where.shape, strict=True)])
         (a, b, c), (i, j, k) = self.block, (w // b for w, b in zip(whole, self.block, strict=True))
@@ -113,17 +131,17 @@ class ImagePair:
         both, own = np.zeros(shape), np.zeros(shape)
         first, value, slope = self.sums.table
         _carry(
-            coefficients, self.inside, first, value, slope, self._fixed, self._moving, self._gaps, self._per_mm,
-            self._start, self._step, self.block, self._carried, both, own,
+            coefficients, self.inside, first, value, slope, self.sums.factors, self._fixed, self._moving, self._gaps,
+            self._per_mm, self._start, self._step, self.block, self._carried, both, own,
         )  # fmt: skip
         sigma = _GAIN_MM / (self.block * self.grid.spacing_mm)
         smooth = gaussian_filter(own, sigma, mode="constant")
         gain = gaussian_filter(both, sigma, mode="constant") / np.maximum(smooth, 1e-9 * smooth.max() + 1e-30)
         matrix, sums = np.zeros((*shape, 6)), np.zeros((shape[0], 2))
-        half = np.zeros((self.grid.shape[0], 3, 2, *self.sums.control.shape[1:]))
+        half = np.zeros((self.grid.shape[0], coefficients.shape[0], 2, *self.sums.control.shape[1:]))
         _normal(
             self._fixed, self._carried, self.inside, halves, gain, pulled, self._step, self.block, first,
-            value, matrix, sums, half,
+            value, self.sums.factors, matrix, sums, half,
         )  # fmt: skip
         square, count = sums.sum(axis=0)
         return Normal(matrix, self.sums.closed(half), float(square), int(count))
@@ -184,6 +202,7 @@ def _carry(
     first: tuple[IntArray, IntArray, IntArray],
     value: tuple[FloatArray, FloatArray, FloatArray],
     slope: tuple[FloatArray, FloatArray, FloatArray],
+    factors: FloatArray,
     fixed: Float32Array,
     moving: Float32Array,
     gaps: BoolArray,
@@ -199,7 +218,7 @@ def _carry(
     ni, nj, nk = inside.shape
     for counted in prange(both.shape[0]):
         bi = np.int64(counted)
-        plane, row = np.empty((3, 2, c.shape[2], c.shape[3])), np.empty((3, c.shape[3]))
+        plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], c.shape[3]))
         for i in range(bi * block[0], min(ni, (bi + 1) * block[0])):
             if not inside[i].any():
                 continue
@@ -208,7 +227,7 @@ def _carry(
                 if not inside[i, j].any():
                     continue
                 at = first[1][j]
-                for m in range(3):
+                for m in range(row.shape[0]):
                     for k in range(row.shape[1]):
                         total = 0.0
                         for q in range(4):
@@ -221,8 +240,9 @@ def _carry(
                     x, y, z = start[0], start[1], start[2]
                     for m in range(3):
                         place = s[m]
-                        for r in range(4):
-                            place += value[2][k, r] * row[m, first[2][k] + r]
+                        for f in range(factors.shape[3]):
+                            for r in range(4):
+                                place += factors[i, j, k, f, 0] * value[2][k, r] * row[3 * f + m, first[2][k] + r]
                         x += per_mm[0, m] * place
                         y += per_mm[1, m] * place
                         z += per_mm[2, m] * place
@@ -246,6 +266,7 @@ def _normal(
     block: IntArray,
     first: tuple[IntArray, IntArray, IntArray],
     value: tuple[FloatArray, FloatArray, FloatArray],
+    factors: FloatArray,
     matrix: FloatArray,
     sums: FloatArray,
     half: FloatArray,
@@ -253,7 +274,7 @@ def _normal(
     ni, nj, nk = inside.shape
     for counted in prange(gain.shape[0]):
         bi = np.int64(counted)
-        row = np.empty((3, half.shape[4]))
+        row = np.empty((half.shape[1], half.shape[4]))
         for i in range(bi * block[0], min(ni, (bi + 1) * block[0])):
             before_i, after_i = max(i - 1, 0), min(i + 1, ni - 1)
             for j in range(nj):
@@ -289,10 +310,11 @@ def _normal(
                     N[5] += g[2] * g[2]
                     sums[bi, 0] += r * r
                     sums[bi, 1] += 1.0
-                    for m in range(3):
-                        for q in range(4):
-                            row[m, first[2][k] + q] += value[2][k, q] * r * g[m]
-                for m in range(3):
+                    for f in range(factors.shape[3]):
+                        for m in range(3):
+                            for q in range(4):
+                                row[3 * f + m, first[2][k] + q] += factors[i, j, k, f, 0] * value[2][k, q] * r * g[m]
+                for m in range(row.shape[0]):
                     for q in range(4):
                         for k in range(row.shape[1]):
                             half[i, m, 0, first[1][j] + q, k] += value[1][j, q] * row[m, k]

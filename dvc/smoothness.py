@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numba import njit, prange
 
@@ -43,6 +45,35 @@ class Bending:
         out = np.empty_like(coefficients)
         _last_two_axes(coefficients, *self._gram[1], *self._gram[2], self._between)
         _first_axis(self._between, *self._gram[0], out)
+        return out
+
+
+class Roughness:
+    """Of several splines on one control grid, each its bending, and its square: ``p |D^2 u|^2 + q |u|^2`` over space.
+
+    Parameters
+    ----------
+    control : Grid
+    weights : sequence of (p, q)
+        Of each spline. The square is counted by the coefficients', times a control cell's volume.
+    """
+
+    def __init__(self, control: Grid, weights: Sequence[tuple[float, float]] = ((1.0, 0.0),)) -> None:
+        self.bending = Bending(control)
+        cell_mm3 = float(np.prod(control.spacing_mm))
+        self._weights = [(p, q * cell_mm3) for p, q in weights]
+
+    @property
+    def diagonals(self) -> list[FloatArray]:
+        """Of each spline, what stands on the matrix' diagonal for any component, (ni, nj, nk)."""
+        return [p * self.bending.diagonal + q for p, q in self._weights]
+
+    def product(self, coefficients: FloatArray) -> FloatArray:
+        """The energy's gradient for coefficients (3 splines, ni, nj, nk)."""
+        out = np.empty_like(coefficients)
+        for s, (p, q) in enumerate(self._weights):
+            own = np.ascontiguousarray(coefficients[3 * s : 3 * s + 3])
+            out[3 * s : 3 * s + 3] = p * self.bending.product(own) + q * own
         return out
 
 

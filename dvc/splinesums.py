@@ -17,6 +17,7 @@ from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.bspline import spline_table
 from dvc.image import Grid
 
+_ONE = np.array([[1.0, 0.0, 0.0, 0.0]])  # the factor of a spline that stands alone
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 Table = tuple[tuple[IntArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]
@@ -25,7 +26,9 @@ Table = tuple[tuple[IntArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ..
 class SplineSums:
     """A control grid and points on a tensor grid of the same axes.
 
-    Displacement u and force f are in components along the grid's axes; gradients are per mm along them.
+    Displacement u and force f are in components along the grid's axes; gradients are per mm along them. A
+    displacement may be a sum of splines, each times a factor that is known at the points, u = a_1 u_1 + a_2 u_2 + ...:
+    coefficients are then those of all splines, (3 splines, mi, mj, mk). Without factors it is one spline.
 
     Parameters
     ----------
@@ -35,31 +38,36 @@ class SplineSums:
         Continuous control index of the points along each axis; inside the spline's valid region.
     inside : (ni, nj, nk) bool
         Points that count; sums at the others are zero.
+    factors : (ni, nj, nk, splines, 4), optional
+        Of each spline's factor the value, and the gradient along the axes, at the points.
     """
 
-    def __init__(self, control: Grid, along: Sequence[FloatArray], inside: BoolArray) -> None:
+    def __init__(
+        self, control: Grid, along: Sequence[FloatArray], inside: BoolArray, factors: FloatArray | None = None
+    ) -> None:
         self.control = control
         self.inside = np.ascontiguousarray(inside)
+        self.factors = np.broadcast_to(_ONE, (*inside.shape, 1, 4)) if factors is None else factors
         rows = [spline_table(np.ascontiguousarray(t), n) for t, n in zip(along, control.shape, strict=True)]
         slopes = [np.ascontiguousarray(r[2] / h) for r, h in zip(rows, control.spacing_mm, strict=True)]
         self.table: Table = (tuple(r[0] for r in rows), tuple(r[1] for r in rows), tuple(slopes))
 
     def evaluate(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Give u (ni, nj, nk, 3) mm and grad u (ni, nj, nk, 3, 3) from coefficients (3, mi, mj, mk)."""
+        """Give u (ni, nj, nk, 3) mm and grad u (ni, nj, nk, 3, 3) from coefficients (3 splines, mi, mj, mk)."""
         u, H = np.zeros((*self.inside.shape, 3)), np.zeros((*self.inside.shape, 3, 3))
-        _evaluate(coefficients, self.inside, *self.table, u, H)
+        _evaluate(coefficients, self.inside, *self.table, self.factors, u, H)
         return u, H
 
     def gathered(self, stress: FloatArray) -> FloatArray:
         """Put stresses P (ni, nj, nk, 3, 3) onto the coefficients: sum over points of P : grad B."""
         half = self._half()
-        _gather(stress, self.inside, *self.table, half)
+        _gather(stress, self.inside, *self.table, self.factors, half)
         return self.closed(half)
 
     def product(self, coefficients: FloatArray, stiffness: Stiffness) -> FloatArray:
-        """Product of the points' part of the Hessian with coefficients (3, mi, mj, mk)."""
+        """Product of the points' part of the Hessian with coefficients (3 splines, mi, mj, mk)."""
         half = self._half()
-        _product(coefficients, self.inside, *self.table, *stiffness, half)
+        _product(coefficients, self.inside, *self.table, self.factors, *stiffness, half)
         return self.closed(half)
 
     def diagonal(self, stiffness: Stiffness) -> FloatArray:
@@ -67,10 +75,25 @@ class SplineSums:
 
         Returns
         -------
-        (6, mi, mj, mk)
-            Of each control point's three coefficients with one another: xx, xy, xz, yy, yz, zz.
+        (6 splines, mi, mj, mk)
+            Of each control point's three coefficients with one another: xx, xy, xz, yy, yz, zz; spline by spline.
         """
+        return np.concatenate([self._diagonal(*self._of_one(stiffness, s)) for s in range(self.factors.shape[3])])
+
+    def _of_one(self, stiffness: Stiffness, spline: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Matrices and weights as one spline sees them through its factor, products of B and grad B left out."""
         image, _, volume, shear = stiffness
+        a, slope = self.factors[..., spline, 0], self.factors[..., spline, 1:]
+        seen = image * (a * a)[..., None]
+        if slope.any():
+            square = np.einsum("...a,...a->...", slope, slope)
+            for entry, (m, n) in enumerate(_PAIRS):
+                seen[..., entry] += (volume + 0.5 * shear) * slope[..., m] * slope[..., n] + 0.5 * shear * square * (
+                    m == n
+                )
+        return seen, volume * a * a, shear * a * a
+
+    def _diagonal(self, image: FloatArray, volume: FloatArray, shear: FloatArray) -> FloatArray:
         first, value, slope = self.table
         # of each axis, the matrices that sum B B, B' B and B' B'
         spread = [
@@ -99,12 +122,12 @@ class SplineSums:
 
     def closed(self, half: FloatArray) -> FloatArray:
         """Sum over the first axis of what was put onto the coefficients of the other two plane by plane."""
-        out = np.empty((3, *self.control.shape))
+        out = np.empty((half.shape[1], *self.control.shape))
         _close(half, self.table[0][0], self.table[1][0], self.table[2][0], out)
         return out
 
     def _half(self) -> FloatArray:
-        return np.empty((self.inside.shape[0], 3, 2, *self.control.shape[1:]))
+        return np.empty((self.inside.shape[0], 3 * self.factors.shape[3], 2, *self.control.shape[1:]))
 
 
 Stiffness = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -120,8 +143,8 @@ def _spread(first: IntArray, weights: FloatArray, count: int) -> csr_array:
 
 @njit(cache=True)
 def plane_sums(c: FloatArray, first: int, value: FloatArray, slope: FloatArray, plane: FloatArray) -> None:
-    """Sums over the first axis for a plane of points: plane (3, 2, mj, mk), values and slopes."""
-    for m in range(3):
+    """Sums over the first axis for a plane of points: plane (3 splines, 2, mj, mk), values and slopes."""
+    for m in range(c.shape[0]):
         for j in range(c.shape[2]):
             w, x, y, z = c[m, first, j], c[m, first + 1, j], c[m, first + 2, j], c[m, first + 3, j]
             sums, slopes = plane[m, 0, j], plane[m, 1, j]
@@ -132,8 +155,8 @@ def plane_sums(c: FloatArray, first: int, value: FloatArray, slope: FloatArray, 
 
 @njit(cache=True)
 def _row_sums(plane: FloatArray, first: int, value: FloatArray, slope: FloatArray, row: FloatArray) -> None:
-    """Sums over the second axis for a row of points: row (3, 3, mk), values and slopes along the first two axes."""
-    for m in range(3):
+    """Sums over the second axis for a row of points: row (3 splines, 3, mk), values, slopes along two axes."""
+    for m in range(plane.shape[0]):
         w, x, y, z = plane[m, 0, first], plane[m, 0, first + 1], plane[m, 0, first + 2], plane[m, 0, first + 3]
         d, e, f, g = plane[m, 1, first], plane[m, 1, first + 1], plane[m, 1, first + 2], plane[m, 1, first + 3]
         sums, by_i, by_j = row[m, 0], row[m, 1], row[m, 2]
@@ -144,31 +167,47 @@ def _row_sums(plane: FloatArray, first: int, value: FloatArray, slope: FloatArra
 
 
 @njit(cache=True)
-def _point_sums(row: FloatArray, at: int, value: FloatArray, slope: FloatArray, u: FloatArray, H: FloatArray) -> None:
-    for m in range(3):
-        a, x, y, z = 0.0, 0.0, 0.0, 0.0
-        for r in range(4):
-            b = value[r]
-            a += b * row[m, 0, at + r]
-            x += b * row[m, 1, at + r]
-            y += b * row[m, 2, at + r]
-            z += slope[r] * row[m, 0, at + r]
-        u[m], H[m, 0], H[m, 1], H[m, 2] = a, x, y, z
+def _point_sums(
+    row: FloatArray, at: int, value: FloatArray, slope: FloatArray, factors: FloatArray, u: FloatArray, H: FloatArray
+) -> None:
+    u[:], H[:] = 0.0, 0.0
+    for s in range(factors.shape[0]):
+        f, by_x, by_y, by_z = factors[s, 0], factors[s, 1], factors[s, 2], factors[s, 3]
+        for m in range(3):
+            line = row[3 * s + m]
+            a, x, y, z = 0.0, 0.0, 0.0, 0.0
+            for r in range(4):
+                b = value[r]
+                a += b * line[0, at + r]
+                x += b * line[1, at + r]
+                y += b * line[2, at + r]
+                z += slope[r] * line[0, at + r]
+            u[m] += f * a
+            H[m, 0] += f * x + by_x * a
+            H[m, 1] += f * y + by_y * a
+            H[m, 2] += f * z + by_z * a
 
 
 @njit(cache=True)
-def _add_to_row(row: FloatArray, at: int, value: FloatArray, slope: FloatArray, f: FloatArray, P: FloatArray) -> None:
-    for m in range(3):
-        for r in range(4):
-            b = value[r]
-            row[m, 0, at + r] += b * f[m] + slope[r] * P[m, 2]
-            row[m, 1, at + r] += b * P[m, 0]
-            row[m, 2, at + r] += b * P[m, 1]
+def _add_to_row(
+    row: FloatArray, at: int, value: FloatArray, slope: FloatArray, factors: FloatArray, f: FloatArray, P: FloatArray
+) -> None:
+    for s in range(factors.shape[0]):
+        a, by_x, by_y, by_z = factors[s, 0], factors[s, 1], factors[s, 2], factors[s, 3]
+        for m in range(3):
+            line = row[3 * s + m]
+            force = a * f[m] + by_x * P[m, 0] + by_y * P[m, 1] + by_z * P[m, 2]
+            x, y, z = a * P[m, 0], a * P[m, 1], a * P[m, 2]
+            for r in range(4):
+                b = value[r]
+                line[0, at + r] += b * force + slope[r] * z
+                line[1, at + r] += b * x
+                line[2, at + r] += b * y
 
 
 @njit(cache=True)
 def _add_row_to_plane(row: FloatArray, first: int, value: FloatArray, slope: FloatArray, plane: FloatArray) -> None:
-    for m in range(3):
+    for m in range(row.shape[0]):
         sums, by_i, by_j = row[m, 0], row[m, 1], row[m, 2]
         for q in range(4):
             v, s = value[q], slope[q]
@@ -185,13 +224,14 @@ def _evaluate(
     first: tuple[IntArray, IntArray, IntArray],
     value: tuple[FloatArray, FloatArray, FloatArray],
     slope: tuple[FloatArray, FloatArray, FloatArray],
+    factors: FloatArray,
     u: FloatArray,
     H: FloatArray,
 ) -> None:
     for i in prange(inside.shape[0]):
         if not inside[i].any():
             continue
-        plane, row = np.empty((3, 2, c.shape[2], c.shape[3])), np.empty((3, 3, c.shape[3]))
+        plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], 3, c.shape[3]))
         plane_sums(c, first[0][i], value[0][i], slope[0][i], plane)
         for j in range(inside.shape[1]):
             if not inside[i, j].any():
@@ -199,7 +239,7 @@ def _evaluate(
             _row_sums(plane, first[1][j], value[1][j], slope[1][j], row)
             for k in range(inside.shape[2]):
                 if inside[i, j, k]:
-                    _point_sums(row, first[2][k], value[2][k], slope[2][k], u[i, j, k], H[i, j, k])
+                    _point_sums(row, first[2][k], value[2][k], slope[2][k], factors[i, j, k], u[i, j, k], H[i, j, k])
 
 
 @njit(parallel=True, cache=True)
@@ -209,20 +249,21 @@ def _gather(
     first: tuple[IntArray, IntArray, IntArray],
     value: tuple[FloatArray, FloatArray, FloatArray],
     slope: tuple[FloatArray, FloatArray, FloatArray],
+    factors: FloatArray,
     half: FloatArray,
 ) -> None:
     for i in prange(inside.shape[0]):
         half[i] = 0.0
         if not inside[i].any():
             continue
-        row, none = np.empty((3, 3, half.shape[4])), np.zeros(3)
+        row, none = np.empty((half.shape[1], 3, half.shape[4])), np.zeros(3)
         for j in range(inside.shape[1]):
             if not inside[i, j].any():
                 continue
             row[:] = 0.0
             for k in range(inside.shape[2]):
                 if inside[i, j, k]:
-                    _add_to_row(row, first[2][k], value[2][k], slope[2][k], none, stress[i, j, k])
+                    _add_to_row(row, first[2][k], value[2][k], slope[2][k], factors[i, j, k], none, stress[i, j, k])
             _add_row_to_plane(row, first[1][j], value[1][j], slope[1][j], half[i])
 
 
@@ -233,6 +274,7 @@ def _product(
     first: tuple[IntArray, IntArray, IntArray],
     value: tuple[FloatArray, FloatArray, FloatArray],
     slope: tuple[FloatArray, FloatArray, FloatArray],
+    factors: FloatArray,
     image: FloatArray,
     cofactor: FloatArray,
     volume: FloatArray,
@@ -243,8 +285,8 @@ def _product(
         half[i] = 0.0
         if not inside[i].any():
             continue
-        plane, row = np.empty((3, 2, c.shape[2], c.shape[3])), np.empty((3, 3, c.shape[3]))
-        back = np.empty((3, 3, c.shape[3]))
+        plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], 3, c.shape[3]))
+        back = np.empty((c.shape[0], 3, c.shape[3]))
         u, f, H, P = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
         plane_sums(c, first[0][i], value[0][i], slope[0][i], plane)
         for j in range(inside.shape[1]):
@@ -255,7 +297,7 @@ def _product(
             for k in range(inside.shape[2]):
                 if not inside[i, j, k]:
                     continue
-                _point_sums(row, first[2][k], value[2][k], slope[2][k], u, H)
+                _point_sums(row, first[2][k], value[2][k], slope[2][k], factors[i, j, k], u, H)
                 N, cof, shearing = image[i, j, k], cofactor[i, j, k], 0.5 * shear[i, j, k]
                 f[0] = N[0] * u[0] + N[1] * u[1] + N[2] * u[2]
                 f[1] = N[1] * u[0] + N[3] * u[1] + N[4] * u[2]
@@ -268,7 +310,7 @@ def _product(
                 for m in range(3):
                     for a in range(3):
                         P[m, a] = swelling * cof[m, a] + shearing * (H[m, a] + H[a, m])
-                _add_to_row(back, first[2][k], value[2][k], slope[2][k], f, P)
+                _add_to_row(back, first[2][k], value[2][k], slope[2][k], factors[i, j, k], f, P)
             _add_row_to_plane(back, first[1][j], value[1][j], slope[1][j], half[i])
 
 
@@ -281,7 +323,7 @@ def _close(half: FloatArray, first: IntArray, value: FloatArray, slope: FloatArr
             if not 0 <= p < 4:
                 continue
             v, s = value[i, p], slope[i, p]
-            for m in range(3):
+            for m in range(out.shape[0]):
                 for j in range(out.shape[2]):
                     onto, sums, slopes = out[m, a, j], half[i, m, 0, j], half[i, m, 1, j]
                     for k in range(out.shape[3]):

@@ -1,0 +1,236 @@
+"""Displacements whose gradient jumps where tissues meet: a smooth B-spline, and another that is counted by depth.
+
+Strain is smooth inside a tissue, but not across its border: fat that shears along stiff skin or along bone does so
+right up to them. One B-spline for all carries that strain over the border, as far as its control points lie apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
+from scipy.special import ndtri
+
+from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
+from dvc.bspline import BSpline, evaluate_spline
+from dvc.errors import GeometryError, InputError
+from dvc.image import Grid, LabelMap, Mask
+
+_CHUNK = 200_000
+_BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
+_SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off
+_NEAR = 1.0  # voxels
+_EVEN = 0.7  # voxels
+_LEAST_MM = 0.05  # every voxel stays on its own side of the border
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Borders:
+    """Where tissues meet, and the two factors that a displacement gets by it.
+
+    With b the distance (mm) from the bone at rest and d the depth of a point below the border of its own tissue,
+
+        m = tanh(b / L),   psi = m L tanh(d / L).
+
+    m is 0 in the bone, psi on every border, and their gradients jump there. The skin's border with the air is none:
+    what counts is the border with another tissue.
+
+    Attributes
+    ----------
+    grid : Grid
+    depth : (tissues, ni, nj, nk)
+        Cubic spline coefficients, mode "mirror", of each tissue's depth, mm: positive in it, negative outside.
+    own : (ni, nj, nk) int
+        Of each voxel the number of its tissue in ``depth``; in the air that of the nearest tissue.
+    rest : int
+        Number of the bone at rest; -1 where none is.
+    reach_mm : float
+        L.
+    """
+
+    grid: Grid
+    depth: FloatArray
+    own: IntArray
+    rest: int
+    reach_mm: float
+
+    @classmethod
+    def of(cls, labels: LabelMap, bone: Mask | None, reach_mm: float) -> Borders:
+        """Borders of the tissues in a label map.
+
+        Parameters
+        ----------
+        labels : LabelMap
+        bone : Mask or None
+            Bone that does not move, on the same grid; it counts as a tissue of its own, whatever its labels are.
+        reach_mm : float
+            L: about the spacing of the control points.
+
+        Raises
+        ------
+        GeometryError
+            If the bone is not on the grid of the labels.
+        InputError
+            If no voxel has a label, or the reach is not above zero.
+        """
+        if bone is not None and not bone.grid.same_as(labels.grid):
+            raise GeometryError("The bone is not on the grid of the label map; bring it there (fit_mask).")
+        if not (np.isfinite(reach_mm) and reach_mm > 0):
+            raise InputError(f"The reach of a border must be above 0 mm; got {reach_mm}.")
+        values = labels.labels if bone is None else np.where(bone.inside, -1, labels.labels)
+        if not values.any():
+            raise InputError("The label map has no tissue in the part of the image that is registered.")
+        spacing = labels.grid.spacing_mm
+        nearest = distance_transform_edt(values == 0, sampling=spacing, return_distances=False, return_indices=True)
+        tissues, own = np.unique(values[tuple(nearest)], return_inverse=True)
+        own = own.reshape(values.shape)
+        depth = np.stack(
+            [spline_filter(_depth_mm(own == n, spacing), order=3, mode="mirror") for n in range(tissues.size)]
+        )
+        rest = int(np.flatnonzero(tissues == -1)[0]) if bool((tissues == -1).any()) else -1
+        return cls(labels.grid, frozen(depth, np.float64), frozen(own, np.int64), rest, float(reach_mm))
+
+    def at_voxels(self) -> FloatArray:
+        """Factors at the voxels, (ni, nj, nk, 2, 4): of m and psi the value, and the gradient along the grid's axes.
+
+        On a border the gradient is that of the voxel's own side.
+        """
+        values, slopes = np.zeros(self.grid.shape), np.zeros((*self.grid.shape, 3))
+        for number, coefficients in enumerate(self.depth):
+            mine = self.own == number
+            values[mine] = self._spline_at_voxels(coefficients, mine)
+            slopes[mine] = self._slopes_at_voxels(coefficients, mine)
+        if self.rest < 0:
+            return self._factors(values, slopes, np.full(values.shape, np.inf), np.zeros_like(slopes), self.own)
+        everywhere = np.ones(self.grid.shape, dtype=bool)
+        bone = self._spline_at_voxels(self.depth[self.rest], everywhere).reshape(self.grid.shape)
+        toward = self._slopes_at_voxels(self.depth[self.rest], everywhere).reshape(*self.grid.shape, 3)
+        return self._factors(values, slopes, -bone, -toward, self.own)
+
+    def at(self, points_mm: FloatArray) -> FloatArray:
+        """Factors at points (n, 3) LPS mm, (n, 2, 4): of m and psi the value, and the gradient in LPS."""
+        indices = self.grid.indices_of(np.asarray(points_mm, dtype=np.float64))
+        depths, slopes = evaluate_spline(self.depth, indices, mirror=True)
+        slopes = slopes @ (np.linalg.inv(self.grid.direction) / self.grid.spacing_mm[:, None])
+        own = np.where(np.isnan(depths), -np.inf, depths).argmax(axis=1)
+        each = np.arange(len(own))
+        free = np.full(len(own), np.inf), np.zeros((len(own), 3))
+        away, toward = free if self.rest < 0 else (-depths[:, self.rest], -slopes[:, self.rest])
+        return self._factors(depths[each, own], slopes[each, own], away, toward, own)
+
+    def _factors(
+        self, depth: FloatArray, slope: FloatArray, away: FloatArray, away_slope: FloatArray, own: IntArray
+    ) -> FloatArray:
+        """Factors from depth d and distance b from the bone, and their gradients."""
+        L = self.reach_mm
+        m, psi = np.tanh(np.maximum(away, 0.0) / L), L * np.tanh(np.maximum(depth, 0.0) / L)
+        m_slope = ((1.0 - m**2) / L)[..., None] * away_slope
+        psi_slope = (1.0 - (psi / L) ** 2)[..., None] * slope
+        out = np.empty((*m.shape, 2, 4))
+        out[..., 0, 0], out[..., 1, 0] = m, m * psi
+        out[..., 0, 1:] = m_slope
+        out[..., 1, 1:] = m[..., None] * psi_slope + psi[..., None] * m_slope
+        if self.rest >= 0:
+            out[own == self.rest] = 0.0
+        return out
+
+    def _spline_at_voxels(self, coefficients: FloatArray, where: BoolArray) -> FloatArray:
+        return evaluate_spline(coefficients[None], np.argwhere(where).astype(np.float64), mirror=True)[0][:, 0]
+
+    def _slopes_at_voxels(self, coefficients: FloatArray, where: BoolArray) -> FloatArray:
+        per_voxel = evaluate_spline(coefficients[None], np.argwhere(where).astype(np.float64), mirror=True)[1][:, 0]
+        return np.asarray(per_voxel / self.grid.spacing_mm)
+
+
+def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
+    """Signed distance from a mask's border, mm, positive inside; the border is smooth, and not made of voxels' faces.
+
+    Blurred by a Gaussian of s, a plane's mask is the normal distribution of the distance over s: near the border the
+    distance is read off from it. Further away it is that to the nearest place of the border so found.
+    """
+    blurred = gaussian_filter(inside.astype(np.float64), _BLUR, mode="nearest")
+    normal = np.stack(np.gradient(blurred, *spacing_mm), axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    sure = (blurred > _SURE) & (blurred < 1.0 - _SURE)
+    sigma_mm = _BLUR * np.linalg.norm(normal * spacing_mm, axis=-1)
+    near_mm = np.where(sure, sigma_mm * ndtri(np.clip(blurred, _SURE, 1.0 - _SURE)), np.inf)
+    side = np.where(inside, 1.0, -1.0)
+    seeds = np.abs(near_mm) < _NEAR * spacing_mm.mean()
+    if not seeds.any():  # one tissue fills everything
+        return np.asarray(side * float(np.linalg.norm(np.array(inside.shape) * spacing_mm)))
+    places = np.moveaxis(np.indices(inside.shape), 0, -1) * spacing_mm
+    border = places - np.where(seeds, near_mm, 0.0)[..., None] * normal
+    to = distance_transform_edt(~seeds, sampling=spacing_mm, return_distances=False, return_indices=True)
+    far_mm = side * np.linalg.norm(places - border[tuple(to)], axis=-1)
+    depth = gaussian_filter(np.where(sure, near_mm, far_mm), _EVEN, mode="nearest")
+    return np.asarray(np.where(inside, np.maximum(depth, _LEAST_MM), np.minimum(depth, -_LEAST_MM)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BorderedSpline:
+    """x = X + u(X), u = m v + psi w: two cubic B-splines v (mm) and w, and the factors of `Borders`.
+
+    u is continuous, and zero in the bone at rest. Its gradient H = m grad v + v (x) grad m + psi grad w + w (x) grad
+    psi jumps across borders: by 2 m w (x) n, n the border's normal, between two tissues that both may move. On a border
+    it is that of the side on which rounding puts the point.
+
+    Parameters
+    ----------
+    smooth, jump : BSpline
+        v and w on one control grid, LPS.
+    borders : Borders
+
+    Raises
+    ------
+    GeometryError
+        If the control grids differ.
+    """
+
+    smooth: BSpline
+    jump: BSpline
+    borders: Borders
+
+    def __post_init__(self) -> None:
+        if not self.smooth.control.same_as(self.jump.control, tolerance_voxels=1e-6):
+            raise GeometryError("The two splines of a displacement with borders need one control grid.")
+
+    @property
+    def control(self) -> Grid:
+        """Control points of both splines."""
+        return self.smooth.control
+
+    def displacement(self, points_mm: FloatArray) -> FloatArray:
+        """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the splines' valid region."""
+        return self.evaluate(points_mm)[0]
+
+    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the splines' valid region."""
+        points = np.asarray(points_mm, dtype=np.float64)
+        return self._joined(points, (self.smooth.evaluate(points), self.jump.evaluate(points)))
+
+    def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid, in the order of ``np.argwhere(where)``.
+
+        Raises
+        ------
+        InputError
+            If ``where`` does not have the shape of ``grid``.
+        """
+        parts = self.smooth.evaluate_on_grid(grid, where), self.jump.evaluate_on_grid(grid, where)
+        return self._joined(grid.points(where), parts)
+
+    def _joined(
+        self, points: FloatArray, parts: tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+    ) -> tuple[FloatArray, FloatArray]:
+        u, H = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        for start in range(0, len(points), _CHUNK):
+            some = slice(start, start + _CHUNK)
+            factors = self.borders.at(points[some])
+            value, slope = factors[..., 0], factors[..., 1:]
+            u[some] = sum(value[:, f, None] * part[0][some] for f, part in enumerate(parts))
+            H[some] = sum(
+                value[:, f, None, None] * part[1][some] + part[0][some][:, :, None] * slope[:, f, None, :]
+                for f, part in enumerate(parts)
+            )
+        return u, H
