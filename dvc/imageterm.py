@@ -216,6 +216,8 @@ def _carry(
 ) -> None:
     """I1(X + u) at the voxels, and sums of I0 I1 and I0 I0 over each block."""
     ni, nj, nk = inside.shape
+    alone = factors.shape[3] == 0
+    splines = 1 if alone else factors.shape[3]
     for counted in prange(both.shape[0]):
         bi = np.int64(counted)
         plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], c.shape[3]))
@@ -240,9 +242,10 @@ def _carry(
                     x, y, z = start[0], start[1], start[2]
                     for m in range(3):
                         place = s[m]
-                        for f in range(factors.shape[3]):
+                        for f in range(splines):
+                            a = 1.0 if alone else factors[i, j, k, f, 0]
                             for r in range(4):
-                                place += factors[i, j, k, f, 0] * value[2][k, r] * row[3 * f + m, first[2][k] + r]
+                                place += a * value[2][k, r] * row[3 * f + m, first[2][k] + r]
                         x += per_mm[0, m] * place
                         y += per_mm[1, m] * place
                         z += per_mm[2, m] * place
@@ -272,6 +275,8 @@ def _normal(
     half: FloatArray,
 ) -> None:
     ni, nj, nk = inside.shape
+    alone = factors.shape[3] == 0
+    splines = 1 if alone else factors.shape[3]
     for counted in prange(gain.shape[0]):
         bi = np.int64(counted)
         row = np.empty((half.shape[1], half.shape[4]))
@@ -310,10 +315,11 @@ def _normal(
                     N[5] += g[2] * g[2]
                     sums[bi, 0] += r * r
                     sums[bi, 1] += 1.0
-                    for f in range(factors.shape[3]):
+                    for f in range(splines):
+                        share = r if alone else r * factors[i, j, k, f, 0]
                         for m in range(3):
                             for q in range(4):
-                                row[3 * f + m, first[2][k] + q] += factors[i, j, k, f, 0] * value[2][k, q] * r * g[m]
+                                row[3 * f + m, first[2][k] + q] += value[2][k, q] * share * g[m]
                 for m in range(row.shape[0]):
                     for q in range(4):
                         for k in range(row.shape[1]):

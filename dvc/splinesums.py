@@ -17,7 +17,7 @@ from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.bspline import spline_table
 from dvc.image import Grid
 
-_ONE = np.array([[1.0, 0.0, 0.0, 0.0]])  # the factor of a spline that stands alone
+_ALONE = np.empty((0, 0, 0, 0, 4))  # factors of a spline that has none
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 Table = tuple[tuple[IntArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]
@@ -47,7 +47,7 @@ class SplineSums:
     ) -> None:
         self.control = control
         self.inside = np.ascontiguousarray(inside)
-        self.factors = np.broadcast_to(_ONE, (*inside.shape, 1, 4)) if factors is None else factors
+        self.factors = _ALONE if factors is None else factors
         rows = [spline_table(np.ascontiguousarray(t), n) for t, n in zip(along, control.shape, strict=True)]
         slopes = [np.ascontiguousarray(r[2] / h) for r, h in zip(rows, control.spacing_mm, strict=True)]
         self.table: Table = (tuple(r[0] for r in rows), tuple(r[1] for r in rows), tuple(slopes))
@@ -78,7 +78,11 @@ class SplineSums:
         (6 splines, mi, mj, mk)
             Of each control point's three coefficients with one another: xx, xy, xz, yy, yz, zz; spline by spline.
         """
-        return np.concatenate([self._diagonal(*self._of_one(stiffness, s)) for s in range(self.factors.shape[3])])
+        image, _, volume, shear = stiffness
+        splines = self.factors.shape[3]
+        if splines == 0:
+            return self._diagonal(image, volume, shear)
+        return np.concatenate([self._diagonal(*self._of_one(stiffness, n)) for n in range(splines)])
 
     def _of_one(self, stiffness: Stiffness, spline: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Matrices and weights as one spline sees them through its factor, products of B and grad B left out."""
@@ -127,7 +131,7 @@ class SplineSums:
         return out
 
     def _half(self) -> FloatArray:
-        return np.empty((self.inside.shape[0], 3 * self.factors.shape[3], 2, *self.control.shape[1:]))
+        return np.empty((self.inside.shape[0], 3 * max(self.factors.shape[3], 1), 2, *self.control.shape[1:]))
 
 
 Stiffness = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -167,42 +171,70 @@ def _row_sums(plane: FloatArray, first: int, value: FloatArray, slope: FloatArra
 
 
 @njit(cache=True)
-def _point_sums(
-    row: FloatArray, at: int, value: FloatArray, slope: FloatArray, factors: FloatArray, u: FloatArray, H: FloatArray
-) -> None:
-    u[:], H[:] = 0.0, 0.0
-    for s in range(factors.shape[0]):
-        f, by_x, by_y, by_z = factors[s, 0], factors[s, 1], factors[s, 2], factors[s, 3]
-        for m in range(3):
-            line = row[3 * s + m]
-            a, x, y, z = 0.0, 0.0, 0.0, 0.0
-            for r in range(4):
-                b = value[r]
-                a += b * line[0, at + r]
-                x += b * line[1, at + r]
-                y += b * line[2, at + r]
-                z += slope[r] * line[0, at + r]
-            u[m] += f * a
-            H[m, 0] += f * x + by_x * a
-            H[m, 1] += f * y + by_y * a
-            H[m, 2] += f * z + by_z * a
+def _point_sums(row: FloatArray, at: int, value: FloatArray, slope: FloatArray, u: FloatArray, H: FloatArray) -> None:
+    for m in range(3):
+        a, x, y, z = 0.0, 0.0, 0.0, 0.0
+        for r in range(4):
+            b = value[r]
+            a += b * row[m, 0, at + r]
+            x += b * row[m, 1, at + r]
+            y += b * row[m, 2, at + r]
+            z += slope[r] * row[m, 0, at + r]
+        u[m], H[m, 0], H[m, 1], H[m, 2] = a, x, y, z
 
 
 @njit(cache=True)
-def _add_to_row(
-    row: FloatArray, at: int, value: FloatArray, slope: FloatArray, factors: FloatArray, f: FloatArray, P: FloatArray
+def _joined_sums(
+    row: FloatArray,
+    at: int,
+    value: FloatArray,
+    slope: FloatArray,
+    factors: FloatArray,
+    room: tuple[FloatArray, FloatArray],
+    u: FloatArray,
+    H: FloatArray,
 ) -> None:
+    """The same of splines with factors: u = sum a u_s, H = sum (a H_s + u_s grad a); room to work in for one's u, H."""
+    part, slopes = room
+    u[:], H[:] = 0.0, 0.0
     for s in range(factors.shape[0]):
-        a, by_x, by_y, by_z = factors[s, 0], factors[s, 1], factors[s, 2], factors[s, 3]
+        _point_sums(row[3 * s : 3 * s + 3], at, value, slope, part, slopes)
         for m in range(3):
-            line = row[3 * s + m]
-            force = a * f[m] + by_x * P[m, 0] + by_y * P[m, 1] + by_z * P[m, 2]
-            x, y, z = a * P[m, 0], a * P[m, 1], a * P[m, 2]
-            for r in range(4):
-                b = value[r]
-                line[0, at + r] += b * force + slope[r] * z
-                line[1, at + r] += b * x
-                line[2, at + r] += b * y
+            u[m] += factors[s, 0] * part[m]
+            for n in range(3):
+                H[m, n] += factors[s, 0] * slopes[m, n] + factors[s, n + 1] * part[m]
+
+
+@njit(cache=True)
+def _add_to_row(row: FloatArray, at: int, value: FloatArray, slope: FloatArray, f: FloatArray, P: FloatArray) -> None:
+    for m in range(3):
+        for r in range(4):
+            b = value[r]
+            row[m, 0, at + r] += b * f[m] + slope[r] * P[m, 2]
+            row[m, 1, at + r] += b * P[m, 0]
+            row[m, 2, at + r] += b * P[m, 1]
+
+
+@njit(cache=True)
+def _add_joined(
+    row: FloatArray,
+    at: int,
+    value: FloatArray,
+    slope: FloatArray,
+    factors: FloatArray,
+    room: tuple[FloatArray, FloatArray],
+    f: FloatArray,
+    P: FloatArray,
+) -> None:
+    """The transpose of `_joined_sums`: each spline gets a f + P grad a, and a P."""
+    part, stress = room
+    for s in range(factors.shape[0]):
+        for m in range(3):
+            part[m] = factors[s, 0] * f[m]
+            for n in range(3):
+                part[m] += factors[s, n + 1] * P[m, n]
+                stress[m, n] = factors[s, 0] * P[m, n]
+        _add_to_row(row[3 * s : 3 * s + 3], at, value, slope, part, stress)
 
 
 @njit(cache=True)
@@ -228,18 +260,24 @@ def _evaluate(
     u: FloatArray,
     H: FloatArray,
 ) -> None:
+    alone = factors.shape[3] == 0
     for i in prange(inside.shape[0]):
         if not inside[i].any():
             continue
         plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], 3, c.shape[3]))
         plane_sums(c, first[0][i], value[0][i], slope[0][i], plane)
+        room = np.empty(3), np.empty((3, 3))
         for j in range(inside.shape[1]):
             if not inside[i, j].any():
                 continue
             _row_sums(plane, first[1][j], value[1][j], slope[1][j], row)
             for k in range(inside.shape[2]):
                 if inside[i, j, k]:
-                    _point_sums(row, first[2][k], value[2][k], slope[2][k], factors[i, j, k], u[i, j, k], H[i, j, k])
+                    at, b, d = first[2][k], value[2][k], slope[2][k]
+                    if alone:
+                        _point_sums(row, at, b, d, u[i, j, k], H[i, j, k])
+                    else:
+                        _joined_sums(row, at, b, d, factors[i, j, k], room, u[i, j, k], H[i, j, k])
 
 
 @njit(parallel=True, cache=True)
@@ -252,18 +290,24 @@ def _gather(
     factors: FloatArray,
     half: FloatArray,
 ) -> None:
+    alone = factors.shape[3] == 0
     for i in prange(inside.shape[0]):
         half[i] = 0.0
         if not inside[i].any():
             continue
         row, none = np.empty((half.shape[1], 3, half.shape[4])), np.zeros(3)
+        room = np.empty(3), np.empty((3, 3))
         for j in range(inside.shape[1]):
             if not inside[i, j].any():
                 continue
             row[:] = 0.0
             for k in range(inside.shape[2]):
                 if inside[i, j, k]:
-                    _add_to_row(row, first[2][k], value[2][k], slope[2][k], factors[i, j, k], none, stress[i, j, k])
+                    at, b, d = first[2][k], value[2][k], slope[2][k]
+                    if alone:
+                        _add_to_row(row, at, b, d, none, stress[i, j, k])
+                    else:
+                        _add_joined(row, at, b, d, factors[i, j, k], room, none, stress[i, j, k])
             _add_row_to_plane(row, first[1][j], value[1][j], slope[1][j], half[i])
 
 
@@ -281,6 +325,7 @@ def _product(
     shear: FloatArray,
     half: FloatArray,
 ) -> None:
+    alone = factors.shape[3] == 0
     for i in prange(inside.shape[0]):
         half[i] = 0.0
         if not inside[i].any():
@@ -289,6 +334,7 @@ def _product(
         back = np.empty((c.shape[0], 3, c.shape[3]))
         u, f, H, P = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
         plane_sums(c, first[0][i], value[0][i], slope[0][i], plane)
+        room = np.empty(3), np.empty((3, 3))
         for j in range(inside.shape[1]):
             if not inside[i, j].any():
                 continue
@@ -297,7 +343,11 @@ def _product(
             for k in range(inside.shape[2]):
                 if not inside[i, j, k]:
                     continue
-                _point_sums(row, first[2][k], value[2][k], slope[2][k], factors[i, j, k], u, H)
+                at, b, d = first[2][k], value[2][k], slope[2][k]
+                if alone:
+                    _point_sums(row, at, b, d, u, H)
+                else:
+                    _joined_sums(row, at, b, d, factors[i, j, k], room, u, H)
                 N, cof, shearing = image[i, j, k], cofactor[i, j, k], 0.5 * shear[i, j, k]
                 f[0] = N[0] * u[0] + N[1] * u[1] + N[2] * u[2]
                 f[1] = N[1] * u[0] + N[3] * u[1] + N[4] * u[2]
@@ -310,7 +360,10 @@ def _product(
                 for m in range(3):
                     for a in range(3):
                         P[m, a] = swelling * cof[m, a] + shearing * (H[m, a] + H[a, m])
-                _add_to_row(back, first[2][k], value[2][k], slope[2][k], factors[i, j, k], f, P)
+                if alone:
+                    _add_to_row(back, at, b, d, f, P)
+                else:
+                    _add_joined(back, at, b, d, factors[i, j, k], room, f, P)
             _add_row_to_plane(back, first[1][j], value[1][j], slope[1][j], half[i])
 
 
