@@ -35,7 +35,7 @@ _VOLUMES = {"tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
 _CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4} | _VOLUMES
 _DIMENSION = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2} | dict.fromkeys(_VOLUMES, 3)
 # Cell arrays of VTK files that hold a region's number, in the order in which they are looked for.
-_REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part")
+_REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part", "part_id")
 _MOST_REGIONS = 256
 # meshio 5.3.5 reads and writes these cells, but has left them out of its own table of dimensions, and fails on them.
 topological_dimension.update({"wedge15": 3, "pyramid13": 3})
@@ -224,6 +224,7 @@ def _from_vtk(path: Path) -> _Raw:
     for wanted in _REGION_ARRAYS:
         if wanted in arrays:
             values = np.concatenate(mesh.cell_data[arrays[wanted]])
+            values = values[:, 0] if values.shape[1:] == (1,) else values  # as legacy VTK has scalars
             numbers = np.unique(values)
             if values.ndim == 1 and len(numbers) <= _MOST_REGIONS and np.all(numbers == np.round(numbers)):
                 regions = {f"{arrays[wanted]} {int(n)}": np.flatnonzero(values == n) for n in numbers}

@@ -257,3 +257,25 @@ def test_a_file_of_calculix_itself_is_read(tmp_path: Path, kind: str) -> None:
     u, H = read_result("heel", tmp_path / "Load1.frd").deformation.evaluate(INSIDE)
     np.testing.assert_allclose(u, 0.01 * moved(INSIDE), atol=1e-5)
     np.testing.assert_allclose(H[0], 0.01 * GRADIENT, atol=1e-5)
+
+
+def test_vtk_as_febio_writes_it(tmp_path: Path) -> None:
+    """The layout of FEBio's own VTK plot file: unloaded points, three to a line, and scalars without a count."""
+    points, cells = block()
+    u = points @ np.array([[0.0, 0.1, 0.0], [0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    part = np.arange(len(cells)) >= len(cells) // 2
+    rows = ["# vtk DataFile Version 3.0", "time 1", "ASCII", "DATASET UNSTRUCTURED_GRID"]
+    rows.append(f"POINTS {len(points)} float")
+    for start in range(0, len(points), 3):
+        rows.append("".join(f"{x:g} {y:g} {z:g} " for x, y, z in points[start : start + 3]))
+    rows += ["", f"CELLS {len(cells)} {5 * len(cells)}"]
+    rows += [f"4 {' '.join(str(n) for n in cell)} " for cell in cells]
+    rows += ["", f"CELL_TYPES {len(cells)}", *["10"] * len(cells), "", f"POINT_DATA {len(u)}"]
+    rows += ["VECTORS displacement float", *(f"{x:g} {y:g} {z:g}" for x, y, z in u), "", f"CELL_DATA {len(part)}"]
+    rows += ["SCALARS part_id int", "LOOKUP_TABLE default", *(str(int(p)) for p in part)]
+    (tmp_path / "heel.1.vtk").write_text("\n".join(rows) + "\n")
+    found = read_result("febio", tmp_path / "heel.1.vtk")
+    np.testing.assert_allclose(found.deformation.displacement(points[13:14]), u[13:14], atol=1e-5)
+    assert {name: len(inside) for name, inside in read_mesh(tmp_path / "heel.1.vtk").regions.items()} == {
+        "part_id 0": np.count_nonzero(~part), "part_id 1": np.count_nonzero(part),
+    }  # fmt: skip
