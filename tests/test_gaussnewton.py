@@ -411,7 +411,7 @@ def test_quality_and_provenance_tell_the_engine_and_how_its_weight_was_chosen(wr
     assert len(told["tried"]) >= 3
     assert min(t["left_out_over_best"] for t in told["tried"]) == 1.0
     assert 0.05 < told["weights"]["bending"] < 1000.0
-    assert "gauss-newton" in quality["error_of_max_shear"]["reason"]
+    assert "Error model of gauss-newton" in quality["error_of_max_shear"]["source"]
     record = json.loads((written / "out" / "Load1" / "provenance.json").read_text())
     assert record["parameters"]["engine"] == "gauss-newton"
     assert record["parameters"]["gauss_newton"]["volume"] == GaussNewton().volume
@@ -419,9 +419,9 @@ def test_quality_and_provenance_tell_the_engine_and_how_its_weight_was_chosen(wr
     assert "gauss-newton" in (written / "out" / "report.html").read_text()
 
 
-def test_no_error_bars_are_made_up(written):
-    assert (written / "out" / "Load1" / "max_shear.nii.gz").exists()
-    assert not (written / "out" / "Load1" / "sigma_max_shear.nii.gz").exists()
+def test_error_bars_are_the_engines_own(written):
+    assert (written / "out" / "Load1" / "sigma_max_shear.nii.gz").exists()
+    assert json.loads((written / "out" / "Load1" / "error_model.json").read_text())["preset"] == "gauss-newton"
 
 
 @pytest.mark.parametrize(
