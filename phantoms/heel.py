@@ -16,7 +16,7 @@ from dvc.image import Grid, Image, LabelMap, Mask
 from phantoms.anatomy import FAT_SIGNAL, TISSUES, Heel
 from phantoms.bodies import EllipsoidUnion
 from phantoms.flow import Border, Flow
-from phantoms.mri import acquire
+from phantoms.mri import acquire, sampled_by
 
 LOADS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     {
@@ -161,7 +161,7 @@ def scan(
         If the SNR is out of range.
     """
     noise, bias = (int(s) for s in np.random.SeedSequence([heel.seed, 2, number]).generate_state(2))
-    signal = octants(heel, grid, motion, foot_motion or RigidMotion.identity())
+    signal = octants(heel, sampled_by(grid), motion, foot_motion or RigidMotion.identity())
     return acquire(signal, grid, snr=snr, reference_signal=FAT_SIGNAL, seed=noise, bias_seed=bias)
 
 

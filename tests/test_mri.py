@@ -8,7 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from dvc.errors import InputError
 from dvc.image import Grid
+from phantoms import mri
 from phantoms.anatomy import Heel
+from phantoms.heel import centred_grid, scan
 from phantoms.mri import acquire, sensitivity
 
 
@@ -33,7 +35,7 @@ def scanned(octants: np.ndarray, grid: Grid) -> np.ndarray:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_frequencies_that_voxels_carry_are_kept_and_finer_ones_are_not(axis: int) -> None:
     """Waves of 0.25 and of 0.75 cycles a voxel: one as it is, the other gone, where plain averaging keeps a ghost."""
-    grid = Grid((20, 20, 20), (0.8, 0.8, 2.0), (0.0, 0.0, 0.0))
+    grid = Grid((20, 20, 20), (0.8, 0.8, 1.5), (0.0, 0.0, 0.0))
     centres, samples = np.arange(20) + 0.5, (np.arange(40) + 0.5) / 2.0
     for frequency, kept in ((0.25, 1.0), (0.75, 0.0)):
         fine = np.moveaxis(np.broadcast_to(np.cos(2 * np.pi * frequency * samples), (40, 40, 40)), 2, axis)
@@ -45,7 +47,7 @@ def test_frequencies_that_voxels_carry_are_kept_and_finer_ones_are_not(axis: int
 
 
 def test_a_point_keeps_its_sum_and_its_place() -> None:
-    grid = Grid((21, 21, 21), (0.8, 0.8, 2.0), (0.0, 0.0, 0.0))
+    grid = Grid((21, 21, 21), (0.8, 0.8, 1.5), (0.0, 0.0, 0.0))
     point = np.zeros((21, 21, 21, 2, 2, 2))
     point[10, 11, 9] = 1.0
     image = scanned(point, grid)
@@ -66,6 +68,24 @@ def test_function_and_array_give_the_same_image(heel: Heel) -> None:
         for signal in (heel.intensity_at, array)
     ]
     np.testing.assert_allclose(images[0], images[1], rtol=1e-6, atol=1e-3)
+
+
+@pytest.mark.parametrize("spacing_mm", [(1.6, 1.6, 1.6), (1.0, 1.0, 4.0), (3.2, 3.2, 3.2)])
+def test_partial_volume_is_right_in_large_voxels(
+    heel: Heel, spacing_mm: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against samples every quarter of a millimetre. Two samples a voxel, however large, miss the borders in it."""
+    i, j, k = (round(32.0 / s) for s in spacing_mm)
+    grid = centred_grid((i, j, k), spacing_mm)
+    images = []
+    for largest_mm in (0.5, mri._LARGEST_MM, np.inf):
+        monkeypatch.setattr(mri, "_LARGEST_MM", largest_mm)
+        images.append(scan(heel, grid, snr=None, number=0).values.astype(float))
+    true, made, bare = images
+    error, without = (np.sqrt(np.mean((image - true) ** 2)) / true.mean() for image in (made, bare))
+    assert error < 0.015
+    if max(spacing_mm) > 2.0:
+        assert without > 0.025
 
 
 def test_sensitivity_is_smooth_and_bounded() -> None:
