@@ -40,7 +40,6 @@ def fit_with_borders(
     labels: LabelMap,
     options: GaussNewton,
     start: Deformation | None = None,
-    progress: str | None = None,
 ) -> tuple[BorderedSpline, Choice]:
     """Find the displacement that carries the fixed image to the moving one, its gradient free to jump at borders.
 
@@ -61,9 +60,7 @@ def fit_with_borders(
         Its weight "rigidity" is the skin's, k.
     """
     weights = Weights(USUAL_BENDING if options.bending is None else options.bending, options.volume, _SKIN_WEIGHT)
-    smooth, _ = fit(
-        fixed, moving, inside, body, bone, replace(options, bending=weights.bending), start=start, progress=progress
-    )
+    smooth, _ = fit(fixed, moving, inside, body, bone, replace(options, bending=weights.bending), start=start)
     axes, control = np.array(fixed.grid.direction), smooth.control
     borders = Borders.of(labels, bone, float(control.spacing_mm.mean()))
     soft = body.inside & (borders.own != borders.rest)

@@ -19,7 +19,7 @@ from dvc.image import Image
 from dvc.imagewrite import write_image
 from dvc.noise import signal_to_noise
 from dvc.planes import View
-from dvc.registration import Registration
+from dvc.registration import Registration, Settings
 from dvc.report import Picture, Table
 from dvc.strainmaps import StrainMaps
 from dvc.tissue import tissue_mask
@@ -151,8 +151,18 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
     if given.preset != used.name:
         raise InputError(f"The error model is that of {given.preset}, and {used.name} was used.")
     if given.parameters_sha256 != hashlib.sha256(used.text.encode()).hexdigest():
-        raise InputError(f"The error of {used.name} was measured with other parameters; run `mrstrain accuracy` again.")
+        raise InputError(_otherwise(used))
     return given
+
+
+def _otherwise(used: Settings) -> str:
+    """Why an error model of this engine or preset does not hold for these settings of it."""
+    if used.gauss_newton is not None and used.gauss_newton.bending is not None:
+        return (
+            f"The error of {used.name} was measured with the weight of the bending chosen by its rule, as for a loaded "
+            f"image; here it was fixed at {used.gauss_newton.bending:g}/mm, as for a repeat scan or by --bending."
+        )
+    return f"The error of {used.name} was measured with other parameters; `mrstrain accuracy` measures that of yours."
 
 
 def _poorer(found: Registration) -> tuple[FloatArray, float]:

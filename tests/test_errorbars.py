@@ -130,7 +130,7 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     assert error_bars(found, subject, maps, own).uncertainty is not None
     assert "that of heel-mr" in error_bars(found, subject, maps, model()).told
     found.settings = Settings(gauss_newton=GaussNewton(bending=2.0))
-    assert "other parameters" in error_bars(found, subject, maps, own).told
+    assert "fixed at 2/mm" in error_bars(found, subject, maps, own).told
 
 
 @pytest.mark.parametrize("name", ["gauss-newton", "heel-mr"])

@@ -1,0 +1,117 @@
+"""Our own engine in the commands: when it is used, what it tells, and how it treats a repeat scan."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dvc.errors import ParameterError, RegistrationError
+from dvc.gaussnewton import USUAL_BENDING, GaussNewton
+from dvc.image import Image
+from dvc.imagefile import read_image
+from dvc.imagewrite import write_image, write_mask
+from dvc.labels import read_mask
+from dvc.presets import load_preset
+from dvc.registration import Settings
+from mrstrain.registering import register as run
+from mrstrain.registering import settings_of
+from mrstrain.registeringone import register_one
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, small_pair) -> Path:
+    folder = tmp_path_factory.mktemp("own-engine")
+    write_image(folder / "Load0.nii.gz", small_pair.reference)
+    write_image(folder / "Load1.nii.gz", small_pair.loaded)
+    write_mask(folder / "bone.nii.gz", small_pair.bone)
+    results = run(
+        folder / "Load0.nii.gz", [folder / "Load1.nii.gz"], out=folder / "out", bone=folder / "bone.nii.gz",
+        threads=1,
+    )  # fmt: skip
+    assert not results.failures
+    return folder
+
+
+def test_quality_and_provenance_tell_the_engine_and_how_its_weight_was_chosen(written):
+    quality = json.loads((written / "out" / "Load1" / "quality.json").read_text())
+    told = quality["regularisation"]
+    assert told["rule"].startswith("bending by cross-validation")
+    assert len(told["tried"]) >= 3
+    assert min(t["left_out_over_best"] for t in told["tried"]) == 1.0
+    assert 0.05 < told["weights"]["bending"] < 1000.0
+    assert "Error model of gauss-newton" in quality["error_of_max_shear"]["source"]
+    record = json.loads((written / "out" / "Load1" / "provenance.json").read_text())
+    assert record["parameters"]["engine"] == "gauss-newton"
+    assert record["parameters"]["gauss_newton"]["volume"] == GaussNewton().volume
+    assert record["parameters"]["stages"] == []
+    assert "gauss-newton" in (written / "out" / "report.html").read_text()
+
+
+def test_error_bars_are_the_engines_own(written):
+    assert (written / "out" / "Load1" / "sigma_max_shear.nii.gz").exists()
+    assert json.loads((written / "out" / "Load1" / "error_model.json").read_text())["preset"] == "gauss-newton"
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"engine": "gauss-newton", "preset": "bone-rigid"}, "elastix"),
+        ({"engine": "elastix", "bending": 3.0}, "gauss-newton"),
+        ({"preset": "heel-mr", "parameters": ["mine.txt"]}, "not both"),
+        ({"engine": "ants"}, "there are elastix and gauss-newton"),
+    ],
+)
+def test_what_belongs_to_the_other_engine_is_refused_first(written, tmp_path, given, told):
+    with pytest.raises(ParameterError, match=told):
+        run(
+            written / "Load0.nii.gz", [written / "Load1.nii.gz"], out=tmp_path / "o", bone=written / "bone.nii.gz",
+            **given,
+        )  # fmt: skip
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkeypatch):
+    """Chosen for a pair without strain the weight is the greatest, and the floor would be far below a load's noise."""
+    used = {}
+
+    def never(reference, loaded, *, settings, **_):
+        used[float(loaded.values[0, 0, 0])] = settings.gauss_newton
+        raise RegistrationError("enough")
+
+    for module in ("registering", "registeringone"):
+        monkeypatch.setattr(f"mrstrain.{module}.register_pair", never)
+    load0, load1 = read_image(written / "Load0.nii.gz"), read_image(written / "Load1.nii.gz")
+    for number, name in ((1.0, "Load1"), (2.0, "again")):
+        values = load1.values.copy()
+        values[0, 0, 0] = number
+        write_image(tmp_path / f"{name}.nii.gz", Image(load1.grid, values))
+    write_mask(tmp_path / "labels.nii.gz", read_mask(written / "bone.nii.gz", load0.grid))
+    with pytest.raises(RegistrationError):
+        run(
+            written / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "o", bone=written / "bone.nii.gz",
+            repeat=tmp_path / "again.nii.gz", workers=1, threads=1,
+        )  # fmt: skip
+    assert used == {1.0: GaussNewton(), 2.0: GaussNewton(bending=USUAL_BENDING)}
+    used.clear()
+    with pytest.raises(RegistrationError):
+        register_one(
+            written / "Load0.nii.gz", tmp_path / "again.nii.gz", out=tmp_path / "repeat",
+            labels=tmp_path / "labels.nii.gz", names=None, bone=written / "bone.nii.gz",
+        )  # fmt: skip
+    assert used == {2.0: GaussNewton(bending=USUAL_BENDING)}
+    assert Settings.of("heel-mr").of_repeat() == Settings.of("heel-mr")
+
+
+def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_path):
+    (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
+    assert settings_of(None, None).gauss_newton == GaussNewton()
+    assert settings_of(None, None, bending=2.0).gauss_newton == GaussNewton(bending=2.0)
+    for engine, preset, files, name in (
+        (None, "heel-mr", [], "heel-mr"),
+        ("elastix", None, [], "heel-mr"),
+        (None, None, [tmp_path / "mine.txt"], "mine.txt"),
+    ):
+        chosen = settings_of(engine, preset, files)
+        assert (chosen.engine, chosen.name) == ("elastix", name)
