@@ -52,7 +52,7 @@ demo: setup
 	$(BIN)/mrstrain demo --out demo
 
 test: setup lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: setup
 	$(BIN)/ruff check .
