@@ -24,6 +24,7 @@ from mrstrain.options import (
     MeshUnit,
     Names,
     Out,
+    Parameters,
     Plate,
     Preset,
     Shear,
@@ -84,9 +85,7 @@ def register(
     bending: Bending = None,
     volume: Volume = None,
     preset: Preset = None,
-    parameters: Annotated[
-        list[Path] | None, typer.Option(help="elastix parameter file(s) of your own, instead of a preset.")
-    ] = None,
+    parameters: Parameters = None,
     allow_unknown_parameters: Annotated[
         bool, typer.Option("--allow-unknown-parameters", help="Accept parameter names we do not know.")
     ] = False,

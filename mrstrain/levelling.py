@@ -11,14 +11,14 @@ import meshio
 import numpy as np
 
 from dvc.displacementfile import read_displacement
-from dvc.errors import InputError
+from dvc.errors import InputError, MrstrainError
 from dvc.imagewrite import write_image
 from dvc.tissue import tissue_mask
 from dvc.whole import whole_file, write_whole
 from mrstrain.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.modelfiles import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.provenance import provenance, write_json
-from mrstrain.registering import register
+from mrstrain.registering import register, settings_of
 from phantoms.twin import loaded_twin
 from validate.levelled import LEVELLED, carried_on
 from validate.mapping import filled_from_nearest
@@ -52,10 +52,11 @@ def level(
     loads: Sequence[str] = (),
     engine: str | None = None,
     preset: str | None = None,
+    parameters: Sequence[Path | str] = (),
     model_mesh: Path | str | None = None,
     model_unit: str = "mm",
     model_frame: str = "LPS",
-    workers: int | None = None,
+    threads: int | None = None,
     seed: int = 1,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Levelled:
@@ -69,17 +70,17 @@ def level(
         A folder with a file for each load, as in `compare`.
     out : path
         Gets a folder called as the model and "-levelled", which `compare` takes beside the model itself, and one ending
-        in "-work" with the images that the model would have given and their registration.
+        in "-work" with the images that the model would have given and, by load, their registration.
     bone, bone_label, tissue, labels, names
         As in `register`; the bone is needed.
     loads : sequence of str
         Names of the loads; all of the model's files by default.
-    engine, preset : str, optional
+    engine, preset, parameters
         Those of the measurement, as in `register`.
     model_mesh, model_unit, model_frame
         As in `compare`.
-    workers : int
-        Registrations at once.
+    threads : int, optional
+        Of each registration; by default all cores.
     seed : int
         Of the noise that is drawn anew, and of the registration.
     progress : callable, optional
@@ -91,6 +92,7 @@ def level(
         If image, bone or model cannot be used, or the model folds; before anything is registered.
     """
     target, place = Path(out), Path(model)
+    settings_of(engine, preset, parameters, allow_unknown=True)  # refused now rather than after the images are made
     if not place.is_dir():
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
     subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
@@ -101,7 +103,7 @@ def level(
     files, notes = model_files(wanted, [place], usual)
     name = place.resolve().name + LEVELLED
     work = name + "-work"
-    given = [Path(p) for p in (load0, bone, tissue, labels, names, model_mesh) if p is not None]
+    given = [Path(p) for p in (load0, bone, tissue, labels, names, model_mesh, *parameters) if p is not None]
     refuse_touching_inputs(target, [name, work], [*given, *(f.path for of in files.values() for f in of)])
     results: dict[str, FeResult] = {}
     body = subject.tissue or tissue_mask(subject.reference)
@@ -125,10 +127,15 @@ def level(
         (target / name / f"{load}.vtu").unlink(missing_ok=True)
     record = provenance(
         "level",
-        {**subject.files, "models": [f.path for of in files.values() for f in of]},
+        {
+            **subject.files,
+            "models": [f.path for of in files.values() for f in of],
+            "parameters": [Path(p) for p in parameters],
+        },
         {
             "engine": engine,
             "preset": preset,
+            "threads": threads,
             "seed": seed,
             "bone_label": bone_label,
             "model_unit": model_unit,
@@ -138,19 +145,19 @@ def level(
     write_json(target / name / "provenance.json", record)
     for load, twin in made.items():
         write_image(target / work / "images" / f"{load}.nii.gz", twin.image)
-    series = register(
-        load0, [target / work / "images" / f"{load}.nii.gz" for load in results],
-        out=target / work / "registered", bone=bone,
-        bone_label=bone_label, tissue=tissue, labels=labels, names=names, engine=engine,
-        preset=preset, workers=workers, seed=seed, progress=progress,
-    )  # fmt: skip
     write_whole(target / name / SETTINGS, IN_IMAGE)
-    for load, result in results.items():
-        found = target / work / "registered" / load / "displacement.nii.gz"
-        if load not in series.failures and found.is_file():
-            _write(target / name / f"{load}.vtu", result, found)
+    for load, result in results.items():  # each in a folder of its own: a study levels several at once
+        try:
+            register(
+                load0, [target / work / "images" / f"{load}.nii.gz"], out=target / work / load, bone=bone,
+                bone_label=bone_label, tissue=tissue, labels=labels, names=names, engine=engine,
+                preset=preset, parameters=parameters, allow_unknown_parameters=True, threads=threads, seed=seed,
+                progress=progress,
+            )  # fmt: skip
+        except MrstrainError as failed:
+            notes.append(f"{load} was not registered: {failed}")
         else:
-            notes.append(f"{load} was not registered: {series.failures.get(load, 'see the registration')}")
+            _write(target / name / f"{load}.vtu", result, target / work / load / load / "displacement.nii.gz")
     return Levelled(target / name, tuple(notes))
 
 

@@ -18,6 +18,7 @@ from mrstrain.options import (
     ModelMesh,
     Names,
     Out,
+    Parameters,
     Plate,
     Preset,
     Shear,
@@ -220,12 +221,11 @@ def level(
     load: Annotated[list[str] | None, typer.Option(help="Name of a load; repeat. Default: all of the model's.")] = None,
     engine: EngineName = None,
     preset: Preset = None,
+    parameters: Parameters = None,
     model_mesh: ModelMesh = None,
     model_unit: MeshUnit = Unit.MM,
     model_frame: MeshFrame = Frame.LPS,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Registrations at once. Default: one for each core.")
-    ] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="Of each registration. Default: all cores.")] = None,
     seed: Annotated[int, typer.Option(help="Of noise and registration.")] = 1,
 ) -> None:
     """A model sent through the measurement itself (it moves the image, which is registered): like against like."""
@@ -245,10 +245,11 @@ def level(
             loads=load or (),
             engine=None if engine is None else engine.value,
             preset=preset,
+            parameters=parameters or (),
             model_mesh=model_mesh,
             model_unit=model_unit.value,
             model_frame=model_frame.value,
-            workers=workers,
+            threads=threads,
             seed=seed,
             progress=progress,
         )

@@ -63,6 +63,9 @@ EngineName = Annotated[
     typer.Option("--engine", help="What finds the non-rigid part. Default: gauss-newton; with --preset, elastix."),
 ]
 Preset = Annotated[str | None, typer.Option(help="Named parameters of elastix, such as heel-mr.")]
+Parameters = Annotated[
+    list[Path] | None, typer.Option(help="elastix parameter file(s) of your own, instead of a preset.")
+]
 Bending = Annotated[
     float | None,
     typer.Option(help="gauss-newton: weight of bending, 1/mm. Default: chosen for each pair by cross-validation."),

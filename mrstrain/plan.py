@@ -232,12 +232,10 @@ def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
-    if study.registration.parameters:
-        raise InputError("[models] level sends models through an engine or a preset, and not through parameter files.")
     sent = _registrations(study)[-1].arguments
-    arguments = {key: sent[key] for key in ("load0", "images", "bone", "engine", "preset", "seed")}
+    arguments = {key: sent[key] for key in ("load0", "images", "bone", "engine", "preset", "parameters", "seed")}
     arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}
-    own = [Path(arguments["load0"]), *(Path(p) for p in arguments["images"].values())]
+    own = [Path(p) for p in (arguments["load0"], *arguments["images"].values(), *arguments["parameters"])]
     gives = (folder.with_name(folder.name + LEVELLED) / f"{load}.vtu",)
     return Stage(f"level {folder.name} {load}", arguments, tuple(own), gives, (f"simulate {folder.name}",))
 

@@ -130,7 +130,7 @@ def level(
         names=images.get("names"),
         tissue=images.get("tissue"),
         loads=[load],
-        workers=1,
+        threads=1,
         progress=lambda _, stage, fraction: tell(stage, fraction),
         **options,
     )

@@ -43,7 +43,7 @@ class Cohort:
     ranking : tuple of Standing
         The models over all loads, the nearest first; empty where no subject has a result of all.
     notes : tuple of str
-        Who is not among those ranked over, and what is unlike between subjects.
+        Who is not among those ranked over, what is unlike between subjects, and whose registrations are doubtful.
     """
 
     out: Path
@@ -109,6 +109,7 @@ def cohort(
             "No subject was compared with a model: " + "; ".join(line for r in ran for line in r.summary())
         )
     shares, notes = _shares(areas)
+    notes += _doubts(ran)
     try:
         ranking = standings(shares)
     except InputError as none:
@@ -128,6 +129,30 @@ def _areas(path: Path) -> list[dict[str, str]]:
         return []
     with path.open(newline="", encoding="utf-8") as file:
         return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
+
+
+def _doubts(ran: Sequence[Ran]) -> list[str]:
+    """Of each subject, the registrations that are not to be trusted and yet count in its areas."""
+    notes = []
+    for one in ran:
+        doubted = [load for load, verdict in _registered(one).items() if verdict.level == "distrust"]
+        if doubted:
+            notes.append(
+                f"{one.study.study.name}: the registration of {', '.join(doubted)} is not to be trusted, and counts in "
+                "its areas and in the ranking. Mend it, or leave this subject out."
+            )
+    return notes
+
+
+def _registered(one: Ran) -> dict[str, Verdict]:
+    """Verdict on each registration of a study that has one."""
+    return {
+        name.removeprefix("register "): section.verdict
+        for name, outcome in one.outcomes.items()
+        if outcome.record is not None and name.startswith("register ")
+        for section in outcome.record.given.sections
+        if section.verdict is not None
+    }
 
 
 def _judged(model: str) -> bool:
@@ -208,13 +233,7 @@ def _write_page(
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for one in ran:
         failed = [f"{o.stage}: {o.words}. {o.reason}" for o in one.outcomes.values() if o.record is None]
-        verdicts = [
-            s.verdict
-            for name, o in one.outcomes.items()
-            if o.record is not None and name.startswith("register ")
-            for s in o.record.given.sections
-            if s.verdict is not None
-        ]
+        verdicts = list(_registered(one).values())
         verdicts += [Verdict("distrust", tuple(failed))] if failed else []
         report = Table("Its own report", ("folder",), ((os.path.relpath(one.study.out, path.parent),),))
         sections.append(Section(one.study.study.name, worst(verdicts) if verdicts else None, (report,)))

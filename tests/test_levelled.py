@@ -14,6 +14,7 @@ from dvc.image import Grid, Mask
 from dvc.imagewrite import write_image, write_mask
 from dvc.mesh import TetMesh
 from dvc.onmesh import OnMesh
+from dvc.presets import load_preset
 from mrstrain.levelling import level
 from phantoms.heel import heel_grid, labels_of, scan
 from tests.blocks import block
@@ -89,10 +90,11 @@ def test_what_comes_back_is_the_model_as_the_measurement_shows_it(tmp_path: Path
     meshio.write(
         tmp_path / "model" / "Load1.vtu", meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"displacement": u})
     )
+    (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
     # The model moves bone and changes volume, which our own engine would not let it do.
     done = level(
         tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "out", bone=tmp_path / "bone.nii.gz",
-        preset="heel-mr",
+        parameters=[tmp_path / "mine.txt"],
     )  # fmt: skip
     assert done.folder.name == "model" + LEVELLED
     back = read_result("levelled", done.folder / "Load1.vtu")

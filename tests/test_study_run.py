@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -325,8 +326,13 @@ def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path
     with (tmp_path / "cohort" / "cohort.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {r["subject"] for r in rows} == {"Ada", "Ben"}
+    assert not any("not to be trusted" in note for note in told.notes)
     page = (tmp_path / "cohort" / "report.html").read_text()
     assert "Ada" in page
     assert "Ben" in page
+    ledger = places[1] / "results" / ".study" / "register Load1.json"
+    ledger.write_text(re.sub(r'"level":"(trust|caution)"', '"level":"distrust"', ledger.read_text()))
+    doubtful = [note for note in cohort(places, out=tmp_path / "cohort").notes if "not to be trusted" in note]
+    assert [note.split(",")[0] for note in doubtful] == ["Ben: the registration of Load1 is not to be trusted"]
     with pytest.raises(InputError, match="name of its own"):
         cohort([places[0], places[0]], out=tmp_path / "cohort")

@@ -146,8 +146,9 @@ def test_inputs_and_results_do_not_lie_in_one_another(tmp_path, old, new):
 
 def test_a_model_is_levelled_by_the_preset_that_measured(tmp_path):
     text = WHOLE + 'level = true\n[registration]\nparameters = ["mine.txt"]\n'
-    with pytest.raises(InputError, match="level"):
-        plan(read_study(written(tmp_path, text)))
+    (stage,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "level trebbi Load1")
+    assert stage.arguments["parameters"] == [str(tmp_path / "mine.txt")]
+    assert tmp_path / "mine.txt" in stage.files
 
 
 def test_files_that_inputs_name_are_inputs_too(tmp_path):
