@@ -17,7 +17,7 @@ import numpy as np
 from dvc.arrays import FloatArray
 from dvc.deformation import evaluate_on_grid
 from dvc.image import Image, LabelMap
-from dvc.imagewrite import write_image
+from dvc.imagewrite import write_image, write_vectors
 from dvc.kinematics import StrainField
 from dvc.whole import whole_file, write_whole
 from validate.agreement import Agreement, Travel
@@ -64,14 +64,18 @@ def write_fields(path: Path, one: Comparison) -> None:
 
 
 def write_on_image(folder: Path, results: Sequence[FeResult], labels: LabelMap) -> None:
-    """Each model's maximal shear on the label map's voxels; NaN outside the labels, and where it is not defined."""
+    """Each model's displacement and maximal shear on the label map's voxels; NaN outside the labels or the model."""
     inside = labels.labels > 0
     for result in results:
-        values = np.full(labels.grid.shape, np.nan, dtype=np.float32)
-        values[inside] = StrainField.from_gradient(
-            evaluate_on_grid(result.deformation, labels.grid, inside)[1]
-        ).max_shear
-        write_image(folder / f"{result.name}_max_shear.nii.gz", Image(labels.grid, values))
+        u = np.full((*labels.grid.shape, 3), np.nan, dtype=np.float32)
+        shear = np.full(labels.grid.shape, np.nan, dtype=np.float32)
+        u[inside], H = evaluate_on_grid(result.deformation, labels.grid, inside)
+        shear[inside] = StrainField.from_gradient(H).max_shear
+        write_image(folder / f"{result.name}_max_shear.nii.gz", Image(labels.grid, shear))
+        write_vectors(
+            folder / f"{result.name}_displacement.nii.gz", labels.grid, u, ("x", "y", "z"),
+            f"displacement u(X) of tissue in the model {result.name}", "LPS", unit="mm",
+        )  # fmt: skip
 
 
 def write_tables(

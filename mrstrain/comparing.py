@@ -138,7 +138,7 @@ def compare(
     least_ml : float
         Volume of the smallest cluster that counts.
     on_image : bool
-        Also write each model's maximal shear on the measurement's voxels.
+        Also write each model's displacement and maximal shear on the voxels of the label map.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 

@@ -145,7 +145,7 @@ def compare(
     thresholds: Annotated[Path | None, typer.Option(help="CSV: max_shear, source. Levels for clusters.")] = None,
     least_ml: Annotated[float, typer.Option(help="Volume of the smallest cluster that counts, mL.")] = 0.1,
     on_image: Annotated[
-        bool, typer.Option("--on-image", help="Also each model's strain on the image's voxels.")
+        bool, typer.Option("--on-image", help="Also each model's displacement and strain on the image's voxels.")
     ] = False,
 ) -> None:
     """Finite-element models of any code against a measurement: curves, areas, location, agreement, and a report."""

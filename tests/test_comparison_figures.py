@@ -172,6 +172,9 @@ def test_what_is_written_is_what_was_found(study: Path) -> None:
     inside = np.isfinite(image)
     assert inside.sum() > 5000
     assert image[inside] == pytest.approx(max_shear(0.5 * LOADS["Load1"]), abs=1e-3)
+    u = nibabel.load(study / "out" / "Load1" / "half_displacement.nii.gz")
+    expected = sheared(0.5 * LOADS["Load1"]).displacement(labels().grid.points(inside))
+    assert u.get_fdata()[:, :, :, 0][inside] == pytest.approx(expected, abs=1e-4)
     part = nibabel.load(study / "out" / "Load1" / "part_max_shear.nii.gz").get_fdata()
     assert np.isfinite(part).sum() == pytest.approx(0.5 * inside.sum(), rel=0.1)
     assert part[np.isfinite(part)] == pytest.approx(max_shear(0.5), abs=1e-3)
