@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -105,6 +107,35 @@ def test_boundary_conditions_are_in_the_meshs_own_numbers_unit_and_frame(tmp_pat
     at = int(np.argmax(np.abs(u[:, 1])))
     assert found[int(nodes[at]) + 1, 2] == pytest.approx(-1e-3 * u[at, 1])
     assert found[int(nodes[at]) + 1, 3] == pytest.approx(1e-3 * u[at, 2])
+
+
+@pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX (ccx) is not installed")
+def test_calculix_runs_with_them(tmp_path: Path) -> None:
+    """By *INCLUDE in a step of its own deck: its outside goes where it was measured, and its inside as ours."""
+    mesh = slab()
+    fat = NeoHooke.of(0.005, 0.4)
+    write_boundary(tmp_path / "Load1", mesh, *outside(mesh, SHEAR))
+    (tmp_path / "Load1.inp").rename(tmp_path / "measured.inp")
+    lines = ["*NODE, NSET=NALL"] + [f"{n + 1}, {x}, {y}, {z}" for n, (x, y, z) in enumerate(mesh.points_mm.tolist())]
+    lines += ["*ELEMENT, TYPE=C3D4, ELSET=EALL"]
+    lines += [f"{i + 1}, " + ", ".join(str(n + 1) for n in cell) for i, cell in enumerate(mesh.cells)]
+    lines += ["*MATERIAL, NAME=M", "*HYPERELASTIC, NEO HOOKE", "0.0025, 85.714", "*SOLID SECTION, ELSET=EALL, MATERIAL=M"]
+    lines += [
+        "*STEP, NLGEOM, INC=100",
+        "*STATIC",
+        "0.2, 1.",
+        "*INCLUDE, INPUT=measured.inp",
+        "*NODE FILE",
+        "U",
+        "*END STEP",
+    ]
+    (tmp_path / "deck.inp").write_text("\n".join(lines) + "\n")
+    subprocess.run(["ccx", "deck"], cwd=tmp_path, check=True, capture_output=True)
+    theirs = read_result("ccx", tmp_path / "deck.frd").deformation.u_mm
+    expected = SHEAR.displacement(mesh.points_mm)
+    assert np.abs(theirs - expected).max() < 1e-4
+    ours = driven(mesh, {"fat": fat, "skin": fat}, SHEAR, "Load1").u_mm
+    assert np.abs(theirs - ours).max() < 1e-3
 
 
 def test_the_command_writes_what_compare_takes(tmp_path: Path) -> None:
