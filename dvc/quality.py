@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import InputError
 from dvc.image import Grid, Image, Mask
+from dvc.noise import noise_sd
 from dvc.resample import fill_missing
 from dvc.strainmaps import StrainMaps
 from dvc.verdict import Level, Verdict
@@ -26,9 +27,11 @@ class Limits:
     The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound
     registrations at SNR 10 to 25 stay above 0.8 and failed ones below 0.6. Those of the voxels come from a
     knee's moved and noisy twin (slices of 4 mm: apparent maximal shear 0.1) and a leg's repeat scan (6 mm: 0.3).
+    Unlikeness is what the similarity lacks of the most that noise leaves: it tells another person's foot.
     """
 
     similarity: tuple[float, float] = (0.7, 0.45)
+    unlikeness: tuple[float, float] = (0.05, 0.09)
     bone_shift_mm: tuple[float, float] = (0.3, 0.8)
     bone_shear_p95: tuple[float, float] = (0.1, 0.25)
     lowest_jacobian: tuple[float, float] = (0.3, 0.0)
@@ -69,6 +72,8 @@ class Quality:
     ----------
     similarity : (before, after rigid, after all) or None
         Pooled local correlation in the tissue, -1 to 1.
+    most_similarity : float
+        What the noise of both images lets the last of these be (`most_similarity`); NaN where it is not known.
     folded_voxels : int
         Voxels with det F <= 0.
     lowest_jacobian : float
@@ -87,6 +92,7 @@ class Quality:
     """
 
     similarity: tuple[float, float, float] | None
+    most_similarity: float
     folded_voxels: int
     lowest_jacobian: float
     lowest_jacobian_at_mm: tuple[float, float, float]
@@ -110,6 +116,7 @@ class Quality:
             "local_similarity": None
             if self.similarity is None
             else dict(zip(("before", "after_rigid", "after_all"), map(plain, self.similarity), strict=True)),
+            "local_similarity_that_noise_allows": plain(self.most_similarity),
             "folded_voxels": self.folded_voxels,
             "lowest_jacobian": plain(self.lowest_jacobian),
             "lowest_jacobian_at_lps_mm": [plain(c) for c in self.lowest_jacobian_at_mm],
@@ -175,6 +182,32 @@ def local_correlation(a: Image, carried: Float32Array, mask: Mask) -> tuple[Floa
     return whole, pooled
 
 
+def most_similarity(a: Image, b: Image, in_a: Mask, in_b: Mask) -> float:
+    """Pooled local correlation of two images of the same tissue, each with its own noise and nothing else apart.
+
+    sqrt((1 - s_a^2 / v_a) (1 - s_b^2 / v_b)), where s is the standard deviation of an image's noise and v the mean
+    local variance in its tissue, in the windows of `local_correlation`.
+
+    Parameters
+    ----------
+    a, b : Image
+        On grids of their own.
+    in_a, in_b : Mask
+        Tissue, on the grid of each.
+    """
+    shares = []
+    for image, mask in ((a, in_a), (b, in_b)):
+        box = mask.box()
+        known = mask.inside[box] & ~image.missing[box]
+        x = np.where(known, fill_missing(image).values[box], 0.0).astype(np.float64)
+        sigma = _WINDOW_MM / image.grid.spacing_mm
+        weight = np.maximum(gaussian_filter(known.astype(np.float64), sigma, mode="constant"), 1e-3)
+        mean, square = (gaussian_filter(part, sigma, mode="constant") / weight for part in (x, x * x))
+        variance = float((square - mean**2)[known].mean())
+        shares.append(max(0.0, 1.0 - noise_sd(image, mask) ** 2 / max(variance, 1e-12)))
+    return float(np.sqrt(shares[0] * shares[1]))
+
+
 def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
     """The apparent strain of a repeat scan, in the voxels of ``where`` that are valid; None where none is."""
     kept = maps.valid & where
@@ -216,6 +249,7 @@ def assess(
     bone: Mask | None,
     *,
     similarity: tuple[float, float, float] | None = None,
+    most_similarity: float = float("nan"),
     landmark_errors_mm: FloatArray | None = None,
     floor: NoiseFloor | None = None,
     limits: Limits | None = None,
@@ -228,6 +262,8 @@ def assess(
         The bone that was aligned on: what moves in it is error. None where none was.
     similarity : (before, after rigid, after all), optional
         Pooled local correlations (`local_correlation`); None where there are no images to compare.
+    most_similarity : float
+        What noise leaves of the last (`most_similarity`); NaN where that is not known.
     """
     lines = limits or Limits()
     jacobian = maps.jacobian
@@ -260,6 +296,13 @@ def assess(
             similarity[2],
             lines.similarity,
             "After registration the images agree poorly: local similarity {value:.2f} (care below {limit:.2f}).",
+        )
+        _judge_above(
+            findings,
+            most_similarity - similarity[2],
+            lines.unlikeness,
+            "After registration the images are less alike than their noise alone explains: local similarity lacks "
+            "{value:.2f} of what it could be (care above {limit:.2f}). Is it the same foot, scanned in the same way?",
         )
         _judge_above(
             findings,
@@ -322,6 +365,7 @@ def assess(
         )
     return Quality(
         similarity,
+        most_similarity,
         folded,
         lowest,
         at,

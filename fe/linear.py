@@ -1,13 +1,15 @@
 """Direct solution of the symmetric, indefinite systems of the solver: the one file that knows which library does it.
 
 PARDISO of Intel's MKL where it runs (x86-64); elsewhere NGSolve's sparse Cholesky where it is installed, and SciPy's
-SuperLU where it is not. A factorisation takes most of a simulation's time, so an old one is used as the preconditioner
-of an iterative solution for as long as that is quicker.
+SuperLU where it is not. A factorisation takes most of a simulation's time, so PARDISO makes it in single precision, and
+an old one is used for as long as that is quicker: either way as the preconditioner of an iterative solution in double.
 """
 
 from __future__ import annotations
 
 import platform
+from contextlib import suppress
+from functools import partial
 from importlib.util import find_spec
 from typing import Any, Protocol
 
@@ -19,6 +21,10 @@ from dvc.arrays import FloatArray, IntArray
 from dvc.errors import MrstrainError
 
 _MOST_STEPS = 10  # of the iterative method: as long as a factorisation, on the meshes that are common here
+_FINE = 1e-8  # residual of a solution by the matrix's own factors
+# PARDISO's own choices for this kind of matrix, which have to be named where one of them is changed (counted from 1):
+# METIS, pivots of 1e-8, none of scaling, matching and refinement, Bunch-Kaufman pivots, and (28) single precision.
+_IN_SINGLE = {1: 1, 2: 2, 8: 0, 10: 8, 11: 0, 13: 0, 21: 1, 28: 1}
 
 
 class SingularError(MrstrainError, RuntimeError):
@@ -26,7 +32,15 @@ class SingularError(MrstrainError, RuntimeError):
 
 
 class Factors(Protocol):
-    """A matrix of fixed pattern, factorised anew whenever its values change."""
+    """A matrix of fixed pattern, factorised anew whenever its values change.
+
+    Attributes
+    ----------
+    rough : bool
+        Whether it is factorised in single precision.
+    """
+
+    rough: bool
 
     def factorise(self, data: FloatArray) -> None:
         """Take new values of the upper triangle, in the order of the pattern."""
@@ -41,7 +55,9 @@ class Factors(Protocol):
         ...
 
 
-def factors(indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None) -> Factors:
+def factors(
+    indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None, rough: bool = False
+) -> Factors:
     """A solver for symmetric matrices whose upper triangle has this pattern (CSR, sorted, with its whole diagonal).
 
     Parameters
@@ -50,10 +66,12 @@ def factors(indptr: IntArray, indices: IntArray, *, threads: int = 1, library: s
         Threads of PARDISO.
     library : {"pardiso", "ngsolve", "superlu"}, optional
         By default the fastest that this machine has.
+    rough : bool
+        In single precision, where the library can.
     """
     chosen = library or _fastest()
     if chosen == "pardiso":
-        return _Pardiso(indptr, indices, threads)
+        return _Pardiso(indptr, indices, threads, rough)
     return _NGSolve(indptr, indices) if chosen == "ngsolve" else _SuperLU(indptr, indices)
 
 
@@ -64,20 +82,25 @@ def _fastest() -> str:
 
 
 class _Pardiso:
-    def __init__(self, indptr: IntArray, indices: IntArray, threads: int) -> None:
+    def __init__(self, indptr: IntArray, indices: IntArray, threads: int, rough: bool) -> None:
         from pypardiso import PyPardisoSolver
 
         size = len(indptr) - 1
-        self._matrix = sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
+        self.rough = rough
+        self._kind = np.float32 if rough else np.float64
+        ones = np.ones(len(indices), dtype=self._kind)
+        self._matrix = sparse.csr_matrix((ones, indices, indptr), shape=(size, size))
         self._solver = PyPardisoSolver(mtype=-2)  # real, symmetric, indefinite
+        for number, value in _IN_SINGLE.items() if rough else ():
+            self._solver.set_iparm(number, value)
         self._solver.libmkl.MKL_Set_Num_Threads(threads)
         self._analysed = False
 
     def factorise(self, data: FloatArray) -> None:
         from pypardiso.pardiso_wrapper import PyPardisoError
 
-        self._matrix.data = np.ascontiguousarray(data)
-        empty = np.zeros(self._matrix.shape[0])
+        self._matrix.data = np.ascontiguousarray(data, dtype=self._kind)
+        empty = np.zeros(self._matrix.shape[0], dtype=self._kind)
         try:
             for phase in (22,) if self._analysed else (11, 22):
                 self._solver.set_phase(phase)
@@ -88,7 +111,9 @@ class _Pardiso:
 
     def solve(self, right: FloatArray) -> FloatArray:
         self._solver.set_phase(33)
-        return np.asarray(self._solver._call_pardiso(self._matrix, np.ascontiguousarray(right)))
+        size = float(np.abs(right).max()) or 1.0  # no force is too small for single precision
+        found = self._solver._call_pardiso(self._matrix, np.ascontiguousarray(right / size, dtype=self._kind))
+        return size * np.asarray(found, dtype=np.float64)
 
     def close(self) -> None:
         self._solver.free_memory(everything=True)
@@ -96,6 +121,8 @@ class _Pardiso:
 
 class _NGSolve:
     """L D L^T without pivoting, of the lower triangle; ordered and analysed once."""
+
+    rough = False
 
     def __init__(self, indptr: IntArray, indices: IntArray) -> None:
         from ngsolve import la
@@ -129,6 +156,8 @@ class _NGSolve:
 
 
 class _SuperLU:
+    rough = False
+
     def __init__(self, indptr: IntArray, indices: IntArray) -> None:
         size = len(indptr) - 1
         self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
@@ -156,7 +185,8 @@ class Solver:
     """Solves with matrices that change a little from one to the next.
 
     The generalised conjugate residual method (Eisenstat, Elman, Schultz 1983, doi:10.1137/0720023) with the last matrix
-    that was factorised as its preconditioner. Where it comes down too slowly the matrix at hand is factorised.
+    that was factorised as its preconditioner. Where it comes down too slowly the matrix at hand is factorised, first in
+    single precision; and where that does not do, in double from then on.
 
     Parameters
     ----------
@@ -170,7 +200,8 @@ class Solver:
     """
 
     def __init__(self, indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None) -> None:
-        self._factors = factors(indptr, indices, threads=threads, library=library)
+        self._new = partial(factors, indptr, indices, threads=threads, library=library)
+        self._factors = self._new(rough=True)
         size = len(indptr) - 1
         self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
         self._diagonal = indptr[:-1]  # the first of each row
@@ -178,15 +209,26 @@ class Solver:
         self.factorisations, self.steps = 0, 0
 
     def solve(self, data: FloatArray, right: FloatArray, tolerance: float) -> FloatArray:
-        """Solve to a residual below ``tolerance`` times that of zero; exactly, where a factorisation is made for it."""
+        """Solve to a residual below ``tolerance`` times that of zero; 1e-8, where a factorisation is made for it."""
         if self._known:
             found = self._iterated(data, right, tolerance)
             if found is not None:
                 return found
+        if self._factors.rough:
+            with suppress(SingularError):
+                self._factorise(data)
+                found = self._iterated(data, right, _FINE)
+                if found is not None:
+                    return found
+            self._factors.close()
+            self._factors = self._new()
+        self._factorise(data)
+        return self._factors.solve(right)
+
+    def _factorise(self, data: FloatArray) -> None:
         self._factors.factorise(data)
         self._known = True
         self.factorisations += 1
-        return self._factors.solve(right)
 
     def forget(self) -> None:
         """Factorise at the next solution, whatever came before: what is solved then depends on nothing older."""
@@ -197,6 +239,8 @@ class Solver:
         diagonal = data[self._diagonal]
         x, residual = np.zeros_like(right), right.copy()
         first = float(np.linalg.norm(right))
+        if first == 0.0:
+            return x
         directions: list[tuple[FloatArray, FloatArray]] = []
         for step in range(1, _MOST_STEPS + 1):
             p = self._factors.solve(residual)

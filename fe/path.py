@@ -26,6 +26,7 @@ _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
 _LEAST_APPROACH_MM = 0.01
+_CREEPING, _LEAST_WAY, _LEAST_TRAVEL_MM = 10, 0.01, 0.3  # so many equilibria that make less of a way, and less travel
 _ENOUGH = (0.2, 0.4, 0.6, 0.8)  # shares of the normal load up to which the plate is moved, and not yet pushed
 
 
@@ -184,8 +185,8 @@ class Path:
         """Go on from what is to the goal, in steps as large as converge; whether it is there.
 
         Where tissue gives way too much under a force, the plate is moved along it for a while, and then pushed again.
-        It is given up where the plate has moved as far as the body is large. A travel goes on in steps so small that
-        what touches does so in its order.
+        It is given up where the plate has moved as far as the body is large, or hardly gets on. A travel goes on in
+        steps so small that what touches does so in its order.
         """
         before = self.reached(goal)
         way = goal.values - before
@@ -202,6 +203,8 @@ class Path:
                 self._told(f"{done:.0%} of the way")
                 self.settled()
                 progress(done)
+                if self._creeps(np.abs(way[~goal.travels]).max(initial=0.0)):
+                    break
                 continue
             self._back(kept)
             step *= _SHRINK
@@ -226,9 +229,23 @@ class Path:
                 step = min(_GROWTH * step, _MOST_APPROACH_MM)
                 self._told("moved")
                 self.settled()
+                if self._creeps(abs(most_n)):
+                    break
             else:
                 self._back(kept)
                 step *= _SHRINK
+
+    def _creeps(self, way_n: float) -> bool:
+        """Whether the last equilibria have made next to nothing of a force's way, nor of travel: it would not end."""
+        if len(self.curve) <= _CREEPING:
+            return False
+        last, before = self.curve[-1], self.curve[-1 - _CREEPING]
+        gained_n = float(np.abs(last.force_n - before.force_n).max())
+        moved_mm = float(np.abs(last.travel_mm - before.travel_mm).max())
+        creeps = gained_n < _LEAST_WAY * way_n and moved_mm < _LEAST_TRAVEL_MM
+        if creeps:
+            self.tell(f"given up: {_CREEPING} steps made {gained_n:.3f} of {way_n:g} N and {moved_mm:.3f} mm")
+        return creeps
 
     def _go(self, travels: BoolArray, aim: FloatArray, moment_nmm: FloatArray | float = 0.0) -> bool:
         """Find equilibrium at travels (mm) along some of the plate's axes, and under forces (N) along the others.

@@ -10,17 +10,19 @@ import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation import Deformation, RigidMotion
+from dvc.errors import InputError
 from dvc.gaussnewton import Choice
 from dvc.image import Image, LabelMap, Mask
 from dvc.imagewrite import write_image
 from dvc.landmarks import target_registration_error
 from dvc.outputs import write_maps, write_mesh_results
-from dvc.quality import NoiseFloor, Quality, assess, local_correlation, noise_floor
+from dvc.quality import NoiseFloor, Quality, assess, local_correlation, most_similarity, noise_floor
 from dvc.regions import region_statistics, write_regions_csv
 from dvc.registration import Registration
 from dvc.report import Picture, Section
 from dvc.resample import carry, shows
 from dvc.strainmaps import StrainMaps, strain_maps
+from dvc.tissue import tissue_mask
 from dvc.transformwrite import write_elastix_transform, write_itk_transform
 from dvc.uncertainty import ErrorModel
 from dvc.verdict import Verdict
@@ -125,8 +127,9 @@ def write_case(
     bone = found.bone if found.alignment.on == "bone" else None
     errors = None if landmarks is None else target_registration_error(found.total, *landmarks)
     quality = assess(
-        maps, found.tissue, bone, similarity=(as_scanned, rigid, after), landmark_errors_mm=errors, floor=floor
-    )
+        maps, found.tissue, bone, similarity=(as_scanned, rigid, after), most_similarity=_most_similarity(found),
+        landmark_errors_mm=errors, floor=floor,
+    )  # fmt: skip
     view = page.view_of(subject, maps)
     labels = _regions(measured)
     bars = error_bars(found, subject, maps, model)
@@ -144,6 +147,13 @@ def write_case(
         bars.write(partial, maps, quality.verdict)
 
     return _written(folder, measured, maps, quality, pictures, _alignment(found), record, more, bars, found.choice)
+
+
+def _most_similarity(found: Registration) -> float:
+    try:
+        return most_similarity(found.reference, found.loaded, found.tissue, tissue_mask(found.loaded))
+    except InputError:  # no threshold finds the body in the loaded image
+        return float("nan")
 
 
 def write_measured(folder: Path, measured: Measured, record: Mapping[str, object]) -> Case:

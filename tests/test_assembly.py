@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from fe.assembly import Assembler
 from fe.elements import Space, element
@@ -195,6 +196,21 @@ def test_a_library_says_when_a_matrix_is_singular(library: str) -> None:
 
     with pytest.raises(SingularError, match="cannot be factorised"):
         solved()
+
+
+@needs_mkl
+def test_where_single_precision_does_not_do_double_does() -> None:
+    """Of numbers that are nothing in single precision."""
+    random = np.random.default_rng(3)
+    turn, _ = np.linalg.qr(random.normal(size=(60, 60)))
+    easy = sparse.triu(turn * np.geomspace(1e-2, 1.0, 60) @ turn.T, format="csr")
+    right = random.normal(size=60)
+    for matrix, rough, factorisations in ((easy, True, 1), (1e-60 * easy, False, 2)):
+        solver = Solver(matrix.indptr, matrix.indices)
+        found = solver.solve(matrix.data, right, 1e-12)
+        left = right - (matrix + sparse.triu(matrix, 1).T) @ found
+        assert np.abs(left).max() < 1e-6
+        assert (solver._factors.rough, solver.factorisations) == (rough, factorisations)
 
 
 def test_an_old_factorisation_serves_a_matrix_close_to_it() -> None:

@@ -119,7 +119,12 @@ def test_calculix_runs_with_them(tmp_path: Path) -> None:
     lines = ["*NODE, NSET=NALL"] + [f"{n + 1}, {x}, {y}, {z}" for n, (x, y, z) in enumerate(mesh.points_mm.tolist())]
     lines += ["*ELEMENT, TYPE=C3D4, ELSET=EALL"]
     lines += [f"{i + 1}, " + ", ".join(str(n + 1) for n in cell) for i, cell in enumerate(mesh.cells)]
-    lines += ["*MATERIAL, NAME=M", "*HYPERELASTIC, NEO HOOKE", "0.0025, 85.714", "*SOLID SECTION, ELSET=EALL, MATERIAL=M"]
+    lines += [
+        "*MATERIAL, NAME=M",
+        "*HYPERELASTIC, NEO HOOKE",
+        "0.0025, 85.714",
+        "*SOLID SECTION, ELSET=EALL, MATERIAL=M",
+    ]
     lines += [
         "*STEP, NLGEOM, INC=100",
         "*STATIC",

@@ -18,6 +18,8 @@ from dvc.registration import Settings
 from mrstrain.registering import register as run
 from mrstrain.registering import settings_of
 from mrstrain.registeringone import register_one
+from phantoms.anatomy import Heel
+from phantoms.heel import scan
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +49,23 @@ def test_quality_and_provenance_tell_the_engine_and_how_its_weight_was_chosen(wr
     assert record["parameters"]["gauss_newton"]["volume"] == GaussNewton().volume
     assert record["parameters"]["stages"] == []
     assert "gauss-newton" in (written / "out" / "report.html").read_text()
+
+
+def test_another_persons_heel_is_not_trusted(written, small_pair, tmp_path):
+    """Bone is found and folds there are none; only their noise tells that the images could be more alike."""
+    write_image(tmp_path / "Load1.nii.gz", scan(Heel(5), small_pair.reference.grid, snr=25.0, number=7))
+    results = run(
+        written / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "out", bone=written / "bone.nii.gz",
+        threads=1,
+    )  # fmt: skip
+    told = json.loads((tmp_path / "out" / "Load1" / "quality.json").read_text())
+    assert told["verdict"]["level"] == "distrust"
+    assert any("Is it the same foot" in reason for reason in told["verdict"]["reasons"])
+    right = json.loads((written / "out" / "Load1" / "quality.json").read_text())
+    lacks = right["local_similarity_that_noise_allows"] - right["local_similarity"]["after_all"]
+    assert lacks < 0.03
+    assert right["verdict"]["level"] == "trust"
+    assert not results.failures
 
 
 def test_error_bars_are_the_engines_own(written):

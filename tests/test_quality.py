@@ -7,7 +7,7 @@ import pytest
 
 from dvc.deformation import Affine, RigidMotion, SampledDisplacement, Within
 from dvc.image import Grid, Image, Mask
-from dvc.quality import assess, local_correlation, noise_floor
+from dvc.quality import assess, local_correlation, most_similarity, noise_floor
 from dvc.strainmaps import strain_maps
 
 GRID = Grid((24, 20, 16), np.array([1.0, 1.2, 1.5]), np.array([-10.0, 5.0, 0.0]))
@@ -68,6 +68,36 @@ def test_row_11_folding_is_found_with_its_place_and_not_trusted():
 )
 def test_a_poor_or_falling_similarity_costs_trust(similarity, level):
     assert assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=similarity).verdict.level == level
+
+
+def test_noise_says_how_alike_two_scans_can_be():
+    """Of one texture, and of two: the pair's own correlation is what was said, and far below it."""
+    grid = Grid((40, 40, 40), (1.0, 1.0, 1.2), (0.0, 0.0, 0.0))
+    inside = np.zeros(grid.shape, dtype=bool)
+    inside[8:-8, 8:-8, 8:-8] = True
+    mask, random = Mask(grid, inside), np.random.default_rng(4)
+    one, other = (
+        np.where(inside, 100.0 + 60.0 * wave, 0.0) for wave in (np.cos(grid.points() @ k) for k in np.eye(3)[:2])
+    )
+
+    def scan(signal):
+        noise = 12.0 * random.standard_normal((2, *grid.shape))
+        return Image(grid, np.hypot(signal + noise[0], noise[1]).astype(np.float32))
+
+    first, again, another = scan(one), scan(one), scan(other)
+    most = most_similarity(first, again, mask, mask)
+    assert 0.8 < most < 0.97
+    assert local_correlation(first, again.values, mask)[1] == pytest.approx(most, abs=0.02)
+    assert local_correlation(first, another.values, mask)[1] < most - 0.3
+
+
+@pytest.mark.parametrize(("lacks", "level"), [(0.04, "trust"), (0.07, "caution"), (0.1, "distrust"), (np.nan, "trust")])
+def test_what_noise_does_not_explain_costs_trust(lacks: float, level: str) -> None:
+    verdict = assess(
+        strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.3, 0.5, 0.85), most_similarity=0.85 + lacks
+    ).verdict
+    assert verdict.level == level
+    assert all("same foot" in reason for reason in verdict.reasons)
 
 
 @pytest.mark.parametrize(("slice_mm", "level"), [(2.0, "trust"), (4.0, "caution"), (6.0, "distrust")])
