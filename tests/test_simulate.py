@@ -9,8 +9,11 @@ from scipy.spatial.transform import Rotation
 from dvc.errors import InputError
 from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
+from fe.elements import element
 from fe.materials import NeoHooke, Ogden
+from fe.model import Model
 from fe.newton import Tolerance
+from fe.path import Path, PlateState
 from fe.plate import Plate
 from fe.simulate import LoadStep, State, simulate
 from tests.blocks import block
@@ -151,6 +154,37 @@ def test_a_load_too_large_ends_with_the_last_state_in_balance() -> None:
     straight = press(dome((3, 4, 4)), [loads[0], LoadStep("as far", 2.0, float(last.force_n[1]))], weak)[-1]
     assert straight.reached == 1.0
     assert np.abs(straight.u_mm - last.u_mm).max() < 0.1 * np.abs(last.u_mm).max()  # steps differ, so does the tape
+
+
+def test_balance_alone_does_where_steps_do_not_get_small(sheared: list[State]) -> None:
+    (state,) = press(dome(), PRESS, tolerance=Tolerance(1e-4, 0.0))
+    assert state.reached == 1.0
+    assert np.abs(state.u_mm - sheared[0].u_mm).max() < 1e-3
+
+
+def test_a_plate_that_hardly_gets_on_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a rule under which every plate hardly does; where it has come to is kept."""
+    monkeypatch.setattr("fe.path._CREEPING", 2)
+    monkeypatch.setattr("fe.path._LEAST_WAY", 0.9)
+    monkeypatch.setattr("fe.path._LEAST_TRAVEL_MM", 100.0)
+    log: list[str] = []
+    (state,) = press(dome(), [LoadStep("pressed", 40.0)], tell=log.append)
+    assert 0.0 < state.reached < 1.0
+    assert state.force_n[0] == pytest.approx(40.0 * state.reached, rel=1e-3)
+    assert any(line.startswith("given up: 2 steps made") for line in log)
+
+
+@pytest.mark.parametrize(
+    ("each_n", "each_mm", "creeps"),
+    [(0.05, 0.02, True), (0.05, 0.6, False), (0.2, 0.02, False)],  # the second is soft tissue that is first touched
+)
+def test_creeping_is_neither_force_nor_travel(each_n: float, each_mm: float, creeps: bool) -> None:
+    path = Path(Model.of(dome(), LAWS, element("P1")), dome(), Plate(DOWN, ALONG), ["bone"], 1, Tolerance(), print)
+    zero = np.zeros(3)
+    path.curve = [PlateState(np.full(3, n * each_mm), np.array([n * each_n, 0, 0]), zero, zero, 0.0) for n in range(11)]
+    assert path._creeps(140.0) == creeps
+    path.curve.pop()
+    assert not path._creeps(140.0)
 
 
 def test_normal_first_then_shear() -> None:
