@@ -74,12 +74,14 @@ def pictures_of(
     displacements = {r.name: _at_nodes(r, found.mesh.points_mm) for r in results}
     told = [name for name in found.tissues if any(a.tissue == name for a in one.areas)]
     curves = figures.volume_strain(found, one.bands, strains, (ALL, *told)[:_PANELS], colours)
-    point = lowest_bone_point(labels, bones, axes)
+    point = lowest_bone_point(labels, bones[0], axes)
     across = (found.mesh.points_mm - point) @ axes[:, 2]
-    through = "It goes through the bone's lowest point."
+    through = f"It goes through the lowest point of {bones[0]}."
     if not across.min() < 0.0 < across.max():
         point = found.mesh.bounds_mm.mean(axis=0)
-        through = "The bone's lowest point lies beside the mesh: the slice goes through the mesh's middle instead."
+        through = (
+            f"The lowest point of {bones[0]} lies beside the mesh: the slice goes through the mesh's middle instead."
+        )
     slices = figures.slices(found, measured, displacements, axes, point)
     apart = said(figures.differences)
     return {
@@ -95,10 +97,9 @@ def pictures_of(
     }
 
 
-def lowest_bone_point(labels: LabelMap, bones: Sequence[str], axes: FloatArray) -> FloatArray:
-    """Where the bone lies furthest along the plate's outward normal, LPS mm; the middle of a flat one."""
-    bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
-    points = labels.grid.points(bone)
+def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
+    """Where a bone lies furthest along the plate's outward normal, LPS mm; the middle of a flat one."""
+    points = labels.grid.points(labels.region(bone).inside)
     height = points @ axes[:, 0]
     return np.asarray(points[height < height.min() + 0.5 * labels.grid.spacing_mm.min()].mean(axis=0))
 

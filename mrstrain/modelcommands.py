@@ -131,7 +131,12 @@ def compare(
     labels: Annotated[Path, typer.Option(help="Label map of the unloaded image.")],
     out: Out,
     names: Names = None,
-    bone: Annotated[list[str] | None, typer.Option(help="Label of bone; repeat. Default: bone.")] = None,
+    bone: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Label of bone; repeat. The slice goes through the lowest point of the first. Default: bone."
+        ),
+    ] = None,
     mesh: Annotated[Path | None, typer.Option(help="Where to compare. Default: the first model's mesh.")] = None,
     model_mesh: ModelMesh = None,
     model_unit: MeshUnit = Unit.MM,

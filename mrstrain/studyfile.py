@@ -141,7 +141,7 @@ class Meshing(_Part):
     labels, names : str, optional
         Another label map than that of the images, such as one without toes.
     bones : tuple of str
-        Labels that are cut out, and whose surface is fixed.
+        Labels that are cut out, and whose surface is fixed; slices go through the lowest point of the first.
     finer : Finer, optional
     limit_minutes : float
         Time after which meshing is given up.

@@ -89,12 +89,15 @@ def test_the_lowest_point_of_bone_is_that_of_a_spur_along_the_outward_normal(
     bone = np.zeros(grid.shape, dtype=np.int64)
     bone[4:16, 4:16, 6:14] = 1
     bone[5, 12, :] = 1  # a spur below and above
+    bone[18, 18, :] = 2  # another bone, as low
     axes = plate_axes(-np.array(normal), (0.0, -1.0, 0.0))
-    found = lowest_bone_point(LabelMap(grid, bone, {1: "bone"}), ["bone"], axes)
+    found = lowest_bone_point(LabelMap(grid, bone, {1: "calcaneus", 2: "ankle"}), "calcaneus", axes)
     assert found == pytest.approx([5.0, 12.0, height])
 
 
-@pytest.mark.parametrize(("aside", "words"), [(0.0, "goes through the bone's"), (30.0, "lies beside the mesh")])
+@pytest.mark.parametrize(
+    ("aside", "words"), [(0.0, "goes through the lowest point of bone"), (30.0, "lies beside the mesh")]
+)
 def test_the_slices_caption_says_where_it_lies(aside: float, words: str) -> None:
     mesh, bone = cube(4), labels()
     model = result("half", mesh, sheared(0.2))
