@@ -35,7 +35,7 @@ def main() -> None:
     one = [_compared(given.study, measured / given.load, models[:1]) for _ in range(given.rounds)]
     told = {
         "versions": versions(),
-        "cells": len(len(read_tet_mesh(results / "mesh" / "mesh.vtu").cells)),
+        "cells": len(read_tet_mesh(results / "mesh" / "mesh.vtu").cells),
         "models": [model.name for model in models],
         "one_load_one_model": one,
         "all_loads_all_models": _compared(given.study, measured, models),
