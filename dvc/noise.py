@@ -38,19 +38,26 @@ def noise_sd(image: Image, tissue: Mask) -> float:
     Gudbjartsson and Patz, Magn Reson Med 1995, doi:10.1002/mrm.1910340618; Donoho and Johnstone, Biometrika 1994,
     doi:10.1093/biomet/81.3.425 (the wavelet estimate).
     """
-    if not tissue.grid.same_as(image.grid) or not tissue.inside.any():
-        raise InputError("The noise needs a tissue mask that is on the image's grid and not empty.")
+    in_air = noise_in_air(image, tissue)
+    if in_air is not None:
+        return in_air
     known = ~image.missing
-    air = image.values[known & (distance_transform_edt(~tissue.inside, sampling=image.grid.spacing_mm) > _AIR_MM)]
-    air = air[air > 0] if np.count_nonzero(air > 0) > 0.9 * max(air.size, 1) else air[:0]
-    if air.size >= _LEAST and np.ptp(air) > 0:
-        return float(np.median(air) / _RAYLEIGH_MEDIAN)
     box = tissue.box()
     finest = np.where(known & tissue.inside, image.values, np.nan)[box].astype(np.float64)
     for axis in range(3):
         if finest.shape[axis] > 1:
             finest = np.diff(finest, axis=axis) / np.sqrt(2.0)
     return float(np.nanmedian(np.abs(finest)) / _NORMAL_MAD) if np.isfinite(finest).any() else 0.0
+
+
+def noise_in_air(image: Image, tissue: Mask) -> float | None:
+    """The same from the air alone; None where the scanner has set it to zero, or too little is in view."""
+    if not tissue.grid.same_as(image.grid) or not tissue.inside.any():
+        raise InputError("The noise needs a tissue mask that is on the image's grid and not empty.")
+    far = distance_transform_edt(~tissue.inside, sampling=image.grid.spacing_mm) > _AIR_MM
+    air = image.values[~image.missing & far]
+    air = air[air > 0] if np.count_nonzero(air > 0) > 0.9 * max(air.size, 1) else air[:0]
+    return float(np.median(air) / _RAYLEIGH_MEDIAN) if air.size >= _LEAST and np.ptp(air) > 0 else None
 
 
 def signal_to_noise(image: Image, tissue: Mask) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,12 +13,12 @@ from scipy.ndimage import gaussian_filter
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import InputError
 from dvc.image import Grid, Image, Mask
-from dvc.noise import noise_sd
 from dvc.resample import fill_missing
 from dvc.strainmaps import StrainMaps
 from dvc.verdict import Level, Verdict
 
 _WINDOW_MM = 2.5
+_MORE_NOISE = 1.5  # times that in the air; parallel imaging has up to twice as much in the tissue
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +74,7 @@ class Quality:
     similarity : (before, after rigid, after all) or None
         Pooled local correlation in the tissue, -1 to 1.
     most_similarity : float
-        What the noise of both images lets the last of these be (`most_similarity`); NaN where it is not known.
+        What noise as in the air lets the last of these be (`most_similarity`); NaN where that is not known.
     folded_voxels : int
         Voxels with det F <= 0.
     lowest_jacobian : float
@@ -182,30 +183,36 @@ def local_correlation(a: Image, carried: Float32Array, mask: Mask) -> tuple[Floa
     return whole, pooled
 
 
-def most_similarity(a: Image, b: Image, in_a: Mask, in_b: Mask) -> float:
-    """Pooled local correlation of two images of the same tissue, each with its own noise and nothing else apart.
+def most_similarity(
+    a: Image, carried: Float32Array, mask: Mask, noise: tuple[float, float]
+) -> Callable[[float], float]:
+    """Pooled local correlation of two images of the same tissue that differ in nothing but their noise.
 
     sqrt((1 - s_a^2 / v_a) (1 - s_b^2 / v_b)), where s is the standard deviation of an image's noise and v the mean
-    local variance in its tissue, in the windows of `local_correlation`.
+    local variance in the mask, in the windows of `local_correlation`.
 
     Parameters
     ----------
-    a, b : Image
-        On grids of their own.
-    in_a, in_b : Mask
-        Tissue, on the grid of each.
+    a : Image
+    carried : (ni, nj, nk)
+        The other image on its grid; NaN where not known.
+    mask : Mask
+    noise : (s_a, s_b)
+
+    Returns
+    -------
+    function of a factor on the noise
     """
+    box = mask.box()
+    known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
+    sigma = _WINDOW_MM / a.grid.spacing_mm
+    weight = np.maximum(gaussian_filter(known.astype(np.float64), sigma, mode="constant"), 1e-3)
     shares = []
-    for image, mask in ((a, in_a), (b, in_b)):
-        box = mask.box()
-        known = mask.inside[box] & ~image.missing[box]
-        x = np.where(known, fill_missing(image).values[box], 0.0).astype(np.float64)
-        sigma = _WINDOW_MM / image.grid.spacing_mm
-        weight = np.maximum(gaussian_filter(known.astype(np.float64), sigma, mode="constant"), 1e-3)
+    for values, s in zip((fill_missing(a).values, carried), noise, strict=True):
+        x = np.where(known, values[box], 0.0).astype(np.float64)
         mean, square = (gaussian_filter(part, sigma, mode="constant") / weight for part in (x, x * x))
-        variance = float((square - mean**2)[known].mean())
-        shares.append(max(0.0, 1.0 - noise_sd(image, mask) ** 2 / max(variance, 1e-12)))
-    return float(np.sqrt(shares[0] * shares[1]))
+        shares.append(s**2 / max(float((square - mean**2)[known].mean()), 1e-12))
+    return lambda factor: float(np.sqrt(np.prod([max(0.0, 1.0 - factor**2 * share) for share in shares])))
 
 
 def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
@@ -249,7 +256,7 @@ def assess(
     bone: Mask | None,
     *,
     similarity: tuple[float, float, float] | None = None,
-    most_similarity: float = float("nan"),
+    most_similarity: Callable[[float], float] | None = None,
     landmark_errors_mm: FloatArray | None = None,
     floor: NoiseFloor | None = None,
     limits: Limits | None = None,
@@ -262,8 +269,9 @@ def assess(
         The bone that was aligned on: what moves in it is error. None where none was.
     similarity : (before, after rigid, after all), optional
         Pooled local correlations (`local_correlation`); None where there are no images to compare.
-    most_similarity : float
-        What noise leaves of the last (`most_similarity`); NaN where that is not known.
+    most_similarity : callable, optional
+        What noise, and a multiple of it, leaves of the last (`most_similarity`). What lacks is not trusted where it is
+        too much for half as much noise again.
     """
     lines = limits or Limits()
     jacobian = maps.jacobian
@@ -297,13 +305,18 @@ def assess(
             lines.similarity,
             "After registration the images agree poorly: local similarity {value:.2f} (care below {limit:.2f}).",
         )
-        _judge_above(
-            findings,
-            most_similarity - similarity[2],
-            lines.unlikeness,
-            "After registration the images are less alike than their noise alone explains: local similarity lacks "
-            "{value:.2f} of what it could be (care above {limit:.2f}). Is it the same foot, scanned in the same way?",
-        )
+        if most_similarity is not None:
+            care, distrust = lines.unlikeness
+            lacks = most_similarity(1.0) - similarity[2]
+            surely = most_similarity(_MORE_NOISE) - similarity[2] > distrust
+            _judge_above(
+                findings,
+                lacks,
+                (care, -np.inf if surely else np.inf),
+                "After registration the images are less alike than noise as strong as in the air would leave them: "
+                "local similarity lacks {value:.2f} (care above {limit:.2f}). Is it the same foot, scanned in the same "
+                "way? Parallel imaging and filters change the noise in the tissue.",
+            )
         _judge_above(
             findings,
             float(maps.grid.spacing_mm.max()),
@@ -365,7 +378,7 @@ def assess(
         )
     return Quality(
         similarity,
-        most_similarity,
+        float("nan") if most_similarity is None else most_similarity(1.0),
         folded,
         lowest,
         at,

@@ -23,7 +23,7 @@ from dvc.errors import MrstrainError
 _MOST_STEPS = 10  # of the iterative method: as long as a factorisation, on the meshes that are common here
 _FINE = 1e-8  # residual of a solution by the matrix's own factors
 # PARDISO's own choices for this kind of matrix, which have to be named where one of them is changed (counted from 1):
-# METIS, pivots of 1e-8, none of scaling, matching and refinement, Bunch-Kaufman pivots, and (28) single precision.
+# METIS, least pivots of 1e-8, neither scaling nor matching, Bunch-Kaufman pivots; and (28) single precision.
 _IN_SINGLE = {1: 1, 2: 2, 8: 0, 10: 8, 11: 0, 13: 0, 21: 1, 28: 1}
 
 
@@ -186,7 +186,7 @@ class Solver:
 
     The generalised conjugate residual method (Eisenstat, Elman, Schultz 1983, doi:10.1137/0720023) with the last matrix
     that was factorised as its preconditioner. Where it comes down too slowly the matrix at hand is factorised, first in
-    single precision; and where that does not do, in double from then on.
+    single precision; and where that does not do, in double until `forget`.
 
     Parameters
     ----------
@@ -202,6 +202,7 @@ class Solver:
     def __init__(self, indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None) -> None:
         self._new = partial(factors, indptr, indices, threads=threads, library=library)
         self._factors = self._new(rough=True)
+        self._began_rough = self._factors.rough
         size = len(indptr) - 1
         self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
         self._diagonal = indptr[:-1]  # the first of each row
@@ -220,12 +221,17 @@ class Solver:
                 found = self._iterated(data, right, _FINE)
                 if found is not None:
                     return found
-            self._factors.close()
-            self._factors = self._new()
+            self._renew(rough=False)
         self._factorise(data)
         return self._factors.solve(right)
 
+    def _renew(self, *, rough: bool) -> None:
+        self._known = False
+        self._factors.close()
+        self._factors = self._new(rough=rough)
+
     def _factorise(self, data: FloatArray) -> None:
+        self._known = False  # whatever becomes of it, the old one is gone
         self._factors.factorise(data)
         self._known = True
         self.factorisations += 1
@@ -233,6 +239,8 @@ class Solver:
     def forget(self) -> None:
         """Factorise at the next solution, whatever came before: what is solved then depends on nothing older."""
         self._known = False
+        if self._began_rough and not self._factors.rough:
+            self._renew(rough=True)
 
     def _iterated(self, data: FloatArray, right: FloatArray, tolerance: float) -> FloatArray | None:
         self._upper.data = np.ascontiguousarray(data)

@@ -17,7 +17,7 @@ _NEAR = 0.02  # forces out of balance, as a share of those on the supports, at w
 _LEAST_VOLUME = 0.002  # no step brings det F at a quadrature point below this: from there the way to folding is short
 _MOST_GROWTH = 3.0  # of the residual in one step
 _WANDERED = 2  # steps in a row that hardly lowered the residual, after which a step is measured before it is made
-_BALANCED = 5  # steps in a row that end in balance, after which it is taken for what it is though they do not get small
+_BALANCED, _SMALL_MM = 5, 0.1  # so many steps in a row that end in balance, the last below this, count as found
 _SHARES = (1.0, 0.5, 0.25)
 _ROUGH, _INEXACT = 0.05, 1e-3  # residual of a linear solution that is not exact, far from equilibrium and near it
 
@@ -31,8 +31,8 @@ class Tolerance:
     force : float
         Largest norm of the forces out of balance, as a share of the forces on the plate and fixed nodes.
     step_mm : float
-        Largest change of a displacement in the last step, mm. Five steps in a row that end within ``force`` do as
-        well: a cell that is nearly flat may have a way to move that costs no force.
+        Largest change of a displacement in the last step, mm. Five steps in a row that end within ``force``, the
+        last below 0.1 mm, do as well: a cell that is nearly flat may have a way to move that costs no force.
     iterations : int
         Steps before giving up.
     """
@@ -149,8 +149,11 @@ def equilibrium(
             forces, residual, lowest = assembler.residual(now)
             balanced = 0
             continue
-        balanced = balanced + 1 if share == 1.0 and balance <= tolerance.force else 0
-        if balanced == _BALANCED or (balanced and largest <= tolerance.step_mm):
+        balanced = balanced + 1 if balance <= tolerance.force else 0
+        if balanced and share == 1.0 and largest <= tolerance.step_mm:
+            return Converged(now, forces, iteration)
+        if balanced >= _BALANCED and largest <= _SMALL_MM:
+            told(f"    taken as found: {balanced} steps in a row ended in balance, the last of {largest:.1e} mm")
             return Converged(now, forces, iteration)
     return None
 

@@ -188,7 +188,7 @@ class Path:
         It is given up where the plate has moved as far as the body is large, or hardly gets on. A travel goes on in
         steps so small that what touches does so in its order.
         """
-        before = self.reached(goal)
+        before, since = self.reached(goal), len(self.curve)
         way = goal.values - before
         axis = int(np.argmax(np.abs(way)))
         largest = _MOST_APPROACH_MM / max(float(np.abs(way[goal.travels]).max(initial=0.0)), 1e-12)
@@ -203,7 +203,7 @@ class Path:
                 self._told(f"{done:.0%} of the way")
                 self.settled()
                 progress(done)
-                if self._creeps(np.abs(way[~goal.travels]).max(initial=0.0)):
+                if done < 1.0 and self._creeps(np.abs(way[~goal.travels]).max(initial=0.0), since):
                     break
                 continue
             self._back(kept)
@@ -218,7 +218,7 @@ class Path:
         """Move the plate along an axis until its force there is enough, or no more can be had; never past the most."""
         sign = 1.0 if most_n >= self.plate.force_n[axis] else -1.0
         farthest = self.plate.travel_mm[axis] + sign * float(np.ptp(self.model.space.nodes_mm[:, 0]))
-        step = _APPROACH_MM
+        step, since = _APPROACH_MM, len(self.curve)
         moving = np.arange(3) == axis
         while sign * (enough_n - self.plate.force_n[axis]) > 0.0 and step > _LEAST_APPROACH_MM:
             if sign * (farthest - self.plate.travel_mm[axis]) < step:
@@ -229,15 +229,15 @@ class Path:
                 step = min(_GROWTH * step, _MOST_APPROACH_MM)
                 self._told("moved")
                 self.settled()
-                if self._creeps(abs(most_n)):
+                if self._creeps(abs(most_n), since):
                     break
             else:
                 self._back(kept)
                 step *= _SHRINK
 
-    def _creeps(self, way_n: float) -> bool:
-        """Whether the last equilibria have made next to nothing of a force's way, nor of travel: it would not end."""
-        if len(self.curve) <= _CREEPING:
+    def _creeps(self, way_n: float, since: int) -> bool:
+        """Whether the last equilibria, of those ``since``, made next to nothing of a force's way, nor of travel."""
+        if len(self.curve) - since < _CREEPING:
             return False
         last, before = self.curve[-1], self.curve[-1 - _CREEPING]
         gained_n = float(np.abs(last.force_n - before.force_n).max())

@@ -99,7 +99,7 @@ def pictures_of(
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
     """Where a bone lies furthest along the plate's outward normal, LPS mm; the middle of a flat one."""
-    points = labels.grid.points(labels.region(bone).inside)
+    points = labels.grid.points(np.isin(labels.labels, [n for n, name in labels.names.items() if name == bone]))
     height = points @ axes[:, 0]
     return np.asarray(points[height < height.min() + 0.5 * labels.grid.spacing_mm.min()].mean(axis=0))
 

@@ -11,7 +11,7 @@ import meshio
 import numpy as np
 
 from dvc.displacementfile import read_displacement
-from dvc.errors import InputError, MrstrainError
+from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.imagewrite import write_image
 from dvc.tissue import tissue_mask
 from dvc.whole import whole_file, write_whole
@@ -76,7 +76,7 @@ def level(
     loads : sequence of str
         Names of the loads; all of the model's files by default.
     engine, preset, parameters
-        Those of the measurement, as in `register`.
+        Those of the measurement, as in `register`; elastix parameters that are not known are let pass.
     model_mesh, model_unit, model_frame
         As in `compare`.
     threads : int, optional
@@ -90,6 +90,8 @@ def level(
     ------
     InputError
         If image, bone or model cannot be used, or the model folds; before anything is registered.
+    RegistrationError
+        If no load could be registered.
     """
     target, place = Path(out), Path(model)
     settings_of(engine, preset, parameters, allow_unknown=True)  # refused now rather than after the images are made
@@ -146,18 +148,23 @@ def level(
     for load, twin in made.items():
         write_image(target / work / "images" / f"{load}.nii.gz", twin.image)
     write_whole(target / name / SETTINGS, IN_IMAGE)
+    failures, registered = list[str](), target / work / "registered"
+    make_output(registered)
     for load, result in results.items():  # each in a folder of its own: a study levels several at once
         try:
             register(
-                load0, [target / work / "images" / f"{load}.nii.gz"], out=target / work / load, bone=bone,
+                load0, [target / work / "images" / f"{load}.nii.gz"], out=registered / load, bone=bone,
                 bone_label=bone_label, tissue=tissue, labels=labels, names=names, engine=engine,
                 preset=preset, parameters=parameters, allow_unknown_parameters=True, threads=threads, seed=seed,
                 progress=progress,
             )  # fmt: skip
-        except MrstrainError as failed:
-            notes.append(f"{load} was not registered: {failed}")
+        except (RegistrationError, WorkerError) as failed:
+            failures.append(f"{load} was not registered: {failed}")
         else:
-            _write(target / name / f"{load}.vtu", result, target / work / load / load / "displacement.nii.gz")
+            _write(target / name / f"{load}.vtu", result, registered / load / load / "displacement.nii.gz")
+    if len(failures) == len(results):
+        raise RegistrationError(" ".join(failures))
+    notes += failures
     return Levelled(target / name, tuple(notes))
 
 

@@ -159,7 +159,7 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
     if quality.similarity is not None:
         for said, value in zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True):
             rows.append((f"Local similarity in the tissue, {said}", float(value), ""))
-        rows.append(("Local similarity that the noise of both images allows, about", quality.most_similarity, ""))
+        rows.append(("Local similarity that noise as in the air allows, about", quality.most_similarity, ""))
     rows += [
         ("Displacement left in the bone (truth: 0), rms", quality.bone_shift_mm, "mm"),
         ("Apparent maximal shear in the bone (truth: 0), 95th percentile", quality.bone_shear_p95, ""),

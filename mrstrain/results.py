@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.deformation import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.gaussnewton import Choice
 from dvc.image import Image, LabelMap, Mask
 from dvc.imagewrite import write_image
 from dvc.landmarks import target_registration_error
+from dvc.noise import noise_in_air
 from dvc.outputs import write_maps, write_mesh_results
 from dvc.quality import NoiseFloor, Quality, assess, local_correlation, most_similarity, noise_floor
 from dvc.regions import region_statistics, write_regions_csv
@@ -127,8 +128,8 @@ def write_case(
     bone = found.bone if found.alignment.on == "bone" else None
     errors = None if landmarks is None else target_registration_error(found.total, *landmarks)
     quality = assess(
-        maps, found.tissue, bone, similarity=(as_scanned, rigid, after), most_similarity=_most_similarity(found),
-        landmark_errors_mm=errors, floor=floor,
+        maps, found.tissue, bone, similarity=(as_scanned, rigid, after),
+        most_similarity=_most_similarity(found, registered, both), landmark_errors_mm=errors, floor=floor,
     )  # fmt: skip
     view = page.view_of(subject, maps)
     labels = _regions(measured)
@@ -149,11 +150,17 @@ def write_case(
     return _written(folder, measured, maps, quality, pictures, _alignment(found), record, more, bars, found.choice)
 
 
-def _most_similarity(found: Registration) -> float:
+def _most_similarity(found: Registration, registered: Float32Array, where: Mask) -> Callable[[float], float] | None:
+    """What the noise in the air of both images leaves of their similarity; None where there is no such air."""
+    reference, loaded = found.reference, found.loaded
     try:
-        return most_similarity(found.reference, found.loaded, found.tissue, tissue_mask(found.loaded))
-    except InputError:  # no threshold finds the body in the loaded image
-        return float("nan")
+        body = Mask(reference.grid, found.tissue.inside | tissue_mask(reference).inside)
+        noise = noise_in_air(reference, body), noise_in_air(loaded, tissue_mask(loaded))
+    except InputError:  # no threshold finds the body
+        return None
+    if noise[0] is None or noise[1] is None:
+        return None
+    return most_similarity(reference, registered, where, (noise[0], noise[1]))
 
 
 def write_measured(folder: Path, measured: Measured, record: Mapping[str, object]) -> Case:

@@ -19,6 +19,7 @@ from mrstrain.inputs import make_output
 from mrstrain.page import flat, said
 from mrstrain.plan import COMPARISON
 from mrstrain.provenance import provenance, write_json
+from mrstrain.registering import REPEAT
 from mrstrain.running import Ran, Told, run_studies
 from mrstrain.studyfile import FILE, read_study
 from validate import figures
@@ -109,7 +110,7 @@ def cohort(
             "No subject was compared with a model: " + "; ".join(line for r in ran for line in r.summary())
         )
     shares, notes = _shares(areas)
-    notes += _doubts(ran)
+    notes += _doubts([one for one in ran if any(one.study.study.name in of for of in shares.values())])
     try:
         ranking = standings(shares)
     except InputError as none:
@@ -135,7 +136,7 @@ def _doubts(ran: Sequence[Ran]) -> list[str]:
     """Of each subject, the registrations that are not to be trusted and yet count in its areas."""
     notes = []
     for one in ran:
-        doubted = [load for load, verdict in _registered(one).items() if verdict.level == "distrust"]
+        doubted = [load for load, v in _registered(one).items() if v.level == "distrust" and load != REPEAT]
         if doubted:
             notes.append(
                 f"{one.study.study.name}: the registration of {', '.join(doubted)} is not to be trusted, and counts in "

@@ -213,6 +213,28 @@ def test_where_single_precision_does_not_do_double_does() -> None:
         assert (solver._factors.rough, solver.factorisations) == (rough, factorisations)
 
 
+@needs_mkl
+def test_after_factorisations_that_failed_comes_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those in single and in double precision; and the next load begins in single again."""
+    matrix = sparse.triu(sparse.eye(40) * 3.0 + np.ones((40, 40)), format="csr")
+    right = np.arange(40.0)
+    solver = Solver(matrix.indptr, matrix.indices)
+    found = solver.solve(matrix.data, right, 1e-6)
+
+    def fails(*_: object) -> None:
+        raise SingularError("no memory")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("fe.linear._Pardiso.factorise", fails)
+        with pytest.raises(SingularError, match="no memory"):
+            solver.solve(-50.0 * matrix.data + np.arange(len(matrix.data)), right, 1e-6)
+    assert solver.solve(matrix.data, right, 1e-6) == pytest.approx(found)
+    assert not solver._factors.rough
+    solver.forget()
+    assert solver._factors.rough
+    assert solver.solve(matrix.data, right, 1e-6) == pytest.approx(found)
+
+
 def test_an_old_factorisation_serves_a_matrix_close_to_it() -> None:
     model = model_of("P1", count=3)
     nodes = model.space.nodes_mm

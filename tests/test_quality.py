@@ -7,6 +7,7 @@ import pytest
 
 from dvc.deformation import Affine, RigidMotion, SampledDisplacement, Within
 from dvc.image import Grid, Image, Mask
+from dvc.noise import noise_in_air
 from dvc.quality import assess, local_correlation, most_similarity, noise_floor
 from dvc.strainmaps import strain_maps
 
@@ -76,26 +77,31 @@ def test_noise_says_how_alike_two_scans_can_be():
     inside = np.zeros(grid.shape, dtype=bool)
     inside[8:-8, 8:-8, 8:-8] = True
     mask, random = Mask(grid, inside), np.random.default_rng(4)
-    one, other = (
-        np.where(inside, 100.0 + 60.0 * wave, 0.0) for wave in (np.cos(grid.points() @ k) for k in np.eye(3)[:2])
-    )
+    one, other = (np.where(inside, 100.0 + 60.0 * np.cos(grid.points()[..., axis]), 0.0) for axis in (0, 1))
 
     def scan(signal):
         noise = 12.0 * random.standard_normal((2, *grid.shape))
         return Image(grid, np.hypot(signal + noise[0], noise[1]).astype(np.float32))
 
     first, again, another = scan(one), scan(one), scan(other)
-    most = most_similarity(first, again, mask, mask)
-    assert 0.8 < most < 0.97
-    assert local_correlation(first, again.values, mask)[1] == pytest.approx(most, abs=0.02)
-    assert local_correlation(first, another.values, mask)[1] < most - 0.3
+    noise = noise_in_air(first, mask), noise_in_air(again, mask)
+    assert noise == pytest.approx((12.0, 12.0), rel=0.02)
+    most = most_similarity(first, again.values, mask, noise)
+    assert 0.8 < most(1.0) < 0.97
+    assert local_correlation(first, again.values, mask)[1] == pytest.approx(most(1.0), abs=0.02)
+    assert local_correlation(first, another.values, mask)[1] < most(1.5) - 0.3
+    assert noise_in_air(Image(grid, np.where(inside, first.values, 0.0)), mask) is None
 
 
-@pytest.mark.parametrize(("lacks", "level"), [(0.04, "trust"), (0.07, "caution"), (0.1, "distrust"), (np.nan, "trust")])
-def test_what_noise_does_not_explain_costs_trust(lacks: float, level: str) -> None:
+@pytest.mark.parametrize(
+    ("lacks", "with_more_noise", "level"),
+    [(0.04, 0.0, "trust"), (0.07, 0.0, "caution"), (0.2, 0.08, "caution"), (0.2, 0.1, "distrust")],
+)
+def test_what_noise_does_not_explain_costs_trust(lacks: float, with_more_noise: float, level: str) -> None:
     verdict = assess(
-        strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.3, 0.5, 0.85), most_similarity=0.85 + lacks
-    ).verdict
+        strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.3, 0.5, 0.7),
+        most_similarity=lambda factor: 0.7 + (lacks if factor == 1.0 else with_more_noise),
+    ).verdict  # fmt: skip
     assert verdict.level == level
     assert all("same foot" in reason for reason in verdict.reasons)
 
