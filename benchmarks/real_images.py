@@ -26,9 +26,10 @@ from dvc.errors import MrstrainError
 from dvc.image import Grid, Image
 from dvc.imagefile import read_image
 from dvc.kinematics import StrainField
-from dvc.quality import local_correlation, noise_floor
+from dvc.quality import noise_floor
 from dvc.registration import Registration, Settings, register
 from dvc.resample import carry
+from dvc.similarity import local_correlation
 from dvc.strainmaps import strain_maps
 from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform

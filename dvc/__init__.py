@@ -24,8 +24,9 @@ from dvc.landmarks import read_landmarks, target_registration_error
 from dvc.mesh import TetMesh
 from dvc.meshfile import MeshFile, read_mesh
 from dvc.presets import Preset, load_preset, preset_names, read_parameter_file
-from dvc.quality import Quality, assess, local_correlation, noise_floor
+from dvc.quality import Quality, assess, noise_floor
 from dvc.registration import Registration, Settings, register
+from dvc.similarity import local_correlation
 from dvc.strainmaps import StrainMaps, strain_maps
 from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform

@@ -22,8 +22,8 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation import Deformation, RigidMotion
 from dvc.errors import InputError, RegistrationError
 from dvc.image import Grid, Image, Mask
-from dvc.quality import local_correlation
 from dvc.resample import carry, fill_missing, smoothed
+from dvc.similarity import local_correlation
 from dvc.transformfile import rigid_from_elastix
 
 AlignOn = Literal["bone", "image", "none"]

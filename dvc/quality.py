@@ -8,17 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import InputError
-from dvc.image import Grid, Image, Mask
-from dvc.resample import fill_missing
+from dvc.image import Grid, Mask
 from dvc.strainmaps import StrainMaps
 from dvc.verdict import Level, Verdict
 
-_WINDOW_MM = 2.5
-_MORE_NOISE = 1.5  # times that in the air; parallel imaging has up to twice as much in the tissue
+_MORE_NOISE = 1.5  # times that in the air: parallel imaging and normalised intensities raise it in the tissue
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +71,7 @@ class Quality:
     similarity : (before, after rigid, after all) or None
         Pooled local correlation in the tissue, -1 to 1.
     most_similarity : float
-        What noise as in the air lets the last of these be (`most_similarity`); NaN where that is not known.
+        What noise as in the air lets the last of these be; NaN where that is not known.
     folded_voxels : int
         Voxels with det F <= 0.
     lowest_jacobian : float
@@ -149,72 +146,6 @@ def _finite(reduce: object, values: FloatArray) -> float:
     return float(reduce(values)) if np.isfinite(values).any() else float("nan")  # type: ignore[operator]
 
 
-def local_correlation(a: Image, carried: Float32Array, mask: Mask) -> tuple[Float32Array, float]:
-    """Correlation in a Gaussian window (sigma 2.5 mm) of an image with another on the same grid.
-
-    Returns
-    -------
-    map : (ni, nj, nk) float32
-        Local correlation in the mask, NaN outside and where ``carried`` is NaN.
-    pooled : float
-        sum(cov) / sqrt(sum(var_a) sum(var_b)) over the mask: one figure, weighted by local structure.
-    """
-    box = mask.box()
-    known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
-    sigma = _WINDOW_MM / a.grid.spacing_mm
-    x = np.where(known, fill_missing(a).values[box], 0.0).astype(np.float32)
-    y = np.where(known, carried[box], 0.0).astype(np.float32)
-    weight = gaussian_filter(known.astype(np.float32), sigma, mode="constant")
-    weight = np.where(known, np.maximum(weight, 1e-3), 1.0)
-
-    def mean(values: Float32Array) -> Float32Array:
-        return np.asarray(gaussian_filter(values, sigma, mode="constant") / weight, dtype=np.float32)
-
-    scale_x, scale_y = max(float(x.std()), 1e-12), max(float(y.std()), 1e-12)
-    x, y = x / scale_x, y / scale_y
-    mx, my = mean(x), mean(y)
-    vx, vy = np.maximum(mean(x * x) - mx * mx, 0.0), np.maximum(mean(y * y) - my * my, 0.0)
-    cov = mean(x * y) - mx * my
-    local = np.where(known, cov / np.sqrt(np.maximum(vx * vy, 1e-12)), np.nan)
-    total = float(np.sqrt(vx[known].sum(dtype=np.float64) * vy[known].sum(dtype=np.float64)))
-    pooled = float(cov[known].sum(dtype=np.float64)) / total if total > 0 else float("nan")
-    whole = np.full(a.grid.shape, np.nan, dtype=np.float32)
-    whole[box] = local
-    return whole, pooled
-
-
-def most_similarity(
-    a: Image, carried: Float32Array, mask: Mask, noise: tuple[float, float]
-) -> Callable[[float], float]:
-    """Pooled local correlation of two images of the same tissue that differ in nothing but their noise.
-
-    sqrt((1 - s_a^2 / v_a) (1 - s_b^2 / v_b)), where s is the standard deviation of an image's noise and v the mean
-    local variance in the mask, in the windows of `local_correlation`.
-
-    Parameters
-    ----------
-    a : Image
-    carried : (ni, nj, nk)
-        The other image on its grid; NaN where not known.
-    mask : Mask
-    noise : (s_a, s_b)
-
-    Returns
-    -------
-    function of a factor on the noise
-    """
-    box = mask.box()
-    known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
-    sigma = _WINDOW_MM / a.grid.spacing_mm
-    weight = np.maximum(gaussian_filter(known.astype(np.float64), sigma, mode="constant"), 1e-3)
-    shares = []
-    for values, s in zip((fill_missing(a).values, carried), noise, strict=True):
-        x = np.where(known, values[box], 0.0).astype(np.float64)
-        mean, square = (gaussian_filter(part, sigma, mode="constant") / weight for part in (x, x * x))
-        shares.append(s**2 / max(float((square - mean**2)[known].mean()), 1e-12))
-    return lambda factor: float(np.sqrt(np.prod([max(0.0, 1.0 - factor**2 * share) for share in shares])))
-
-
 def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
     """The apparent strain of a repeat scan, in the voxels of ``where`` that are valid; None where none is."""
     kept = maps.valid & where
@@ -268,10 +199,10 @@ def assess(
     bone : Mask or None
         The bone that was aligned on: what moves in it is error. None where none was.
     similarity : (before, after rigid, after all), optional
-        Pooled local correlations (`local_correlation`); None where there are no images to compare.
+        Pooled local correlations (`dvc.similarity.local_correlation`); None where there are no images to compare.
     most_similarity : callable, optional
-        What noise, and a multiple of it, leaves of the last (`most_similarity`). What lacks is not trusted where it is
-        too much for half as much noise again.
+        What noise, and a multiple of it, leaves of the last (`dvc.similarity.most_similarity`). What lacks is not
+        trusted where it is too much for half as much noise again.
     """
     lines = limits or Limits()
     jacobian = maps.jacobian

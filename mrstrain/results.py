@@ -17,11 +17,12 @@ from dvc.imagewrite import write_image
 from dvc.landmarks import target_registration_error
 from dvc.noise import noise_in_air
 from dvc.outputs import write_maps, write_mesh_results
-from dvc.quality import NoiseFloor, Quality, assess, local_correlation, most_similarity, noise_floor
+from dvc.quality import NoiseFloor, Quality, assess, noise_floor
 from dvc.regions import region_statistics, write_regions_csv
 from dvc.registration import Registration
 from dvc.report import Picture, Section
 from dvc.resample import carry, shows
+from dvc.similarity import local_correlation, most_similarity
 from dvc.strainmaps import StrainMaps, strain_maps
 from dvc.tissue import tissue_mask
 from dvc.transformwrite import write_elastix_transform, write_itk_transform

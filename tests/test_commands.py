@@ -22,8 +22,8 @@ from dvc.imagefile import read_image
 from dvc.imagewrite import write_image, write_labels, write_mask
 from dvc.kinematics import StrainField
 from dvc.meshwrite import VERDICT_FIELD
-from dvc.quality import local_correlation
 from dvc.resample import carry
+from dvc.similarity import local_correlation
 from dvc.transformfile import read_transform
 from dvc.uncertainty import POOLED, ErrorModel, ErrorTable
 from mrstrain.registering import register

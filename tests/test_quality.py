@@ -8,7 +8,8 @@ import pytest
 from dvc.deformation import Affine, RigidMotion, SampledDisplacement, Within
 from dvc.image import Grid, Image, Mask
 from dvc.noise import noise_in_air
-from dvc.quality import assess, local_correlation, most_similarity, noise_floor
+from dvc.quality import assess, noise_floor
+from dvc.similarity import local_correlation, most_similarity
 from dvc.strainmaps import strain_maps
 
 GRID = Grid((24, 20, 16), np.array([1.0, 1.2, 1.5]), np.array([-10.0, 5.0, 0.0]))

@@ -1,0 +1,83 @@
+"""How alike two images on one grid are in their local structure, and how alike their noise lets them be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from dvc.arrays import Float32Array
+from dvc.image import Image, Mask
+from dvc.resample import fill_missing
+
+_WINDOW_MM = 2.5
+
+
+def local_correlation(a: Image, carried: Float32Array, mask: Mask) -> tuple[Float32Array, float]:
+    """Correlation in a Gaussian window (sigma 2.5 mm) of an image with another on the same grid.
+
+    Returns
+    -------
+    map : (ni, nj, nk) float32
+        Local correlation in the mask, NaN outside and where ``carried`` is NaN.
+    pooled : float
+        sum(cov) / sqrt(sum(var_a) sum(var_b)) over the mask: one figure, weighted by local structure.
+    """
+    box = mask.box()
+    known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
+    sigma = _WINDOW_MM / a.grid.spacing_mm
+    x = np.where(known, fill_missing(a).values[box], 0.0).astype(np.float32)
+    y = np.where(known, carried[box], 0.0).astype(np.float32)
+    weight = gaussian_filter(known.astype(np.float32), sigma, mode="constant")
+    weight = np.where(known, np.maximum(weight, 1e-3), 1.0)
+
+    def mean(values: Float32Array) -> Float32Array:
+        return np.asarray(gaussian_filter(values, sigma, mode="constant") / weight, dtype=np.float32)
+
+    scale_x, scale_y = max(float(x.std()), 1e-12), max(float(y.std()), 1e-12)
+    x, y = x / scale_x, y / scale_y
+    mx, my = mean(x), mean(y)
+    vx, vy = np.maximum(mean(x * x) - mx * mx, 0.0), np.maximum(mean(y * y) - my * my, 0.0)
+    cov = mean(x * y) - mx * my
+    local = np.where(known, cov / np.sqrt(np.maximum(vx * vy, 1e-12)), np.nan)
+    total = float(np.sqrt(vx[known].sum(dtype=np.float64) * vy[known].sum(dtype=np.float64)))
+    pooled = float(cov[known].sum(dtype=np.float64)) / total if total > 0 else float("nan")
+    whole = np.full(a.grid.shape, np.nan, dtype=np.float32)
+    whole[box] = local
+    return whole, pooled
+
+
+def most_similarity(
+    a: Image, carried: Float32Array, mask: Mask, noise: tuple[float, float]
+) -> Callable[[float], float]:
+    """Pooled local correlation of two images of the same tissue that differ in nothing but their noise.
+
+    sqrt((1 - s_a^2 / v_a) (1 - s_b^2 / v_b)), where s is the standard deviation of an image's noise and v the mean
+    local variance in the mask, in the windows of `local_correlation`.
+
+    Parameters
+    ----------
+    a : Image
+    carried : (ni, nj, nk)
+        The other image on its grid, reference configuration; NaN where not known.
+    mask : Mask
+        On that grid too.
+    noise : (s_a, s_b)
+        In the unit of each image (`dvc.noise.noise_in_air`).
+
+    Returns
+    -------
+    callable
+        Of a factor on both standard deviations, the correlation that they leave.
+    """
+    box = mask.box()
+    known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
+    sigma = _WINDOW_MM / a.grid.spacing_mm
+    weight = np.maximum(gaussian_filter(known.astype(np.float64), sigma, mode="constant"), 1e-3)
+    shares = []
+    for values, s in zip((fill_missing(a).values, carried), noise, strict=True):
+        x = np.where(known, values[box], 0.0).astype(np.float64)
+        mean, square = (gaussian_filter(part, sigma, mode="constant") / weight for part in (x, x * x))
+        shares.append(s**2 / max(float((square - mean**2)[known].mean()), 1e-12))
+    return lambda factor: float(np.sqrt(np.prod([max(0.0, 1.0 - factor**2 * share) for share in shares])))
