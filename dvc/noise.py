@@ -51,7 +51,11 @@ def noise_sd(image: Image, tissue: Mask) -> float:
 
 
 def noise_in_air(image: Image, tissue: Mask) -> float | None:
-    """The same from the air alone; None where the scanner has set it to zero, or too little is in view."""
+    """Standard deviation of the noise in either channel, in the image's own unit, from the air alone.
+
+    Parameters, errors and source are those of `noise_sd`. None where the scanner has set the air to zero, or under
+    1000 voxels of it are in view. Parallel imaging has more noise in the tissue than this.
+    """
     if not tissue.grid.same_as(image.grid) or not tissue.inside.any():
         raise InputError("The noise needs a tissue mask that is on the image's grid and not empty.")
     far = distance_transform_edt(~tissue.inside, sampling=image.grid.spacing_mm) > _AIR_MM

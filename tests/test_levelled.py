@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dvc.deformation import evaluate_on_grid
-from dvc.errors import InputError
+from dvc.errors import InputError, RegistrationError
 from dvc.image import Grid, Mask
 from dvc.imagewrite import write_image, write_mask
 from dvc.mesh import TetMesh
@@ -74,7 +74,9 @@ def test_levelled_models_are_judged_as_found() -> None:
     assert np.isnan(area["a" + LEVELLED].estimate_ml)
 
 
-def test_what_comes_back_is_the_model_as_the_measurement_shows_it(tmp_path: Path, heel) -> None:
+def test_what_comes_back_is_the_model_as_the_measurement_shows_it(
+    tmp_path: Path, heel, monkeypatch: pytest.MonkeyPatch
+) -> None:
     grid = heel_grid(1.6)
     tissues = labels_of(heel, grid)
     write_image(tmp_path / "Load0.nii.gz", scan(heel, grid, snr=25.0, number=0))
@@ -109,5 +111,13 @@ def test_what_comes_back_is_the_model_as_the_measurement_shows_it(tmp_path: Path
     ):
         with pytest.raises(InputError, match=message):
             level(tmp_path / "Load0.nii.gz", wrong, out=tmp_path / "two", bone=tmp_path / "bone.nii.gz")
+
+    def fails(*_: object, **__: object) -> None:
+        raise RegistrationError("No load could be registered. Load1: folded")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("mrstrain.levelling.register", fails)
+        with pytest.raises(RegistrationError, match=r"Load1 was not registered: .* folded"):
+            level(tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "two", bone=tmp_path / "bone.nii.gz")
     with pytest.raises(InputError, match="needs the bone"):
         level(tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "two")
