@@ -76,6 +76,13 @@ class Model:
         """Displacements and pressures."""
         return 3 * len(self.space.nodes_mm) + self.space.pressures
 
+    @property
+    def node_volumes_mm3(self) -> FloatArray:
+        """Each cell's volume in equal parts to its displacement nodes, (n,)."""
+        cells = self.space.cells
+        each = np.repeat(self.volumes_mm3 / cells.shape[1], cells.shape[1])
+        return np.bincount(cells.ravel(), weights=each, minlength=len(self.space.nodes_mm)).astype(np.float64)
+
     def unknowns_of_cells(self) -> IntArray:
         """Unknowns of each cell (m, 3 a + 4): its nodes' x, y, z one node after the other, then its pressures."""
         nodes = self.space.cells

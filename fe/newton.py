@@ -14,9 +14,12 @@ from fe.turning import Turning
 
 _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at
-_LEAST_VOLUME = 0.002  # no step brings det F at a quadrature point below this: from there the way to folding is short
+LEAST_VOLUME = 0.002
+"""No step brings det F at a quadrature point below this: from there the way to folding is short."""
+
 _MOST_GROWTH = 3.0  # of the residual in one step
-_WANDERED = 2  # steps in a row that hardly lowered the residual, after which a step is measured before it is made
+# Steps in a row that hardly lowered the residual, after which each is measured before it is made; and no more are.
+_WANDERED, _LOST = 2, 12
 _BALANCED, _SMALL_MM = 5, 0.1  # so many steps in a row that end in balance, the last below this, count as found
 _SHARES = (1.0, 0.5, 0.25)
 _ROUGH, _INEXACT = 0.05, 1e-3  # residual of a linear solution that is not exact, far from equilibrium and near it
@@ -95,7 +98,7 @@ def equilibrium(
     Returns
     -------
     Converged or None
-        None if it does not converge.
+        None if it does not converge; where forces alone are given, `fe.descent` may.
     """
     now = state.copy()
     left = moves.copy()
@@ -106,7 +109,7 @@ def equilibrium(
     wandering, balanced, balance, turn = 0, 0, 0.0, np.zeros(3)
 
     def unbalanced(at: FloatArray, carried: FloatArray, rest: FloatArray) -> float:
-        of_forces = _norm(outside - rest, held, assembler)
+        of_forces = out_of_balance(outside - rest, assembler, held)
         return of_forces if turning is None else float(np.hypot(of_forces, turning.missing_n(at, carried)))
 
     for iteration in range(1, tolerance.iterations + 1):
@@ -133,16 +136,18 @@ def equilibrium(
             tried = _ahead(turning, now, change, turn, share)
             forces, residual, lowest = assembler.residual(tried)
             after = unbalanced(tried, forces, residual)
-            if lowest > _LEAST_VOLUME and after <= bound:
+            if lowest > LEAST_VOLUME and after <= bound:
                 break
             share *= 0.5
             if share < _LEAST_SHARE:
                 return None
         largest = float(np.abs((tried - now)[:displacements]).max())
         now, left = tried, (1.0 - share) * left
-        balance = after / max(_reaction(assembler, forces), 1e-9)
+        balance = after / max(reaction(assembler, forces), 1e-9)
         wandering = wandering + 1 if after > 0.5 * before and balance > tolerance.force else 0
         told(f"    {iteration}: out of balance {balance:.1e}, step {largest:.1e} mm, least det F {lowest:.3f}")
+        if wandering >= _LOST:
+            return None
         if left.any() or balance > _NEAR:
             continue
         if changed(now, forces):
@@ -176,19 +181,20 @@ def _best_share(
     for share in _SHARES:
         tried = _ahead(turning, now, change, turn, share)
         forces, residual, lowest = assembler.residual(tried)
-        left[share] = unbalanced(tried, forces, residual) if lowest > _LEAST_VOLUME else np.inf
+        left[share] = unbalanced(tried, forces, residual) if lowest > LEAST_VOLUME else np.inf
     return min(_SHARES, key=lambda share: left[share])
 
 
-def _norm(residual: FloatArray, held: IntArray, assembler: Assembler) -> float:
-    """Of the forces out of balance, N."""
-    balance = residual.copy()
-    balance[held] = 0.0
+def out_of_balance(unbalanced: FloatArray, assembler: Assembler, held: IntArray | None = None) -> float:
+    """Norm of forces by equation (N), without those of unknowns that are prescribed."""
+    balance = unbalanced.copy()
     balance[assembler.idle] = 0.0
+    if held is not None:
+        balance[held] = 0.0
     return float(np.linalg.norm(balance[assembler.force_equations]))
 
 
-def _reaction(assembler: Assembler, forces: FloatArray) -> float:
+def reaction(assembler: Assembler, forces: FloatArray) -> float:
     """Norm of the force that fixed nodes and shared equations carry, N."""
     carried = (assembler.equation < 0) | (assembler.equation >= assembler.own_equations)
     return float(np.linalg.norm(forces[carried]))

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.mesh import TetMesh
 from fe.assembly import Assembler
+from fe.descent import descend
 from fe.elements import edges_of
 from fe.linear import Solver
 from fe.model import Model
-from fe.newton import Tolerance, equilibrium
+from fe.newton import Converged, Tolerance, equilibrium
 from fe.plate import Contact, Hold, Plate
 from fe.turning import Turning
 
@@ -23,10 +24,11 @@ SURFACE = "skin"
 
 _FIRST_STEP = 0.25
 _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
+_DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
-_LEAST_APPROACH_MM = 0.01
-_CREEPING, _LEAST_WAY, _LEAST_TRAVEL_MM = 10, 0.01, 0.3  # so many equilibria that make less of a way, and less travel
+_LEAST_APPROACH_MM = 0.1
+_ALONG_NORMAL = np.array([True, False, False])
 _ENOUGH = (0.2, 0.4, 0.6, 0.8)  # shares of the normal load up to which the plate is moved, and not yet pushed
 
 
@@ -158,7 +160,7 @@ class Path:
                 if part[0] > self.plate.travel_mm[0] and not self.raise_to(Goal(part, goal.travels).unsheared()):
                     return False
             else:
-                self._push(0, share * goal.values[0], goal.values[0])
+                self._push(share * goal.values[0], goal.values[0])
             if not self.contact.plate.turns or self._let_go():
                 return True
         return False
@@ -184,73 +186,53 @@ class Path:
     def raise_to(self, goal: Goal, progress: Callable[[float], None] = lambda _: None) -> bool:
         """Go on from what is to the goal, in steps as large as converge; whether it is there.
 
-        Where tissue gives way too much under a force, the plate is moved along it for a while, and then pushed again.
-        It is given up where the plate has moved as far as the body is large, or hardly gets on. A travel goes on in
-        steps so small that what touches does so in its order.
+        Where Newton's method does not get on under forces, it goes on downhill (`fe.descent`), unless the plate turns.
+        A travel goes on in steps so small that what touches does so in its order.
         """
-        before, since = self.reached(goal), len(self.curve)
+        before = self.reached(goal)
         way = goal.values - before
-        axis = int(np.argmax(np.abs(way)))
         largest = _MOST_APPROACH_MM / max(float(np.abs(way[goal.travels]).max(initial=0.0)), 1e-12)
-        done, step, pushed = 0.0, _FIRST_STEP, bool(goal.travels.any())
-        while done < 1.0 and step > min(_LEAST_STEP, 0.01 * largest):
+        done, step, downhill = 0.0, _FIRST_STEP, False
+        while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else min(_LEAST_STEP, 0.01 * largest)):
             step = min(step, largest)
             share = min(1.0, done + step)
             kept = self.standing
-            if self._go(goal.travels, before + share * way):
+            if self._go(goal.travels, before + share * way, downhill=downhill):
                 done, step = share, step * _GROWTH
-                pushed = bool(goal.travels.any())
                 self._told(f"{done:.0%} of the way")
                 self.settled()
                 progress(done)
-                if done < 1.0 and self._creeps(np.abs(way[~goal.travels]).max(initial=0.0), since):
-                    break
                 continue
             self._back(kept)
             step *= _SHRINK
-            if step < _SOFT_STEP and not pushed:
-                pushed = True
-                self._push(axis, before[axis] + min(1.0, done + _FIRST_STEP) * way[axis], goal.values[axis])
-                done, step = float((self.plate.force_n - before) @ way / (way @ way)), _FIRST_STEP
+            if step < _SOFT_STEP and not (downhill or goal.travels.any() or self.contact.hold.loose):
+                downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0
 
-    def _push(self, axis: int, enough_n: float, most_n: float) -> None:
-        """Move the plate along an axis until its force there is enough, or no more can be had; never past the most."""
-        sign = 1.0 if most_n >= self.plate.force_n[axis] else -1.0
-        farthest = self.plate.travel_mm[axis] + sign * float(np.ptp(self.model.space.nodes_mm[:, 0]))
-        step, since = _APPROACH_MM, len(self.curve)
-        moving = np.arange(3) == axis
-        while sign * (enough_n - self.plate.force_n[axis]) > 0.0 and step > _LEAST_APPROACH_MM:
-            if sign * (farthest - self.plate.travel_mm[axis]) < step:
+    def _push(self, enough_n: float, most_n: float) -> None:
+        """Move the plate along its normal until its force is enough, or no more can be had; never past the most."""
+        farthest = self.plate.travel_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
+        step, growth = _APPROACH_MM, _GROWTH
+        while self.plate.force_n[0] < enough_n and step > _LEAST_APPROACH_MM:
+            if farthest - self.plate.travel_mm[0] < step:
                 break
             kept = self.standing
-            aim = np.where(moving, self.plate.travel_mm + sign * step, self.plate.force_n)
-            if self._go(moving, aim) and sign * (most_n - self.plate.force_n[axis]) > 0.0:
-                step = min(_GROWTH * step, _MOST_APPROACH_MM)
+            aim = np.array([self.plate.travel_mm[0] + step, *self.plate.force_n[1:]])
+            if self._go(_ALONG_NORMAL, aim) and self.plate.force_n[0] < most_n:
+                step = min(growth * step, _MOST_APPROACH_MM)
                 self._told("moved")
                 self.settled()
-                if self._creeps(abs(most_n), since):
-                    break
             else:
                 self._back(kept)
-                step *= _SHRINK
+                step, growth = _SHRINK * step, 1.0
 
-    def _creeps(self, way_n: float, since: int) -> bool:
-        """Whether the last equilibria, of those ``since``, made next to nothing of a force's way, nor of travel."""
-        if len(self.curve) - since < _CREEPING:
-            return False
-        last, before = self.curve[-1], self.curve[-1 - _CREEPING]
-        gained_n = float(np.abs(last.force_n - before.force_n).max())
-        moved_mm = float(np.abs(last.travel_mm - before.travel_mm).max())
-        creeps = gained_n < _LEAST_WAY * way_n and moved_mm < _LEAST_TRAVEL_MM
-        if creeps:
-            self.tell(f"given up: {_CREEPING} steps made {gained_n:.3f} of {way_n:g} N and {moved_mm:.3f} mm")
-        return creeps
-
-    def _go(self, travels: BoolArray, aim: FloatArray, moment_nmm: FloatArray | float = 0.0) -> bool:
+    def _go(
+        self, travels: BoolArray, aim: FloatArray, moment_nmm: FloatArray | float = 0.0, *, downhill: bool = False
+    ) -> bool:
         """Find equilibrium at travels (mm) along some of the plate's axes, and under forces (N) along the others.
 
-        A plate that turns freely also takes up a moment (3,), N mm.
+        A plate that turns freely also takes up a moment (3,), N mm. ``downhill`` is by `fe.descent`: under forces
+        alone, and a plate that does not turn.
         """
         contact = self.contact
         contact.begin(self.state)
@@ -258,21 +240,24 @@ class Path:
         outside = np.zeros(self.assembler.size)
         outside[equations] = np.where(travels, 0.0, aim)
         self.assembler.share(contact.followers)
-        turning = None
-        if contact.hold.loose:
-            turning = Turning(contact, self.assembler, self.solver, np.broadcast_to(moment_nmm, 3))
-        found = equilibrium(
-            self.assembler,
-            self.solver,
-            self.state,
-            outside,
-            equations[travels],
-            (aim - self.plate.travel_mm)[travels],
-            self.tolerance,
-            self._changed,
-            self.tell,
-            turning,
-        )
+        if downhill:
+            found = self._descended(outside)
+        else:
+            turning = None
+            if contact.hold.loose:
+                turning = Turning(contact, self.assembler, self.solver, np.broadcast_to(moment_nmm, 3))
+            found = equilibrium(
+                self.assembler,
+                self.solver,
+                self.state,
+                outside,
+                equations[travels],
+                (aim - self.plate.travel_mm)[travels],
+                self.tolerance,
+                self._changed,
+                self.tell,
+                turning,
+            )
         if found is None:
             return False
         travel = contact.travel_mm(found.state)
@@ -290,6 +275,18 @@ class Path:
         )
         self.curve.append(self.plate)
         return True
+
+    def _descended(self, outside: FloatArray) -> Converged | None:
+        """Equilibrium under forces; what touches on the way does so from where it was the step before."""
+
+        def changed(state: FloatArray, forces: FloatArray) -> bool:
+            touched = self._changed(state, forces)
+            self.contact.begin(state)
+            return touched
+
+        return descend(
+            self.assembler, self.solver, self.state, outside, self.tolerance, changed, self.tell, self.extent_mm
+        )
 
     def _area_mm2(self) -> float:
         """Area of the faces of which every corner holds to the plate, as they are now."""

@@ -18,6 +18,7 @@ from dvc.onmesh import OnMesh
 from dvc.regions import SHEAR_THRESHOLDS, volume_above
 from dvc.whole import whole_file, write_whole
 from fe.materials import Material
+from fe.model import CROWDED
 from fe.simulate import State
 
 _SHARES = (0.5, 0.9, 0.99)
@@ -104,6 +105,8 @@ class RegionFigures:
         Of the whole region, as a share of its volume.
     stable_share : float
         Share of the volume in which the law is stable (Drucker) at the strain reached.
+    crowded_share : float
+        Share of the volume with det F below `fe.model.CROWDED`, where the solver holds cells open beyond their law.
     """
 
     load: str
@@ -119,6 +122,7 @@ class RegionFigures:
     above_ml: tuple[float, ...]
     volume_change: float
     stable_share: float
+    crowded_share: float
 
 
 def region_figures(mesh: TetMesh, state: State, laws: Mapping[str, Material]) -> list[RegionFigures]:
@@ -139,6 +143,7 @@ def region_figures(mesh: TetMesh, state: State, laws: Mapping[str, Material]) ->
                 tuple(volume_above(shear, volumes / 1000.0, SHEAR_THRESHOLDS).tolist()),
                 float(volumes @ strain.jacobian[cells] / volumes.sum()) - 1.0,
                 float(volumes[stable].sum() / volumes.sum()),
+                float(volumes[strain.jacobian[cells] < CROWDED].sum() / volumes.sum()),
             )
         )  # fmt: skip
     return rows
@@ -165,7 +170,8 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
     above = [f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS]
     writer.writerow(
         ["load", "reached", "region", "volume_ml", "max_shear_p50", "max_shear_p90", "max_shear_p99",
-         "von_mises_p50_mpa", "von_mises_p90_mpa", "von_mises_p99_mpa", *above, "volume_change", "stable_share"]
+         "von_mises_p50_mpa", "von_mises_p90_mpa", "von_mises_p99_mpa", *above, "volume_change", "stable_share",
+         "crowded_share"]
     )  # fmt: skip
     for row in rows:
         numbers = (
@@ -173,7 +179,14 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
             row.stress_p50_mpa, row.stress_p90_mpa, row.stress_p99_mpa, *row.above_ml, row.volume_change,
         )  # fmt: skip
         writer.writerow(
-            [row.load, f"{row.reached:.4g}", row.region, *(f"{v:.6g}" for v in numbers), f"{row.stable_share:.6g}"]
+            [
+                row.load,
+                f"{row.reached:.4g}",
+                row.region,
+                *(f"{v:.6g}" for v in numbers),
+                f"{row.stable_share:.6g}",
+                f"{row.crowded_share:.6g}",
+            ]
         )
     write_whole(path, text.getvalue())
 

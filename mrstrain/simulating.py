@@ -19,6 +19,7 @@ from fe.elements import TOLD
 from fe.elements import element as formulation
 from fe.materials import MODES, Material
 from fe.meshstore import read_tet_mesh
+from fe.model import CROWDED
 from fe.plate import Plate
 from fe.published import MaterialSet, material_set
 from fe.restart import ENDING
@@ -40,6 +41,7 @@ Told = Callable[[str, str, float], None]
 _TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
 _FAR = 0.05  # det F of a patch further from 1 than this is counted
 _MUCH = 0.05  # share of the volume above which that is told
+_CROWD = 0.01  # share of a region's volume, squeezed flat, above which that is told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -297,6 +299,13 @@ def _written(
         if row.stable_share < 1.0
     )
     notes += unstable
+    notes += tuple(
+        f"{row.load}: {row.crowded_share:.1%} of {row.region} is squeezed below det F {CROWDED:g}, where the solver "
+        "holds cells open; the law bears no pressure above its bulk modulus "
+        f"({laws[row.region].bulk_modulus_mpa:.2g} MPa)."
+        for row in rows
+        if row.crowded_share > _CROWD
+    )
     tried = {state.load.name for state in states}
     notes += tuple(
         f"{load.name} was not tried: the load before it was not reached." for load in loads if load.name not in tried

@@ -9,12 +9,10 @@ from scipy.spatial.transform import Rotation
 from dvc.errors import InputError
 from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
-from fe.elements import element
 from fe.materials import NeoHooke, Ogden
-from fe.model import Model
 from fe.newton import Tolerance
-from fe.path import Path, PlateState
 from fe.plate import Plate
+from fe.result import region_figures
 from fe.simulate import LoadStep, State, simulate
 from tests.blocks import block
 from tests.test_assembly import needs_ngsolve
@@ -162,30 +160,6 @@ def test_balance_alone_does_where_steps_do_not_get_small(sheared: list[State]) -
     assert np.abs(state.u_mm - sheared[0].u_mm).max() < 1e-3
 
 
-def test_a_plate_that_hardly_gets_on_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a rule under which every plate hardly does; where it has come to is kept."""
-    monkeypatch.setattr("fe.path._CREEPING", 2)
-    monkeypatch.setattr("fe.path._LEAST_WAY", 0.9)
-    monkeypatch.setattr("fe.path._LEAST_TRAVEL_MM", 100.0)
-    log: list[str] = []
-    (state,) = press(dome(), [LoadStep("pressed", 40.0)], tell=log.append)
-    assert 0.0 < state.reached < 1.0
-    assert state.force_n[0] == pytest.approx(40.0 * state.reached, rel=1e-3)
-    assert any(line.startswith("given up: 2 steps made") for line in log)
-
-
-@pytest.mark.parametrize(
-    ("each_n", "each_mm", "creeps"),
-    [(0.05, 0.02, True), (0.05, 0.6, False), (0.2, 0.02, False)],  # the second is soft tissue that is first touched
-)
-def test_creeping_is_neither_force_nor_travel(each_n: float, each_mm: float, creeps: bool) -> None:
-    path = Path(Model.of(dome(), LAWS, element("P1")), dome(), Plate(DOWN, ALONG), ["bone"], 1, Tolerance(), print)
-    zero = np.zeros(3)
-    path.curve = [PlateState(np.full(3, n * each_mm), np.array([n * each_n, 0, 0]), zero, zero, 0.0) for n in range(11)]
-    assert path._creeps(140.0, since=1) == creeps
-    assert not path._creeps(140.0, since=2)  # one of the ten belongs to what was done before
-
-
 def test_normal_first_then_shear() -> None:
     alone, after = (press(dome(), loads)[-1] for loads in ([SHEARED], [*PRESS, SHEARED]))
     assert np.abs(alone.u_mm - after.u_mm).max() < 1e-6
@@ -317,3 +291,18 @@ def test_the_plate_travels_its_gap_first(sheared: list[State]) -> None:
 def test_a_gap_must_not_be_negative() -> None:
     with pytest.raises(InputError, match="0 mm or more"):
         Plate(DOWN, ALONG, gap_mm=-1.0)
+
+
+def test_where_stiff_skin_buckles_over_soft_fat_the_way_goes_downhill(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A published pair of laws, skin a thousand times as stiff as fat; without the way down a third is reached."""
+    soft = {"skin": NeoHooke.of(0.3247, nu=0.495), "fat": NeoHooke.of(0.00029, nu=0.495)}
+    loads = [LoadStep("pressed", 10.0)]
+    (there,) = press(dome((5, 8, 8)), loads, soft)
+    assert there.reached == 1.0
+    assert there.force_n == pytest.approx([10.0, 0.0, 0.0], abs=0.01)
+    crowded = {row.region: row.crowded_share for row in region_figures(dome((5, 8, 8)), there, soft)}
+    assert crowded["skin"] == 0.0
+    assert 0.01 < crowded["fat"] < 0.5
+    monkeypatch.setattr("fe.path.descend", lambda *_: None)
+    (before,) = press(dome((5, 8, 8)), loads, soft)
+    assert before.reached < 0.5

@@ -118,6 +118,17 @@ def test_loads_that_cannot_be_reached_are_marked_in_every_file(mesh_file: Path, 
     assert (out / "luboz" / "mine.csv").read_text() == "kept"
 
 
+def test_tissue_squeezed_beyond_its_law_is_told(mesh_file: Path, tmp_path: Path) -> None:
+    told = {}
+    for name in ("friedman", "luboz"):  # fat's bulk modulus 0.029 and 0.5 MPa; pressure 0.025 MPa over the whole face
+        given = ["simulate", str(mesh_file), "--set", name, "--load", "a=10", *PLATE, "--out", str(tmp_path / name)]
+        told[name] = CliRunner().invoke(app, given).output
+    assert re.search(
+        r"a: \d+\.\d% of fat is squeezed below det F 0\.4, .*its bulk modulus \(0\.029 MPa\)", told["friedman"]
+    )
+    assert "squeezed below" not in told["luboz"]
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

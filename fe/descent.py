@@ -1,0 +1,152 @@
+"""Downhill to equilibrium, where Newton's method loses its way: a stiff skin that buckles over soft fat.
+
+At such a load the next equilibrium is far, and in between the tangent has directions along which a step of Newton's
+goes against the forces. A body without inertia in a viscous medium goes with them: c V du/dt = forces out of balance,
+V the nodes' volumes. Implicit steps of it, (K + d V) du = forces with d = c / dt, are Newton's as d -> 0
+(pseudo-transient continuation; Kelley and Keyes 1998, doi:10.1137/S0036142996304796). d rises where a step would go
+against the forces, or the tangent foretells badly what is left of them, and falls where it foretells well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from fe.assembly import Assembler
+from fe.linear import SingularError, Solver
+from fe.newton import LEAST_VOLUME, Converged, Tolerance, out_of_balance, reaction
+
+_FIRST, _RISE = 1e-5, 4.0  # damping d at the start, N/mm4, and how much more there is of it for a step that will not do
+_MOST_STEPS = 300
+_LARGEST_MM, _TOO_FAR_MM = 1.0, 3.0  # a longer step is shortened to that; a step that long is damped more
+_MOST_GROWTH = 3.0  # of the forces out of balance in one step
+# Of d after a step, by the share of those forces that was not foretold; of cells that are nearly flat it never is well.
+_CHANGES = ((0.1, 0.2), (0.5, 1.0 / 3.0), (1.0, 0.5), (3.0, 1.0), (np.inf, 2.0))
+_BORNE = 0.5  # share of the forces that the medium may still take in the last step
+_ACCURACY = 1e-3  # of linear solutions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """A step that was tried: where it leads, with which forces, and by how much its tangent was wrong.
+
+    Attributes
+    ----------
+    wrong, borne : float
+        Forces not foretold, and those that the medium takes, as shares of the forces out of balance before.
+    after_n : float
+        Out of balance there, N.
+    """
+
+    state: FloatArray
+    forces: FloatArray
+    residual: FloatArray
+    lowest: float
+    largest_mm: float
+    wrong: float
+    borne: float
+    after_n: float
+
+
+def descend(
+    assembler: Assembler,
+    solver: Solver,
+    state: FloatArray,
+    outside: FloatArray,
+    tolerance: Tolerance,
+    changed: Callable[[FloatArray, FloatArray], bool] = lambda _state, _forces: False,
+    told: Callable[[str], None] = lambda _: None,
+    farthest_mm: float = np.inf,
+) -> Converged | None:
+    """Find the state in balance with forces from outside to which a body in a viscous medium comes.
+
+    Parameters
+    ----------
+    assembler, solver, state, outside, tolerance, told
+        As in `fe.newton.equilibrium`; no unknown is prescribed.
+    changed : callable
+        As there; asked after every step.
+    farthest_mm : float
+        Given up where a node has moved by more, mm.
+
+    Returns
+    -------
+    Converged or None
+        None if it is not found in 300 steps.
+    """
+    now, damping = state.copy(), _FIRST
+    forces, residual, lowest = assembler.residual(now)
+    if not lowest > 0.0:
+        return None
+    tangent = assembler.tangent(now)
+    for count in range(1, _MOST_STEPS + 1):
+        before_n = out_of_balance(outside - residual, assembler)
+        step = _tried(assembler, solver, now, tangent, outside, residual, damping)
+        if step is None or step.after_n > _MOST_GROWTH * before_n:
+            damping *= _RISE
+            continue
+        now, forces, residual = step.state, step.forces, step.residual
+        balance = step.after_n / max(reaction(assembler, forces), 1e-9)
+        told(
+            f"    downhill {count}: out of balance {balance:.1e}, step {step.largest_mm:.1e} mm, least det F "
+            f"{step.lowest:.3f}, damping {damping:.1e}"
+        )
+        moved_mm = float(np.abs(now[: 3 * len(assembler.model.space.nodes_mm)]).max())
+        if moved_mm > farthest_mm:
+            told(f"    given up: a node has moved by {moved_mm:.0f} mm, and the body is not that large")
+            return None
+        damping *= next(factor for limit, factor in _CHANGES if step.wrong <= limit)
+        if changed(now, forces):
+            forces, residual, _ = assembler.residual(now)
+        elif balance <= tolerance.force and step.largest_mm <= tolerance.step_mm and step.borne <= _BORNE:
+            return Converged(now, forces, count)
+        tangent = assembler.tangent(now)
+    return None
+
+
+def _tried(
+    assembler: Assembler,
+    solver: Solver,
+    now: FloatArray,
+    tangent: FloatArray,
+    outside: FloatArray,
+    residual: FloatArray,
+    damping: float,
+) -> _Step | None:
+    """A damped step from a state with that tangent and residual; None where it goes against the forces, or folds."""
+    model = assembler.model
+    right = outside - residual
+    right[assembler.idle] = 0.0
+    volumes = np.concatenate([np.repeat(model.node_volumes_mm3, 3), np.zeros(model.space.pressures)])
+    medium = damping * assembler.by_equation(volumes)
+    data = tangent.copy()
+    data[assembler.indptr[:-1]] += medium  # the diagonal stands first in its row
+    try:
+        change = solver.solve(data, right, _ACCURACY)
+    except SingularError:
+        return None
+    moves = assembler.spread(change)
+    longest_mm = float(np.abs(moves[: len(volumes) - model.space.pressures]).max())
+    # Twice the energy of the step in a body that is stiffer by the medium; that of a step uphill is below zero.
+    energy = float((change * right) @ np.where(assembler.force_equations, 1.0, -1.0))
+    if not (energy > 0.0 and longest_mm <= _TOO_FAR_MM):
+        return None
+    share = _LARGEST_MM / max(longest_mm, _LARGEST_MM)
+    forces, left, lowest = assembler.residual(now + share * moves)
+    if not lowest > LEAST_VOLUME:
+        return None
+    borne = share * medium * change
+    before_n = max(out_of_balance(right, assembler), 1e-300)
+    return _Step(
+        now + share * moves,
+        forces,
+        left,
+        lowest,
+        share * longest_mm,
+        out_of_balance(outside - left - (1.0 - share) * right - borne, assembler) / before_n,
+        out_of_balance(borne, assembler) / before_n,
+        out_of_balance(outside - left, assembler),
+    )
