@@ -1,4 +1,4 @@
-"""How alike two images on one grid are in their local structure, and how alike their noise lets them be."""
+"""How alike two images on one grid are: in local structure, beside what their noise allows, and but for an offset."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from dvc.image import Image, Mask
 from dvc.resample import fill_missing
 
 _WINDOW_MM = 2.5
+_BRIGHT = 75.0  # percentile of the tissue that stands for its brightness
+_FEWEST = 1000  # voxels
+_LEAST = 1e-5  # eigenvalue of normal equations, over their trace, below which there is no contrast
 
 
 def local_correlation(a: Image, carried: Float32Array, mask: Mask) -> tuple[Float32Array, float]:
@@ -81,3 +84,39 @@ def most_similarity(
         mean, square = (gaussian_filter(part, sigma, mode="constant") / weight for part in (x, x * x))
         shares.append(s**2 / max(float((square - mean**2)[known].mean()), 1e-12))
     return lambda factor: float(np.sqrt(np.prod([max(0.0, 1.0 - factor**2 * share) for share in shares])))
+
+
+def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float = 0.0) -> float:
+    """How much of one image's brightness is an offset to the other's, and no factor of it.
+
+    Fitted is ``carried = g(X) a + o(X)`` with g and o linear in X, by least squares in which the noise of ``a``, known
+    beforehand, does not lower g (Fuller, Measurement Error Models, 1987, section 2.2).
+
+    Parameters
+    ----------
+    a, carried, mask
+        As in `local_correlation`.
+    noise : float
+        Standard deviation of the noise of ``a``, in its unit.
+
+    Returns
+    -------
+    float
+        95th percentile of abs(o) over the mask, as a share of the tissue's brightness (75th percentile of ``carried``);
+        NaN where the mask has too few voxels that both know, or no contrast beyond the noise.
+    """
+    box = mask.box()
+    known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
+    at = np.argwhere(known)
+    if len(at) < _FEWEST:
+        return float("nan")
+    x, y = (values[box][known].astype(np.float64) for values in (a.values, carried))
+    size, bright = float(np.abs(x).max()), float(np.percentile(y, _BRIGHT))
+    linear = np.column_stack([np.ones(len(at)), 2.0 * at / np.maximum(at.max(axis=0), 1) - 1.0])
+    both = np.hstack([linear * (x / size)[:, None], linear])
+    normal = both.T @ both
+    normal[:4, :4] -= (noise / size) ** 2 * (linear.T @ linear)
+    if not (bright > 0.0 and np.linalg.eigvalsh(normal).min() > _LEAST * np.trace(normal)):
+        return float("nan")
+    offset = linear @ np.linalg.solve(normal, both.T @ y)[4:]
+    return float(np.percentile(np.abs(offset), 95)) / bright

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.gaussnewton import Choice
@@ -22,7 +22,7 @@ from dvc.regions import region_statistics, write_regions_csv
 from dvc.registration import Registration
 from dvc.report import Picture, Section
 from dvc.resample import carry, shows
-from dvc.similarity import local_correlation, most_similarity
+from dvc.similarity import brightness_offset, local_correlation, most_similarity
 from dvc.strainmaps import StrainMaps, strain_maps
 from dvc.tissue import tissue_mask
 from dvc.transformwrite import write_elastix_transform, write_itk_transform
@@ -128,10 +128,20 @@ def write_case(
         floor = noise_floor(maps, _soft(measured))
     bone = found.bone if found.alignment.on == "bone" else None
     errors = None if landmarks is None else target_registration_error(found.total, *landmarks)
+    noise = _noise_in_air(found)
+    offset = float("nan")
+    if found.settings.needs_one_contrast:
+        offset = brightness_offset(reference, registered, both, noise[0] if noise else 0.0)
     quality = assess(
-        maps, found.tissue, bone, similarity=(as_scanned, rigid, after),
-        most_similarity=_most_similarity(found, registered, both), landmark_errors_mm=errors, floor=floor,
-    )  # fmt: skip
+        maps,
+        found.tissue,
+        bone,
+        similarity=(as_scanned, rigid, after),
+        most_similarity=most_similarity(reference, registered, both, noise) if noise else None,
+        offset=offset,
+        landmark_errors_mm=errors,
+        floor=floor,
+    )
     view = page.view_of(subject, maps)
     labels = _regions(measured)
     bars = error_bars(found, subject, maps, model)
@@ -151,17 +161,15 @@ def write_case(
     return _written(folder, measured, maps, quality, pictures, _alignment(found), record, more, bars, found.choice)
 
 
-def _most_similarity(found: Registration, registered: Float32Array, where: Mask) -> Callable[[float], float] | None:
-    """What the noise in the air of both images leaves of their similarity; None where there is no such air."""
+def _noise_in_air(found: Registration) -> tuple[float, float] | None:
+    """Of both images; None where there is no such air."""
     reference, loaded = found.reference, found.loaded
     try:
         body = Mask(reference.grid, found.tissue.inside | tissue_mask(reference).inside)
         noise = noise_in_air(reference, body), noise_in_air(loaded, tissue_mask(loaded))
     except InputError:  # no threshold finds the body
         return None
-    if noise[0] is None or noise[1] is None:
-        return None
-    return most_similarity(reference, registered, where, (noise[0], noise[1]))
+    return None if noise[0] is None or noise[1] is None else (noise[0], noise[1])
 
 
 def write_measured(folder: Path, measured: Measured, record: Mapping[str, object]) -> Case:

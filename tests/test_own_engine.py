@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dvc.errors import ParameterError, RegistrationError
@@ -66,6 +67,23 @@ def test_another_persons_heel_is_not_trusted(written, small_pair, tmp_path):
     assert lacks < 0.03
     assert right["verdict"]["level"] == "trust"
     assert not results.failures
+
+
+def test_an_offset_of_brightness_is_not_trusted(written, small_pair, tmp_path):
+    """It is taken for motion, and nothing else tells: tissue's texture is as alike as ever."""
+    loaded = small_pair.loaded
+    rising = np.linspace(0.0, 0.3, loaded.grid.shape[1])[:, None] * np.percentile(loaded.values, 90)
+    write_image(tmp_path / "Load1.nii.gz", Image(loaded.grid, (loaded.values + rising).astype(np.float32)))
+    run(
+        written / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "out", bone=written / "bone.nii.gz",
+        threads=1,
+    )  # fmt: skip
+    told = json.loads((tmp_path / "out" / "Load1" / "quality.json").read_text())
+    right = json.loads((written / "out" / "Load1" / "quality.json").read_text())
+    name = "offset_between_images_over_brightness"
+    assert right[name] < 0.05
+    assert told[name] > 0.1
+    assert any("by an offset of" in reason for reason in told["verdict"]["reasons"])
 
 
 def test_error_bars_are_the_engines_own(written):

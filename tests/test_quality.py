@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from dvc.deformation import Affine, RigidMotion, SampledDisplacement, Within
 from dvc.image import Grid, Image, Mask
 from dvc.noise import noise_in_air
 from dvc.quality import assess, noise_floor
-from dvc.similarity import local_correlation, most_similarity
+from dvc.similarity import brightness_offset, local_correlation, most_similarity
 from dvc.strainmaps import strain_maps
 
 GRID = Grid((24, 20, 16), np.array([1.0, 1.2, 1.5]), np.array([-10.0, 5.0, 0.0]))
@@ -105,6 +106,32 @@ def test_what_noise_does_not_explain_costs_trust(lacks: float, with_more_noise: 
     ).verdict  # fmt: skip
     assert verdict.level == level
     assert all("same foot" in reason for reason in verdict.reasons)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.2])
+@pytest.mark.parametrize("noise", [0.0, 0.15])
+def test_an_offset_is_told_from_a_gain_that_varies(noise: float, offset: float) -> None:
+    rng = np.random.default_rng(3)
+    grid = Grid((40, 36, 32), (1.6, 1.6, 1.6), (0.0, 0.0, 0.0))
+    tissue = 1.0 + 0.3 * np.sign(gaussian_filter(rng.normal(size=grid.shape), 2.0))
+    along = np.linspace(-1.0, 1.0, 40)[:, None, None]
+    loaded = ((1.0 + 0.3 * along) * tissue + offset * along + noise * rng.normal(size=grid.shape)).astype(np.float32)
+    reference = Image(grid, (tissue + noise * rng.normal(size=grid.shape)).astype(np.float32))
+    mask = Mask(grid, np.ones(grid.shape, dtype=bool))
+    found = brightness_offset(reference, loaded, mask, noise)
+    assert found == pytest.approx(0.95 * offset / float(np.percentile(loaded, 75)), abs=0.02)
+    if noise:  # it lowers the gain, which seems an offset where it is not taken into account
+        assert brightness_offset(reference, loaded, mask) > found + 0.04
+    flat = Image(grid, np.full(grid.shape, 2.0, dtype=np.float32))
+    assert np.isnan(brightness_offset(flat, loaded, mask))
+
+
+@pytest.mark.parametrize(
+    ("offset", "level"), [(0.06, "trust"), (0.09, "caution"), (0.13, "distrust"), (np.nan, "trust")]
+)
+def test_an_offset_between_the_images_costs_trust(offset: float, level: str) -> None:
+    quality = assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.3, 0.5, 0.9), offset=offset)
+    assert quality.verdict.level == level
 
 
 @pytest.mark.parametrize(("slice_mm", "level"), [(2.0, "trust"), (4.0, "caution"), (6.0, "distrust")])
