@@ -54,8 +54,8 @@ class Settings:
     seed : int
         Seed of every random number.
     threads : int
-        Threads of each worker. elastix' results are equal bit for bit on equal numbers of threads, those of
-        Gauss-Newton, after the bone's alignment, on any.
+        Threads of each worker. Results are equal bit for bit on equal numbers of threads; what Gauss-Newton adds to
+        the correction of shading and the bone's alignment is so on any.
     gauss_newton : GaussNewton, optional
         Parameters of our own engine, which then takes the place of elastix and the presets.
     borders : AtBorders, optional
@@ -106,11 +106,11 @@ class Settings:
 
     def of_repeat(self) -> Settings:
         """For a repeat scan: a weight chosen for it alone would smooth away the noise that it is to show."""
-        own = self.gauss_newton
-        if own is None or own.bending is not None:
+        if self.gauss_newton is None:
             return self
+        own = replace(self.gauss_newton, bending=self.gauss_newton.bending or USUAL_BENDING)
         borders = None if self.borders is None else replace(self.borders, skin=self.borders.skin or USUAL_SKIN)
-        return replace(self, gauss_newton=replace(own, bending=USUAL_BENDING), borders=borders)
+        return replace(self, gauss_newton=own, borders=borders)
 
     @classmethod
     def of(cls, name: str = GAUSS_NEWTON, **others: object) -> Settings:
