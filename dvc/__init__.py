@@ -4,6 +4,7 @@ The public surface. All geometry is LPS mm in the reference (unloaded) configura
 """
 
 from dvc.align import Alignment
+from dvc.borders import BorderedSpline
 from dvc.bspline import BSpline
 from dvc.deformation import (
     Affine,
@@ -26,6 +27,7 @@ from dvc.meshfile import MeshFile, read_mesh
 from dvc.presets import Preset, load_preset, preset_names, read_parameter_file
 from dvc.quality import Quality, assess, noise_floor
 from dvc.registration import Registration, Settings, register
+from dvc.sharpen import AtBorders
 from dvc.similarity import local_correlation
 from dvc.strainmaps import StrainMaps, strain_maps
 from dvc.tissue import tissue_mask
@@ -35,7 +37,9 @@ from dvc.verdict import Verdict
 __all__ = [
     "Affine",
     "Alignment",
+    "AtBorders",
     "BSpline",
+    "BorderedSpline",
     "Composed",
     "Deformation",
     "Grid",

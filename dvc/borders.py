@@ -6,7 +6,7 @@ right up to them. One B-spline for all carries that strain over the border, as f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
@@ -23,6 +23,8 @@ _SURE = 0.03  # of the blurred mask: between that and its complement the border'
 _NEAR = 1.0  # voxels
 _EVEN = 0.7  # voxels
 _LEAST_MM = 0.05  # every voxel stays on its own side of the border
+NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm": _LEAST_MM}
+"""Every number that decides where a border lies, for a record."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +92,10 @@ class Borders:
         )
         rest = int(np.flatnonzero(tissues == -1)[0]) if bool((tissues == -1).any()) else -1
         return cls(labels.grid, frozen(depth, np.float64), frozen(own, np.int64), rest, float(reach_mm))
+
+    def turned(self, rotation: FloatArray) -> Borders:
+        """The borders of a body that is turned about the world's origin."""
+        return replace(self, grid=self.grid.moved_by(rotation, np.zeros(3)))
 
     def at_voxels(self) -> FloatArray:
         """Factors at the voxels, (ni, nj, nk, 2, 4): of m and psi the value, and the gradient along the grid's axes.
@@ -200,14 +206,32 @@ class BorderedSpline:
         """Control points of both splines."""
         return self.smooth.control
 
+    def turned(self, rotation: FloatArray) -> BorderedSpline:
+        """The same displacement of a body that is turned, with its borders, about the world's origin."""
+        return BorderedSpline(self.smooth.turned(rotation), self.jump.turned(rotation), self.borders.turned(rotation))
+
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the splines' valid region."""
-        return self.evaluate(points_mm)[0]
+        points = np.asarray(points_mm, dtype=np.float64)
+        u = np.empty((len(points), 3))
+        for start in range(0, len(points), _CHUNK):
+            some = points[start : start + _CHUNK]
+            m, psi = np.moveaxis(self.borders.at(some)[..., 0], 1, 0)
+            u[start : start + _CHUNK] = m[:, None] * self.smooth.displacement(some) + psi[
+                :, None
+            ] * self.jump.displacement(some)
+        return u
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the splines' valid region."""
         points = np.asarray(points_mm, dtype=np.float64)
-        return self._joined(points, (self.smooth.evaluate(points), self.jump.evaluate(points)))
+        u, H = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        for start in range(0, len(points), _CHUNK):
+            some = slice(start, start + _CHUNK)
+            u[some], H[some] = self._joined(
+                points[some], self.smooth.evaluate(points[some]), self.jump.evaluate(points[some])
+            )
+        return u, H
 
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid, in the order of ``np.argwhere(where)``.
@@ -217,20 +241,34 @@ class BorderedSpline:
         InputError
             If ``where`` does not have the shape of ``grid``.
         """
-        parts = self.smooth.evaluate_on_grid(grid, where), self.jump.evaluate_on_grid(grid, where)
-        return self._joined(grid.points(where), parts)
+        if where.shape != grid.shape:
+            raise InputError(f"The mask 'where' has shape {where.shape}; its grid has {grid.shape}.")
+        step = max(1, _CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: memory stays that of the result
+        found = []
+        for start in range(0, grid.shape[0], step):
+            box = (slice(start, start + step), slice(None), slice(None))
+            here, part = grid.part(box), where[box]
+            found.append(
+                self._joined(
+                    here.points(part), self.smooth.evaluate_on_grid(here, part), self.jump.evaluate_on_grid(here, part)
+                )
+            )
+        return np.concatenate([u for u, _ in found]), np.concatenate([H for _, H in found])
 
     def _joined(
-        self, points: FloatArray, parts: tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+        self, points: FloatArray, smooth: tuple[FloatArray, FloatArray], jump: tuple[FloatArray, FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        u, H = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
-        for start in range(0, len(points), _CHUNK):
-            some = slice(start, start + _CHUNK)
-            factors = self.borders.at(points[some])
-            value, slope = factors[..., 0], factors[..., 1:]
-            u[some] = sum(value[:, f, None] * part[0][some] for f, part in enumerate(parts))
-            H[some] = sum(
-                value[:, f, None, None] * part[1][some] + part[0][some][:, :, None] * slope[:, f, None, :]
-                for f, part in enumerate(parts)
-            )
-        return u, H
+        """Join u and H of both splines at the same points."""
+        factors = self.borders.at(points)
+        value, slope = factors[..., 0], factors[..., 1:]
+        parts = (smooth, jump)
+        u = sum(value[:, f, None] * part[0] for f, part in enumerate(parts))
+        H = sum(
+            value[:, f, None, None] * part[1] + part[0][:, :, None] * slope[:, f, None, :]
+            for f, part in enumerate(parts)
+        )
+        return np.asarray(u), np.asarray(H)
+
+
+Spline = BSpline | BorderedSpline
+"""What a registration finds: one B-spline, or two that know the tissues' borders."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.linalg import solve_banded
@@ -102,17 +101,21 @@ class Choice:
         Mean square residual of the half of the voxels that was left out, over that of the best.
     tried_in_skin : tuple of (rigidity, left-out residual)
         Likewise for the weight of strain in the skin, where borders of tissues are known.
+    rigidity_of : {"bone", "skin"}
+        Whose strain the weight "rigidity" is of.
     """
 
     weights: Weights
     rule: str
     tried: tuple[tuple[float, float], ...] = ()
     tried_in_skin: tuple[tuple[float, float], ...] = ()
+    rigidity_of: str = "bone"
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
         told: dict[str, object] = {
             "weights": asdict(self.weights),
+            "rigidity_of": self.rigidity_of,
             "rule": self.rule,
             "tried": [{"bending": b, "left_out_over_best": round(v, 6)} for b, v in self.tried],
         }
@@ -129,7 +132,7 @@ def fit(
     bone: Mask | None,
     options: GaussNewton,
     start: Deformation | None = None,
-    progress: str | None = None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[BSpline, Choice]:
     """Find the displacement that carries the fixed image to the moving one.
 
@@ -146,8 +149,8 @@ def fit(
     options : GaussNewton
     start : Deformation, optional
         First guess, u in mm LPS; where it is not defined its nearest value is taken.
-    progress : str, optional
-        Path of a file that tells the share that is done.
+    progress : callable, optional
+        Gets the share that is done.
 
     Returns
     -------
@@ -162,7 +165,6 @@ def fit(
     RegistrationError
         If it diverges.
     """
-    tell = _teller(progress)
     scale = float(np.nanpercentile(fixed.values[body.inside], 75))
     if not scale > 0:
         raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
@@ -183,16 +185,16 @@ def fit(
         )
         level = _level(pictures, inside.inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
-        tell((number + 1) / (len(LEVELS) + 2))
+        progress((number + 1) / (len(LEVELS) + 2))
     choice = Choice(weights, "fixed beforehand")
     if options.bending is None:
         part = _middle(inside.inside)
         choice = choose(
             Level(*pictures, inside.inside & part, soft & part, core & part, control), coefficients, weights
         )
-        tell((len(LEVELS) + 1) / (len(LEVELS) + 2))
+        progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
         coefficients = level.descend(coefficients, choice.weights, steps=_LAST_STEPS, stop_mm=LEVELS[-1][-1])
-    tell(1.0)
+    progress(1.0)
     return BSpline(control, turned(axes, coefficients)), choice
 
 
@@ -317,11 +319,3 @@ def turned(rotation: FloatArray, coefficients: FloatArray) -> FloatArray:
     """Coefficients (3, ...) of a displacement in rotated axes; sums in a fixed order, as BLAS would not do it."""
     x, y, z = coefficients
     return np.stack([row[0] * x + row[1] * y + row[2] * z for row in rotation])
-
-
-def _teller(path: str | None) -> Callable[[float], None]:
-    def tell(share: float) -> None:
-        if path is not None:
-            Path(path).write_text(f"{share:.3f}")
-
-    return tell

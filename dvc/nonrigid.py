@@ -5,19 +5,22 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from dvc import elastix
 from dvc.align import Alignment
+from dvc.borders import Spline
 from dvc.bspline import BSpline
 from dvc.deformation import Deformation
 from dvc.errors import ParameterError, RegistrationError
 from dvc.gaussnewton import Choice, GaussNewton, fit
-from dvc.image import Grid, Image, Mask
+from dvc.image import Grid, Image, LabelMap, Mask
 from dvc.presets import Preset
 from dvc.resample import fill_missing
+from dvc.sharpen import AtBorders, fit_with_borders
 from dvc.tissue import widened
 from dvc.transformfile import bspline_from_elastix
 from dvc.transformwrite import write_elastix_transform
@@ -87,30 +90,44 @@ def by_gauss_newton(
     start: Deformation | None,
     worker: Worker,
     tell: Callable[[float], None],
-) -> tuple[BSpline, Choice]:
-    """Displacement by our own engine, begun at ``start`` if there is one; ``bone`` stays rigid."""
+    borders: tuple[AtBorders, LabelMap] | None = None,
+) -> tuple[Spline, Choice]:
+    """Displacement by our own engine, begun at ``start`` if there is one; ``bone`` stays rigid.
+
+    With ``borders``, the tissues on the reference grid, strain may jump where they meet.
+    """
     whole, box = _compared(reference, body)
     mask = _cut(whole, box)
-    rigid = None if bone is None else _cut(bone, box)
-    fixed = Image(mask.grid, reference.values[box])
+    given = (
+        Image(mask.grid, reference.values[box]),
+        _moved_back(loaded, alignment),
+        mask,
+        _cut(body, box),
+        None if bone is None else _cut(bone, box),
+    )
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
         done = Path(folder) / "share done"
         done.write_text("0")
-        found = worker.run(
-            "registering with gauss-newton",
-            fit,
-            fixed,
-            _moved_back(loaded, alignment),
-            mask,
-            _cut(body, box),
-            rigid,
-            options,
-            start,
-            str(done),
-            watch=lambda: tell(float(done.read_text() or 0)),
-        )
+
+        def run(engine: Callable[..., tuple[Spline, Choice]], *more: object) -> tuple[Spline, Choice]:
+            return worker.run(
+                "registering with gauss-newton", engine, *given, *more, start, partial(_note, str(done)),
+                watch=lambda: tell(float(done.read_text() or 0)),
+            )  # fmt: skip
+
+        if borders is None:
+            found = run(fit, options)
+        else:
+            at_borders, labels = borders
+            here = LabelMap(mask.grid, labels.labels[box], labels.names)
+            found = run(fit_with_borders, here, options, at_borders)
     tell(1.0)
     return found
+
+
+def _note(path: str, share: float) -> None:
+    """Write the share that is done where the process that waits looks for it."""
+    Path(path).write_text(f"{share:.3f}")
 
 
 def without_gaps(image: Image) -> tuple[Image, Mask | None]:

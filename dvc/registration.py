@@ -20,20 +20,22 @@ from scipy.spatial.transform import Rotation
 from dvc import elastix
 from dvc.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.arrays import FloatArray
+from dvc.borders import Spline
 from dvc.bspline import BSpline
-from dvc.deformation import Composed, Deformation, Within
+from dvc.deformation import Composed, Deformation, RigidMotion, Within
 from dvc.errors import InputError, ParameterError
 from dvc.gaussnewton import USUAL_BENDING, Choice, GaussNewton
-from dvc.image import Image, Mask
+from dvc.image import Image, LabelMap, Mask
 from dvc.nonrigid import by_elastix, by_gauss_newton, without_gaps
 from dvc.presets import Preset, load_preset, preset_or_file
 from dvc.resample import fill_missing
 from dvc.shading import without_shading
+from dvc.sharpen import USUAL_SKIN, AtBorders
 from dvc.tissue import tissue_mask
 from dvc.worker import Worker
 
 Progress = Callable[[str, float], None]
-_Scan = TypeVar("_Scan", Image, Mask)
+_Scan = TypeVar("_Scan", Image, Mask, LabelMap)
 
 GAUSS_NEWTON = "gauss-newton"
 """Name of our own engine, where elastix has presets."""
@@ -52,10 +54,17 @@ class Settings:
     seed : int
         Seed of every random number.
     threads : int
-        Threads of each worker. elastix' results are equal bit for bit on equal numbers of threads, those of
-        Gauss-Newton, after the bone's alignment, on any.
+        Threads of each worker. Results are equal bit for bit on equal numbers of threads; what Gauss-Newton adds to
+        the correction of shading and the bone's alignment is so on any.
     gauss_newton : GaussNewton, optional
         Parameters of our own engine, which then takes the place of elastix and the presets.
+    borders : AtBorders, optional
+        Our own engine then lets strain jump at the borders of the tissues of a label map.
+
+    Raises
+    ------
+    ParameterError
+        If borders are asked of elastix.
     """
 
     presets: tuple[Preset, ...] = ()
@@ -63,6 +72,14 @@ class Settings:
     seed: int = 1
     threads: int = 1
     gauss_newton: GaussNewton | None = None
+    borders: AtBorders | None = None
+
+    def __post_init__(self) -> None:
+        if self.borders is not None and self.gauss_newton is None:
+            raise ParameterError(
+                f"Borders of tissues are for the engine {GAUSS_NEWTON}; elastix finds one smooth spline. Leave out "
+                "--borders, or the engine, preset or parameter files of elastix."
+            )
 
     @property
     def engine(self) -> str:
@@ -83,14 +100,17 @@ class Settings:
     @property
     def text(self) -> str:
         """All parameters of the non-rigid part, as written."""
-        return self.gauss_newton.text if self.gauss_newton is not None else "\n".join(p.text for p in self.presets)
+        if self.gauss_newton is None:
+            return "\n".join(p.text for p in self.presets)
+        return self.gauss_newton.text if self.borders is None else self.borders.text(self.gauss_newton)
 
     def of_repeat(self) -> Settings:
         """For a repeat scan: a weight chosen for it alone would smooth away the noise that it is to show."""
-        own = self.gauss_newton
-        if own is None or own.bending is not None:
+        if self.gauss_newton is None:
             return self
-        return replace(self, gauss_newton=replace(own, bending=USUAL_BENDING))
+        own = replace(self.gauss_newton, bending=self.gauss_newton.bending or USUAL_BENDING)
+        borders = None if self.borders is None else replace(self.borders, skin=self.borders.skin or USUAL_SKIN)
+        return replace(self, gauss_newton=own, borders=borders)
 
     @classmethod
     def of(cls, name: str = GAUSS_NEWTON, **others: object) -> Settings:
@@ -113,8 +133,8 @@ class Registration:
     bone : Mask or None
     alignment : Alignment
         The bone's rigid motion, reference to loaded.
-    bspline : BSpline
-        Displacement of tissue relative to its bone, reference configuration, LPS mm.
+    bspline : BSpline or BorderedSpline
+        Displacement of tissue relative to its bone, reference configuration, LPS mm; with borders the second.
     settings : Settings
     seconds : float
         Wall time.
@@ -127,7 +147,7 @@ class Registration:
     tissue: Mask
     bone: Mask | None
     alignment: Alignment
-    bspline: BSpline
+    bspline: Spline
     settings: Settings
     seconds: float
     choice: Choice | None = None
@@ -149,8 +169,9 @@ def register(
     *,
     bone: Mask | None = None,
     tissue: Mask | None = None,
+    labels: LabelMap | None = None,
     settings: Settings | None = None,
-    start: BSpline | None = None,
+    start: Deformation | None = None,
     worker: Worker | None = None,
     progress: Progress | None = None,
 ) -> Registration:
@@ -164,11 +185,13 @@ def register(
         The bone to align on, on the reference grid; needed unless ``settings.align_on`` is not "bone".
     tissue : Mask, optional
         Body on the reference grid, bone included; found by a threshold where it is not given.
+    labels : LabelMap, optional
+        Tissues on the reference grid; needed, and used, where ``settings.borders`` is given.
     settings : Settings, optional
         The engine gauss-newton, seed 1, one thread by default.
-    start : BSpline, optional
-        Result of another load to start from: its coefficients are the first guess, which the registration
-        then corrects against these two images, so no error is carried on.
+    start : Deformation, optional
+        Result of another load (its ``bspline``) to start from: the first guess, which the registration then corrects
+        against these two images, so no error is carried on. elastix starts from a `BSpline` alone.
     worker : Worker, optional
         Process to run elastix in; a new one by default.
     progress : callable, optional
@@ -181,7 +204,8 @@ def register(
     Raises
     ------
     InputError
-        If the two images are the same, or a mask is missing or empty.
+        If the two images are the same, a mask or the labels are missing, empty or on another grid, or elastix is to
+        start from something else than one B-spline.
     RegistrationError
         If the bone cannot be found in the loaded image, if the contrast of the two images is turned round and is not
         to be followed by mutual information, or if elastix fails; with elastix' reason.
@@ -197,6 +221,13 @@ def register(
     refuse_one_image_twice([("The unloaded image", reference), ("the loaded one", loaded)])
     body = tissue if tissue is not None else tissue_mask(reference)
     _check_masks(reference, body, bone, chosen.align_on)
+    if chosen.borders is not None:
+        _check_labels(reference, labels)
+    if chosen.gauss_newton is None and start is not None and not isinstance(start, BSpline):
+        raise InputError(
+            f"elastix starts from one B-spline, and a {type(start).__name__} is given: start from a result without "
+            f"borders, or register with {GAUSS_NEWTON}."
+        )
     own = worker is None
     runner = worker or Worker(chosen.threads)
     try:
@@ -213,28 +244,33 @@ def register(
         turn = Rotation.from_matrix(fixed.grid.direction).as_matrix()
         fixed, moving, inside = _turned(fixed, turn.T), _turned(moving, turn.T), _turned(inside, turn.T)
         on = None if on is None else _turned(on, turn.T)
-        start = None if start is None else start.turned(turn.T)
+        begun_at = None if start is None else _turned_start(start, turn.T)
         alignment = _align(fixed, moving, inside, on, chosen, runner)
         if chosen.align_on == "none" and chosen.needs_one_contrast:  # a rigid alignment refuses it by itself
             refuse_turned_contrast(fixed, moving, inside, alignment.motion)
         tell("aligning", 1.0)
-        bspline, choice = start, None
+        bspline: Spline | None = None
+        choice = None
         if chosen.gauss_newton is not None:
             rigid = on if chosen.align_on == "bone" else None
+            borders = None
+            if chosen.borders is not None and labels is not None:
+                borders = chosen.borders, _turned(labels.toward_lps(), turn.T)
             bspline, choice = by_gauss_newton(
-                fixed, moving, inside, rigid, alignment, chosen.gauss_newton, start, runner,
-                lambda fraction: tell("registering", fraction),
+                fixed, moving, inside, rigid, alignment, chosen.gauss_newton, begun_at, runner,
+                lambda fraction: tell("registering", fraction), borders,
             )  # fmt: skip
+        last = begun_at if isinstance(begun_at, BSpline) else None
         for number, preset in enumerate(chosen.presets if chosen.gauss_newton is None else ()):
             stage = "registering" if len(chosen.presets) == 1 else f"registering, stage {number + 1}"
-            bspline = by_elastix(
+            bspline = last = by_elastix(
                 fixed,
                 moving,
                 inside,
                 alignment,
                 preset,
                 _seeds(chosen)[number + 1],
-                bspline,
+                last,
                 runner,
                 lambda fraction, stage=stage: tell(stage, fraction),  # type: ignore[misc]
             )
@@ -278,6 +314,23 @@ def _check_masks(reference: Image, body: Mask, bone: Mask | None, on: AlignOn) -
             raise InputError(f"The {name} mask is not on the unloaded image's grid; bring it there (fit_mask).")
         if not mask.inside.any():
             raise InputError(f"The {name} mask is empty.")
+
+
+def _check_labels(reference: Image, labels: LabelMap | None) -> None:
+    if labels is None:
+        raise InputError("Borders of tissues are asked for, and no label map is given: give --labels, too.")
+    if not labels.grid.same_as(reference.grid):
+        raise InputError("The label map is not on the unloaded image's grid; bring it there (fit_mask).")
+    if not labels.labels.any():
+        raise InputError("The label map is empty.")
+
+
+def _turned_start(start: Deformation, rotation: FloatArray) -> Deformation:
+    """The start in a world that is turned about its origin."""
+    if isinstance(start, BSpline):
+        return start.turned(rotation)
+    there = RigidMotion(rotation, np.zeros(3))
+    return Composed([there.inverse(), start, there])
 
 
 def _align(

@@ -12,23 +12,61 @@ voxels that were left out: what the skin does moves the fat beside it. docs/deci
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray
-from dvc.borders import BorderedSpline, Borders
+from dvc.borders import NUMBERS, BorderedSpline, Borders
 from dvc.bspline import BSpline
 from dvc.deformation import Deformation
 from dvc.descent import Level, Weights
+from dvc.errors import ParameterError
 from dvc.gaussnewton import LEVELS, USUAL_BENDING, Choice, GaussNewton, choose, fit, scaled, turned
 from dvc.image import Image, LabelMap, Mask
 
 _SKIN = "skin"
-_SKIN_WEIGHT = 3.0  # of its strain, 1/mm3, to begin with
+USUAL_SKIN = 3.0
+"""Weight of strain in the skin, 1/mm3, to begin with; between those that loaded pairs get, 0.03 to 65."""
 _SKIN_POWERS = -5, 4  # of the square root of ten, times that: 0.01 to 300
 _STEPS = 3
 _BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
+_SMOOTH_SHARE = 0.4  # of the time
+
+
+@dataclass(frozen=True, slots=True)
+class AtBorders:
+    """Parameters of the stage with borders, beside those of the engine.
+
+    Attributes
+    ----------
+    skin : float or None
+        Weight k of strain in the skin, 1/mm3; None: chosen for each pair by cross-validation.
+
+    Raises
+    ------
+    ParameterError
+        For a weight that is not above zero.
+    """
+
+    skin: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.skin is not None and not (np.isfinite(self.skin) and self.skin > 0):
+            raise ParameterError(f"The weight of strain in the skin must be above 0; got {self.skin}.")
+
+    def text(self, options: GaussNewton) -> str:
+        """Every number that decides the result, as JSON: the engine's, and those of its last stage."""
+        stage = {
+            "usual_skin": USUAL_SKIN,
+            "powers": _SKIN_POWERS,
+            "steps": _STEPS,
+            "of_jumps": [_BENDING, _SQUARE],
+            "distances": NUMBERS,
+        }
+        return json.dumps(json.loads(options.text) | {"borders": asdict(self) | stage})
 
 
 def fit_with_borders(
@@ -39,7 +77,9 @@ def fit_with_borders(
     bone: Mask | None,
     labels: LabelMap,
     options: GaussNewton,
+    at_borders: AtBorders,
     start: Deformation | None = None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[BorderedSpline, Choice]:
     """Find the displacement that carries the fixed image to the moving one, its gradient free to jump at borders.
 
@@ -49,6 +89,7 @@ def fit_with_borders(
         Tissues, on the grid of ``fixed``. One that is named "skin" may resist strain.
     bone : Mask or None
         Bone that does not move; without it nothing is held.
+    at_borders : AtBorders
 
     The other parameters, and errors, are those of `dvc.gaussnewton.fit`.
 
@@ -57,14 +98,19 @@ def fit_with_borders(
     displacement : BorderedSpline
         LPS mm.
     choice : Choice
-        Its weight "rigidity" is the skin's, k.
+        Its weight "rigidity" is the skin's, k; zero where there is no skin.
     """
-    weights = Weights(USUAL_BENDING if options.bending is None else options.bending, options.volume, _SKIN_WEIGHT)
-    smooth, _ = fit(fixed, moving, inside, body, bone, replace(options, bending=weights.bending), start=start)
+    bending = USUAL_BENDING if options.bending is None else options.bending
+    smooth, _ = fit(
+        fixed, moving, inside, body, bone, replace(options, bending=bending), start=start,
+        progress=lambda share: progress(_SMOOTH_SHARE * share),
+    )  # fmt: skip
     axes, control = np.array(fixed.grid.direction), smooth.control
     borders = Borders.of(labels, bone, float(control.spacing_mm.mean()))
     soft = body.inside & (borders.own != borders.rest)
-    skin = soft & np.isin(labels.labels, [number for number, name in labels.names.items() if name == _SKIN])
+    skin = soft & np.isin(labels.labels, [number for number, name in labels.names.items() if name.lower() == _SKIN])
+    usual = USUAL_SKIN if at_borders.skin is None else at_borders.skin
+    weights = Weights(bending, options.volume, usual if skin.any() else 0.0)
     scale = float(np.nanpercentile(fixed.values[body.inside], 75))
     pictures = scaled(fixed, scale), scaled(moving, scale)
     factors = borders.at_voxels()
@@ -77,15 +123,19 @@ def fit_with_borders(
     stop_mm = LEVELS[-1][-1]
     found: FloatArray = np.concatenate([turned(axes.T, smooth.coefficients_mm), np.zeros((3, *control.shape))])
     found = whole.descend(found, weights, steps=_STEPS, stop_mm=stop_mm)
-    choice, in_skin = Choice(weights, "bending fixed beforehand"), Choice(weights, "")
-    if skin.any():
+    choice, in_skin = Choice(weights, "bending fixed beforehand"), Choice(weights, "rigidity fixed beforehand")
+    progress(_SMOOTH_SHARE + 0.1)
+    if skin.any() and at_borders.skin is None:
         in_skin = choose(slab, found, weights, "rigidity", _SKIN_POWERS)
         choice = replace(choice, weights=in_skin.weights)
+    progress(_SMOOTH_SHARE + 0.3)
     if options.bending is None:
         choice = choose(slab, found, choice.weights)
-    if skin.any():
-        choice = replace(choice, rule=f"{choice.rule}; in skin {in_skin.rule}", tried_in_skin=in_skin.tried)
+    rule = f"{choice.rule}; in skin {in_skin.rule}" if skin.any() else choice.rule
+    choice = replace(choice, rule=rule, tried_in_skin=in_skin.tried, rigidity_of=_SKIN)
+    progress(_SMOOTH_SHARE + 0.5)
     found = whole.descend(found, choice.weights, steps=_STEPS, stop_mm=stop_mm)
+    progress(1.0)
     smooth, jump = (BSpline(control, turned(axes, c)) for c in np.split(found, 2))
     return BorderedSpline(smooth, jump, borders), choice
 

@@ -10,6 +10,7 @@ import numpy as np
 import SimpleITK as sitk
 
 from dvc.arrays import FloatArray
+from dvc.borders import BorderedSpline, Spline
 from dvc.bspline import BSpline
 from dvc.deformation import RigidMotion
 from dvc.elastixtext import Value, format_parameters
@@ -118,8 +119,11 @@ def _euler_angles(rotation: FloatArray) -> list[float]:
     return [float(x), float(y), float(z)]
 
 
-def write_itk_transform(path: StrPath, bspline: BSpline, then: RigidMotion | None = None) -> Path:
+def write_itk_transform(path: StrPath, bspline: Spline, then: RigidMotion | None = None) -> Path:
     """Write ``x = R (X + u(X)) + t`` as an ITK composite transform (.h5 or .tfm), as 3D Slicer reads it.
+
+    ITK has no spline with borders: of a `BorderedSpline` u is written at the voxels on which it was found, the box
+    around the tissue. Between them ITK interpolates linearly; outside the box, as outside a B-spline, it takes u as 0.
 
     Raises
     ------
@@ -131,23 +135,32 @@ def write_itk_transform(path: StrPath, bspline: BSpline, then: RigidMotion | Non
     place = Path(path)
     if place.suffix.lower() not in (".h5", ".tfm"):
         raise InputError(f"{place}: ITK transforms are written as .h5 or .tfm; choose one of these endings.")
-    images = []
-    for component in bspline.coefficients_mm:
-        image = sitk.GetImageFromArray(np.ascontiguousarray(component.T))
-        image.SetSpacing(bspline.control.spacing_mm.tolist())
-        image.SetOrigin(bspline.control.origin_mm.tolist())
-        image.SetDirection(bspline.control.direction.ravel().tolist())
-        images.append(image)
     composite = sitk.CompositeTransform(3)
     if then is not None:  # what is added last acts first
         motion = sitk.AffineTransform(3)
         motion.SetMatrix(then.rotation.ravel().tolist())
         motion.SetTranslation(then.translation_mm.tolist())
         composite.AddTransform(motion)
-    composite.AddTransform(sitk.BSplineTransform(images, 3))
+    if isinstance(bspline, BorderedSpline):
+        grid = bspline.borders.grid
+        u = bspline.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
+        composite.AddTransform(sitk.DisplacementFieldTransform(_itk_image(grid, u)))
+    else:
+        images = [_itk_image(bspline.control, component) for component in bspline.coefficients_mm]
+        composite.AddTransform(sitk.BSplineTransform(images, 3))
     with whole_file(place) as part:
         try:
             sitk.WriteTransform(composite, os.fspath(part))
         except RuntimeError as failure:
             raise OSError(str(failure)) from failure
     return place
+
+
+def _itk_image(grid: Grid, values: FloatArray) -> sitk.Image:
+    """Values (ni, nj, nk) or (ni, nj, nk, components) as an image of ITK."""
+    reordered = np.ascontiguousarray(np.moveaxis(values, (0, 1, 2), (2, 1, 0)))
+    image = sitk.GetImageFromArray(reordered, isVector=values.ndim == 4)
+    image.SetSpacing(grid.spacing_mm.tolist())
+    image.SetOrigin(grid.origin_mm.tolist())
+    image.SetDirection(grid.direction.ravel().tolist())
+    return image

@@ -107,11 +107,15 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
             if isinstance(reference, Image) and _same(reference, image):
                 wrong.append(f"{name} is the unloaded image: every voxel is equal.")
     how = told.registration
-    settings = tried(lambda: settings_of(how.engine, how.preset, [told.path(p) for p in how.parameters]))
+    settings = tried(
+        lambda: settings_of(how.engine, how.preset, [told.path(p) for p in how.parameters], borders=how.borders)
+    )
     if settings:
         own = how.error_model
         model = tried(lambda: error_model_of(settings.name) if own is None else read_error_model(told.path(own)))
-        if model is None:
+        if how.borders:
+            notes.append("With borders = true results will have no intervals: that error has not been measured yet.")
+        elif model is None:
             notes.append(f"{settings.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
     if told.compare.thresholds is not None:
         tried(lambda: read_thresholds(told.path(str(told.compare.thresholds))))

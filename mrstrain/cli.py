@@ -16,6 +16,7 @@ from mrstrain.options import (
     Bending,
     Bone,
     BoneLabel,
+    Borders,
     EngineName,
     Frame,
     Labels,
@@ -84,6 +85,7 @@ def register(
     engine: EngineName = None,
     bending: Bending = None,
     volume: Volume = None,
+    borders: Borders = False,
     preset: Preset = None,
     parameters: Parameters = None,
     allow_unknown_parameters: Annotated[
@@ -138,6 +140,7 @@ def register(
             engine=None if engine is None else engine.value,
             bending=bending,
             volume=volume,
+            borders=borders,
             preset=preset,
             parameters=parameters or (),
             allow_unknown_parameters=allow_unknown_parameters,

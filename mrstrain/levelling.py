@@ -18,7 +18,7 @@ from dvc.whole import whole_file, write_whole
 from mrstrain.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.modelfiles import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.provenance import provenance, write_json
-from mrstrain.registering import register, settings_of
+from mrstrain.registering import refuse_without_labels, register, settings_of
 from phantoms.twin import loaded_twin
 from validate.levelled import LEVELLED, carried_on
 from validate.mapping import filled_from_nearest
@@ -51,6 +51,7 @@ def level(
     names: Path | str | None = None,
     loads: Sequence[str] = (),
     engine: str | None = None,
+    borders: bool = False,
     preset: str | None = None,
     parameters: Sequence[Path | str] = (),
     model_mesh: Path | str | None = None,
@@ -75,7 +76,7 @@ def level(
         As in `register`; the bone is needed.
     loads : sequence of str
         Names of the loads; all of the model's files by default.
-    engine, preset, parameters
+    engine, borders, preset, parameters
         Those of the measurement, as in `register`; elastix parameters that are not known are let pass.
     model_mesh, model_unit, model_frame
         As in `compare`.
@@ -94,7 +95,10 @@ def level(
         If no load could be registered.
     """
     target, place = Path(out), Path(model)
-    settings_of(engine, preset, parameters, allow_unknown=True)  # refused now rather than after the images are made
+    # Refused now rather than after the images are made.
+    settings_of(engine, preset, parameters, borders=borders, allow_unknown=True)
+    if borders:
+        refuse_without_labels(labels)
     if not place.is_dir():
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
     subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
@@ -136,6 +140,7 @@ def level(
         },
         {
             "engine": engine,
+            "borders": borders,
             "preset": preset,
             "threads": threads,
             "seed": seed,
@@ -155,8 +160,8 @@ def level(
             register(
                 load0, [target / work / "images" / f"{load}.nii.gz"], out=registered / load, bone=bone,
                 bone_label=bone_label, tissue=tissue, labels=labels, names=names, engine=engine,
-                preset=preset, parameters=parameters, allow_unknown_parameters=True, threads=threads, seed=seed,
-                progress=progress,
+                borders=borders, preset=preset, parameters=parameters, allow_unknown_parameters=True,
+                threads=threads, seed=seed, progress=progress,
             )  # fmt: skip
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")

@@ -113,7 +113,7 @@ def _registration(record: Record) -> str:
     how = (
         f"with {elastix} through {ours}: {'; then '.join(_stage(stage) for stage in stages)}"
         if not own
-        else f"with the Gauss-Newton engine of {ours}: {_weights(own)}"
+        else f"with the Gauss-Newton engine of {ours}: {_weights(own, given.get('borders'))}"
     )
     if own and given.get("align") != "none":
         how += f"; rigid alignment with {elastix}"
@@ -123,13 +123,21 @@ def _registration(record: Record) -> str:
     )
 
 
-def _weights(own: Record) -> str:
+def _weights(own: Record, borders: Record | None) -> str:
     bending = own.get("bending")
     weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
-    return (
+    told = (
         f"a cubic B-spline with control points every {own.get('spacing_mm'):g} mm, least squares over all voxels, and "
         f"penalties on bending (weight {weight}), on change of volume in soft tissue ({own.get('volume'):g}/mm3) and "
         f"on strain of the bone ({own.get('rigidity'):g}/mm3)"
+    )
+    if borders is None:
+        return told
+    skin = borders.get("skin")
+    weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
+    return (
+        f"{told}; from there a second B-spline was added that vanishes on the borders of the label map's tissues, so "
+        f"that strain may jump there, the bone held at rest and strain of the skin penalised (weight {weight})"
     )
 
 

@@ -10,6 +10,7 @@ import typer
 from mrstrain.options import (
     Bone,
     BoneLabel,
+    Borders,
     EngineName,
     Frame,
     Labels,
@@ -225,6 +226,7 @@ def level(
     names: Names = None,
     load: Annotated[list[str] | None, typer.Option(help="Name of a load; repeat. Default: all of the model's.")] = None,
     engine: EngineName = None,
+    borders: Borders = False,
     preset: Preset = None,
     parameters: Parameters = None,
     model_mesh: ModelMesh = None,
@@ -249,6 +251,7 @@ def level(
             names=names,
             loads=load or (),
             engine=None if engine is None else engine.value,
+            borders=borders,
             preset=preset,
             parameters=parameters or (),
             model_mesh=model_mesh,

@@ -70,4 +70,10 @@ Bending = Annotated[
     float | None,
     typer.Option(help="gauss-newton: weight of bending, 1/mm. Default: chosen for each pair by cross-validation."),
 ]
+Borders = Annotated[
+    bool,
+    typer.Option(
+        "--borders", help="gauss-newton: strain may jump where the tissues of --labels meet. No error bars yet."
+    ),
+]
 Volume = Annotated[float | None, typer.Option(help="gauss-newton: weight of the change of volume, 1/mm3.")]

@@ -9,6 +9,7 @@ import numpy as np
 
 from dvc import figures
 from dvc.arrays import Float32Array
+from dvc.gaussnewton import Choice
 from dvc.image import Image, LabelMap
 from dvc.planes import View
 from dvc.quality import NoiseFloor, Quality
@@ -19,6 +20,13 @@ from dvc.verdict import Verdict, worst
 from mrstrain.inputs import Subject
 
 _SHEAR_SCALE = 0.5
+WITH_BORDERS = (
+    "Strain may jump where the tissues of the label map meet (--borders), and bone that was aligned on does not move "
+    "at all, by the making of it: that it is at rest says nothing on this registration. It believes the labels to half "
+    "a voxel. The whole motion is in transform.h5, as displacements at voxels; text files of elastix are not written, "
+    "since elastix knows no spline with borders."
+)
+"""What a load's part of the report says of it."""
 _CLOSING = (
     Section(
         "How to read this",
@@ -32,8 +40,8 @@ _CLOSING = (
             "A verdict judges the registration, not the tissue. It cannot see everything: inside a uniform region, and "
             "along a smooth skin, an image does not show how tissue slides. Small shears are lifted by noise; a repeat "
             "scan without load (--repeat) tells by how much. Strain that jumps at a border of tissues is smeared over "
-            "about one spacing of the control points (3 to 5 mm). Scanner distortion and creep between scans "
-            "are not seen at all.",
+            "about one spacing of the control points (3 to 5 mm), unless --borders was asked for. "
+            "Scanner distortion and creep between scans are not seen at all.",
             "A noise floor is what a repeat scan shows where there is no strain. MAER is the mean over voxels of the "
             "mean absolute value of the six strain components, SDER the standard deviation of the same.",
             "Missing is NaN in every map, never zero; valid.nii.gz tells where values are. Programs built on ITK show "
@@ -188,6 +196,21 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
 
 def _number(value: object) -> float | None:
     return float(value) if isinstance(value, int | float) else None
+
+
+def weights_table(choice: Choice) -> Table:
+    """Tell the weights of the prior, and of those that were tried what they left of half of the voxels."""
+    used = choice.weights
+    stiff = f"strain of {choice.rigidity_of}"
+    rows: list[tuple[Cell, ...]] = [
+        ("bending", used.bending, "1/mm", "used"),
+        ("change of volume in soft tissue", used.volume, "1/mm3", "used"),
+        (stiff, used.rigidity, "1/mm3", "used"),
+    ]
+    rows += [("bending", weight, "1/mm", left) for weight, left in choice.tried]
+    rows += [(stiff, weight, "1/mm3", left) for weight, left in choice.tried_in_skin]
+    columns = ("penalty on", "weight", "unit", "residual left out, over the best")
+    return Table("Weights of the registration", columns, tuple(rows), f"{choice.rule}.")
 
 
 def region_table(regions: Sequence[RegionRow]) -> Table:

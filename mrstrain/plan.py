@@ -19,6 +19,7 @@ from validate.levelled import LEVELLED
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
 """Kinds of stages, in the order in which they come."""
 
+_AS_MEASURED = ("load0", "images", "bone", "engine", "borders", "preset", "parameters", "seed")
 _MINUTES = {"register": 1.0, "mesh": 1.3, "simulate": 2.5, "drive": 2.0, "level": 1.5, "compare": 1.5}
 
 REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
@@ -145,7 +146,7 @@ def _registrations(study: Study) -> list[Stage]:
     error_model = [] if how.error_model is None else [study.path(how.error_model)]
     shared: dict[str, Any] = {
         "load0": str(load0), "images": aside, "bone": images.bone, "align": how.align,
-        "engine": how.engine, "preset": how.preset,
+        "engine": how.engine, "borders": how.borders, "preset": how.preset,
         "parameters": [str(p) for p in own], "error_model": str(error_model[0]) if error_model else None,
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "seed": study.study.seed, "threads": 1,
@@ -233,7 +234,7 @@ def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
     sent = _registrations(study)[-1].arguments
-    arguments = {key: sent[key] for key in ("load0", "images", "bone", "engine", "preset", "parameters", "seed")}
+    arguments = {key: sent[key] for key in _AS_MEASURED}
     arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}
     own = [Path(p) for p in (arguments["load0"], *arguments["images"].values(), *arguments["parameters"])]
     gives = (folder.with_name(folder.name + LEVELLED) / f"{load}.vtu",)

@@ -11,7 +11,7 @@ import numpy as np
 
 from dvc.align import AlignOn
 from dvc.arrays import FloatArray
-from dvc.bspline import BSpline
+from dvc.borders import Spline
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
 from dvc.gaussnewton import GaussNewton
 from dvc.image import Image, Mask
@@ -20,6 +20,7 @@ from dvc.landmarks import read_landmarks
 from dvc.presets import load_preset, read_parameter_file
 from dvc.registration import GAUSS_NEWTON, Registration, Settings, refuse_one_image_twice
 from dvc.registration import register as register_pair
+from dvc.sharpen import AtBorders
 from dvc.tissue import tissue_mask
 from dvc.uncertainty import ErrorModel, error_model_of, read_error_model
 from dvc.worker import Worker, each_in_workers, usable_cores
@@ -39,6 +40,7 @@ Told = Callable[[str, str, float], None]
 REPEAT = "repeat"
 """Name of a repeat scan's results."""
 _BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plate's axes
+_BYTES_WITH_BORDERS = 24  # more: transform.h5 then holds displacements
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,7 @@ def register(
     engine: str | None = None,
     bending: float | None = None,
     volume: float | None = None,
+    borders: bool = False,
     preset: str | None = None,
     parameters: Sequence[Path | str] = (),
     allow_unknown_parameters: bool = False,
@@ -117,6 +120,9 @@ def register(
     engine : {"gauss-newton", "elastix"}, optional
         What finds the non-rigid part: our own, unless a preset or parameter files of elastix are given. ``bending``
         (1/mm) and ``volume`` (1/mm3) fix our own engine's weights; the first is otherwise chosen for each pair.
+    borders : bool
+        Our own engine: strain may jump where the tissues of ``labels`` meet, and the bone stays exactly at rest. For
+        labels that are right to half a voxel; it has no error bars yet.
     preset : str, optional
         Named parameters of elastix, heel-mr by default; or ``parameters``, files of your own, applied one after the
         other.
@@ -165,8 +171,11 @@ def register(
     if landmarks is not None and len(loads) != 1:
         raise InputError(f"--landmarks belong to one loaded image; {len(loads)} are given. Register that one alone.")
     settings = settings_of(
-        engine, preset, parameters, bending=bending, volume=volume, allow_unknown=allow_unknown_parameters
-    )
+        engine, preset, parameters, bending=bending, volume=volume, borders=borders,
+        allow_unknown=allow_unknown_parameters,
+    )  # fmt: skip
+    if borders:
+        refuse_without_labels(labels)
     given = [
         Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh, error_model) if p is not None
     ]
@@ -196,7 +205,8 @@ def register(
     refuse_one_image_twice(
         [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
     )
-    needed = _BYTES_PER_VOXEL * int(np.prod(subject.reference.grid.shape)) * len(cases)
+    each_voxel = _BYTES_PER_VOXEL + (_BYTES_WITH_BORDERS if borders else 0)
+    needed = each_voxel * int(np.prod(subject.reference.grid.shape)) * len(cases)
     refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
     make_output(target)
     cores = usable_cores()
@@ -251,6 +261,7 @@ def record_of(
             "rigid": load_preset("bone-rigid").text,
             "engine": settings.engine,
             "gauss_newton": None if own is None else asdict(own),
+            "borders": None if settings.borders is None else asdict(settings.borders),
             "stages": [{"name": s.name, "text": s.text} for s in settings.presets],
             **more,
         },
@@ -264,6 +275,7 @@ def settings_of(
     *,
     bending: float | None = None,
     volume: float | None = None,
+    borders: bool = False,
     allow_unknown: bool = False,
 ) -> Settings:
     """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused.
@@ -277,6 +289,8 @@ def settings_of(
     if engine == "elastix":
         if bending is not None or volume is not None:
             raise ParameterError(f"--bending and --volume are weights of --engine {GAUSS_NEWTON}; elastix has none.")
+        if borders:
+            raise ParameterError(f"--borders is for --engine {GAUSS_NEWTON}: elastix finds one smooth spline.")
         if parameters and preset:
             raise ParameterError(
                 f"Give the preset {preset} or parameter files, not both: only one of them would be used."
@@ -289,7 +303,20 @@ def settings_of(
             f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
         )
     own = GaussNewton(bending=bending)
-    return Settings(gauss_newton=own if volume is None else replace(own, volume=volume))
+    return Settings(
+        gauss_newton=own if volume is None else replace(own, volume=volume), borders=AtBorders() if borders else None
+    )
+
+
+def refuse_without_labels(labels: Path | str | None) -> None:
+    """Refuse borders of tissues that nobody has told.
+
+    Raises
+    ------
+    InputError
+    """
+    if labels is None:
+        raise InputError("--borders needs the tissues: give a label map of the unloaded image with --labels.")
 
 
 class _Run:
@@ -317,7 +344,7 @@ class _Run:
             self._floor_known.set()
 
     def all(self, at_once: int, chain: bool) -> None:
-        last: list[BSpline] = []
+        last: list[Spline] = []
 
         def one(name: str, worker: Worker) -> None:
             start = last[-1] if chain and last and name != REPEAT else None
@@ -327,6 +354,7 @@ class _Run:
                     self.images[name],
                     bone=self.subject.bone,
                     tissue=self.body,
+                    labels=self.subject.labels,
                     settings=self.settings.of_repeat() if name == REPEAT else self.settings,
                     start=start,
                     worker=worker,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dvc.align import AlignOn
 from dvc.bspline import BSpline
+from dvc.deformation import Composed, Deformation
 from dvc.errors import InputError
 from dvc.imagefile import read_image
 from dvc.quality import read_noise_floor
@@ -18,7 +19,7 @@ from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import Worker
 from mrstrain.inputs import read_subject
 from mrstrain.registering import REPEAT, record_of, settings_of
-from mrstrain.results import Case, write_case
+from mrstrain.results import ITK_FILE, Case, write_case
 
 
 def register_one(
@@ -32,6 +33,7 @@ def register_one(
     tissue: Path | None = None,
     align: AlignOn = "bone",
     engine: str | None = None,
+    borders: bool = False,
     preset: str | None = None,
     parameters: Sequence[Path] = (),
     error_model: Path | None = None,
@@ -71,12 +73,12 @@ def register_one(
         shear_direction=shear_direction,
     )
     loaded = read_image(load)
-    settings = replace(settings_of(engine, preset, parameters), align_on=align, seed=seed, threads=threads)
+    settings = replace(
+        settings_of(engine, preset, parameters, borders=borders), align_on=align, seed=seed, threads=threads
+    )
     model = error_model_of(settings.name) if error_model is None else read_error_model(error_model)
     floor = None if repeat is None else read_noise_floor(repeat / "quality.json")
-    start = None if after is None else read_transform(after / "TransformParameters.0.txt")
-    if start is not None and not isinstance(start, BSpline):
-        raise InputError(f"{after}: no B-spline to start from.")
+    start = None if after is None else _found(after)
     record = record_of(
         subject,
         {"loads": [load], "error_model": [] if error_model is None else [error_model]},
@@ -95,9 +97,22 @@ def register_one(
             loaded,
             bone=subject.bone,
             tissue=body,
+            labels=subject.labels,
             settings=settings.of_repeat() if is_repeat else settings,
             start=start,
             worker=worker,
             progress=tell,
         )
     return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model)
+
+
+def _found(folder: Path) -> Deformation:
+    """What another load's folder holds: its B-spline, or displacements at voxels where that one has borders."""
+    text = folder / "TransformParameters.0.txt"
+    if text.is_file():
+        found = read_transform(text)
+        if not isinstance(found, BSpline):
+            raise InputError(f"{text}: no B-spline to start from.")
+        return found
+    whole = read_transform(folder / ITK_FILE)
+    return whole.parts[0] if isinstance(whole, Composed) else whole  # the bone's motion comes last

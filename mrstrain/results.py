@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray
+from dvc.bspline import BSpline
 from dvc.deformation import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.gaussnewton import Choice
@@ -33,6 +34,9 @@ from mrstrain import page
 from mrstrain.errorbars import ErrorBars, error_bars
 from mrstrain.inputs import Subject
 from mrstrain.provenance import write_json
+
+ITK_FILE = "transform.h5"
+"""Name of the whole motion's file."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,11 +158,15 @@ def write_case(
     def more(partial: Path) -> None:
         write_image(partial / "aligned.nii.gz", Image(grid, aligned))
         write_image(partial / "registered.nii.gz", Image(grid, registered))
-        write_elastix_transform(partial, found.bspline, motion, grid)
-        write_itk_transform(partial / "transform.h5", found.bspline, motion)
+        if isinstance(found.bspline, BSpline):
+            write_elastix_transform(partial, found.bspline, motion, grid)
+        write_itk_transform(partial / ITK_FILE, found.bspline, motion)
         bars.write(partial, maps, quality.verdict)
 
-    return _written(folder, measured, maps, quality, pictures, _alignment(found), record, more, bars, found.choice)
+    return _written(
+        folder, measured, maps, quality, pictures, _alignment(found), record, more, bars, found.choice,
+        borders=found.settings.borders is not None,
+    )  # fmt: skip
 
 
 def _noise_in_air(found: Registration) -> tuple[float, float] | None:
@@ -196,13 +204,15 @@ def _written(
     more: Callable[[Path], None],
     bars: ErrorBars | None = None,
     choice: Choice | None = None,
+    borders: bool = False,
 ) -> Case:
     subject = measured.subject
     regions = region_statistics(_regions(measured), maps.by_quantity)
     told = quality.as_dict() | {"alignment": dict(alignment)}
     tables = [page.key_figures(quality, alignment), page.region_table(regions)]
     if choice is not None:
-        told["regularisation"] = choice.as_dict()
+        told["regularisation"] = choice.as_dict() | {"borders": borders}
+        tables.append(page.weights_table(choice))
     if bars is not None:
         told["error_of_max_shear"] = bars.as_dict()
         tables += [table for table in (bars.table(),) if table is not None]
@@ -223,7 +233,10 @@ def _written(
         quality.verdict,
         tuple(tables),
         tuple(pictures.values()),
-        () if bars is None or bars.uncertainty is not None else (f"No error bars. {bars.told}",),
+        (
+            *((page.WITH_BORDERS,) if borders else ()),
+            *(() if bars is None or bars.uncertainty is not None else (f"No error bars. {bars.told}",)),
+        ),
     )
     without = "" if bars is None or bars.uncertainty is not None else bars.told
     return Case(measured.name, section, quality.verdict, shear, noise_floor(maps, _soft(measured)), without)

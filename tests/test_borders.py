@@ -12,7 +12,7 @@ from dvc.deformation import Deformation, evaluate_on_grid
 from dvc.errors import GeometryError, InputError
 from dvc.gaussnewton import Choice, GaussNewton, control_grid, fit
 from dvc.image import Grid, Image, LabelMap, Mask
-from dvc.sharpen import fit_with_borders
+from dvc.sharpen import AtBorders, fit_with_borders
 from dvc.smoothness import Bending, Roughness
 from dvc.splinesums import SplineSums
 
@@ -219,7 +219,7 @@ def scanned(skin: float) -> tuple[Image, Image, Mask, LabelMap]:
 @pytest.fixture(scope="module")
 def along_stiff_skin() -> tuple[BorderedSpline, Choice]:
     fixed, moving, body, labels = scanned(skin=0.0)
-    return fit_with_borders(fixed, moving, body, body, labels.region("bone"), labels, GaussNewton())
+    return fit_with_borders(fixed, moving, body, body, labels.region("bone"), labels, GaussNewton(), AtBorders())
 
 
 def shear_errors(found: Deformation, skin: float) -> dict[str, float]:
@@ -249,7 +249,9 @@ def test_strain_that_jumps_is_found_up_to_the_border(along_stiff_skin):
 def test_the_images_tell_whether_the_skin_resists(along_stiff_skin):
     """Where skin does not shear it is made stiff, 300; where it shears as fat does it is not, below 0.1."""
     fixed, moving, body, labels = scanned(skin=1.0)
-    found, choice = fit_with_borders(fixed, moving, body, body, labels.region("bone"), labels, GaussNewton())
+    found, choice = fit_with_borders(
+        fixed, moving, body, body, labels.region("bone"), labels, GaussNewton(), AtBorders()
+    )
     assert choice.weights.rigidity < 1.0
     assert shear_errors(found, 1.0)["skin"] < 0.02
     stiff = along_stiff_skin[1]
@@ -261,7 +263,7 @@ def test_the_images_tell_whether_the_skin_resists(along_stiff_skin):
 def test_without_skin_and_bone_and_with_a_fixed_weight():
     fixed, moving, body, labels = scanned(skin=1.0)
     plain = LabelMap(GRID, labels.labels, {1: "bone", 2: "fat", 3: "cartilage"})
-    found, choice = fit_with_borders(fixed, moving, body, body, None, plain, GaussNewton(bending=30.0))
+    found, choice = fit_with_borders(fixed, moving, body, body, None, plain, GaussNewton(bending=30.0), AtBorders())
     assert choice.weights.bending == 30.0
     assert not choice.tried
     assert not choice.tried_in_skin

@@ -14,6 +14,7 @@ from dvc.gaussnewton import GaussNewton
 from dvc.image import Grid, Image, LabelMap, Mask
 from dvc.presets import load_preset
 from dvc.registration import Settings
+from dvc.sharpen import AtBorders
 from dvc.strainmaps import StrainMaps
 from dvc.uncertainty import POOLED, ErrorModel, ErrorTable, error_model_of
 from dvc.verdict import Verdict
@@ -131,6 +132,11 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     assert "that of heel-mr" in error_bars(found, subject, maps, model()).told
     found.settings = Settings(gauss_newton=GaussNewton(bending=2.0))
     assert "fixed at 2/mm" in error_bars(found, subject, maps, own).told
+    found.settings = replace(Settings.of("gauss-newton"), borders=AtBorders())
+    bars = error_bars(found, subject, maps, error_model_of("gauss-newton"))
+    assert bars.uncertainty is None
+    assert "without borders" in bars.told
+    assert "without borders" in error_bars(found, subject, maps, own).told
 
 
 @pytest.mark.parametrize("name", ["gauss-newton", "heel-mr"])

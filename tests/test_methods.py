@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dvc.gaussnewton import GaussNewton
 from dvc.presets import load_preset
+from dvc.sharpen import AtBorders
 from mrstrain.methods import methods
 
 VERSIONS = {"mrstrain": "9.8.7", "itk-elastix": "0.1.2", "SimpleITK": "3.4.5", "pytetwild": "6.7"}
@@ -76,6 +77,7 @@ def test_our_own_engine_is_told_with_its_weights(tmp_path: Path) -> None:
         record["parameters"] |= {"stages": [], "gauss_newton": asdict(GaussNewton(bending=bending))}
         (place / "provenance.json").write_text(json.dumps(record))
         text = told({"Load1": place}, {"ansys": tmp_path / "Load1.csv"})
+        assert "borders" not in text
         for said in (
             "Gauss-Newton engine of mrstrain 9.8.7",
             "every 3.2 mm",
@@ -85,6 +87,16 @@ def test_our_own_engine_is_told_with_its_weights(tmp_path: Path) -> None:
         ):
             assert said in text, said
         assert "taken as it was given" not in text.split("Results of other")[0]
+
+
+def test_borders_are_told(tmp_path: Path) -> None:
+    place = measured(tmp_path, "Load1")
+    record = json.loads((place / "provenance.json").read_text())
+    record["parameters"] |= {"stages": [], "gauss_newton": asdict(GaussNewton()), "borders": asdict(AtBorders())}
+    (place / "provenance.json").write_text(json.dumps(record))
+    text = told({"Load1": place}, {"ansys": tmp_path / "Load1.csv"})
+    assert "vanishes on the borders of the label map's tissues" in text
+    assert "strain of the skin penalised (weight chosen for each pair by cross-validation)" in text
 
 
 def test_what_is_not_known_is_not_claimed(tmp_path: Path) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from dvc.errors import InputError
+from mrstrain.ledger import Ledger
 from mrstrain.plan import plan
 from mrstrain.studyfile import read_study
 
@@ -149,6 +151,21 @@ def test_a_model_is_levelled_by_the_preset_that_measured(tmp_path):
     (stage,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "level trebbi Load1")
     assert stage.arguments["parameters"] == [str(tmp_path / "mine.txt")]
     assert tmp_path / "mine.txt" in stage.files
+
+
+def test_borders_are_asked_of_measurement_and_levelling_and_their_results_are_others(tmp_path):
+    text = WHOLE + "level = true\n[registration]\n"
+    keys: dict[str, list[str]] = {}
+    for borders in ("false", "true"):
+        for stage in plan(read_study(written(tmp_path, text + f"borders = {borders}\n"))):
+            if stage.kind in {"register", "level"}:
+                assert stage.arguments["borders"] is (borders == "true")
+                alone = replace(stage, files=())
+                ledger = Ledger(tmp_path / "results", tmp_path)
+                key = ledger.key(alone, ledger.made_from(alone, stage.arguments), {})
+                keys.setdefault(stage.name, []).append(key)
+    assert len(keys) > 2
+    assert all(plain != with_borders for plain, with_borders in keys.values())
 
 
 def test_files_that_inputs_name_are_inputs_too(tmp_path):

@@ -1,0 +1,296 @@
+"""`register --borders` from images to files: what it gains, what it writes, what it refuses, what it says of itself."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from scipy.spatial.transform import Rotation
+
+from dvc.align import not_aligned
+from dvc.borders import BorderedSpline, Borders
+from dvc.bspline import BSpline
+from dvc.deformation import Deformation, RigidMotion, evaluate_on_grid
+from dvc.errors import InputError, ParameterError, RegistrationError
+from dvc.gaussnewton import GaussNewton, control_grid
+from dvc.image import Grid, Image, LabelMap, Mask
+from dvc.imagefile import read_image
+from dvc.imagewrite import write_image, write_labels
+from dvc.kinematics import StrainField
+from dvc.nonrigid import by_gauss_newton
+from dvc.registration import Settings, register
+from dvc.sharpen import USUAL_SKIN, AtBorders
+from dvc.transformfile import read_transform
+from dvc.worker import Worker
+from mrstrain.registering import register as run
+from mrstrain.registering import settings_of
+from mrstrain.registeringone import register_one
+from mrstrain.straining import strain
+from phantoms.anatomy import Heel
+from phantoms.heel import drawn_motion, labels_of, scan, sliding
+from phantoms.study import distances_mm
+from tests.test_borders import scanned, sheared
+
+GRID = Grid((35, 35, 28), (1.6, 1.6, 1.6), (-28.2, -10.2, -43.6))  # the pad, with the lower half of the calcaneus
+INNER = (slice(3, -3),) * 3
+
+
+@dataclass(frozen=True)
+class Pad:
+    """A heel pad whose fat slides along skin and bone at rest: the images in a folder, tissues and truth."""
+
+    folder: Path
+    labels: LabelMap
+    motion: Deformation
+
+    def apart_mm(self) -> np.ndarray:
+        """Distance to the nearest border of tissues."""
+        return distances_mm(self.labels)[1]
+
+    def shear_error(self, shear: np.ndarray) -> dict[str, float]:
+        """Root mean square error of a map of maximal shear: in skin, and in fat within 3 mm of bone."""
+        inner = np.zeros(GRID.shape, dtype=bool)
+        inner[INNER] = True
+        _, H = evaluate_on_grid(self.motion, GRID, inner)
+        error = np.full(GRID.shape, np.nan)
+        error[inner] = shear[inner] - StrainField.from_gradient(H).max_shear
+        fat = self.labels.region("fat").inside & (distances_mm(self.labels)[0] < 3.0)
+        parts = {"skin": self.labels.region("skin").inside, "fat": fat}
+        return {name: float(np.sqrt(np.nanmean(error[inner & part] ** 2))) for name, part in parts.items()}
+
+
+@pytest.fixture(scope="module")
+def pad(tmp_path_factory) -> Pad:
+    folder = tmp_path_factory.mktemp("pad")
+    heel = Heel(1)
+    motion, foot, labels = sliding(heel, 4.0), drawn_motion(1, 5), labels_of(heel, GRID)
+    for number, (name, how) in enumerate({"Load0": (None, None), "Load1": (motion, foot)}.items()):
+        write_image(folder / f"{name}.nii.gz", scan(heel, GRID, *how, snr=25.0, number=number))
+    write_labels(folder / "tissues.nrrd", labels)
+    return Pad(folder, labels, motion)
+
+
+def asked(pad: Pad, **more: object) -> dict[str, object]:
+    return {"labels": pad.folder / "tissues.nrrd", "names": pad.folder / "tissues.csv", "bone_label": "bone", **more}
+
+
+@pytest.fixture(scope="module")
+def out(pad) -> Path:
+    """The load registered with borders."""
+    results = run(
+        pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"], out=pad.folder / "out", borders=True, threads=1,
+        **asked(pad),
+    )  # fmt: skip
+    assert not results.failures
+    return results.out
+
+
+def shear_of(folder: Path) -> np.ndarray:
+    return read_image(folder / "max_shear.nii.gz", allow_missing=True).values
+
+
+def test_strain_is_found_up_to_bone_and_skin(pad, out, worker):
+    """Without borders .101 in fat within 3 mm of bone and .119 in skin, with them .037 and .015."""
+    smooth = register(
+        *(read_image(pad.folder / f"Load{n}.nii.gz") for n in (0, 1)), bone=pad.labels.region("bone"),
+        tissue=Mask(GRID, pad.labels.labels > 0), labels=pad.labels, worker=worker,
+    )  # fmt: skip
+    assert isinstance(smooth.bspline, BSpline)
+    _, H = smooth.bspline.evaluate(GRID.points().reshape(-1, 3))
+    before = pad.shear_error(StrainField.from_gradient(H).max_shear.reshape(GRID.shape))
+    after = pad.shear_error(shear_of(out / "Load1"))
+    assert after["fat"] < 0.6 * before["fat"]
+    assert after["skin"] < 0.3 * before["skin"]
+    assert np.nanmax(shear_of(out / "Load1")[pad.labels.region("bone").inside]) == 0.0
+
+
+def test_its_transform_is_the_whole_motion_to_itk_and_to_us(pad, out, tmp_path):
+    folder = out / "Load1"
+    assert not list(folder.glob("TransformParameters*"))
+    alignment = json.loads((folder / "quality.json").read_text())["alignment"]
+    motion = RigidMotion(np.array(alignment["rotation"]), np.array(alignment["translation_lps_mm"]))
+    u = np.asarray(nibabel.load(folder / "displacement.nii.gz").dataobj)[:, :, :, 0]
+    known = np.isfinite(u).all(axis=-1)
+    X, x = GRID.points(known)[::37], motion.apply(GRID.points(known) + u[known])[::37]
+    itk = sitk.ReadTransform(str(folder / "transform.h5"))
+    np.testing.assert_allclose([itk.TransformPoint(p) for p in X.tolist()], x, atol=1e-3)
+    np.testing.assert_allclose(X + read_transform(folder / "transform.h5").displacement(X), x, atol=1e-3)
+    assert np.linalg.norm(u[known], axis=-1).max() > 2.0
+    body = tmp_path / "body.nrrd"
+    write_labels(body, LabelMap(GRID, (pad.labels.labels > 0).astype(np.int64), {1: "body"}))
+    strain(
+        pad.folder / "Load0.nii.gz", folder / "transform.h5", out=tmp_path / "again", tissue=body, **asked(pad)
+    )  # fmt: skip
+    again, first = shear_of(tmp_path / "again" / "transform"), shear_of(folder)
+    apart = np.full(GRID.shape, np.nan)
+    apart[INNER] = np.abs(again - first)[INNER]
+    deep = (pad.apart_mm() > 4.0) & np.isfinite(apart)
+    assert np.count_nonzero(deep) > 2000
+    assert apart[deep].max() < 0.015
+    assert np.nanmax(apart) > 0.1  # a jump between two voxels is lost in displacements at voxels
+
+
+def test_quality_and_report_tell_the_weights_and_that_there_are_no_error_bars(out):
+    told = json.loads((out / "Load1" / "quality.json").read_text())
+    weights = told["regularisation"]
+    assert (weights["borders"], weights["rigidity_of"]) == (True, "skin")
+    assert min(tried["left_out_over_best"] for tried in weights["tried_in_skin"]) == 1.0
+    assert len(weights["tried_in_skin"]) >= 3
+    assert weights["weights"]["rigidity"] > 10.0
+    assert told["error_of_max_shear"]["known"] is False
+    assert "without borders" in json.dumps(told["error_of_max_shear"])
+    assert not (out / "Load1" / "intervals.csv").exists()
+    report = (out / "report.html").read_text()
+    for sentence in ("has not been measured yet", "text files of elastix are not written", "strain of skin"):
+        assert sentence in report, sentence
+    given = json.loads((out / "Load1" / "provenance.json").read_text())["parameters"]
+    assert given["borders"] == {"skin": None}
+
+
+def test_a_study_begins_a_load_where_the_one_before_ended(pad, out, monkeypatch):
+    used = {}
+
+    def never(*_: object, **given: object) -> None:
+        used.update(given)
+        raise RegistrationError("enough")
+
+    monkeypatch.setattr("mrstrain.registeringone.register_pair", never)
+    more = {"labels": pad.folder / "tissues.nrrd", "names": pad.folder / "tissues.csv", "bone": "bone"}
+    with pytest.raises(RegistrationError, match="enough"):
+        register_one(
+            pad.folder / "Load0.nii.gz", pad.folder / "Load1.nii.gz", out=pad.folder / "one", after=out / "Load1",
+            borders=True, **more,
+        )  # fmt: skip
+    assert used["settings"].borders == AtBorders()
+    np.testing.assert_array_equal(used["labels"].labels, pad.labels.labels)
+    u = np.asarray(nibabel.load(out / "Load1" / "displacement.nii.gz").dataobj)[:, :, :, 0]
+    known = np.isfinite(u).all(axis=-1)
+    np.testing.assert_allclose(used["start"].displacement(GRID.points(known)), u[known], atol=1e-3)
+    assert np.abs(u[known]).max() > 2.0
+
+
+@pytest.fixture(scope="module")
+def layers() -> dict[str, object]:
+    """Fat between bone at rest and stiff skin, small; registered as it lies."""
+    fixed, moving, body, labels = scanned(skin=0.0)
+    return {
+        "reference": fixed, "loaded": moving, "tissue": body, "labels": labels, "bone": labels.region("bone"),
+        "settings": Settings(gauss_newton=GaussNewton(bending=3.0), borders=AtBorders(30.0), align_on="none"),
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found(layers, worker) -> BorderedSpline:
+    spline = register(**layers, worker=worker).bspline
+    assert isinstance(spline, BorderedSpline)
+    return spline
+
+
+def test_the_images_may_lie_askew_and_be_stored_in_any_order(layers, found, worker):
+    """The same scans in a turned world, axes in another order: labels go with them."""
+    turn = Rotation.from_rotvec([25.0, -15.0, 35.0], degrees=True).as_matrix()
+
+    def stored(scan: Image | Mask | LabelMap, name: str) -> Image | Mask | LabelMap:
+        """Axes k, i, j, the first of them from its far end."""
+        values, grid = getattr(scan, name), scan.grid.moved_by(turn, np.zeros(3))
+        values = values.transpose(2, 0, 1)[::-1]
+        order = [2, 0, 1]
+        direction = grid.direction[:, order] * np.array([-1.0, 1.0, 1.0])
+        origin = grid.points_at(np.array([0.0, 0.0, grid.shape[2] - 1.0]))
+        return replace(scan, grid=Grid(values.shape, grid.spacing_mm[order], origin, direction), **{name: values})
+
+    given = {"reference": "values", "loaded": "values", "tissue": "inside", "bone": "inside", "labels": "labels"}
+    askew = register(
+        **{name: stored(layers[name], field) for name, field in given.items()}, settings=layers["settings"],
+        worker=worker,
+    ).bspline  # fmt: skip
+    X = layers["reference"].grid.points()[4:-4:3, 4:-4:3, 4:-4:3].reshape(-1, 3)
+    u, H = found.evaluate(X)
+    other_u, other_H = askew.evaluate(X @ turn.T)
+    np.testing.assert_allclose(other_u, u @ turn.T, atol=1e-3)
+    np.testing.assert_allclose(turn.T @ other_H @ turn, H, atol=1e-3)
+
+
+def test_threads_do_not_change_a_bit(layers):
+    """From images as they are: N4 and elastix, which come before, do not promise that."""
+    fixed, moving, body, labels, bone = (layers[name] for name in ("reference", "loaded", "tissue", "labels", "bone"))
+    as_scanned, told = not_aligned(fixed, moving, body), []
+    for threads in (1, 2):
+        with Worker(threads) as worker:
+            told.append(
+                by_gauss_newton(
+                    fixed, moving, body, bone, as_scanned, GaussNewton(bending=3.0), None, worker, lambda _: None,
+                    (AtBorders(), labels),
+                )
+            )  # fmt: skip
+    (one, choice), (two, same) = told
+    assert choice == same
+    assert len(choice.tried_in_skin) >= 3
+    np.testing.assert_array_equal(one.smooth.coefficients_mm, two.smooth.coefficients_mm)
+    np.testing.assert_array_equal(one.jump.coefficients_mm, two.jump.coefficients_mm)
+    np.testing.assert_array_equal(one.borders.depth, two.borders.depth)
+
+
+def test_a_result_with_borders_may_be_a_start(layers, worker):
+    """Images of one texture, 19 mm apart, which no search from nothing finds; no bone is held."""
+    far = np.array([14.0, -10.0, 9.0])
+    loaded, labels = layers["loaded"], layers["labels"]
+    control = control_grid(labels.grid, np.full(3, 4.0))
+    there = np.broadcast_to(far[:, None, None, None], (3, *control.shape))
+    start = BorderedSpline(
+        BSpline(control, there), BSpline(control, np.zeros_like(there)), Borders.of(labels, None, 3.0)
+    )
+    moved = replace(loaded, grid=loaded.grid.moved_by(np.eye(3), far))
+    X = labels.grid.points()[8:-8:3, 8:-8:3, 8:-8:3].reshape(-1, 3)
+
+    def off_mm(begun_at: BorderedSpline | None) -> float:
+        found = register(**{**layers, "bone": None, "loaded": moved}, start=begun_at, worker=worker).bspline
+        return float(np.median(np.linalg.norm(found.displacement(X) - far - sheared(X, 0.0), axis=1)))
+
+    assert off_mm(start) < 0.5
+    assert off_mm(None) > 3.0
+
+
+def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
+    missing = {**layers, "labels": None}
+    with pytest.raises(InputError, match="give --labels"):
+        register(**missing)
+    labels = layers["labels"]
+    aside = labels.grid.moved_by(np.eye(3), np.array([50.0, 0.0, 0.0]))
+    with pytest.raises(InputError, match="not on the unloaded image's grid"):
+        register(**{**layers, "labels": replace(labels, grid=aside)})
+    with pytest.raises(InputError, match="label map is empty"):
+        register(**{**layers, "labels": replace(labels, labels=np.zeros_like(labels.labels))})
+    with pytest.raises(InputError, match="a BorderedSpline is given"):
+        register(**{**layers, "settings": Settings.of("heel-mr"), "start": found})
+    with pytest.raises(ParameterError, match="elastix finds one smooth spline"):
+        Settings(Settings.of("heel-mr").presets, borders=AtBorders())
+    with pytest.raises(ParameterError, match="must be above 0"):
+        AtBorders(0.0)
+    with pytest.raises(ParameterError, match="--borders is for --engine gauss-newton"):
+        settings_of(None, "heel-mr", borders=True)
+    for wrong, kind, said in (
+        ({"bone": pad.folder / "bone.nrrd"}, InputError, "--labels"),
+        (asked(pad, preset="heel-mr"), ParameterError, "--borders"),
+    ):
+        with pytest.raises(kind, match=said):
+            run(pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"], out=tmp_path / "o", borders=True, **wrong)
+    assert not (tmp_path / "o").exists()
+
+
+def test_its_parameters_are_not_those_of_the_plain_engine():
+    plain = Settings.of()
+    with_borders = replace(plain, borders=AtBorders())
+    assert with_borders.name == plain.name
+    told = json.loads(with_borders.text)
+    assert told.pop("borders")["skin"] is None
+    assert told == json.loads(plain.text)
+    assert json.loads(with_borders.of_repeat().text)["borders"]["skin"] == USUAL_SKIN
+    fixed = Settings(gauss_newton=GaussNewton(bending=2.0), borders=AtBorders())
+    assert fixed.of_repeat() == replace(fixed, borders=AtBorders(USUAL_SKIN))
+    assert replace(with_borders, borders=AtBorders(7.0)).of_repeat().borders == AtBorders(7.0)
