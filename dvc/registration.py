@@ -54,8 +54,8 @@ class Settings:
     seed : int
         Seed of every random number.
     threads : int
-        Threads of each worker. Results are equal bit for bit on equal numbers of threads; what Gauss-Newton adds to
-        the correction of shading and the bone's alignment is so on any.
+        Threads of each worker. elastix' results, the bone's alignment among them, are equal bit for bit on equal
+        numbers of threads; the correction of shading, and what Gauss-Newton adds, on any.
     gauss_newton : GaussNewton, optional
         Parameters of our own engine, which then takes the place of elastix and the presets.
     borders : AtBorders, optional

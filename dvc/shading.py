@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -43,11 +45,23 @@ def without_shading(image: Image) -> Image:
     n4 = sitk.N4BiasFieldCorrectionImageFilter()
     n4.SetMaximumNumberOfIterations(_ITERATIONS)
     n4.SetNumberOfControlPoints([_CONTROL_POINTS] * 3)
-    n4.Execute(sitk.Shrink(scan, shrink), sitk.Shrink(mask, shrink))
-    log_field = sitk.GetArrayFromImage(n4.GetLogBiasFieldAsImage(scan)).T
+    with _one_thread():
+        n4.Execute(sitk.Shrink(scan, shrink), sitk.Shrink(mask, shrink))
+        log_field = sitk.GetArrayFromImage(n4.GetLogBiasFieldAsImage(scan)).T
     found = log_field[inside]  # away from tissue the spline is extrapolated and may be anything
     field = np.exp(np.clip(log_field, found.min(), found.max()) - float(np.median(found)))
     return Image(image.grid, low + (image.values - low) / field.astype(np.float32))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """N4 adds up in parts, one for each thread of ITK's default: in one alone, its bits do not depend on them."""
+    usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
+    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)
+    try:
+        yield
+    finally:
+        sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
 
 
 def _to_sitk(image: Image, values: npt.NDArray[Any]) -> sitk.Image:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 
 from dvc.align import _scored
 from dvc.deformation import RigidMotion
@@ -85,6 +86,14 @@ def test_shading_is_removed_whatever_the_images_zero(offset):
         return float(values[bright].std() / values[bright].mean())
 
     assert unevenness(corrected) < 0.5 * unevenness(noisy)
+    usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
+    try:
+        for threads in (1, 2, 4):
+            sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(threads)
+            again = without_shading(Image(grid, noisy + offset)).values - offset
+            assert np.array_equal(again, corrected)
+    finally:
+        sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
 
 
 def test_a_hash_follows_the_voxels_that_a_header_names(tmp_path):
