@@ -23,7 +23,7 @@ from dvc.arrays import FloatArray
 from dvc.bspline import BSpline
 from dvc.deformation import Composed, Deformation, Within
 from dvc.errors import InputError, ParameterError
-from dvc.gaussnewton import USUAL_BENDING, Choice, GaussNewton
+from dvc.gaussnewton import Choice, GaussNewton
 from dvc.image import Image, Mask
 from dvc.nonrigid import by_elastix, by_gauss_newton, without_gaps
 from dvc.presets import Preset, load_preset, preset_or_file
@@ -88,9 +88,9 @@ class Settings:
     def of_repeat(self) -> Settings:
         """For a repeat scan: a weight chosen for it alone would smooth away the noise that it is to show."""
         own = self.gauss_newton
-        if own is None or own.bending is not None:
+        if own is None:
             return self
-        return replace(self, gauss_newton=replace(own, bending=USUAL_BENDING))
+        return replace(self, gauss_newton=replace(own, bending=own.weights.bending, volume=own.weights.volume))
 
     @classmethod
     def of(cls, name: str = GAUSS_NEWTON, **others: object) -> Settings:

@@ -20,8 +20,8 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.borders import BorderedSpline, Borders
 from dvc.bspline import BSpline
 from dvc.deformation import Deformation
-from dvc.descent import Level, Weights
-from dvc.gaussnewton import LEVELS, USUAL_BENDING, Choice, GaussNewton, choose, fit, scaled, turned
+from dvc.descent import Level
+from dvc.gaussnewton import LEVELS, Choice, GaussNewton, choose, fit, scaled, turned
 from dvc.image import Image, LabelMap, Mask
 
 _SKIN = "skin"
@@ -59,8 +59,9 @@ def fit_with_borders(
     choice : Choice
         Its weight "rigidity" is the skin's, k.
     """
-    weights = Weights(USUAL_BENDING if options.bending is None else options.bending, options.volume, _SKIN_WEIGHT)
-    smooth, _ = fit(fixed, moving, inside, body, bone, replace(options, bending=weights.bending), start=start)
+    bending = options.weights.bending
+    smooth, first = fit(fixed, moving, inside, body, bone, replace(options, bending=bending), start=start)
+    weights = replace(first.weights, rigidity=_SKIN_WEIGHT)
     axes, control = np.array(fixed.grid.direction), smooth.control
     borders = Borders.of(labels, bone, float(control.spacing_mm.mean()))
     soft = body.inside & (borders.own != borders.rest)
@@ -85,6 +86,7 @@ def fit_with_borders(
         choice = choose(slab, found, choice.weights)
     if skin.any():
         choice = replace(choice, rule=f"{choice.rule}; in skin {in_skin.rule}", tried_in_skin=in_skin.tried)
+    choice = replace(choice, asked=first.asked)
     found = whole.descend(found, choice.weights, steps=_STEPS, stop_mm=stop_mm)
     smooth, jump = (BSpline(control, turned(axes, c)) for c in np.split(found, 2))
     return BorderedSpline(smooth, jump, borders), choice

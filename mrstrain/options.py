@@ -70,4 +70,6 @@ Bending = Annotated[
     float | None,
     typer.Option(help="gauss-newton: weight of bending, 1/mm. Default: chosen for each pair by cross-validation."),
 ]
-Volume = Annotated[float | None, typer.Option(help="gauss-newton: weight of the change of volume, 1/mm3.")]
+Volume = Annotated[
+    float | None, typer.Option(help="gauss-newton: weight of the change of volume, 1/mm3; by the images.")
+]

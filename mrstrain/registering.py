@@ -116,7 +116,7 @@ def register(
     align : {"bone", "image", "none"}
     engine : {"gauss-newton", "elastix"}, optional
         What finds the non-rigid part: our own, unless a preset or parameter files of elastix are given. ``bending``
-        (1/mm) and ``volume`` (1/mm3) fix our own engine's weights; the first is otherwise chosen for each pair.
+        (1/mm) and ``volume`` (1/mm3) fix our own engine's weights, which are otherwise chosen for each pair.
     preset : str, optional
         Named parameters of elastix, heel-mr by default; or ``parameters``, files of your own, applied one after the
         other.
@@ -288,8 +288,7 @@ def settings_of(
         raise ParameterError(
             f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
         )
-    own = GaussNewton(bending=bending)
-    return Settings(gauss_newton=own if volume is None else replace(own, volume=volume))
+    return Settings(gauss_newton=GaussNewton(bending=bending, volume=volume))
 
 
 class _Run:

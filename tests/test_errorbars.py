@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dvc.gaussnewton import GaussNewton
+from dvc.gaussnewton import Choice, GaussNewton
 from dvc.image import Grid, Image, LabelMap, Mask
 from dvc.presets import load_preset
 from dvc.registration import Settings
@@ -47,7 +47,8 @@ def given(with_labels: bool = True, with_bone: bool = True):
     shear = np.where(inside, 0.1, np.nan).astype(np.float32)
     maps = StrainMaps(GRID, inside, np.zeros((*GRID.shape, 3)), np.zeros((*GRID.shape, 6)), shear, np.ones(GRID.shape))
     settings = Settings.of("heel-mr")
-    return SimpleNamespace(settings=settings, tissue=Mask(GRID, inside), reference=image, loaded=image), subject, maps
+    body = Mask(GRID, inside)
+    return SimpleNamespace(settings=settings, tissue=body, reference=image, loaded=image, choice=None), subject, maps
 
 
 def test_every_bone_is_left_out_whatever_its_name() -> None:
@@ -129,6 +130,10 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     own = model("gauss-newton", text=found.settings.text)
     assert error_bars(found, subject, maps, own).uncertainty is not None
     assert "that of heel-mr" in error_bars(found, subject, maps, model()).told
+    found.choice = Choice(GaussNewton().weights, "", asked=0.01)
+    assert error_bars(found, subject, maps, own).uncertainty is not None
+    found.choice = Choice(GaussNewton().weights, "", asked=0.05)
+    assert "phantoms that keep their volume" in error_bars(found, subject, maps, own).told
     found.settings = Settings(gauss_newton=GaussNewton(bending=2.0))
     assert "fixed at 2/mm" in error_bars(found, subject, maps, own).told
 
