@@ -132,10 +132,7 @@ def write_case(
         maps, found.tissue, bone, similarity=(as_scanned, rigid, after),
         most_similarity=_most_similarity(found, registered, both), landmark_errors_mm=errors, floor=floor,
     )  # fmt: skip
-    if found.choice is not None and found.choice.frees_volume:
-        # on phantoms that change their volume like that, a half to nine tenths of the change came back
-        asked = Verdict("caution", (f"{found.choice.volume_told} It may be larger than was found.",))
-        quality = replace(quality, verdict=worst([quality.verdict, asked]))
+    quality = replace(quality, verdict=with_volume(quality.verdict, found.choice))
     view = page.view_of(subject, maps)
     labels = _regions(measured)
     bars = error_bars(found, subject, maps, model)
@@ -179,6 +176,16 @@ def write_measured(folder: Path, measured: Measured, record: Mapping[str, object
         **_motion(measured.bone_motion),
     }
     return _written(folder, measured, maps, quality, pictures, alignment, record, lambda _: None)
+
+
+def with_volume(verdict: Verdict, choice: Choice | None) -> Verdict:
+    """The verdict, at best "Use with care" where the images asked for a change of volume.
+
+    On phantoms that change their volume like that, two thirds to all of the change came back.
+    """
+    if choice is None or not choice.frees_volume:
+        return verdict
+    return worst([verdict, Verdict("caution", (f"{choice.volume_told} It may be larger than was found.",))])
 
 
 def _written(

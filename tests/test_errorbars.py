@@ -19,6 +19,7 @@ from dvc.uncertainty import POOLED, ErrorModel, ErrorTable, error_model_of
 from dvc.verdict import Verdict
 from mrstrain.errorbars import error_bars
 from mrstrain.inputs import Subject
+from mrstrain.results import with_volume
 
 GRID = Grid((40, 40, 40), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))
 NAMES = {1: "Calcaneus", 2: "fat", 3: "Left talus"}
@@ -136,6 +137,15 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     assert "phantoms that keep their volume" in error_bars(found, subject, maps, own).told
     found.settings = Settings(gauss_newton=GaussNewton(bending=2.0))
     assert "fixed at 2/mm" in error_bars(found, subject, maps, own).told
+
+
+def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:
+    allowed, kept = (Choice(GaussNewton().weights, "", asked=asked) for asked in (0.05, 0.01))
+    doubted = with_volume(Verdict("trust"), allowed)
+    assert doubted.level == "caution"
+    assert "ask for a change of volume, of 5.0 % or more" in doubted.reasons[0]
+    assert with_volume(Verdict("trust"), kept).level == "trust"
+    assert with_volume(Verdict("distrust", ("It folds.",)), allowed).reasons == ("It folds.",)
 
 
 @pytest.mark.parametrize("name", ["gauss-newton", "heel-mr"])
