@@ -27,7 +27,7 @@ from dvc.strainmaps import StrainMaps, strain_maps
 from dvc.tissue import tissue_mask
 from dvc.transformwrite import write_elastix_transform, write_itk_transform
 from dvc.uncertainty import ErrorModel
-from dvc.verdict import Verdict, worst
+from dvc.verdict import Verdict
 from dvc.whole import whole_folder
 from mrstrain import page
 from mrstrain.errorbars import ErrorBars, error_bars
@@ -181,11 +181,15 @@ def write_measured(folder: Path, measured: Measured, record: Mapping[str, object
 def with_volume(verdict: Verdict, choice: Choice | None) -> Verdict:
     """The verdict, at best "Use with care" where the images asked for a change of volume.
 
-    On phantoms that change their volume like that, two thirds to all of the change came back.
+    On phantoms that change their volume like that, two thirds to all of the change came back. Images of another foot
+    ask for one too, and fit better once it is allowed: what is doubted all the same is then not to be trusted.
     """
     if choice is None or not choice.frees_volume:
         return verdict
-    return worst([verdict, Verdict("caution", (f"{choice.volume_told} It may be larger than was found.",))])
+    reason = f"{choice.volume_told} It may be larger than was found."
+    if verdict.level == "distrust":
+        return verdict
+    return Verdict("caution" if verdict.level == "trust" else "distrust", (*verdict.reasons, reason))
 
 
 def _written(
