@@ -26,11 +26,23 @@ _FLATTEST = 0.1  # det F below this is taken as this in F^-T
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Weights of the prior: bending (1/mm), change of volume in soft tissue and strain in what is stiff (1/mm3)."""
+    """Weights of the prior.
+
+    Attributes
+    ----------
+    bending : float
+        1/mm.
+    volume, rigidity : float
+        Of the change of volume in soft tissue, and of strain in what is stiff, 1/mm3.
+    volume_gradient : float
+        Of the gradient of the change of volume in soft tissue, 1/mm: volume may then change, but from place to place
+        only slowly.
+    """
 
     bending: float
     volume: float
     rigidity: float
+    volume_gradient: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +113,11 @@ class Level:
         self.roughness = Roughness(control, rough)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0
+        # between neighbouring blocks of soft tissue: the volume that their difference stands for, over its length^2
+        self._between = [
+            np.minimum(*_neighbours(self._soft, axis)) / length**2
+            for axis, length in enumerate(block * fixed.grid.spacing_mm)
+        ]
 
     def at(self, coefficients: FloatArray, halves: int = -1) -> State:
         """The state at a displacement; of the voxels all (-1) or one half (0, 1), as in `ImagePair.normal`."""
@@ -116,15 +133,20 @@ class Level:
     def prior(self, state: State, weights: Weights) -> float:
         """The energy of everything but the images."""
         strain = _green_lagrange(state.F[self._resists])
+        uneven = weights.volume_gradient * _dot(state.J, self._unevenness(state.J)) if weights.volume_gradient else 0.0
         return 0.5 * (
             weights.bending * _dot(state.coefficients, state.bent)
             + weights.volume * _dot(self._soft, (state.J - 1.0) ** 2)
             + weights.rigidity * _dot(self._stiff[self._resists], np.einsum("nab,nab->n", strain, strain))
+            + uneven
         )
 
     def prior_gradient(self, state: State, weights: Weights) -> FloatArray:
         """Derivative of `prior` by the coefficients."""
-        stress = (weights.volume * self._soft * (state.J - 1.0))[..., None, None] * state.cofactor
+        pressure = weights.volume * self._soft * (state.J - 1.0)
+        if weights.volume_gradient:
+            pressure += weights.volume_gradient * self._unevenness(state.J)
+        stress = pressure[..., None, None] * state.cofactor
         F = state.F[self._resists]
         stress[self._resists] += (weights.rigidity * self._stiff[self._resists])[:, None, None] * (
             F @ _green_lagrange(F)
@@ -140,7 +162,7 @@ class Level:
             weights.rigidity * self._stiff,
         )
         force = state.images.force / variance - self.prior_gradient(state, weights)
-        diagonal = self.pair.blocks.diagonal(stiffness)
+        diagonal = self.pair.blocks.diagonal(self._stiffness_alone(stiffness, weights))
         for spline, rough in enumerate(self.roughness.diagonals):
             for entry in (6 * spline, 6 * spline + 3, 6 * spline + 5):
                 diagonal[entry] += weights.bending * rough
@@ -148,7 +170,12 @@ class Level:
         blocks, roughness = self.pair.blocks, self.roughness
 
         def product(c: FloatArray) -> FloatArray:
-            return np.asarray(blocks.product(c, stiffness) + weights.bending * roughness.product(c))
+            out = blocks.product(c, stiffness) + weights.bending * roughness.product(c)
+            if weights.volume_gradient:
+                swelling = np.einsum("...ab,...ab->...", state.cofactor, blocks.evaluate(c)[1])
+                pressure = weights.volume_gradient * self._unevenness(swelling)
+                out += blocks.gathered(pressure[..., None, None] * state.cofactor)
+            return np.asarray(out)
 
         inverse = np.concatenate([_inverted(own) for own in np.split(diagonal, len(diagonal) // 6)])
         return conjugate_gradients(product, force, inverse, tolerance, most)
@@ -206,6 +233,45 @@ class Level:
                 break
         return state.coefficients
 
+    def swelling(self, coefficients: FloatArray, percentile: float) -> float:
+        """A percentile of |J - 1| over the blocks that are soft tissue alone."""
+        change = np.abs(self.at(coefficients).J - 1.0)[self._whole_soft]
+        return float(np.percentile(change, percentile))
+
+    def sharpness(self, coefficients: FloatArray) -> float:
+        """How sharply the images see a displacement: median over soft tissue of g^2 / s^2 along an axis, 1/mm5."""
+        state = self.at(coefficients)
+        seen = state.images.matrix[self._whole_soft][:, [0, 3, 5]].mean(axis=1)
+        variance = max(state.variance, _LEAST_RESIDUAL**2)
+        return float(np.median(seen)) / variance / float(self._soft.max())
+
+    @property
+    def _whole_soft(self) -> BoolArray:
+        return np.asarray(self._soft > 0.99 * self._soft.max())
+
+    def _stiffness_alone(self, stiffness: Stiffness, weights: Weights) -> Stiffness:
+        """With what a change of volume in one block alone would cost: for the preconditioner."""
+        if not weights.volume_gradient:
+            return stiffness
+        image, cofactor, volume, shear = stiffness
+        alone = np.zeros_like(self._soft)
+        for axis, between in enumerate(self._between):
+            before, after = _neighbours(alone, axis)
+            before += between
+            after += between
+        return image, cofactor, volume + weights.volume_gradient * alone, shear
+
+    def _unevenness(self, J: FloatArray) -> FloatArray:
+        """Derivative by J of half the integral of |grad J|^2 over soft tissue, by differences, mm."""
+        out = np.zeros_like(J)
+        for axis, between in enumerate(self._between):
+            low, high = _neighbours(J, axis)
+            flow = between * (high - low)
+            before, after = _neighbours(out, axis)
+            before -= flow
+            after += flow
+        return out
+
     def _longest(self, step: FloatArray) -> float:
         """The furthest that a step moves tissue, over the control spacing; air may go where it likes."""
         moved = self.pair.blocks.evaluate(step)[0][(self._soft > 0) | (self._stiff > 0)]
@@ -215,6 +281,12 @@ class Level:
         moved = self.pair.blocks.evaluate(step)[0]
         square = np.einsum("...a,...a->...", moved, moved)
         return float(np.sqrt(_dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)))
+
+
+def _neighbours(field: FloatArray, axis: int) -> tuple[FloatArray, FloatArray]:
+    """Views on the values before and after each border between neighbours along an axis."""
+    along = np.moveaxis(field, axis, 0)
+    return np.moveaxis(along[:-1], 0, axis), np.moveaxis(along[1:], 0, axis)
 
 
 def cofactors(F: FloatArray) -> FloatArray:

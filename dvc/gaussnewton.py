@@ -32,6 +32,12 @@ _BLURRED = 2.0  # standard deviations: nearer to its ends a blurred image shows 
 _RIM_MM = 1.2  # bone nearer to its surface than that may be tissue in part of a voxel
 USUAL_BENDING = 3.0
 """Weight of the bending, 1/mm, that strongly loaded pairs get, about."""
+USUAL_VOLUME = 300.0
+"""Weight of the change of volume, 1/mm3, of tissue that keeps its volume."""
+# Where the images ask for a change of volume, its gradient is held instead: while it is looked for with this weight
+# over how sharply a displacement is seen (mm4), so that large voxels and small ones are judged alike; then with 1/mm.
+_LOOKING_MM4, _FREED = 1000.0, 100.0
+_ASKED = 0.04  # the change of volume that a hundredth of the soft tissue exceeds: between loads and swelling
 _RATIO = np.sqrt(10.0)
 _POWERS = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
 _CHECK_STEPS, _CHECK_TOLERANCE, _CHECK_MOST = 2, 0.05, 80
@@ -49,8 +55,8 @@ class GaussNewton:
         Between control points, at the finest level; never less than two voxels.
     bending : float or None
         Weight b of the bending, 1/mm; None: chosen for each pair by cross-validation.
-    volume : float
-        Weight v of the change of volume in soft tissue, 1/mm3.
+    volume : float or None
+        Weight v of the change of volume in soft tissue, 1/mm3; None: 300, unless the images ask for such a change.
     rigidity : float
         Weight w of strain in the bone, 1/mm3.
 
@@ -62,7 +68,7 @@ class GaussNewton:
 
     spacing_mm: float = 3.2
     bending: float | None = None
-    volume: float = 300.0
+    volume: float | None = None
     rigidity: float = 1000.0
 
     def __post_init__(self) -> None:
@@ -71,12 +77,17 @@ class GaussNewton:
         if self.bending is not None and not (np.isfinite(self.bending) and self.bending > 0):
             raise ParameterError(f"The weight of the bending must be above 0; got {self.bending}.")
         for name in ("volume", "rigidity"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise ParameterError(f"The weight '{name}' must be 0 or more; got {getattr(self, name)}.")
+            weight = getattr(self, name)
+            if weight is not None and not (np.isfinite(weight) and weight >= 0):
+                raise ParameterError(f"The weight '{name}' must be 0 or more; got {weight}.")
 
     @property
     def text(self) -> str:
-        """Every number that decides the result, as JSON: what an error model or a record names the engine by."""
+        """Every number that decides the result, as JSON: what an error model or a record names the engine by.
+
+        Volume by the rule reads as volume kept, which gives the same result bit for bit unless the rule frees it
+        (`Choice.frees_volume`); of a result for which it did, this text alone says too little.
+        """
         rule = {
             "usual": USUAL_BENDING,
             "ratio": _RATIO,
@@ -85,7 +96,13 @@ class GaussNewton:
         }
         rims = {"blurred": _BLURRED, "bone_rim_mm": _RIM_MM}
         told = {"engine": "gauss-newton", "levels": LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
-        return json.dumps(asdict(self) | told)
+        return json.dumps(asdict(self) | {"volume": self.weights.volume} | told)
+
+    @property
+    def weights(self) -> Weights:
+        """Weights to begin with: the usual ones where a rule decides."""
+        bending = USUAL_BENDING if self.bending is None else self.bending
+        return Weights(bending, USUAL_VOLUME if self.volume is None else self.volume, self.rigidity)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +120,9 @@ class Choice:
         Likewise for the weight of strain in the skin, where borders of tissues are known.
     rigidity_of : {"bone", "skin"}
         Whose strain the weight "rigidity" is of.
+    asked : float or None
+        The change of volume that a hundredth of the soft tissue exceeds if only its gradient is held; None where the
+        weight of the change of volume was fixed beforehand.
     """
 
     weights: Weights
@@ -110,6 +130,25 @@ class Choice:
     tried: tuple[tuple[float, float], ...] = ()
     tried_in_skin: tuple[tuple[float, float], ...] = ()
     rigidity_of: str = "bone"
+    asked: float | None = None
+
+    @property
+    def frees_volume(self) -> bool:
+        """Whether the images ask for a change of volume, so that only its gradient was held."""
+        return self.asked is not None and self.asked > _ASKED
+
+    @property
+    def volume_told(self) -> str:
+        """How the change of volume was held, and why."""
+        if self.asked is None:
+            return f"Its weight was fixed beforehand, {self.weights.volume:g}/mm3."
+        found = f"{100.0 * self.asked:.1f} % or more in a hundredth of the soft tissue"
+        if self.frees_volume:
+            return (
+                f"The images ask for a change of volume, of {found}: it was allowed, and only its gradient held "
+                f"({self.weights.volume_gradient:g}/mm)."
+            )
+        return f"The images ask for no more change of volume than noise does, {found}: volume was kept."
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
@@ -118,6 +157,11 @@ class Choice:
             "rigidity_of": self.rigidity_of,
             "rule": self.rule,
             "tried": [{"bending": b, "left_out_over_best": round(v, 6)} for b, v in self.tried],
+            "change_of_volume": {
+                "rule": self.volume_told,
+                "asked": None if self.asked is None else round(self.asked, 4),
+                "allowed_above": None if self.asked is None else _ASKED,
+            },
         }
         if self.tried_in_skin:
             told["tried_in_skin"] = [{"rigidity": w, "left_out_over_best": round(v, 6)} for w, v in self.tried_in_skin]
@@ -172,7 +216,7 @@ def fit(
     core = np.zeros(body.grid.shape, dtype=bool)
     if bone is not None:
         core = distance_transform_edt(bone.inside, sampling=bone.grid.spacing_mm) > _RIM_MM
-    weights = Weights(USUAL_BENDING if options.bending is None else options.bending, options.volume, options.rigidity)
+    weights, asked = options.weights, None
     spacing = np.maximum(options.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
     axes = np.array(fixed.grid.direction)
     soft = body.inside & ~core
@@ -185,13 +229,16 @@ def fit(
         )
         level = _level(pictures, inside.inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
+        if options.volume is None and number == len(LEVELS) - 2:
+            asked = _volume_asked(level, coefficients, weights)
+            if asked > _ASKED:
+                weights = replace(weights, volume=0.0, volume_gradient=_FREED)
         progress((number + 1) / (len(LEVELS) + 2))
-    choice = Choice(weights, "fixed beforehand")
+    choice = Choice(weights, "fixed beforehand", asked=asked)
     if options.bending is None:
         part = _middle(inside.inside)
-        choice = choose(
-            Level(*pictures, inside.inside & part, soft & part, core & part, control), coefficients, weights
-        )
+        middle = Level(*pictures, inside.inside & part, soft & part, core & part, control)
+        choice = replace(choose(middle, coefficients, weights), asked=asked)
         progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
         coefficients = level.descend(coefficients, choice.weights, steps=_LAST_STEPS, stop_mm=LEVELS[-1][-1])
     progress(1.0)
@@ -237,6 +284,17 @@ def choose(
         rule += "; it is least at the end of what is tried"
     chosen = replace(weights, **{name: float(usual * _RATIO**power)})
     return Choice(chosen, rule, tuple((float(usual * _RATIO**p), found[p] / found[best]) for p in sorted(found)))
+
+
+def _volume_asked(level: Level, coefficients: FloatArray, weights: Weights) -> float:
+    """The change of volume |J - 1| that a hundredth of the soft tissue exceeds once only its gradient is held.
+
+    One step from the result that keeps volume. Held so, a change over 2 cm or more costs little, and noise, or detail
+    that the spline cannot follow without a change of volume, moves it by a hundredth.
+    """
+    held = _LOOKING_MM4 * level.sharpness(coefficients)
+    looking = replace(weights, bending=USUAL_BENDING, volume=0.0, volume_gradient=held)
+    return level.swelling(level.descend(coefficients, looking, steps=1, stop_mm=0.0), 99.0)
 
 
 def _middle(inside: BoolArray) -> BoolArray:

@@ -24,7 +24,7 @@ from dvc.borders import Spline
 from dvc.bspline import BSpline
 from dvc.deformation import Composed, Deformation, RigidMotion, Within
 from dvc.errors import InputError, ParameterError
-from dvc.gaussnewton import USUAL_BENDING, Choice, GaussNewton
+from dvc.gaussnewton import Choice, GaussNewton
 from dvc.image import Image, LabelMap, Mask
 from dvc.nonrigid import by_elastix, by_gauss_newton, without_gaps
 from dvc.presets import Preset, load_preset, preset_or_file
@@ -106,11 +106,12 @@ class Settings:
 
     def of_repeat(self) -> Settings:
         """For a repeat scan: a weight chosen for it alone would smooth away the noise that it is to show."""
-        if self.gauss_newton is None:
+        own = self.gauss_newton
+        if own is None:
             return self
-        own = replace(self.gauss_newton, bending=self.gauss_newton.bending or USUAL_BENDING)
         borders = None if self.borders is None else replace(self.borders, skin=self.borders.skin or USUAL_SKIN)
-        return replace(self, gauss_newton=own, borders=borders)
+        fixed = replace(own, bending=own.weights.bending, volume=own.weights.volume)
+        return replace(self, gauss_newton=fixed, borders=borders)
 
     @classmethod
     def of(cls, name: str = GAUSS_NEWTON, **others: object) -> Settings:

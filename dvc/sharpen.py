@@ -22,9 +22,9 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.borders import NUMBERS, BorderedSpline, Borders
 from dvc.bspline import BSpline
 from dvc.deformation import Deformation
-from dvc.descent import Level, Weights
+from dvc.descent import Level
 from dvc.errors import ParameterError
-from dvc.gaussnewton import LEVELS, USUAL_BENDING, Choice, GaussNewton, choose, fit, scaled, turned
+from dvc.gaussnewton import LEVELS, Choice, GaussNewton, choose, fit, scaled, turned
 from dvc.image import Image, LabelMap, Mask
 
 _SKIN = "skin"
@@ -100,8 +100,8 @@ def fit_with_borders(
     choice : Choice
         Its weight "rigidity" is the skin's, k; zero where there is no skin.
     """
-    bending = USUAL_BENDING if options.bending is None else options.bending
-    smooth, _ = fit(
+    bending = options.weights.bending
+    smooth, first = fit(
         fixed, moving, inside, body, bone, replace(options, bending=bending), start=start,
         progress=lambda share: progress(_SMOOTH_SHARE * share),
     )  # fmt: skip
@@ -110,7 +110,7 @@ def fit_with_borders(
     soft = body.inside & (borders.own != borders.rest)
     skin = soft & np.isin(labels.labels, [number for number, name in labels.names.items() if name.lower() == _SKIN])
     usual = USUAL_SKIN if at_borders.skin is None else at_borders.skin
-    weights = Weights(bending, options.volume, usual if skin.any() else 0.0)
+    weights = replace(first.weights, rigidity=usual if skin.any() else 0.0)
     scale = float(np.nanpercentile(fixed.values[body.inside], 75))
     pictures = scaled(fixed, scale), scaled(moving, scale)
     factors = borders.at_voxels()
@@ -132,7 +132,7 @@ def fit_with_borders(
     if options.bending is None:
         choice = choose(slab, found, choice.weights)
     rule = f"{choice.rule}; in skin {in_skin.rule}" if skin.any() else choice.rule
-    choice = replace(choice, rule=rule, tried_in_skin=in_skin.tried, rigidity_of=_SKIN)
+    choice = replace(choice, rule=rule, tried_in_skin=in_skin.tried, rigidity_of=_SKIN, asked=first.asked)
     progress(_SMOOTH_SHARE + 0.5)
     found = whole.descend(found, choice.weights, steps=_STEPS, stop_mm=stop_mm)
     progress(1.0)

@@ -303,7 +303,7 @@ def accuracy(
     snr: Annotated[list[float] | None, typer.Option(help="Signal-to-noise ratio; repeat for several.")] = None,
     motion: Annotated[
         list[str] | None,
-        typer.Option(help="still, smooth, sliding, Load1 to Load4, wave-L (wavelength L mm); repeat for several."),
+        typer.Option(help="still, smooth, sliding, swelling, Load1 to Load4, wave-L (L mm); repeat for several."),
     ] = None,
     seed: Annotated[
         list[int] | None,

@@ -152,6 +152,11 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
         raise InputError(f"The error model is that of {given.preset}, and {used.name} was used.")
     if given.parameters_sha256 != hashlib.sha256(used.text.encode()).hexdigest():
         raise InputError(_otherwise(used))
+    if found.choice is not None and found.choice.frees_volume:
+        raise InputError(
+            f"The error of {used.name} was measured on phantoms that keep their volume; here the images ask for a "
+            "change of volume, which was allowed."
+        )
     return given
 
 

@@ -126,9 +126,15 @@ def _registration(record: Record) -> str:
 def _weights(own: Record, borders: Record | None) -> str:
     bending = own.get("bending")
     weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
+    volume = own.get("volume")
+    kept = (
+        "300/mm3, or of its gradient alone where the images ask for such a change"
+        if volume is None
+        else f"{volume:g}/mm3"
+    )
     told = (
         f"a cubic B-spline with control points every {own.get('spacing_mm'):g} mm, least squares over all voxels, and "
-        f"penalties on bending (weight {weight}), on change of volume in soft tissue ({own.get('volume'):g}/mm3) and "
+        f"penalties on bending (weight {weight}), on change of volume in soft tissue ({kept}) and "
         f"on strain of the bone ({own.get('rigidity'):g}/mm3)"
     )
     if borders is None:

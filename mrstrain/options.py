@@ -76,4 +76,7 @@ Borders = Annotated[
         "--borders", help="gauss-newton: strain may jump where the tissues of --labels meet. No error bars yet."
     ),
 ]
-Volume = Annotated[float | None, typer.Option(help="gauss-newton: weight of the change of volume, 1/mm3.")]
+Volume = Annotated[
+    float | None,
+    typer.Option(help="gauss-newton: weight of the change of volume, 1/mm3. Default: 300, or as the images ask."),
+]

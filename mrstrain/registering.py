@@ -119,7 +119,7 @@ def register(
     align : {"bone", "image", "none"}
     engine : {"gauss-newton", "elastix"}, optional
         What finds the non-rigid part: our own, unless a preset or parameter files of elastix are given. ``bending``
-        (1/mm) and ``volume`` (1/mm3) fix our own engine's weights; the first is otherwise chosen for each pair.
+        (1/mm) and ``volume`` (1/mm3) fix our own engine's weights, which are otherwise chosen for each pair.
     borders : bool
         Our own engine: strain may jump where the tissues of ``labels`` meet, and the bone stays exactly at rest. For
         labels that are right to half a voxel; it has no error bars yet.
@@ -302,10 +302,8 @@ def settings_of(
         raise ParameterError(
             f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
         )
-    own = GaussNewton(bending=bending)
-    return Settings(
-        gauss_newton=own if volume is None else replace(own, volume=volume), borders=AtBorders() if borders else None
-    )
+    own = GaussNewton(bending=bending, volume=volume)
+    return Settings(gauss_newton=own, borders=AtBorders() if borders else None)
 
 
 def refuse_without_labels(labels: Path | str | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -116,9 +116,7 @@ def write_case(
     reference, loaded, motion = found.reference, found.loaded, found.alignment.motion
     grid = reference.grid
     measured = Measured(name, subject, found.tissue, found.deformation, motion)
-    edge = float(
-        found.bspline.control.spacing_mm.min()
-    )  # nearer to the scan's end, control points see half their tissue
+    edge = float(found.bspline.control.spacing_mm.min())  # nearer to the scan's end a spline sees half its tissue
     maps = strain_maps(found.deformation, found.tissue, lambda x: shows(loaded, motion.apply(x), edge))
     before = carry(loaded, grid)
     aligned = carry(loaded, grid, motion.apply)
@@ -146,6 +144,7 @@ def write_case(
         landmark_errors_mm=errors,
         floor=floor,
     )
+    quality = replace(quality, verdict=with_volume(quality.verdict, found.choice))
     view = page.view_of(subject, maps)
     labels = _regions(measured)
     bars = error_bars(found, subject, maps, model)
@@ -191,6 +190,20 @@ def write_measured(folder: Path, measured: Measured, record: Mapping[str, object
         **_motion(measured.bone_motion),
     }
     return _written(folder, measured, maps, quality, pictures, alignment, record, lambda _: None)
+
+
+def with_volume(verdict: Verdict, choice: Choice | None) -> Verdict:
+    """The verdict, at best "Use with care" where the images asked for a change of volume.
+
+    On phantoms that change their volume like that, two thirds to all of the change came back. Images of another foot
+    ask for one too, and fit better once it is allowed: what is doubted all the same is then not to be trusted.
+    """
+    if choice is None or not choice.frees_volume:
+        return verdict
+    reason = f"{choice.volume_told} It may be larger than was found."
+    if verdict.level == "distrust":
+        return verdict
+    return Verdict("caution" if verdict.level == "trust" else "distrust", (*verdict.reasons, reason))
 
 
 def _written(

@@ -1,7 +1,7 @@
-"""Incompressible flows of soft tissue around bone and, where wanted, inside a skin, with exact gradient and inverse.
+"""Flows of soft tissue around bone and, where wanted, inside a skin, with exact gradient and inverse.
 
 A flow carries every point for one unit of time along a stationary velocity v. Where div v = 0, volume is
-kept. Following the same velocity backwards is the inverse map.
+kept, as it is unless a flow is asked not to. Following the same velocity backwards is the inverse map.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _rise(x, y, z, parts, numbers, side, q):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _velocity(p, rest, skin, window, plate, pivot, v, L, q):  # type: ignore[no-untyped-def]
+def _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q):  # type: ignore[no-untyped-def]
     """Write the velocity at p into v and its gradient into L; q is room to work in."""
     v[:] = 0.0
     L[:, :] = 0.0
@@ -121,6 +121,14 @@ def _velocity(p, rest, skin, window, plate, pivot, v, L, q):  # type: ignore[no-
 
     # psi = chi w
     w = np.exp(-0.5 * s)
+    c0, c1, c2 = plate[0], plate[1], plate[2]
+    if not keeps:
+        g0, g1, g2 = w * (g0 + chi * e0), w * (g1 + chi * e1), w * (g2 + chi * e2)
+        v[0], v[1], v[2] = chi * w * c0, chi * w * c1, chi * w * c2
+        L[0, 0], L[0, 1], L[0, 2] = c0 * g0, c0 * g1, c0 * g2
+        L[1, 0], L[1, 1], L[1, 2] = c1 * g0, c1 * g1, c1 * g2
+        L[2, 0], L[2, 1], L[2, 2] = c2 * g0, c2 * g1, c2 * g2
+        return
     h00 = w * (h00 + 2.0 * g0 * e0 + chi * (e0 * e0 - f0))
     h11 = w * (h11 + 2.0 * g1 * e1 + chi * (e1 * e1 - f1))
     h22 = w * (h22 + 2.0 * g2 * e2 + chi * (e2 * e2 - f2))
@@ -129,7 +137,6 @@ def _velocity(p, rest, skin, window, plate, pivot, v, L, q):  # type: ignore[no-
     h12 = w * (h12 + g1 * e2 + g2 * e1 + chi * e1 * e2)
     g0, g1, g2 = w * (g0 + chi * e0), w * (g1 + chi * e1), w * (g2 + chi * e2)
 
-    c0, c1, c2 = plate[0], plate[1], plate[2]
     r0, r1, r2 = p[0] - pivot[0], p[1] - pivot[1], p[2] - pivot[2]
     along = 0.5 * (g0 * c0 + g1 * c1 + g2 * c2)
     share = chi * w + 0.5 * (g0 * r0 + g1 * r1 + g2 * r2)
@@ -147,7 +154,7 @@ def _velocity(p, rest, skin, window, plate, pivot, v, L, q):  # type: ignore[no-
 
 
 @njit(parallel=True, cache=True)
-def _carry(points, rest, skin, window, plate, pivot, steps, gradient):  # type: ignore[no-untyped-def]
+def _carry(points, rest, skin, window, plate, pivot, keeps, steps, gradient):  # type: ignore[no-untyped-def]
     """Runge-Kutta 4 on x' = v(x) and, with it, on (F - I)' = grad v F."""
     count = points.shape[0]
     u = np.zeros((count, 3))
@@ -173,7 +180,7 @@ def _carry(points, rest, skin, window, plate, pivot, steps, gradient):  # type: 
                         for i in range(3):
                             for j in range(3):
                                 M[i, j] = F1[n, i, j] + nodes[stage] * K[i, j]
-                    _velocity(p, rest, skin, window, plate, pivot, v, L, q)
+                    _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q)
                     for i in range(3):
                         du[i] += shares[stage] * v[i]
                         moving = moving or v[i] != 0.0
@@ -234,16 +241,17 @@ _NO_BORDER = (np.zeros((0, 9)), np.ones(3))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flow:
-    """An incompressible flow that moves what lies near a plate with it, around a body at rest.
+    """A flow, by default incompressible, that moves what lies near a plate with it, around a body at rest.
 
     The velocity is v = curl(psi a), a(x) = c x (x - o) / 2, of which curl a = c:
 
         v = psi c + [c (grad psi . r) - r (grad psi . c)] / 2,   r = x - o,
 
-    so that div v = 0 exactly, v = c where psi = 1 and v = 0 where psi = 0. psi is the product of a rise from the
-    body at rest (`Border`), of another from the inner surface of a skin at rest, if there is one, and of a
-    Gaussian window around the sole, which ends the motion upward and forward. Points follow v for one unit of
-    time by Runge-Kutta 4 with fixed steps; F follows dF/dt = (grad v) F by the same scheme, which makes it the
+    so that div v = 0 exactly, v = c where psi = 1 and v = 0 where psi = 0; a flow that need not keep volume has
+    v = psi c alone, and div v = c . grad psi: tissue shrinks before what moves and swells behind. psi is the
+    product of a rise from the body at rest (`Border`), of another from the inner surface of a skin at rest, if there is
+    one, and of a Gaussian window around the sole, which ends the motion upward and forward. Points follow v for one
+    unit of time by Runge-Kutta 4 with fixed steps; F follows dF/dt = (grad v) F by the same scheme, which makes it the
     derivative of the discrete map itself. No point crosses a border, so u and F are exact up to it on either side.
 
     Parameters
@@ -260,6 +268,7 @@ class Flow:
         Outside its body nothing moves.
     steps : int
         Runge-Kutta steps.
+    keeps_volume : bool
 
     Raises
     ------
@@ -274,6 +283,7 @@ class Flow:
     width_mm: FloatArray
     skin: Border | None = None
     steps: int = 10
+    keeps_volume: bool = True
 
     def __post_init__(self) -> None:
         for name in ("plate_mm", "pivot_mm", "centre_mm", "width_mm"):
@@ -290,7 +300,10 @@ class Flow:
         points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 3)
         window = np.array([self.centre_mm, self.width_mm])
         skin = _NO_BORDER if self.skin is None else self.skin._numbers()
-        u, H = _carry(points, self.rest._numbers(), skin, window, self.plate_mm, self.pivot_mm, self.steps, gradient)
+        u, H = _carry(
+            points, self.rest._numbers(), skin, window, self.plate_mm, self.pivot_mm, self.keeps_volume, self.steps,
+            gradient,
+        )  # fmt: skip
         lost = ~np.isfinite(points).all(axis=-1)
         u[lost] = np.nan
         if gradient:

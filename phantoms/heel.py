@@ -234,6 +234,23 @@ def sliding(heel: Heel, shear_mm: float) -> Flow:
     )
 
 
+def swelling(heel: Heel) -> Flow:
+    """Return a flow of the heel pad that changes its volume: det F from about 0.91 to 1.17, smoothly over 20 to 40 mm.
+
+    Its bones are at rest, and volume does not change in or at them. Tissue below the calcaneus is carried forward and a
+    little down: what lies before it is drained, what lies behind and above it is fuller.
+    """
+    bones = heel.skeleton
+    return Flow(
+        heel.size * np.array([0.0, -2.4, -0.8]),
+        pivot_mm=heel.size * np.array([0.0, 15.0, -47.0]),
+        rest=Border(EllipsoidUnion(bones.centres_mm, bones.forms, sharpness=1.25), ramp=1.0),
+        centre_mm=heel.size * np.array([0.0, 8.0, -40.0]),
+        width_mm=heel.size * np.array([15.0, 14.0, 15.0]),
+        keeps_volume=False,
+    )
+
+
 def under_load(heel: Heel, load: str) -> Motion:
     """Return the motion of a heel under one of LOADS: the pad slides inside its skin, and the plate moves all.
 

@@ -25,7 +25,18 @@ from dvc.uncertainty import to_surface_mm
 from dvc.whole import whole_file
 from dvc.worker import Worker
 from phantoms.anatomy import Heel
-from phantoms.heel import LOADS, covering, drawn_motion, heel_grid, labels_of, pressed, scan, sliding, under_load
+from phantoms.heel import (
+    LOADS,
+    covering,
+    drawn_motion,
+    heel_grid,
+    labels_of,
+    pressed,
+    scan,
+    sliding,
+    swelling,
+    under_load,
+)
 from phantoms.motions import ShearWave
 
 RIGID = ("bone", "ankle")
@@ -48,8 +59,8 @@ class Case:
     snr : float
         Fat's signal over the noise's standard deviation.
     motion : str
-        "still" (registered as a repeat scan is), "smooth", "sliding", "Load1" to "Load4", or "wave-L" with a
-        wavelength L in mm.
+        "still" (registered as a repeat scan is), "smooth", "sliding", "swelling" (volume changes), "Load1" to
+        "Load4", or "wave-L" with a wavelength L in mm.
     seed : int
         Of the heel, its images and the foot's motion.
     """
@@ -180,6 +191,8 @@ def motion_named(heel: Heel, name: str) -> Motion | None:
         return pressed(heel)
     if name == "sliding":
         return sliding(heel, 4.0)
+    if name == "swelling":
+        return swelling(heel)
     if name in LOADS:
         return under_load(heel, name)
     if name.startswith("wave-"):
@@ -190,7 +203,9 @@ def motion_named(heel: Heel, name: str) -> Motion | None:
         # Along the foot, with its crests across the pad's thickness; each heel sees another phase.
         phase = float(np.random.default_rng([heel.seed, 4]).uniform(0.0, 2.0 * np.pi))
         return ShearWave(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), wavelength, _WAVE_PEAK, phase)
-    raise InputError(f"No motion '{name}'; there are still, smooth, sliding, {', '.join(LOADS)} and wave-L (L in mm).")
+    raise InputError(
+        f"No motion '{name}'; there are still, smooth, sliding, swelling, {', '.join(LOADS)} and wave-L (L in mm)."
+    )
 
 
 def measure(

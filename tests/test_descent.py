@@ -124,10 +124,12 @@ def test_the_prior_of_a_stretch_is_its_closed_form(level):
 
 
 def test_a_rotation_costs_nothing(level):
-    assert level.prior(level.at(rotated(level)), Weights(1.0, 1.0, 1.0)) < 1e-9
+    assert level.prior(level.at(rotated(level)), Weights(1.0, 1.0, 1.0, 1.0)) < 1e-9
 
 
-@pytest.mark.parametrize("weights", [Weights(2.0, 0.0, 0.0), Weights(0.0, 3.0, 0.0), Weights(0.0, 0.0, 4.0)])
+@pytest.mark.parametrize(
+    "weights", [Weights(2.0, 0.0, 0.0), Weights(0.0, 3.0, 0.0), Weights(0.0, 0.0, 4.0), Weights(0, 0, 0, 5.0)]
+)
 def test_the_priors_gradient_is_that_of_its_energy(level, weights):
     random = np.random.default_rng(6)
     c = rotated(level) + 0.3 * random.normal(size=(3, *level.control.shape))

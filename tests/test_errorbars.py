@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dvc.gaussnewton import GaussNewton
+from dvc.gaussnewton import Choice, GaussNewton
 from dvc.image import Grid, Image, LabelMap, Mask
 from dvc.presets import load_preset
 from dvc.registration import Settings
@@ -20,6 +20,7 @@ from dvc.uncertainty import POOLED, ErrorModel, ErrorTable, error_model_of
 from dvc.verdict import Verdict
 from mrstrain.errorbars import error_bars
 from mrstrain.inputs import Subject
+from mrstrain.results import with_volume
 
 GRID = Grid((40, 40, 40), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))
 NAMES = {1: "Calcaneus", 2: "fat", 3: "Left talus"}
@@ -48,7 +49,8 @@ def given(with_labels: bool = True, with_bone: bool = True):
     shear = np.where(inside, 0.1, np.nan).astype(np.float32)
     maps = StrainMaps(GRID, inside, np.zeros((*GRID.shape, 3)), np.zeros((*GRID.shape, 6)), shear, np.ones(GRID.shape))
     settings = Settings.of("heel-mr")
-    return SimpleNamespace(settings=settings, tissue=Mask(GRID, inside), reference=image, loaded=image), subject, maps
+    body = Mask(GRID, inside)
+    return SimpleNamespace(settings=settings, tissue=body, reference=image, loaded=image, choice=None), subject, maps
 
 
 def test_every_bone_is_left_out_whatever_its_name() -> None:
@@ -130,6 +132,10 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     own = model("gauss-newton", text=found.settings.text)
     assert error_bars(found, subject, maps, own).uncertainty is not None
     assert "that of heel-mr" in error_bars(found, subject, maps, model()).told
+    found.choice = Choice(GaussNewton().weights, "", asked=0.01)
+    assert error_bars(found, subject, maps, own).uncertainty is not None
+    found.choice = Choice(GaussNewton().weights, "", asked=0.05)
+    assert "phantoms that keep their volume" in error_bars(found, subject, maps, own).told
     found.settings = Settings(gauss_newton=GaussNewton(bending=2.0))
     assert "fixed at 2/mm" in error_bars(found, subject, maps, own).told
     found.settings = replace(Settings.of("gauss-newton"), borders=AtBorders())
@@ -137,6 +143,16 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     assert bars.uncertainty is None
     assert "without borders" in bars.told
     assert "without borders" in error_bars(found, subject, maps, own).told
+
+
+def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:
+    allowed, kept = (Choice(GaussNewton().weights, "", asked=asked) for asked in (0.05, 0.01))
+    doubted = with_volume(Verdict("trust"), allowed)
+    assert doubted.level == "caution"
+    assert "ask for a change of volume, of 5.0 % or more" in doubted.reasons[0]
+    assert with_volume(Verdict("trust"), kept).level == "trust"
+    assert with_volume(Verdict("caution", ("Less alike.",)), allowed).level == "distrust"
+    assert with_volume(Verdict("distrust", ("It folds.",)), allowed).reasons == ("It folds.",)
 
 
 @pytest.mark.parametrize("name", ["gauss-newton", "heel-mr"])

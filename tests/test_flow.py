@@ -15,7 +15,7 @@ from dvc.kinematics import StrainField
 from phantoms.anatomy import Heel
 from phantoms.bodies import EllipsoidUnion
 from phantoms.flow import Border, Flow
-from phantoms.heel import LOADS, pressed, sliding, under_load
+from phantoms.heel import LOADS, pressed, sliding, swelling, under_load
 
 
 def test_flow_is_a_deformation(heel: Heel) -> None:
@@ -27,12 +27,16 @@ def motions(heel: Heel) -> dict[str, Motion]:
     return {"pressed": pressed(heel), "pressed lightly": pressed(heel, 0.3), "sliding": sliding(heel, 4.0)} | loads
 
 
+def those_and_swelling(heel: Heel) -> dict[str, Motion]:
+    return motions(heel) | {"swelling": swelling(heel)}
+
+
 MOTIONS = ["pressed", "pressed lightly", "sliding", *LOADS]
 
 
-@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("name", [*MOTIONS, "swelling"])
 def test_gradient_is_the_derivative_of_the_map(heel: Heel, tissue_points: np.ndarray, name: str) -> None:
-    flow, h = motions(heel)[name], 3e-4
+    flow, h = those_and_swelling(heel)[name], 3e-4
     # Differences must not reach across a border, where the gradient jumps.
     away = np.minimum(np.abs(heel.skeleton.distance(tissue_points)), np.abs(heel.flesh.distance(tissue_points)))
     points = tissue_points[away > 0.01][:1500]
@@ -50,9 +54,9 @@ def test_both_ways_give_the_same_displacement(heel: Heel, tissue_points: np.ndar
     np.testing.assert_array_equal(flow.evaluate(tissue_points)[0], flow.displacement(tissue_points))
 
 
-@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize("name", [*MOTIONS, "swelling"])
 def test_backward_flow_is_the_inverse(heel: Heel, tissue_points: np.ndarray, name: str) -> None:
-    flow = motions(heel)[name]
+    flow = those_and_swelling(heel)[name]
     u, H = flow.evaluate(tissue_points)
     back, H_back = flow.inverse().evaluate(tissue_points + u)
     assert np.abs(u + back).max() < 1e-6
@@ -63,6 +67,16 @@ def test_backward_flow_is_the_inverse(heel: Heel, tissue_points: np.ndarray, nam
 def test_volume_is_kept(heel: Heel, tissue_points: np.ndarray, name: str) -> None:
     _, H = motions(heel)[name].evaluate(tissue_points)
     np.testing.assert_allclose(np.linalg.det(H + np.eye(3)), 1.0, atol=1e-5)
+
+
+def test_swelling_changes_volume_and_nothing_in_bone(heel: Heel, tissue_points: np.ndarray) -> None:
+    u, H = swelling(heel).evaluate(tissue_points)
+    J, bone = np.linalg.det(H + np.eye(3)), heel.skeleton.distance(tissue_points) <= 0
+    assert 0.88 < J.min() < 0.93
+    assert 1.1 < J.max() < 1.2
+    assert bone.any()
+    assert not u[bone].any()
+    assert not H[bone].any()
 
 
 def test_runge_kutta_is_of_fourth_order(heel: Heel, tissue_points: np.ndarray) -> None:

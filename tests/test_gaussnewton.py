@@ -14,7 +14,7 @@ from dvc.bspline import BSpline
 from dvc.deformation import Affine, evaluate_on_grid
 from dvc.descent import Level
 from dvc.errors import ParameterError
-from dvc.gaussnewton import GaussNewton, _level, control_grid, fit, spline_through
+from dvc.gaussnewton import USUAL_VOLUME, Choice, GaussNewton, _level, control_grid, fit, spline_through
 from dvc.image import Image
 from dvc.kinematics import StrainField
 from dvc.registration import Settings, register
@@ -72,6 +72,53 @@ def test_what_bends_is_smoothed_less_than_what_does_not():
 
     assert 0.3 < chosen(1.0) < 5.0  # found to 0.17 mm root mean square at a weight of 1, to 0.20 at 10
     assert chosen(0.0) > 20.0  # found to 0.04 mm at 30, to 0.12 at 1
+
+
+def swollen(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement and det F of a hump of 3 mm whose volume changes by up to 23 %."""
+    away = points - GRID.centre_mm
+    hump = 3.0 * np.exp(-0.5 * (away**2).sum(axis=-1) / 8.0**2)
+    return hump[..., None] * np.array([1.0, 0.0, 0.0]), 1.0 - hump * away[..., 0] / 64.0
+
+
+def swollen_pair() -> tuple[Image, Image]:
+    seen = TURNED.points().reshape(-1, 3)
+    at = seen
+    for _ in range(40):
+        at = seen - swollen(at)[0]
+    return scanned(texture(GRID.points()), at, 0.1)
+
+
+def test_a_change_of_volume_that_the_images_ask_for_is_found():
+    where = everything()
+    X = GRID.points(where.inside)
+    _, true = swollen(X)
+
+    def share(**options: float) -> tuple[float, Choice]:
+        bspline, choice = fit(*swollen_pair(), where, where, None, GaussNewton(5.0, 3.0, **options))
+        J = np.linalg.det(bspline.evaluate(X)[1] + np.eye(3))
+        return float(((J - 1.0) * (true - 1.0)).sum() / ((true - 1.0) ** 2).sum()), choice
+
+    kept, by_hand = share(volume=USUAL_VOLUME)
+    freed, by_rule = share()
+    assert kept < 0.1  # found: 0.04
+    assert freed > 0.75  # found: 0.84
+    assert not by_hand.frees_volume
+    assert by_rule.frees_volume
+    assert "images ask for a change of volume" in str(by_rule.as_dict()["change_of_volume"])
+    assert "fixed beforehand, 300/mm3" in by_hand.volume_told
+
+
+def test_where_volume_is_kept_the_rule_changes_nothing():
+    shear = np.eye(3) + np.array([[0.0, 0.12, 0.0], [0.0, 0.0, 0.06], [0.0, 0.0, 0.0]])
+    motion = Affine(shear, GRID.centre_mm - shear @ GRID.centre_mm)
+    pair = pair_of(motion, 0.1)
+    found, choice = fit(*pair, everything(), everything(), None, GaussNewton(5.0, 3.0))
+    same, _ = fit(*pair, everything(), everything(), None, GaussNewton(5.0, 3.0, USUAL_VOLUME))
+    assert choice.asked is not None
+    assert not choice.frees_volume
+    assert GaussNewton().text == GaussNewton(volume=USUAL_VOLUME).text
+    np.testing.assert_array_equal(found.coefficients_mm, same.coefficients_mm)
 
 
 def test_where_a_blurred_image_shows_its_padding_it_is_not_used():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dvc.errors import ParameterError, RegistrationError
-from dvc.gaussnewton import USUAL_BENDING, GaussNewton
+from dvc.gaussnewton import USUAL_BENDING, USUAL_VOLUME, GaussNewton
 from dvc.image import Image
 from dvc.imagefile import read_image
 from dvc.imagewrite import write_image, write_mask
@@ -47,7 +47,9 @@ def test_quality_and_provenance_tell_the_engine_and_how_its_weight_was_chosen(wr
     assert "Error model of gauss-newton" in quality["error_of_max_shear"]["source"]
     record = json.loads((written / "out" / "Load1" / "provenance.json").read_text())
     assert record["parameters"]["engine"] == "gauss-newton"
-    assert record["parameters"]["gauss_newton"]["volume"] == GaussNewton().volume
+    assert record["parameters"]["gauss_newton"]["volume"] is None
+    assert told["weights"]["volume"] == USUAL_VOLUME
+    assert "volume was kept" in told["change_of_volume"]["rule"]
     assert record["parameters"]["stages"] == []
     assert "gauss-newton" in (written / "out" / "report.html").read_text()
 
@@ -130,14 +132,14 @@ def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkey
             written / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "o", bone=written / "bone.nii.gz",
             repeat=tmp_path / "again.nii.gz", workers=1, threads=1,
         )  # fmt: skip
-    assert used == {1.0: GaussNewton(), 2.0: GaussNewton(bending=USUAL_BENDING)}
+    assert used == {1.0: GaussNewton(), 2.0: GaussNewton(bending=USUAL_BENDING, volume=USUAL_VOLUME)}
     used.clear()
     with pytest.raises(RegistrationError):
         register_one(
             written / "Load0.nii.gz", tmp_path / "again.nii.gz", out=tmp_path / "repeat",
             labels=tmp_path / "labels.nii.gz", names=None, bone=written / "bone.nii.gz",
         )  # fmt: skip
-    assert used == {2.0: GaussNewton(bending=USUAL_BENDING)}
+    assert used == {2.0: GaussNewton(bending=USUAL_BENDING, volume=USUAL_VOLUME)}
     assert Settings.of("heel-mr").of_repeat() == Settings.of("heel-mr")
 
 
