@@ -19,11 +19,12 @@ from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import usable_cores
 from fe.meshstore import read_tet_mesh
 from fe.published import material_set
+from mrstrain.engines import settings_of
 from mrstrain.ledger import Ledger
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.pipeline import Pipeline
 from mrstrain.plan import Stage, plan
-from mrstrain.registering import REPEAT, settings_of
+from mrstrain.registering import REPEAT
 from mrstrain.studyfile import Study, read_study
 from validate.location import read_thresholds
 

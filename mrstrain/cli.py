@@ -18,6 +18,7 @@ from mrstrain.options import (
     BoneLabel,
     Borders,
     EngineName,
+    FieldFrame,
     Frame,
     Labels,
     MeshFile,
@@ -29,6 +30,8 @@ from mrstrain.options import (
     Plate,
     Preset,
     Shear,
+    Start,
+    StartFrame,
     Tissue,
     Unit,
     Volume,
@@ -95,6 +98,8 @@ def register(
         bool,
         typer.Option("--chain", help="Start each load from the result of the one before it, in the order given."),
     ] = False,
+    start: Start = None,
+    start_frame: StartFrame = None,
     repeat: Annotated[Path | None, typer.Option(help="A second unloaded image: gives the noise floor.")] = None,
     landmarks: Annotated[
         Path | None,
@@ -145,6 +150,8 @@ def register(
             parameters=parameters or (),
             allow_unknown_parameters=allow_unknown_parameters,
             chain=chain,
+            start=start,
+            start_frame=None if start_frame is None else start_frame.value,
             repeat=repeat,
             landmarks=landmarks,
             mesh=mesh,
@@ -178,10 +185,7 @@ def strain(
     tissue: Tissue = None,
     labels: Labels = None,
     names: Names = None,
-    frame: Annotated[
-        Frame | None,
-        typer.Option(help="Frame of a displacement image's components, where no JSON beside it tells."),
-    ] = None,
+    frame: FieldFrame = None,
     mesh: MeshFile = None,
     mesh_unit: MeshUnit = Unit.MM,
     mesh_frame: MeshFrame = Frame.LPS,
@@ -264,10 +268,7 @@ def twin(
     tissue: Tissue = None,
     labels: Labels = None,
     names: Names = None,
-    frame: Annotated[
-        Frame | None,
-        typer.Option(help="Frame of a displacement image's components, where no JSON beside it tells."),
-    ] = None,
+    frame: FieldFrame = None,
     seed: Annotated[int, typer.Option(min=0, help="Of noise and shading.")] = 1,
 ) -> None:
     """A loaded image made of your own unloaded one, with the truth beside it: to see how well that is found."""

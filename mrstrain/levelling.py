@@ -15,10 +15,11 @@ from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.imagewrite import write_image
 from dvc.tissue import tissue_mask
 from dvc.whole import whole_file, write_whole
+from mrstrain.engines import refuse_without_labels, settings_of
 from mrstrain.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.modelfiles import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.provenance import provenance, write_json
-from mrstrain.registering import refuse_without_labels, register, settings_of
+from mrstrain.registering import register
 from phantoms.twin import loaded_twin
 from validate.levelled import LEVELLED, carried_on
 from validate.mapping import filled_from_nearest

@@ -80,3 +80,11 @@ Volume = Annotated[
     float | None,
     typer.Option(help="gauss-newton: weight of the change of volume, 1/mm3. Default: 300, or as the images ask."),
 ]
+FieldFrame = Annotated[
+    Frame | None, typer.Option(help="Frame of a displacement image's components, where no JSON beside it tells.")
+]
+Start = Annotated[
+    Path | None,
+    typer.Option(help="What another tool found for one load, to be refined: a transform or displacement image."),
+]
+StartFrame = Annotated[Frame | None, typer.Option(help="Frame of --start, where its file does not tell it.")]

@@ -12,18 +12,18 @@ import numpy as np
 from dvc.align import AlignOn
 from dvc.arrays import FloatArray
 from dvc.borders import Spline
+from dvc.deformation import Deformation
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
-from dvc.gaussnewton import GaussNewton
 from dvc.image import Image, Mask
 from dvc.imagefile import read_image
 from dvc.landmarks import read_landmarks
-from dvc.presets import load_preset, read_parameter_file
+from dvc.presets import load_preset
 from dvc.registration import GAUSS_NEWTON, Registration, Settings, refuse_one_image_twice
 from dvc.registration import register as register_pair
-from dvc.sharpen import AtBorders
 from dvc.tissue import tissue_mask
 from dvc.uncertainty import ErrorModel, error_model_of, read_error_model
 from dvc.worker import Worker, each_in_workers, usable_cores
+from mrstrain.engines import refuse_without_labels, settings_of
 from mrstrain.inputs import (
     Subject,
     case_names,
@@ -35,6 +35,7 @@ from mrstrain.inputs import (
 from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
 from mrstrain.results import Case, write_case
+from mrstrain.straining import read_any, without_motion
 
 Told = Callable[[str, str, float], None]
 REPEAT = "repeat"
@@ -87,6 +88,8 @@ def register(
     parameters: Sequence[Path | str] = (),
     allow_unknown_parameters: bool = False,
     chain: bool = False,
+    start: Path | str | None = None,
+    start_frame: str | None = None,
     repeat: Path | str | None = None,
     landmarks: Path | str | None = None,
     mesh: Path | str | None = None,
@@ -128,6 +131,9 @@ def register(
         other.
     chain : bool
         Start each load from the result of the one before, in the order given.
+    start : path, optional
+        What any tool has found for a single loaded image, to be refined by our own engine: a transform or displacement
+        image, as in `strain`, with ``start_frame`` ("LPS" or "RAS") where a displacement image does not tell it.
     repeat : path, optional
         A second unloaded image; its apparent strain is the noise floor.
     landmarks : path, optional
@@ -168,17 +174,19 @@ def register(
         cases, paths = [*cases, REPEAT], [*paths, Path(repeat)]
     if not paths:
         raise InputError("Give at least one loaded image.")
-    if landmarks is not None and len(loads) != 1:
-        raise InputError(f"--landmarks belong to one loaded image; {len(loads)} are given. Register that one alone.")
+    for option, value in (("--landmarks", landmarks), ("--start", start)):
+        if value is not None and len(loads) != 1:
+            raise InputError(f"{option}: belongs to one loaded image; {len(loads)} are given. Register that one alone.")
     settings = settings_of(
         engine, preset, parameters, bending=bending, volume=volume, borders=borders,
         allow_unknown=allow_unknown_parameters,
     )  # fmt: skip
     if borders:
         refuse_without_labels(labels)
-    given = [
-        Path(p) for p in (load0, *paths, bone, tissue, labels, names, landmarks, mesh, error_model) if p is not None
-    ]
+    if start is not None and settings.gauss_newton is None:
+        raise ParameterError(f"--start is for --engine {GAUSS_NEWTON}; elastix begins at results of its own (--chain).")
+    files = (load0, *paths, bone, tissue, labels, names, landmarks, start, mesh, error_model)
+    given = [Path(p) for p in files if p is not None]
     refuse_touching_inputs(target, cases, given)
     subject = read_subject(
         load0,
@@ -202,6 +210,9 @@ def register(
     # Read now: what is wrong with it must not be found after an hour.
     model = None if error_model is None else read_error_model(error_model)
     points = None if landmarks is None else read_landmarks(landmarks)[:2]
+    body = subject.tissue or tissue_mask(subject.reference)
+    held = {"bone": subject.bone, "image": body, "none": None}[align]
+    begun_at = None if start is None else without_motion(read_any(start, start_frame), held)[0]
     refuse_one_image_twice(
         [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
     )
@@ -220,11 +231,13 @@ def register(
             "loads": paths[: len(loads)],
             "repeat": paths[len(loads) :],
             "landmarks": [] if landmarks is None else [Path(landmarks)],
+            "start": [] if start is None else [Path(start)],
             "error_model": [] if error_model is None else [Path(error_model)],
         },
         settings,
         {
             "chain": chain,
+            "start_frame": start_frame,
             "bone_label": bone_label,
             "shear_direction_lps": None if shear_direction is None else list(shear_direction),
             "mesh_unit": mesh_unit,
@@ -232,8 +245,7 @@ def register(
             "allow_missing": allow_missing,
         },
     )
-    body = subject.tissue or tissue_mask(subject.reference)
-    run = _Run(target, subject, images, settings, body, record, points, model, progress or (lambda *_: None))
+    run = _Run(target, subject, images, settings, body, record, points, model, begun_at, progress or (lambda *_: None))
     run.all(at_once, chain)
     finished = [run.cases[name] for name in cases if name in run.cases]
     if not finished:
@@ -268,55 +280,6 @@ def record_of(
     )
 
 
-def settings_of(
-    engine: str | None,
-    preset: str | None,
-    parameters: Sequence[Path | str] = (),
-    *,
-    bending: float | None = None,
-    volume: float | None = None,
-    borders: bool = False,
-    allow_unknown: bool = False,
-) -> Settings:
-    """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused.
-
-    Where none is asked for: elastix if a preset or parameter files are given, else our own.
-    """
-    if engine is None:
-        engine = "elastix" if preset or parameters else GAUSS_NEWTON
-    if engine not in {"elastix", GAUSS_NEWTON}:
-        raise ParameterError(f"No engine '{engine}'; there are elastix and {GAUSS_NEWTON}.")
-    if engine == "elastix":
-        if bending is not None or volume is not None:
-            raise ParameterError(f"--bending and --volume are weights of --engine {GAUSS_NEWTON}; elastix has none.")
-        if borders:
-            raise ParameterError(f"--borders is for --engine {GAUSS_NEWTON}: elastix finds one smooth spline.")
-        if parameters and preset:
-            raise ParameterError(
-                f"Give the preset {preset} or parameter files, not both: only one of them would be used."
-            )
-        if parameters:
-            return Settings(tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters))
-        return Settings.of(preset or "heel-mr")
-    if parameters or preset:
-        raise ParameterError(
-            f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
-        )
-    own = GaussNewton(bending=bending, volume=volume)
-    return Settings(gauss_newton=own, borders=AtBorders() if borders else None)
-
-
-def refuse_without_labels(labels: Path | str | None) -> None:
-    """Refuse borders of tissues that nobody has told.
-
-    Raises
-    ------
-    InputError
-    """
-    if labels is None:
-        raise InputError("--borders needs the tissues: give a label map of the unloaded image with --labels.")
-
-
 class _Run:
     """The loads of one series: registered in worker processes, each written as soon as it is finished."""
 
@@ -330,10 +293,11 @@ class _Run:
         record: dict[str, object],
         landmarks: tuple[FloatArray, FloatArray] | None,
         model: ErrorModel | None,
+        start: Deformation | None,
         tell: Told,
     ) -> None:
         self.out, self.subject, self.images, self.settings, self.body = out, subject, images, settings, body
-        self.record, self.landmarks, self.model, self._tell = record, landmarks, model, tell
+        self.record, self.landmarks, self.model, self.start, self._tell = record, landmarks, model, start, tell
         self.cases: dict[str, Case] = {}
         self.failures: dict[str, str] = {}
         self._telling, self._writing = threading.Lock(), threading.Lock()
@@ -345,7 +309,7 @@ class _Run:
         last: list[Spline] = []
 
         def one(name: str, worker: Worker) -> None:
-            start = last[-1] if chain and last and name != REPEAT else None
+            start = None if name == REPEAT else last[-1] if chain and last else self.start
             try:
                 found = register_pair(
                     self.subject.reference,

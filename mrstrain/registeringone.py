@@ -17,8 +17,9 @@ from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform
 from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import Worker
+from mrstrain.engines import settings_of
 from mrstrain.inputs import read_subject
-from mrstrain.registering import REPEAT, record_of, settings_of
+from mrstrain.registering import REPEAT, record_of
 from mrstrain.results import ITK_FILE, Case, write_case
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from dvc.align import motion_of
 from dvc.deformation import Composed, Deformation, RigidMotion
 from dvc.displacementfile import read_displacement
+from dvc.image import Mask
 from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform
 from mrstrain.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
@@ -45,20 +46,38 @@ class Given:
 
     def measured(self, name: str) -> Measured:
         """The deformation of tissue relative to its bone, where there is one."""
-        bone = self.subject.bone
-        motion = RigidMotion.identity() if bone is None else motion_of(self.whole, bone)
-        relative = self.whole if bone is None else Composed([self.whole, motion.inverse()])
+        relative, motion = without_motion(self.whole, self.subject.bone)
         body = self.subject.tissue or tissue_mask(self.subject.reference)
         return Measured(name, self.subject, body, relative, motion)
+
+
+def without_motion(whole: Deformation, bone: Mask | None) -> tuple[Deformation, RigidMotion]:
+    """A deformation without the rigid motion of a mask's voxels (least squares), and that motion; whole without one.
+
+    Raises
+    ------
+    InputError
+        If it is not defined in the mask.
+    """
+    if bone is None:
+        return whole, RigidMotion.identity()
+    motion = motion_of(whole, bone)
+    return Composed([whole, motion.inverse()]), motion
+
+
+def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
+    """A deformation from the file of any tool: a transform, or a displacement image, which may not tell its frame."""
+    source = Path(deformation)
+    if source.suffix.lower() in _TRANSFORMS:
+        return read_transform(source)
+    return read_displacement(source, frame=frame)
 
 
 def read_deformation(
     subject: Subject, deformation: Path | str, *, frame: str | None, command: str, parameters: Mapping[str, object]
 ) -> Given:
     """Read a deformation of a subject's unloaded image from the file of any tool."""
-    source = Path(deformation)
-    whole: Deformation
-    whole = read_transform(source) if source.suffix.lower() in _TRANSFORMS else read_displacement(source, frame=frame)
+    source, whole = Path(deformation), read_any(deformation, frame)
     record = provenance(command, {**subject.files, "deformation": source}, {"frame": frame, **parameters})
     return Given(subject, whole, source, record)
 

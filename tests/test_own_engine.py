@@ -16,8 +16,8 @@ from dvc.imagewrite import write_image, write_mask
 from dvc.labels import read_mask
 from dvc.presets import load_preset
 from dvc.registration import Settings
+from mrstrain.engines import settings_of
 from mrstrain.registering import register as run
-from mrstrain.registering import settings_of
 from mrstrain.registeringone import register_one
 from phantoms.anatomy import Heel
 from phantoms.heel import scan

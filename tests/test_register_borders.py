@@ -27,8 +27,8 @@ from dvc.registration import Settings, register
 from dvc.sharpen import USUAL_SKIN, AtBorders
 from dvc.transformfile import read_transform
 from dvc.worker import Worker
+from mrstrain.engines import settings_of
 from mrstrain.registering import register as run
-from mrstrain.registering import settings_of
 from mrstrain.registeringone import register_one
 from mrstrain.straining import strain
 from phantoms.anatomy import Heel

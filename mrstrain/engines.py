@@ -1,0 +1,61 @@
+"""Which engine a command is to register with, by what it was asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from dvc.errors import InputError, ParameterError
+from dvc.gaussnewton import GaussNewton
+from dvc.presets import read_parameter_file
+from dvc.registration import GAUSS_NEWTON, Settings
+from dvc.sharpen import AtBorders
+
+
+def settings_of(
+    engine: str | None,
+    preset: str | None,
+    parameters: Sequence[Path | str] = (),
+    *,
+    bending: float | None = None,
+    volume: float | None = None,
+    borders: bool = False,
+    allow_unknown: bool = False,
+) -> Settings:
+    """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused.
+
+    Where none is asked for: elastix if a preset or parameter files are given, else our own.
+    """
+    if engine is None:
+        engine = "elastix" if preset or parameters else GAUSS_NEWTON
+    if engine not in {"elastix", GAUSS_NEWTON}:
+        raise ParameterError(f"No engine '{engine}'; there are elastix and {GAUSS_NEWTON}.")
+    if engine == "elastix":
+        if bending is not None or volume is not None:
+            raise ParameterError(f"--bending and --volume are weights of --engine {GAUSS_NEWTON}; elastix has none.")
+        if borders:
+            raise ParameterError(f"--borders is for --engine {GAUSS_NEWTON}: elastix finds one smooth spline.")
+        if parameters and preset:
+            raise ParameterError(
+                f"Give the preset {preset} or parameter files, not both: only one of them would be used."
+            )
+        if parameters:
+            return Settings(tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters))
+        return Settings.of(preset or "heel-mr")
+    if parameters or preset:
+        raise ParameterError(
+            f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
+        )
+    own = GaussNewton(bending=bending, volume=volume)
+    return Settings(gauss_newton=own, borders=AtBorders() if borders else None)
+
+
+def refuse_without_labels(labels: Path | str | None) -> None:
+    """Refuse borders of tissues that nobody has told.
+
+    Raises
+    ------
+    InputError
+    """
+    if labels is None:
+        raise InputError("--borders needs the tissues: give a label map of the unloaded image with --labels.")
