@@ -17,12 +17,14 @@ import numpy as np
 from dvc.arrays import FloatArray
 from fe.assembly import Assembler
 from fe.linear import SingularError, Solver
-from fe.newton import LEAST_VOLUME, Converged, Tolerance, out_of_balance, reaction
+from fe.newton import BALANCED, LEAST_VOLUME, SMALL_MM, Converged, Tolerance, out_of_balance, reaction
 
-_FIRST, _RISE = 1e-5, 4.0  # damping d at the start, N/mm4, and how much more there is of it for a step that will not do
-_MOST_STEPS = 300
+_FIRST, _MOST = 1e-5, 1e6  # damping d, N/mm4
+_RISE = 4.0  # of d for a step that will not do
+_MOST_STEPS = 400
 _LARGEST_MM, _TOO_FAR_MM = 1.0, 3.0  # a longer step is shortened to that; a step that long is damped more
-_MOST_GROWTH = 3.0  # of the forces out of balance in one step
+_MOST_GROWTH = 3.0, 1.5  # of the forces out of balance in one step: far from balance, and near it
+_NEAR = 10.0  # times what is asked
 # Of d after a step, by the share of those forces that was not foretold; of cells that are nearly flat it never is well.
 _CHANGES = ((0.1, 0.2), (0.5, 1.0 / 3.0), (1.0, 0.5), (3.0, 1.0), (np.inf, 2.0))
 _BORNE = 0.5  # share of the forces that the medium may still take in the last step
@@ -75,9 +77,9 @@ def descend(
     Returns
     -------
     Converged or None
-        None if it is not found in 300 steps.
+        None if it is not found in 400 steps. As in `fe.newton.Tolerance`, steps that stay in balance are enough.
     """
-    now, damping = state.copy(), _FIRST
+    now, damping, growth, balanced = state.copy(), _FIRST, _MOST_GROWTH[0], 0
     forces, residual, lowest = assembler.residual(now)
     if not lowest > 0.0:
         return None
@@ -85,8 +87,10 @@ def descend(
     for count in range(1, _MOST_STEPS + 1):
         before_n = out_of_balance(outside - residual, assembler)
         step = _tried(assembler, solver, now, tangent, outside, residual, damping)
-        if step is None or step.after_n > _MOST_GROWTH * before_n:
+        if step is None or step.after_n > growth * before_n:
             damping *= _RISE
+            if damping > _MOST:
+                return None
             continue
         now, forces, residual = step.state, step.forces, step.residual
         balance = step.after_n / max(reaction(assembler, forces), 1e-9)
@@ -99,9 +103,13 @@ def descend(
             told(f"    given up: a node has moved by {moved_mm:.0f} mm, and the body is not that large")
             return None
         damping *= next(factor for limit, factor in _CHANGES if step.wrong <= limit)
+        growth = _MOST_GROWTH[balance <= _NEAR * tolerance.force]
+        balanced = balanced + 1 if balance <= tolerance.force else 0
+        newtons = step.largest_mm <= tolerance.step_mm and step.borne <= _BORNE
         if changed(now, forces):
             forces, residual, _ = assembler.residual(now)
-        elif balance <= tolerance.force and step.largest_mm <= tolerance.step_mm and step.borne <= _BORNE:
+            balanced = 0
+        elif (balanced and newtons) or (balanced >= BALANCED and step.largest_mm <= SMALL_MM):
             return Converged(now, forces, count)
         tangent = assembler.tangent(now)
     return None

@@ -20,7 +20,8 @@ LEAST_VOLUME = 0.002
 _MOST_GROWTH = 3.0  # of the residual in one step
 # Steps in a row that hardly lowered the residual, after which each is measured before it is made; and no more are.
 _WANDERED, _LOST = 2, 12
-_BALANCED, _SMALL_MM = 5, 0.1  # so many steps in a row that end in balance, the last below this, count as found
+BALANCED, SMALL_MM = 5, 0.1
+"""So many steps in a row that end in balance, the last below this, count as found."""
 _SHARES = (1.0, 0.5, 0.25)
 _ROUGH, _INEXACT = 0.05, 1e-3  # residual of a linear solution that is not exact, far from equilibrium and near it
 
@@ -157,7 +158,7 @@ def equilibrium(
         balanced = balanced + 1 if balance <= tolerance.force else 0
         if balanced and share == 1.0 and largest <= tolerance.step_mm:
             return Converged(now, forces, iteration)
-        if balanced >= _BALANCED and largest <= _SMALL_MM:
+        if balanced >= BALANCED and largest <= SMALL_MM:
             told(f"    taken as found: {balanced} steps in a row ended in balance, the last of {largest:.1e} mm")
             return Converged(now, forces, iteration)
     return None

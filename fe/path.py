@@ -198,7 +198,7 @@ class Path:
             share = min(1.0, done + step)
             kept = self.standing
             if self._go(goal.travels, before + share * way, downhill=downhill):
-                done, step = share, step * _GROWTH
+                done, step = share, step if downhill else step * _GROWTH
                 self._told(f"{done:.0%} of the way")
                 self.settled()
                 progress(done)
