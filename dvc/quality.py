@@ -196,7 +196,7 @@ def assess(
     *,
     similarity: tuple[float, float, float] | None = None,
     most_similarity: Callable[[float], float] | None = None,
-    offset: float = float("nan"),
+    offset: Callable[[float], float] | None = None,
     landmark_errors_mm: FloatArray | None = None,
     floor: NoiseFloor | None = None,
     limits: Limits | None = None,
@@ -212,8 +212,9 @@ def assess(
     most_similarity : callable, optional
         What noise, and a multiple of it, leaves of the last (`dvc.similarity.most_similarity`). What lacks is not
         trusted where it is too much for half as much noise again.
-    offset : float, optional
-        Between the registered images, as a share of brightness; NaN where it does not matter, as to mutual information.
+    offset : callable, optional
+        Between the registered images, as a share of brightness, at the noise and at a multiple of it
+        (`dvc.similarity.brightness_offset`). It is not trusted where it is too much for half as much noise again.
     """
     lines = limits or Limits()
     jacobian = maps.jacobian
@@ -227,6 +228,7 @@ def assess(
             squared = (maps.displacement_mm[kept].astype(np.float64) ** 2).sum(axis=1)
             bone_shift = float(np.sqrt(squared.mean()))
             bone_shear = float(np.percentile(maps.max_shear[kept], 95))
+    share = float("nan") if offset is None else offset(1.0)
     findings: list[Verdict] = []
     if bone is not None and not np.isfinite(bone_shift):
         findings.append(Verdict("caution", ("The bone has no result, so whether it stayed rigid is not known.",)))
@@ -259,10 +261,11 @@ def assess(
                 "local similarity lacks {value:.2f} (care above {limit:.2f}). Is it the same foot, scanned in the same "
                 "way? Parallel imaging and filters change the noise in the tissue.",
             )
+        surely = offset is not None and offset(_MORE_NOISE) > lines.offset[1]
         _judge_above(
             findings,
-            offset,
-            lines.offset,
+            share,
+            (lines.offset[0], -np.inf if surely else np.inf),
             "The images' brightness differs by more than a factor: by an offset of {value:.0%} of the tissue's (care "
             "above {limit:.0%}), which is taken for motion. Scan both in the same way, or take it out of the images.",
         )
@@ -328,7 +331,7 @@ def assess(
     return Quality(
         similarity,
         float("nan") if most_similarity is None else most_similarity(1.0),
-        offset,
+        share,
         folded,
         lowest,
         at,

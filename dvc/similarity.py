@@ -86,11 +86,11 @@ def most_similarity(
     return lambda factor: float(np.sqrt(np.prod([max(0.0, 1.0 - factor**2 * share) for share in shares])))
 
 
-def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float = 0.0) -> float:
+def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float) -> Callable[[float], float]:
     """How much of one image's brightness is an offset to the other's, and no factor of it.
 
-    Fitted is ``carried = g(X) a + o(X)`` with g and o linear in X, by least squares in which the noise of ``a``, known
-    beforehand, does not lower g (Fuller, Measurement Error Models, 1987, section 2.2).
+    Fitted is ``carried = g(X) a + o(X)`` with g quadratic and o linear in X, by least squares in which the noise of
+    ``a``, known beforehand, does not lower g (Fuller, Measurement Error Models, 1987, section 2.2).
 
     Parameters
     ----------
@@ -101,22 +101,30 @@ def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float 
 
     Returns
     -------
-    float
-        95th percentile of abs(o) over the mask, as a share of the tissue's brightness (75th percentile of ``carried``);
-        NaN where the mask has too few voxels that both know, or no contrast beyond the noise.
+    callable
+        Of a factor on that noise, the 95th percentile of abs(o) over the mask, as a share of the tissue's brightness
+        (75th percentile of ``carried``); NaN where the mask has too few voxels that both know, or no contrast beyond
+        the noise.
     """
     box = mask.box()
     known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
     at = np.argwhere(known)
     if len(at) < _FEWEST:
-        return float("nan")
+        return lambda _: float("nan")
     x, y = (values[box][known].astype(np.float64) for values in (a.values, carried))
     size, bright = float(np.abs(x).max()), float(np.percentile(y, _BRIGHT))
-    linear = np.column_stack([np.ones(len(at)), 2.0 * at / np.maximum(at.max(axis=0), 1) - 1.0])
-    both = np.hstack([linear * (x / size)[:, None], linear])
-    normal = both.T @ both
-    normal[:4, :4] -= (noise / size) ** 2 * (linear.T @ linear)
-    if not (bright > 0.0 and np.linalg.eigvalsh(normal).min() > _LEAST * np.trace(normal)):
-        return float("nan")
-    offset = linear @ np.linalg.solve(normal, both.T @ y)[4:]
-    return float(np.percentile(np.abs(offset), 95)) / bright
+    place = 2.0 * at / np.maximum(at.max(axis=0), 1) - 1.0
+    linear = np.column_stack([np.ones(len(at)), place])
+    gain = np.column_stack([linear, place**2, place * np.roll(place, 1, axis=1)])
+    terms = gain.shape[1]
+    both = np.hstack([gain * (x / size)[:, None], linear])
+    normal, right, own = both.T @ both, both.T @ y, gain.T @ gain
+
+    def offset(factor: float) -> float:
+        told = normal.copy()
+        told[:terms, :terms] -= (factor * noise / size) ** 2 * own
+        if not (bright > 0.0 and np.linalg.eigvalsh(told).min() > _LEAST * np.trace(told)):
+            return float("nan")
+        return float(np.percentile(np.abs(linear @ np.linalg.solve(told, right)[terms:]), 95)) / bright
+
+    return offset

@@ -19,7 +19,7 @@ from fe.assembly import Assembler
 from fe.linear import SingularError, Solver
 from fe.newton import BALANCED, LEAST_VOLUME, SMALL_MM, Converged, Tolerance, out_of_balance, reaction
 
-_FIRST, _MOST = 1e-5, 1e6  # damping d, N/mm4
+_FIRST, _LEAST, _MOST = 1e-5, 1e-9, 1e6  # damping d, N/mm4
 _RISE = 4.0  # of d for a step that will not do
 _MOST_STEPS = 400
 _LARGEST_MM, _TOO_FAR_MM = 1.0, 3.0  # a longer step is shortened to that; a step that long is damped more
@@ -102,14 +102,14 @@ def descend(
         if moved_mm > farthest_mm:
             told(f"    given up: a node has moved by {moved_mm:.0f} mm, and the body is not that large")
             return None
-        damping *= next(factor for limit, factor in _CHANGES if step.wrong <= limit)
+        damping = max(_LEAST, damping * next(factor for limit, factor in _CHANGES if step.wrong <= limit))
         growth = _MOST_GROWTH[balance <= _NEAR * tolerance.force]
         balanced = balanced + 1 if balance <= tolerance.force else 0
-        newtons = step.largest_mm <= tolerance.step_mm and step.borne <= _BORNE
+        small_mm = SMALL_MM if balanced >= BALANCED else tolerance.step_mm
         if changed(now, forces):
             forces, residual, _ = assembler.residual(now)
             balanced = 0
-        elif (balanced and newtons) or (balanced >= BALANCED and step.largest_mm <= SMALL_MM):
+        elif balanced and step.largest_mm <= small_mm and step.borne <= _BORNE:
             return Converged(now, forces, count)
         tangent = assembler.tangent(now)
     return None

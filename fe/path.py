@@ -27,7 +27,7 @@ _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
 _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
-_LEAST_APPROACH_MM = 0.1
+_LEAST_APPROACH_MM = 0.01
 _ALONG_NORMAL = np.array([True, False, False])
 _ENOUGH = (0.2, 0.4, 0.6, 0.8)  # shares of the normal load up to which the plate is moved, and not yet pushed
 
@@ -186,8 +186,8 @@ class Path:
     def raise_to(self, goal: Goal, progress: Callable[[float], None] = lambda _: None) -> bool:
         """Go on from what is to the goal, in steps as large as converge; whether it is there.
 
-        Where Newton's method does not get on under forces, it goes on downhill (`fe.descent`), unless the plate turns.
-        A travel goes on in steps so small that what touches does so in its order.
+        Where Newton's method does not get on under forces, it goes on downhill (`fe.descent`), with a plate on
+        tape that does not turn. A travel goes on in steps so small that what touches does so in its order.
         """
         before = self.reached(goal)
         way = goal.values - before
@@ -205,7 +205,7 @@ class Path:
                 continue
             self._back(kept)
             step *= _SHRINK
-            if step < _SOFT_STEP and not (downhill or goal.travels.any() or self.contact.hold.loose):
+            if step < _SOFT_STEP and not (downhill or goal.travels.any()) and self.contact.stays:
                 downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0
 

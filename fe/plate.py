@@ -126,6 +126,11 @@ class Contact:
         return self.nodes[self.hold.nodes]
 
     @property
+    def stays(self) -> bool:
+        """Whether what touches stays where it does, on a plate that does not turn now."""
+        return self.plate.taped and not self.hold.loose
+
+    @property
     def followers(self) -> dict[int, IntArray]:
         """Unknowns that follow each of the plate's three displacements."""
         return {axis: 3 * self.held + axis for axis in range(3 if self.plate.taped else 1)}

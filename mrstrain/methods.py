@@ -110,10 +110,11 @@ def _registration(record: Record) -> str:
     }.get(str(given.get("align")), "The loaded image was, without rigid alignment,")
     elastix = f"elastix (Klein 2010, Shamonin 2014; itk-elastix {versions.get('itk-elastix', '?')})"
     ours = f"mrstrain {versions.get('mrstrain', '?')}"
+    on_bone = given.get("align") == "bone"
     how = (
         f"with {elastix} through {ours}: {'; then '.join(_stage(stage) for stage in stages)}"
         if not own
-        else f"with the Gauss-Newton engine of {ours}: {_weights(own, given.get('borders'))}"
+        else f"with the Gauss-Newton engine of {ours}: {_weights(own, given.get('borders'), on_bone)}"
     )
     if own and given.get("align") != "none":
         how += f"; rigid alignment with {elastix}"
@@ -123,7 +124,7 @@ def _registration(record: Record) -> str:
     )
 
 
-def _weights(own: Record, borders: Record | None) -> str:
+def _weights(own: Record, borders: Record | None, on_bone: bool) -> str:
     bending = own.get("bending")
     weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
     volume = own.get("volume")
@@ -143,7 +144,8 @@ def _weights(own: Record, borders: Record | None) -> str:
     weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
     return (
         f"{told}; from there a second B-spline was added that vanishes on the borders of the label map's tissues, so "
-        f"that strain may jump there, the bone held at rest and strain of the skin penalised (weight {weight})"
+        f"that strain may jump there, {'the bone held at rest and ' if on_bone else ''}strain of the skin penalised "
+        f"(weight {weight})"
     )
 
 

@@ -205,12 +205,13 @@ def weights_table(choice: Choice) -> Table:
     rows: list[tuple[Cell, ...]] = [
         ("bending", used.bending, "1/mm", "used"),
         ("change of volume in soft tissue", used.volume, "1/mm3", "used"),
+        ("gradient of that change", used.volume_gradient, "1/mm", "used"),
         (stiff, used.rigidity, "1/mm3", "used"),
     ]
     rows += [("bending", weight, "1/mm", left) for weight, left in choice.tried]
     rows += [(stiff, weight, "1/mm3", left) for weight, left in choice.tried_in_skin]
     columns = ("penalty on", "weight", "unit", "residual left out, over the best")
-    return Table("Weights of the registration", columns, tuple(rows), f"{choice.rule}.")
+    return Table("Weights of the registration", columns, tuple(rows), f"{choice.rule}. {choice.volume_told}")
 
 
 def region_table(regions: Sequence[RegionRow]) -> Table:

@@ -183,6 +183,8 @@ def register(
     )  # fmt: skip
     if borders:
         refuse_without_labels(labels)
+    if start_frame is not None and start is None:
+        raise ParameterError("--start-frame is the frame of --start, which is not given.")
     if start is not None and settings.gauss_newton is None:
         raise ParameterError(f"--start is for --engine {GAUSS_NEWTON}; elastix begins at results of its own (--chain).")
     files = (load0, *paths, bone, tissue, labels, names, landmarks, start, mesh, error_model)

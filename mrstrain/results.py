@@ -131,9 +131,9 @@ def write_case(
     bone = found.bone if found.alignment.on == "bone" else None
     errors = None if landmarks is None else target_registration_error(found.total, *landmarks)
     noise = _noise_in_air(found)
-    offset = float("nan")
-    if found.settings.needs_one_contrast:
-        offset = brightness_offset(reference, registered, both, noise[0] if noise else 0.0)
+    offset = None
+    if noise and found.settings.gauss_newton is not None:  # correlation, as in elastix, is blind to an even one
+        offset = brightness_offset(reference, registered, both, noise[0])
     quality = assess(
         maps,
         found.tissue,
@@ -201,8 +201,6 @@ def with_volume(verdict: Verdict, choice: Choice | None) -> Verdict:
     if choice is None or not choice.frees_volume:
         return verdict
     reason = f"{choice.volume_told} It may be larger than was found."
-    if verdict.level == "distrust":
-        return verdict
     return Verdict("caution" if verdict.level == "trust" else "distrust", (*verdict.reasons, reason))
 
 

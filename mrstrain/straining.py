@@ -9,6 +9,7 @@ from pathlib import Path
 from dvc.align import motion_of
 from dvc.deformation import Composed, Deformation, RigidMotion
 from dvc.displacementfile import read_displacement
+from dvc.errors import InputError
 from dvc.image import Mask
 from dvc.tissue import tissue_mask
 from dvc.transformfile import read_transform
@@ -69,6 +70,8 @@ def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
     """A deformation from the file of any tool: a transform, or a displacement image, which may not tell its frame."""
     source = Path(deformation)
     if source.suffix.lower() in _TRANSFORMS:
+        if frame is not None:
+            raise InputError(f"{source}: a transform file is in LPS; a frame is told of displacement images alone.")
         return read_transform(source)
     return read_displacement(source, frame=frame)
 

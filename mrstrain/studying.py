@@ -54,7 +54,16 @@ SEEDS = (1, 2)
 # What makes the images: a study goes on only with runs made by the same.
 _MAKING = {"anatomy.py", "bodies.py", "flow.py", "heel.py", "motions.py", "mri.py", "study.py"}
 # Our own engine, which has no release number as elastix has.
-_ENGINE = {"gaussnewton.py", "descent.py", "imageterm.py", "smoothness.py", "splinesums.py", "nonrigid.py"}
+_ENGINE = {
+    "gaussnewton.py",
+    "descent.py",
+    "imageterm.py",
+    "smoothness.py",
+    "splinesums.py",
+    "nonrigid.py",
+    "shading.py",
+    "registration.py",
+}
 _SECONDS = 36.0  # of one run on one core, as measured, half of it to make and to score the pair
 _ELASTIX_SECONDS = 75.0  # as measured: 3,500 iterations, whatever the voxel
 _MEGABYTES = 5.0  # of one run's samples, as measured at 0.8 mm
@@ -278,7 +287,7 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
         _write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], [asdict(row) for row in rows])
     presets = list(dict.fromkeys(r.case.preset for r in runs))
     for preset in presets:
-        some = [r for r in runs if r.case.preset == preset]
+        some = [r for r in runs if r.case.preset == preset and r.case.keeps_volume]
         if any(r.case.wavelength_mm is None for r in some):
             plain = [r for r in some if r.case.wavelength_mm is None]
             seeds = sorted({r.case.seed for r in plain})

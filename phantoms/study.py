@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +76,11 @@ class Case:
         """For a file and for people."""
         spacing = "x".join(f"{s:g}" for s in self.spacing_mm)
         return f"{Path(self.preset).stem}_{spacing}mm_snr{self.snr:g}_{self.motion}_{self.seed}"
+
+    @property
+    def keeps_volume(self) -> bool:
+        """Whether soft tissue does: error models are of such pairs, registered as such."""
+        return self.motion != "swelling"
 
     @property
     def wavelength_mm(self) -> float | None:
@@ -243,8 +248,11 @@ def measure(
         loaded = scan(heel, where, motion, foot, snr=case.snr, number=number + 1)
     # A wave moves the bone too: nothing there to align on.
     settings = Settings.of(case.preset, align_on="none" if wave else "bone", threads=worker.threads)
+    own = settings.gauss_newton
     if motion is None:
         settings = settings.of_repeat()
+    elif own is not None and case.keeps_volume:
+        settings = replace(settings, gauss_newton=replace(own, volume=own.weights.volume))
     found = register(
         reference,
         loaded,

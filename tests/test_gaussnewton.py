@@ -15,10 +15,11 @@ from dvc.deformation import Affine, evaluate_on_grid
 from dvc.descent import Level
 from dvc.errors import ParameterError
 from dvc.gaussnewton import USUAL_VOLUME, Choice, GaussNewton, _level, control_grid, fit, spline_through
-from dvc.image import Image
+from dvc.image import Image, LabelMap
 from dvc.kinematics import StrainField
 from dvc.registration import Settings, register
 from dvc.resample import smoothed
+from dvc.sharpen import AtBorders, fit_with_borders
 from dvc.transformfile import read_transform
 from dvc.transformwrite import write_elastix_transform
 from tests.textures import GRID, TURNED, everything, pair_of, scanned, texture
@@ -107,6 +108,12 @@ def test_a_change_of_volume_that_the_images_ask_for_is_found():
     assert by_rule.frees_volume
     assert "images ask for a change of volume" in str(by_rule.as_dict()["change_of_volume"])
     assert "fixed beforehand, 300/mm3" in by_hand.volume_told
+    tissue = LabelMap(GRID, np.ones(GRID.shape, dtype=np.int16), {1: "fat"})  # and so it is where borders are known
+    options = GaussNewton(5.0, 3.0)
+    _, with_borders = fit_with_borders(*swollen_pair(), where, where, None, tissue, options, AtBorders())
+    assert with_borders.frees_volume
+    assert with_borders.weights.volume == 0.0
+    assert with_borders.weights.volume_gradient == by_rule.weights.volume_gradient > 0.0
 
 
 def test_where_volume_is_kept_the_rule_changes_nothing():

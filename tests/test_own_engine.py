@@ -71,6 +71,24 @@ def test_another_persons_heel_is_not_trusted(written, small_pair, tmp_path):
     assert not results.failures
 
 
+def test_a_change_of_volume_that_was_allowed_is_told_and_costs_trust(tiny_pair, tmp_path, monkeypatch):
+    """By a limit under which every pair asks for one, in what is made of a result."""
+    monkeypatch.setattr("dvc.gaussnewton._ASKED", -1.0)
+    for name in ("reference", "loaded"):
+        write_image(tmp_path / f"{name}.nii.gz", getattr(tiny_pair, name))
+    write_mask(tmp_path / "bone.nii.gz", tiny_pair.bone)
+    run(
+        tmp_path / "reference.nii.gz", [tmp_path / "loaded.nii.gz"], out=tmp_path / "out", threads=1,
+        bone=tmp_path / "bone.nii.gz",
+    )  # fmt: skip
+    told = json.loads((tmp_path / "out" / "loaded" / "quality.json").read_text())
+    assert told["verdict"]["level"] != "trust"
+    assert any("ask for a change of volume" in reason for reason in told["verdict"]["reasons"])
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "gradient of that change" in report
+    assert "only its gradient held" in report
+
+
 def test_an_offset_of_brightness_is_not_trusted(written, small_pair, tmp_path):
     """It is taken for motion, and nothing else tells: tissue's texture is as alike as ever."""
     loaded = small_pair.loaded

@@ -115,22 +115,27 @@ def test_an_offset_is_told_from_a_gain_that_varies(noise: float, offset: float) 
     grid = Grid((40, 36, 32), (1.6, 1.6, 1.6), (0.0, 0.0, 0.0))
     tissue = 1.0 + 0.3 * np.sign(gaussian_filter(rng.normal(size=grid.shape), 2.0))
     along = np.linspace(-1.0, 1.0, 40)[:, None, None]
-    loaded = ((1.0 + 0.3 * along) * tissue + offset * along + noise * rng.normal(size=grid.shape)).astype(np.float32)
+    made = (1.0 + 0.3 * along - 0.3 * along**2) * tissue + offset * along + noise * rng.normal(size=grid.shape)
+    loaded = made.astype(np.float32)
     reference = Image(grid, (tissue + noise * rng.normal(size=grid.shape)).astype(np.float32))
     mask = Mask(grid, np.ones(grid.shape, dtype=bool))
-    found = brightness_offset(reference, loaded, mask, noise)
+    found = brightness_offset(reference, loaded, mask, noise)(1.0)
     assert found == pytest.approx(0.95 * offset / float(np.percentile(loaded, 75)), abs=0.02)
     if noise:  # it lowers the gain, which seems an offset where it is not taken into account
-        assert brightness_offset(reference, loaded, mask) > found + 0.04
+        assert brightness_offset(reference, loaded, mask, 0.0)(1.0) > found + 0.04
     flat = Image(grid, np.full(grid.shape, 2.0, dtype=np.float32))
-    assert np.isnan(brightness_offset(flat, loaded, mask))
+    assert np.isnan(brightness_offset(flat, loaded, mask, 0.0)(1.0))
 
 
 @pytest.mark.parametrize(
-    ("offset", "level"), [(0.06, "trust"), (0.09, "caution"), (0.13, "distrust"), (np.nan, "trust")]
+    ("offset", "with_more_noise", "level"),
+    [(0.06, 0.2, "trust"), (0.09, 0.2, "distrust"), (0.13, 0.1, "caution"), (np.nan, np.nan, "trust")],
 )
-def test_an_offset_between_the_images_costs_trust(offset: float, level: str) -> None:
-    quality = assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.3, 0.5, 0.9), offset=offset)
+def test_an_offset_between_the_images_costs_trust(offset: float, with_more_noise: float, level: str) -> None:
+    quality = assess(
+        strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.3, 0.5, 0.9),
+        offset=lambda factor: offset if factor == 1.0 else with_more_noise,
+    )  # fmt: skip
     assert quality.verdict.level == level
 
 

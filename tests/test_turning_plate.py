@@ -57,6 +57,12 @@ def free() -> list[State]:
     return pressed(wedge(0.15), True)
 
 
+def test_a_small_load_is_reached_too() -> None:
+    """The first moves are then far too large: the plate stands on its first nodes until smaller ones are made."""
+    (state,) = pressed(wedge(), True, [LoadStep("a", 0.5)])
+    assert state.reached == 1.0
+
+
 def test_a_free_plate_carries_no_moment_and_a_locked_one_does(free: list[State]) -> None:
     locked = pressed(wedge(0.15), False)
     for turned, level in zip(free, locked, strict=True):
