@@ -174,13 +174,16 @@ def test_a_study_begins_a_load_where_the_one_before_ended(pad, out, monkeypatch)
     assert np.abs(u[known]).max() > 2.0
 
 
+FIXED = GaussNewton(bending=3.0, volume=300.0)
+
+
 @pytest.fixture(scope="module")
 def layers() -> dict[str, object]:
     """Fat between bone at rest and stiff skin, small; registered as it lies."""
     fixed, moving, body, labels = scanned(skin=0.0)
     return {
         "reference": fixed, "loaded": moving, "tissue": body, "labels": labels, "bone": labels.region("bone"),
-        "settings": Settings(gauss_newton=GaussNewton(bending=3.0), borders=AtBorders(30.0), align_on="none"),
+        "settings": Settings(gauss_newton=FIXED, borders=AtBorders(30.0), align_on="none"),
     }  # fmt: skip
 
 
@@ -291,6 +294,6 @@ def test_its_parameters_are_not_those_of_the_plain_engine():
     assert told.pop("borders")["skin"] is None
     assert told == json.loads(plain.text)
     assert json.loads(with_borders.of_repeat().text)["borders"]["skin"] == USUAL_SKIN
-    fixed = Settings(gauss_newton=GaussNewton(bending=2.0), borders=AtBorders())
+    fixed = Settings(gauss_newton=GaussNewton(bending=2.0, volume=100.0), borders=AtBorders())
     assert fixed.of_repeat() == replace(fixed, borders=AtBorders(USUAL_SKIN))
     assert replace(with_borders, borders=AtBorders(7.0)).of_repeat().borders == AtBorders(7.0)
