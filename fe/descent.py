@@ -79,6 +79,8 @@ def descend(
     Converged or None
         None if it is not found in 400 steps. As in `fe.newton.Tolerance`, steps that stay in balance are enough.
     """
+    model = assembler.model
+    volumes = np.concatenate([np.repeat(model.node_volumes_mm3, 3), np.zeros(model.space.pressures)])
     now, damping, growth, balanced = state.copy(), _FIRST, _MOST_GROWTH[0], 0
     forces, residual, lowest = assembler.residual(now)
     if not lowest > 0.0:
@@ -86,7 +88,8 @@ def descend(
     tangent = assembler.tangent(now)
     for count in range(1, _MOST_STEPS + 1):
         before_n = out_of_balance(outside - residual, assembler)
-        step = _tried(assembler, solver, now, tangent, outside, residual, damping)
+        medium = damping * assembler.by_equation(volumes)
+        step = _tried(assembler, solver, now, tangent, outside, residual, medium, before_n)
         if step is None or step.after_n > growth * before_n:
             damping *= _RISE
             if damping > _MOST:
@@ -98,7 +101,7 @@ def descend(
             f"    downhill {count}: out of balance {balance:.1e}, step {step.largest_mm:.1e} mm, least det F "
             f"{step.lowest:.3f}, damping {damping:.1e}"
         )
-        moved_mm = float(np.abs(now[: 3 * len(assembler.model.space.nodes_mm)]).max())
+        moved_mm = float(np.abs(now[: -model.space.pressures]).max())
         if moved_mm > farthest_mm:
             told(f"    given up: a node has moved by {moved_mm:.0f} mm, and the body is not that large")
             return None
@@ -122,14 +125,15 @@ def _tried(
     tangent: FloatArray,
     outside: FloatArray,
     residual: FloatArray,
-    damping: float,
+    medium: FloatArray,
+    before_n: float,
 ) -> _Step | None:
-    """A damped step from a state with that tangent and residual; None where it goes against the forces, or folds."""
-    model = assembler.model
+    """A damped step from a state with that tangent and residual; None where it goes against the forces, or folds.
+
+    ``medium`` (equations,) is d V, N/mm; ``before_n`` how much is out of balance, N.
+    """
     right = outside - residual
     right[assembler.idle] = 0.0
-    volumes = np.concatenate([np.repeat(model.node_volumes_mm3, 3), np.zeros(model.space.pressures)])
-    medium = damping * assembler.by_equation(volumes)
     data = tangent.copy()
     data[assembler.indptr[:-1]] += medium  # the diagonal stands first in its row
     try:
@@ -137,7 +141,7 @@ def _tried(
     except SingularError:
         return None
     moves = assembler.spread(change)
-    longest_mm = float(np.abs(moves[: len(volumes) - model.space.pressures]).max())
+    longest_mm = float(np.abs(moves[: -assembler.model.space.pressures]).max())
     # Twice the energy of the step in a body that is stiffer by the medium; that of a step uphill is below zero.
     energy = float((change * right) @ np.where(assembler.force_equations, 1.0, -1.0))
     if not (energy > 0.0 and longest_mm <= _TOO_FAR_MM):
@@ -147,7 +151,7 @@ def _tried(
     if not lowest > LEAST_VOLUME:
         return None
     borne = share * medium * change
-    before_n = max(out_of_balance(right, assembler), 1e-300)
+    before_n = max(before_n, 1e-300)
     return _Step(
         now + share * moves,
         forces,
