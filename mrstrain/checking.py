@@ -30,6 +30,7 @@ from validate.location import read_thresholds
 
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
 _REGISTER_S, _MAPS_S_PER_MVOXEL = 50.0, 7.0
+_BORDERS = 2.5  # times as long with `borders = true` (docs/decisions/0009)
 _CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
 _MESH_S = 100.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
@@ -198,10 +199,11 @@ def _cost(study: Study, stages: tuple[Stage, ...], reference: Image, labels: Lab
 
 def _seconds(stage: Stage, study: Study, voxels: float, labels: LabelMap) -> float:
     loads = len(study.loads)
+    registering = _REGISTER_S * (_BORDERS if study.registration.borders else 1.0) + _MAPS_S_PER_MVOXEL * voxels / 1e6
     if stage.kind == "register":
-        return _REGISTER_S + _MAPS_S_PER_MVOXEL * voxels / 1e6
+        return registering
     if stage.kind == "level":
-        return 1.5 * (_REGISTER_S + _MAPS_S_PER_MVOXEL * voxels / 1e6)
+        return 1.5 * registering
     if stage.kind == "mesh":
         return _MESH_S
     if stage.kind == "compare":

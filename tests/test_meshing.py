@@ -10,7 +10,7 @@ from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.image import Grid, LabelMap
 from dvc.imagewrite import write_labels
 from dvc.mesh import TetMesh
-from fe.meshing import dihedral_angles_deg, mesh_labels
+from fe.meshing import _guessed, dihedral_angles_deg, mesh_labels
 from fe.meshstore import read_tet_mesh, write_tet_mesh
 from fe.surfaces import borders_of, labels_at
 from tests.blocks import block
@@ -145,3 +145,10 @@ def test_the_command_replaces_no_input(tmp_path: Path) -> None:
         mesh("a.nii.gz", out=tmp_path / "mesh.msh")
     with pytest.raises(OutputError, match="would be replaced"):
         mesh("a.nii.gz", names=tmp_path / "heel.json", out=tmp_path / "heel.vtu")
+
+
+def test_a_mesh_that_takes_longer_than_expected_always_has_some_time_left():
+    shares = [0.5, 1.0, 2.0, 5.0, 20.0]  # of the expected time
+    left = [share * (1.0 / _guessed(share) - 1.0) for share in shares]
+    assert left[0] == pytest.approx(0.5)
+    assert all(0.1 < some < 0.25 for some in left[1:]), left
