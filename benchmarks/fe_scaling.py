@@ -2,8 +2,8 @@
 
     .venv/bin/python -m benchmarks.fe_scaling m20.vtu m80.vtu m320.vtu --out benchmarks/results/fe_scaling.json
 
-Meshes of one label map with edges of other lengths, as `mrstrain mesh` makes them. Each is solved in a process of its own,
-all in turn and again, and the least time counts. Exponents are those of a power law through all meshes, by least squares.
+Meshes of one label map with edges of other lengths, as `mrstrain mesh` makes them. Each is solved in a process of its
+own, all in turn and again, and the least time counts. Exponents are those of a power law through all meshes.
 """
 
 from __future__ import annotations

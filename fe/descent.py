@@ -4,15 +4,17 @@ At such a load the next equilibrium is far, and in between the tangent has direc
 goes against the forces. A body without inertia in a viscous medium goes with them: c V du/dt = forces out of balance,
 V the nodes' volumes. Implicit steps of it, (K + d V) du = forces with d = c / dt, are Newton's as d -> 0
 (pseudo-transient continuation; Kelley and Keyes 1998, doi:10.1137/S0036142996304796). d rises where a step would go
-against the forces, or the tangent foretells badly what is left of them, and falls where it foretells well.
+against the forces, or the tangent foretells badly what is left of them, and falls where it foretells well. A few nodes,
+those of nearly flat cells, are foretold badly for long: the medium is thicker there, and they do not hold up the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from dvc.arrays import FloatArray
 from fe.assembly import Assembler
@@ -20,13 +22,19 @@ from fe.linear import SingularError, Solver
 from fe.newton import BALANCED, LEAST_VOLUME, SMALL_MM, Converged, Tolerance, out_of_balance, reaction
 
 _FIRST, _LEAST, _MOST = 1e-5, 1e-9, 1e6  # damping d, N/mm4
-_RISE = 4.0  # of d for a step that will not do
 _MOST_STEPS = 400
 _LARGEST_MM, _TOO_FAR_MM = 1.0, 3.0  # a longer step is shortened to that; a step that long is damped more
 _MOST_GROWTH = 3.0, 1.5  # of the forces out of balance in one step: far from balance, and near it
 _NEAR = 10.0  # times what is asked
-# Of d after a step, by the share of those forces that was not foretold; of cells that are nearly flat it never is well.
+# Of d after a step, by the share of those forces that was not foretold, of which no node counts more than _CLIPPED.
 _CHANGES = ((0.1, 0.2), (0.5, 1.0 / 3.0), (1.0, 0.5), (3.0, 1.0), (np.inf, 2.0))
+_CLIPPED = 0.1
+_RISE = 4.0  # of d for a step that goes uphill, too far, or folds a cell
+# For one after which forces are far larger, of d, and of the medium's thickness at the nodes that did most of it.
+_RISE_OVER, _THICKENED, _MOST_OF_IT = 1.5, 4.0, 0.1
+# How the medium's thickness at a node changes after a step, by the share of the forces that was not foretold there.
+_THICKNESSES = ((0.1, 0.5), (0.3, 1.0), (np.inf, 4.0))
+_THICKEST = 1e3
 _BORNE = 0.5  # share of the forces that the medium may still take in the last step
 _ACCURACY = 1e-3  # of linear solutions
 
@@ -37,10 +45,10 @@ class _Step:
 
     Attributes
     ----------
-    wrong, borne : float
-        Forces not foretold, and those that the medium takes, as shares of the forces out of balance before.
-    after_n : float
-        Out of balance there, N.
+    unforeseen_n : (n,)
+        Forces at nodes that the tangent did not foretell, N; zero for nodes that hold to the plate.
+    borne_n, after_n : float
+        Forces that the medium takes, and forces out of balance there, N.
     """
 
     state: FloatArray
@@ -48,8 +56,8 @@ class _Step:
     residual: FloatArray
     lowest: float
     largest_mm: float
-    wrong: float
-    borne: float
+    unforeseen_n: FloatArray
+    borne_n: float
     after_n: float
 
 
@@ -80,18 +88,22 @@ def descend(
         None if it is not found in 400 steps. As in `fe.newton.Tolerance`, steps that stay in balance are enough.
     """
     model = assembler.model
-    volumes = np.concatenate([np.repeat(model.node_volumes_mm3, 3), np.zeros(model.space.pressures)])
-    now, damping, growth, balanced = state.copy(), _FIRST, _MOST_GROWTH[0], 0
+    now, damping, thickness = state.copy(), _FIRST, np.ones(len(model.space.nodes_mm))
+    growth, balanced = _MOST_GROWTH[0], 0
     forces, residual, lowest = assembler.residual(now)
     if not lowest > 0.0:
         return None
     tangent = assembler.tangent(now)
     for count in range(1, _MOST_STEPS + 1):
-        before_n = out_of_balance(outside - residual, assembler)
-        medium = damping * assembler.by_equation(volumes)
-        step = _tried(assembler, solver, now, tangent, outside, residual, medium, before_n)
+        before_n = max(out_of_balance(outside - residual, assembler), 1e-300)
+        by_node = np.repeat(damping * thickness * model.node_volumes_mm3, 3)
+        medium = assembler.by_equation(np.concatenate([by_node, np.zeros(model.space.pressures)]))
+        step = _tried(assembler, solver, now, tangent, outside, residual, medium)
         if step is None or step.after_n > growth * before_n:
-            damping *= _RISE
+            damping *= _RISE if step is None else _RISE_OVER
+            if step is not None:
+                blamed = step.unforeseen_n > _MOST_OF_IT * step.unforeseen_n.max()
+                thickness = np.minimum(np.where(blamed, _THICKENED, 1.0) * thickness, _THICKEST)
             if damping > _MOST:
                 return None
             continue
@@ -105,17 +117,25 @@ def descend(
         if moved_mm > farthest_mm:
             told(f"    given up: a node has moved by {moved_mm:.0f} mm, and the body is not that large")
             return None
-        damping = max(_LEAST, damping * next(factor for limit, factor in _CHANGES if step.wrong <= limit))
+        wrong = step.unforeseen_n / before_n
+        damping = max(_LEAST, damping * float(_by(_CHANGES, np.linalg.norm(np.minimum(wrong, _CLIPPED)))))
+        thickness = np.clip(thickness * _by(_THICKNESSES, wrong), 1.0, _THICKEST)
         growth = _MOST_GROWTH[balance <= _NEAR * tolerance.force]
         balanced = balanced + 1 if balance <= tolerance.force else 0
         small_mm = SMALL_MM if balanced >= BALANCED else tolerance.step_mm
         if changed(now, forces):
             forces, residual, _ = assembler.residual(now)
             balanced = 0
-        elif balanced and step.largest_mm <= small_mm and step.borne <= _BORNE:
+        elif balanced and step.largest_mm <= small_mm and step.borne_n <= _BORNE * before_n:
             return Converged(now, forces, count)
         tangent = assembler.tangent(now)
     return None
+
+
+def _by(table: Sequence[tuple[float, float]], values: npt.ArrayLike) -> FloatArray:
+    """Of each value the factor beside the first limit that it does not exceed."""
+    limits, factors = np.array(table).T
+    return np.asarray(factors[np.searchsorted(limits, values)])
 
 
 def _tried(
@@ -126,11 +146,10 @@ def _tried(
     outside: FloatArray,
     residual: FloatArray,
     medium: FloatArray,
-    before_n: float,
 ) -> _Step | None:
     """A damped step from a state with that tangent and residual; None where it goes against the forces, or folds.
 
-    ``medium`` (equations,) is d V, N/mm; ``before_n`` how much is out of balance, N.
+    ``medium`` (equations,) is d V, N/mm.
     """
     right = outside - residual
     right[assembler.idle] = 0.0
@@ -151,14 +170,16 @@ def _tried(
     if not lowest > LEAST_VOLUME:
         return None
     borne = share * medium * change
-    before_n = max(before_n, 1e-300)
+    unforeseen = outside - left - (1.0 - share) * right - borne
+    unforeseen[assembler.own_equations :] = 0.0
+    at_nodes = assembler.spread(unforeseen)[: -assembler.model.space.pressures].reshape(-1, 3)
     return _Step(
         now + share * moves,
         forces,
         left,
         lowest,
         share * longest_mm,
-        out_of_balance(outside - left - (1.0 - share) * right - borne, assembler) / before_n,
-        out_of_balance(borne, assembler) / before_n,
+        np.linalg.norm(at_nodes, axis=1),
+        out_of_balance(borne, assembler),
         out_of_balance(outside - left, assembler),
     )
