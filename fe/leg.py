@@ -77,12 +77,12 @@ class Leg:
             self._stages, self._counted = earlier.stages, path.iterations - earlier.iterations
         path.settled = lambda: settled(self.kept())
 
-    def go(self, progress: Callable[[float], None]) -> bool:
+    def go(self) -> bool:
         """Go to the goal, normal first and then shear; whether it is there."""
         path, goal = self._path, self._goal
-        stages: list[Callable[[], bool]] = [partial(path.raise_to, goal, progress)]
+        stages: list[Callable[[], bool]] = [partial(path.raise_to, goal)]
         if self._first and goal.sheared:
-            stages.insert(0, partial(path.raise_to, goal.unsheared(), progress))
+            stages.insert(0, partial(path.raise_to, goal.unsheared()))
         if self._first:
             stages.insert(0, partial(path.approach, goal))
         for stage in stages[self._stages :]:

@@ -183,7 +183,7 @@ class Path:
             self._back(level)
         return left == 0.0
 
-    def raise_to(self, goal: Goal, progress: Callable[[float], None] = lambda _: None) -> bool:
+    def raise_to(self, goal: Goal) -> bool:
         """Go on from what is to the goal, in steps as large as converge; whether it is there.
 
         Where Newton's method does not get on under forces, it goes on downhill (`fe.descent`), with a plate on
@@ -201,7 +201,6 @@ class Path:
                 done, step = share, step if downhill else step * _GROWTH
                 self._told(f"{done:.0%} of the way")
                 self.settled()
-                progress(done)
                 continue
             self._back(kept)
             step *= _SHRINK

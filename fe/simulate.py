@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy import sparse
@@ -192,19 +191,21 @@ def simulate(
     states: list[State] = []
     try:
         for number, load in enumerate(loads):
+
+            def stands(kept: Kept, number: int = number, load: LoadStep = load) -> None:
+                progress((number + max(kept.reached, 0.0)) / len(loads))
+                settled(load, kept)
+
             leg = Leg(
                 path,
                 load.goal,
                 states[-1].load.goal if states else None,
                 earlier[number] if number < len(earlier) else None,
-                partial(settled, load),
+                stands,
             )
-
-            def told(share: float, done: int = number) -> None:
-                progress((done + share) / len(loads))
-
-            whole = leg.go(told)
+            whole = leg.go()
             kept = leg.kept()
+            progress((number + 1.0) / len(loads))
             u = kept.unknowns[: 3 * len(model.space.nodes_mm)].reshape(-1, 3)[: len(mesh.points_mm)]
             held = path.contact.held
             states.append(

@@ -306,3 +306,12 @@ def test_where_stiff_skin_buckles_over_soft_fat_the_way_goes_downhill(monkeypatc
     monkeypatch.setattr("fe.path.descend", lambda *_: None)
     (before,) = press(dome((5, 8, 8)), loads, soft)
     assert before.reached < 0.5
+
+
+def test_how_much_is_done_is_told_from_the_first_touch_on() -> None:
+    shares: list[float] = []
+    press(dome(), [*PRESS, SHEARED], progress=shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert sum(0.0 < share < 0.4 for share in shares) > 2  # on the way of the plate to the first load
+    assert any(0.5 < share < 1.0 for share in shares)
