@@ -16,6 +16,7 @@ from mrstrain.inputs import make_output
 from mrstrain.ledger import Ledger
 from mrstrain.pipeline import Outcome, Pipeline, run_all
 from mrstrain.plan import KINDS, Stage, plan
+from mrstrain.progress import ALL
 from mrstrain.runpage import write_run_report
 from mrstrain.studyfile import Study, read_study
 
@@ -132,7 +133,7 @@ def run_studies(
     pipelines: dict[str, Pipeline] = {}
     lines: dict[str, Callable[[str], None]] = {}
 
-    def line_of(log: Callable[[str], None], stages: Sequence[Stage]) -> Callable[[str], None]:
+    def line_of(prefix: str, log: Callable[[str], None], stages: Sequence[Stage]) -> Callable[[str], None]:
         minutes = {stage.name: stage.minutes for stage in stages}
 
         def line(text: str) -> None:
@@ -141,7 +142,8 @@ def run_studies(
             name = text.split(": ", maxsplit=1)[0]
             if name in minutes:
                 ended += minutes[name]
-                tell("all", stages_told, ended / total)
+                tell(prefix + name, "ended", 1.0)  # one that failed has not told so
+                tell(ALL, stages_told, ended / total)
 
         return line
 
@@ -156,7 +158,7 @@ def run_studies(
             pipelines[prefix] = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
             log = stack.enter_context(_log(study.out / LOG))
             log(f"Study '{study.study.name}': {len(stages)} stages")
-            lines[prefix] = line_of(log, stages)
+            lines[prefix] = line_of(prefix, log, stages)
         run_all(pipelines, pool, lines)
         done = []
         for prefix, study in zip(prefixes, studies, strict=True):

@@ -60,7 +60,7 @@ def run(
     if report_only:
         done = report(study)
     else:
-        with live() as progress:
+        with live(of_all=True) as progress:
             done = start(
                 study, only=only or (), force=force or (), scheduler=scheduler, workers=workers, progress=progress
             )
@@ -80,7 +80,7 @@ def cohort(
     from mrstrain.progress import live
     from mrstrain.subjects import cohort as start
 
-    with live() as progress:
+    with live(of_all=True) as progress:
         done = start(studies, out=out, scheduler=scheduler, workers=workers, progress=progress)
     for line in done.summary():
         typer.echo(line)
@@ -100,7 +100,7 @@ def demo(
     from mrstrain.demo import demo as run
     from mrstrain.progress import live
 
-    with live() as progress:
+    with live(of_all=True) as progress:
         done = run(out, seed=seed, full=full, workers=workers, progress=progress)
     for line in done.lines:
         typer.echo(line)
