@@ -118,11 +118,14 @@ def write_report(
     sections: Sequence[Section],
     closing: Sequence[Section],
     provenance: Mapping[str, str],
+    *,
+    notes: Sequence[str] = (),
 ) -> None:
     """Write a report: verdict first, if there is one, then the sections, the closing ones, and where it all came from.
 
     One HTML file without anything to fetch, and without scripts but for a section's viewer; all text is escaped. A list
-    of the sections with their verdicts stands at the top where there are two or more.
+    of the sections with their verdicts stands at the top where there are two or more; ``notes``, a line each, stand
+    between the verdict and it.
 
     Raises
     ------
@@ -140,6 +143,7 @@ def write_report(
         sections=list(sections),
         closing=list(closing),
         provenance=dict(provenance),
+        notes=list(notes),
         script=script() if any(section.viewers for section in sections) else "",
     )
     write_whole(path, page)

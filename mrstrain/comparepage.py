@@ -16,6 +16,7 @@ from dvc.kinematics import StrainField
 from dvc.report import Cell, Picture, Section, Table
 from dvc.verdict import Verdict
 from dvc.viewer import Viewer, Volume
+from mrstrain.methods import METHODS
 from mrstrain.page import said
 from validate import figures
 from validate.comparison import NOTHING, Comparison, Total
@@ -193,7 +194,7 @@ def closing_sections(thresholds: Sequence[Threshold], methods: Sequence[str]) ->
         None,
         (Table("Thresholds", ("maximal shear", "source"), tuple((t.max_shear, t.source) for t in thresholds)),),
     )
-    return [_CLOSING, sources, Section("Methods, to be pasted", paragraphs=tuple(methods))]
+    return [_CLOSING, sources, Section(METHODS, paragraphs=tuple(methods))]
 
 
 def shown(area: Area) -> str:

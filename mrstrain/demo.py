@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 from dvc.errors import OutputError
 from dvc.imagewrite import write_labels
 from dvc.labels import read_labels, read_mask
-from dvc.report import Section, Table
 from dvc.transformfile import read_transform
 from dvc.whole import write_whole
+from mrstrain.againsttruth import TABLE, write_errors
 from mrstrain.loads import LOADS
 from mrstrain.making import phantom
 from mrstrain.plan import REGISTRATION
@@ -31,7 +29,6 @@ _SETS = ("trebbi", "luboz", "akrami")
 _ALL_SETS = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")
 _COARSE = "tissues_to_mesh_coarse"
 _COARSE_MM = 1.2  # voxels of the label map that is meshed
-_FIGURES = ("true_p50", "true_p95", "shear_rmse", "shear_bias", "u_p50_mm", "u_p95_mm")
 _STUDY = """# The demonstration: a phantom heel, whose strain is known at every point (see the folder truth).
 [study]
 name = "Phantom heel"
@@ -103,8 +100,8 @@ def demo(
     _make(target, seed, full, progress)
     ran = run(target, workers=workers, progress=progress)
     errors = _errors(target, seed, ran)
-    _write_table(target / "error.csv", errors)
-    write_run_report(target / "results" / REPORT, ran.study, ran.outcomes, ahead=[_section(errors)])
+    write_errors(target / TABLE, errors, ran.outcomes)
+    write_run_report(target / "results" / REPORT, ran.study, ran.outcomes)
     return Shown(tuple(_told(errors, ran)), ran.complete)
 
 
@@ -153,41 +150,6 @@ def _errors(target: Path, seed: int, ran: Ran) -> dict[str, tuple[TissueError, .
         valid = read_mask(folder / "valid.nii.gz").inside
         errors[load] = errors_by_tissue(labels, under_load(heel, load), found, valid)
     return errors
-
-
-def _write_table(path: Path, errors: dict[str, tuple[TissueError, ...]]) -> None:
-    table = io.StringIO()
-    writer = csv.DictWriter(table, ["load", *(f.name for f in fields(TissueError))], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({"load": load} | asdict(error) for load, of in errors.items() for error in of)
-    write_whole(path, table.getvalue())
-
-
-def _section(errors: dict[str, tuple[TissueError, ...]]) -> Section:
-    columns = (
-        "load", "tissue", "true shear, median", "true shear, p95", "RMSE", "bias", "u error, median", "u error, p95",
-    )  # fmt: skip
-    return Section(
-        "Error against the truth",
-        tables=(
-            Table(
-                "Maximal shear and displacement, by load and tissue",
-                columns,
-                tuple(
-                    (load, *(getattr(error, key) for key in ("tissue", *_FIGURES)))
-                    for load, of in errors.items()
-                    for error in of
-                ),
-                note="Displacement in mm. The calcaneus and the ankle's bones are rigid: their true shear is zero.",
-            ),
-        ),
-        paragraphs=(
-            "These images are a phantom: the strain is known at every point, so the measurement below can be compared "
-            "with the truth, wherever it has a result. Real images have no such table; the verdict, the intervals and "
-            "the repeat scan stand in for it. The phantom's tissue flows as a motion prescribes and knows no forces: "
-            "no material set is the true one.",
-        ),
-    )
 
 
 def _told(errors: dict[str, tuple[TissueError, ...]], ran: Ran) -> list[str]:

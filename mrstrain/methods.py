@@ -23,6 +23,8 @@ _PAPERS = {
     "doi:10.3389/fninf.2013.00050",
     "Lowekamp 2013": "Lowekamp BC, Chen DT, Ibáñez L, Blezek D. The design of SimpleITK. Front Neuroinform 7:45, 2013. "
     "doi:10.3389/fninf.2013.00045",
+    "Tustison 2010": "Tustison NJ, Avants BB, Cook PA, Zheng Y, Egan A, Yushkevich PA, Gee JC. N4ITK: improved N3 bias "
+    "correction. IEEE Trans Med Imaging 29(6):1310-1320, 2010. doi:10.1109/TMI.2010.2046908",
     "Hu 2020": "Hu Y, Schneider T, Wang B, Zorin D, Panozzo D. Fast tetrahedral meshing in the wild. ACM Trans Graph "
     "39(4):117, 2020. doi:10.1145/3386569.3392385",
     "Trebbi 2023": "Trebbi A, Fougeron N, Payan Y. Definition and evaluation of a finite element model of the human "
@@ -34,6 +36,8 @@ _PAPERS = {
     "Bland 1986": "Bland JM, Altman DG. Statistical methods for assessing agreement between two methods of clinical "
     "measurement. Lancet 327(8476):307-310, 1986. doi:10.1016/S0140-6736(86)90837-8",
 }
+METHODS = "Methods, to be pasted"
+"""Title of a report's section with these paragraphs."""
 _PUBLISHED = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")  # tables 2 and 3 of Trebbi 2023
 
 Record = Mapping[str, Any]
@@ -67,12 +71,26 @@ def methods(
     version : str
         Of the program that compares.
     """
-    parts = [_measured(measured), *_simulated(models), _compared(cells, strains, thresholds, least_ml, version)]
+    parts = [
+        _measured(measured),
+        *_simulated(models, measured),
+        _compared(cells, strains, thresholds, least_ml, version),
+    ]
     if error_known:
         parts.append(_doubt(measured))
     parts.append(f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue).")
+    return _with_references(parts)
+
+
+def methods_of_registrations(measured: Mapping[str, Path]) -> tuple[str, ...]:
+    """Paragraphs on the measurement alone, the references last; ``measured`` as in `methods`."""
+    known = _sources(measured)
+    return _with_references([_measured(measured), *([f"Error of the maximal shear: {known}"] if known else [])])
+
+
+def _with_references(parts: Sequence[str]) -> tuple[str, ...]:
     used = [paper for name, paper in _PAPERS.items() if any(name in part for part in parts)]
-    return (*parts, "References", *used)
+    return (*parts, *(("References", *used) if used else ()))
 
 
 def _record(place: Path) -> Record:
@@ -119,7 +137,8 @@ def _registration(record: Record) -> str:
     if own and given.get("align") != "none":
         how += f"; rigid alignment with {elastix}"
     return (
-        f"{align} registered non-rigidly {how}; seed {given.get('seed')}. Images were read and "
+        f"{align} registered non-rigidly {how}; seed {given.get('seed')}. Beforehand the smooth receive field was "
+        "taken out of both images (N4, Tustison 2010). Images were read and "
         f"written with SimpleITK {versions.get('SimpleITK', '?')} (Lowekamp 2013)."
     )
 
@@ -168,13 +187,21 @@ def _stage(stage: Record) -> str:
     )
 
 
-def _simulated(models: Mapping[str, Path]) -> list[str]:
+def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list[str]:
     """How models were computed: those of ours by their own records, others by their files."""
     parts, others, groups = [], [], dict[str, list[str]]()
+    driven, levelled = [], dict[str, list[str]]()
     published = False
     for name, path in models.items():
         record = _record(path.parent / "simulation.json")
         given = record.get("parameters", {})
+        if record.get("command") == "drive":
+            driven.append(_driven(name, record))
+            published = published or record["set"] in _PUBLISHED
+            continue
+        if _record(path.parent / "provenance.json").get("command") == "level":
+            levelled.setdefault(_levelled(path, measured), []).append(name)
+            continue
         if record.get("command") != "simulate" or "set" not in given:
             others.append(f"{name} ({path.suffix[1:]})")
             continue
@@ -184,14 +211,39 @@ def _simulated(models: Mapping[str, Path]) -> list[str]:
         groups.setdefault(_solver(record), []).append(name)
     told = []
     if parts:
-        told.append(
-            " ".join(f"{_listed(names)} {how}" for how, names in groups.items())
-            + (" Published sets of laws are those that Trebbi 2023 compiled. " if published else " ")
-            + " ".join(parts)
-        )
+        told.append(" ".join([*(f"{_listed(names)} {how}" for how, names in groups.items()), *parts]))
+    if driven:
+        told.append(f"{_DRIVEN} {' '.join(driven)}")
+    if published:
+        told.append("Published sets of laws are those that Trebbi 2023 compiled.")
+    told += [f"{_listed(names)}: {how}" for how, names in levelled.items()]
     if others:
         told.append(f"Results of other programs were taken as given: {_listed(others)}.")
     return told
+
+
+_DRIVEN = (
+    "Driven models bear no force: each node on the outside of the mesh was moved by the measured displacement, or held "
+    "where the mesh names it bone, and those inside follow from the laws."
+)
+
+
+def _driven(name: str, record: Record) -> str:
+    """One model whose outside went where it was measured."""
+    laws = "; ".join(f"{region}: {law}" for region, law in record["laws"].items())
+    return f"{name}: with mrstrain {record.get('versions', {}).get('mrstrain', '?')} ({laws})."
+
+
+def _levelled(path: Path, measured: Mapping[str, Path]) -> str:
+    """How a model's file came out of the measurement that it was sent through."""
+    work = path.parent.with_name(path.parent.name + "-work") / "registered" / path.stem / path.stem
+    how = _registration(_record(work / "provenance.json"))
+    same = how in {_registration(_record(folder / "provenance.json")) for folder in measured.values()}
+    return (
+        "the model was sent through the measurement: its displacement moved the unloaded image, freed of noise; noise "
+        "and a receive field were drawn anew; and the pair was registered"
+        + (" as the images were." if same else f" as follows. {how}")
+    )
 
 
 def _solver(record: Record) -> str:
@@ -225,12 +277,14 @@ def _compared(
 
 
 def _doubt(measured: Mapping[str, Path]) -> str:
-    sources = {
-        str(_record(folder / "quality.json").get("error_of_max_shear", {}).get("source", ""))
-        for folder in measured.values()
-    }
-    known = " ".join(sorted(s for s in sources if s))
+    known = _sources(measured)
     return (
         f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATED} draws) come from truths drawn by the "
         f"registration's error model: bias, spatially correlated noise. {known} Displacement has no error model."
     )
+
+
+def _sources(measured: Mapping[str, Path]) -> str:
+    """Where the registrations' error models come from, each told once."""
+    records = (_record(folder / "quality.json").get("error_of_max_shear", {}) for folder in measured.values())
+    return " ".join(sorted({str(one["source"]) for one in records if one.get("source")}))

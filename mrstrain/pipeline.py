@@ -33,12 +33,20 @@ class Outcome:
         Why it has none, or is no result of what the study says now.
     again : bool
         Whether it was there already.
+    asked : bool
+        Whether it was among those that might be run.
     """
 
     stage: str
     record: Record | None
     reason: str = ""
     again: bool = False
+    asked: bool = True
+
+    @property
+    def left_out(self) -> bool:
+        """Whether it has no result for the reason alone that it was not asked for."""
+        return not self.asked and self.words == "not run"
 
     @property
     def whole(self) -> bool:
@@ -101,7 +109,7 @@ class Pipeline:
                 try:
                     work = self._settled(stage)
                 except (OSError, MrstrainError) as failure:  # an input that is gone, or may not be read
-                    self.outcomes[stage.name] = Outcome(stage.name, None, str(failure))
+                    self.outcomes[stage.name] = Outcome(stage.name, None, str(failure), asked=self._asked(stage))
                     continue
                 if work is not None:
                     ready.append((stage, work))
@@ -109,9 +117,9 @@ class Pipeline:
 
     def _settled(self, stage: Stage) -> Mapping[str, Any] | None:
         """Give the arguments of a stage that has to be run now; None for one whose outcome is known."""
-        lacking = self._lacking(stage)
+        lacking, asked = self._lacking(stage), self._asked(stage)
         if lacking:
-            self.outcomes[stage.name] = Outcome(stage.name, None, f"Not run: {lacking}")
+            self.outcomes[stage.name] = Outcome(stage.name, None, f"Not run: {lacking}", asked=asked)
             return None
         arguments = self._arguments(stage)
         made_from = self.ledger.made_from(stage, arguments)
@@ -119,15 +127,23 @@ class Pipeline:
         key = self.ledger.key(stage, made_from, built_on)
         kept = self.ledger.finished(stage)
         same = kept is not None and kept.key == key
-        if not _among(stage, self._only, default=True):
-            reason = self._why_not(stage) if kept is None else "" if same else _OUT_OF_DATE
-            self.outcomes[stage.name] = Outcome(stage.name, kept, reason, again=True)
+        if not asked:
+            reason = self._why_not(stage) if kept is None else self._built_on_old(stage) if same else _OUT_OF_DATE
+            self.outcomes[stage.name] = Outcome(stage.name, kept, reason, again=True, asked=False)
         elif kept is not None and same and not kept.given.retry and not _among(stage, self._force, default=False):
-            self.outcomes[stage.name] = Outcome(stage.name, kept, again=True)
+            self.outcomes[stage.name] = Outcome(stage.name, kept, self._built_on_old(stage), again=True)
         else:
             self._keys[stage.name] = key, made_from
             return arguments
         return None
+
+    def _asked(self, stage: Stage) -> bool:
+        return _among(stage, self._only, default=True)
+
+    def _built_on_old(self, stage: Stage) -> str:
+        """Which results that it reads are out of date, so that it is too; empty where none is."""
+        old = [name for name in stage.before if self.outcomes[name].words == "OUT OF DATE"]
+        return f"Built on {', '.join(old)}, out of date." if old else ""
 
     def _why_not(self, stage: Stage) -> str:
         return self.ledger.reason(stage) or "Not run: it has no result, and is not among those asked for."
@@ -139,7 +155,7 @@ class Pipeline:
         for stage in self.stages:
             anew = any(told[name] == "run" for name in stage.before)
             record = kept[stage.name]
-            if not _among(stage, self._only, default=True):
+            if not self._asked(stage):
                 told[stage.name] = "left out"
             elif anew or record is None or _among(stage, self._force, default=False):
                 told[stage.name] = "run"
@@ -201,7 +217,7 @@ class Pipeline:
             else:
                 key, made_from = self._keys[stage.name]
                 record = self.ledger.keep(stage, key, made_from, outcome, seconds)
-                self.outcomes[stage.name] = Outcome(stage.name, record)
+                self.outcomes[stage.name] = Outcome(stage.name, record, self._built_on_old(stage))
         except (OSError, MrstrainError) as failure:
             self.outcomes[stage.name] = Outcome(stage.name, None, str(failure))
         one = self.outcomes[stage.name]

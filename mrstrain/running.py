@@ -11,11 +11,12 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from dvc.errors import InputError, OutputError
+from dvc.errors import InputError, OutputError, ParameterError
 from mrstrain.inputs import make_output
 from mrstrain.ledger import Ledger
 from mrstrain.pipeline import Outcome, Pipeline, run_all
 from mrstrain.plan import KINDS, Stage, plan
+from mrstrain.progress import ALL
 from mrstrain.runpage import write_run_report
 from mrstrain.studyfile import Study, read_study
 
@@ -41,13 +42,15 @@ class Ran:
 
     @property
     def complete(self) -> bool:
-        """Whether every stage has a whole result of what the study says now."""
-        return all(outcome.whole for outcome in self.outcomes.values())
+        """Whether every stage that was asked for has a whole result of what the study says now."""
+        return all(outcome.whole for outcome in self.outcomes.values() if outcome.asked)
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
         lines = []
         for name, outcome in self.outcomes.items():
+            if outcome.left_out:
+                continue
             if not outcome.whole:
                 told = () if outcome.record is None else outcome.record.given.lines
                 lines += [f"{name}: {outcome.words}. {outcome.reason}".rstrip(), *(f"    {line}" for line in told)]
@@ -60,6 +63,9 @@ class Ran:
         compared = self.outcomes.get("compare")
         if compared is not None and compared.record is not None:
             lines += compared.record.given.lines
+        left_out = [name for name, outcome in self.outcomes.items() if outcome.left_out]
+        if left_out:
+            lines.append(f"Not asked for, and without a result: {', '.join(left_out)}.")
         again = sum(outcome.again and outcome.record is not None for outcome in self.outcomes.values())
         return [
             *lines,
@@ -103,6 +109,8 @@ def run(
     ------
     InputError
         If the study cannot be read, or a file is missing; before anything is run.
+    ParameterError
+        If both a scheduler and a number of workers are given.
     OutputError
         If another run is at work in the same folder, or it cannot be written to.
     """
@@ -121,6 +129,11 @@ def run_studies(
     progress: Told | None = None,
 ) -> list[Ran]:
     """Run several studies on one cluster, each as `run` does it; what cannot be run is refused before any begins."""
+    if scheduler is not None and workers is not None:
+        raise ParameterError(
+            f"--workers {workers} is for this machine's cores; the scheduler at {scheduler} has workers of its own. "
+            "Give one of the two."
+        )
     planned = [plan(study) for study in studies]
     for stages in planned:
         refuse_unknown(stages, (*only, *force))
@@ -132,7 +145,7 @@ def run_studies(
     pipelines: dict[str, Pipeline] = {}
     lines: dict[str, Callable[[str], None]] = {}
 
-    def line_of(log: Callable[[str], None], stages: Sequence[Stage]) -> Callable[[str], None]:
+    def line_of(prefix: str, log: Callable[[str], None], stages: Sequence[Stage]) -> Callable[[str], None]:
         minutes = {stage.name: stage.minutes for stage in stages}
 
         def line(text: str) -> None:
@@ -141,7 +154,8 @@ def run_studies(
             name = text.split(": ", maxsplit=1)[0]
             if name in minutes:
                 ended += minutes[name]
-                tell("all", stages_told, ended / total)
+                tell(prefix + name, "ended", 1.0)  # one that failed has not told so
+                tell(ALL, stages_told, ended / total)
 
         return line
 
@@ -156,7 +170,7 @@ def run_studies(
             pipelines[prefix] = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
             log = stack.enter_context(_log(study.out / LOG))
             log(f"Study '{study.study.name}': {len(stages)} stages")
-            lines[prefix] = line_of(log, stages)
+            lines[prefix] = line_of(prefix, log, stages)
         run_all(pipelines, pool, lines)
         done = []
         for prefix, study in zip(prefixes, studies, strict=True):

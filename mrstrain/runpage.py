@@ -8,23 +8,18 @@ from pathlib import Path
 
 from dvc.report import Section, Table, write_report
 from dvc.verdict import Verdict, worst
+from mrstrain.againsttruth import error_against_truth
 from mrstrain.ledger import Record
+from mrstrain.methods import METHODS, methods_of_registrations
 from mrstrain.page import flat
 from mrstrain.pipeline import Outcome
+from mrstrain.plan import REGISTRATION
 from mrstrain.provenance import provenance, write_json
 from mrstrain.studyfile import Study
 
 
-def write_run_report(
-    path: Path,
-    study: Study,
-    outcomes: Mapping[str, Outcome],
-    ahead: Sequence[Section] = (),
-) -> None:
-    """Write a study's report, one self-contained page, and what it was made from as ``provenance.json`` beside it.
-
-    ``ahead`` are sections that come first.
-    """
+def write_run_report(path: Path, study: Study, outcomes: Mapping[str, Outcome]) -> None:
+    """Write a study's report, one self-contained page, and what it was made from as ``provenance.json`` beside it."""
     compared: list[Section] = []
     registered: list[Section] = []
     closing: list[Section] = []
@@ -37,10 +32,8 @@ def write_run_report(
         else:
             compared += given.sections
         closing += given.closing
-    verdicts = [section.verdict for section in (*registered, *compared[:1]) if section.verdict is not None]
-    failed = [f"{o.stage} {o.words.lower()}: {o.reason}" for o in outcomes.values() if o.record is None or o.reason]
-    if failed:
-        verdicts.append(Verdict("distrust", tuple(failed)))
+    if not closing and registered:
+        closing.append(_methods(study, outcomes))
     record = provenance("run", {}, study.model_dump(mode="json", exclude={"place"}))
     made = {name: o.record for name, o in outcomes.items() if o.record is not None}
     record["inputs"] = {"inputs": _inputs(made)}
@@ -49,10 +42,11 @@ def write_run_report(
     write_report(
         path,
         study.study.name,
-        _verdict(verdicts),
-        [*ahead, *compared, *registered, _stages(outcomes)],
+        _verdict(registered, compared),
+        [*error_against_truth(study, outcomes), *compared, *registered, _stages(outcomes)],
         closing,
         flat(record),
+        notes=_lacking(outcomes),
     )
 
 
@@ -62,13 +56,40 @@ def _inputs(made: Mapping[str, Record]) -> list[dict[str, str]]:
     return [{"name": name, "sha256": sha} for name, sha in seen]
 
 
-def _verdict(verdicts: Sequence[Verdict]) -> Verdict | None:
-    """The worst of all, saying what a good one is about: the measurement, and not the models."""
-    if not verdicts:
+def _verdict(registered: Sequence[Section], compared: Sequence[Section]) -> Verdict | None:
+    """The worst of the registrations', and of what went into the comparison; none where nothing is judged.
+
+    What failed or was left out says nothing about the registrations that are there: `_lacking` tells it.
+    """
+    judged = [section.verdict for section in registered if section.verdict is not None]
+    went_in = [section.verdict for section in compared[:1] if section.verdict is not None]
+    if not judged:
         return None
-    found = worst(verdicts)
-    told = f"The measurement: {len(verdicts)} images are registered soundly. The models are judged below."
-    return found if found.reasons else replace(found, reasons=(told,))
+    found = worst([*judged, *(verdict for verdict in went_in if verdict.level != "distrust")])
+    if found.reasons:
+        return found
+    told = "1 image is" if len(judged) == 1 else f"{len(judged)} images are"
+    models = " The models are judged below." if compared else ""
+    return replace(found, reasons=(f"The measurement: {told} registered soundly.{models}",))
+
+
+def _lacking(outcomes: Mapping[str, Outcome]) -> list[str]:
+    """What a reader would miss: stages that are not whole, and those that were not asked for; a line each."""
+    broken = [one for one in outcomes.values() if not (one.whole or one.left_out)]
+    left_out = [one.stage for one in outcomes.values() if one.left_out]
+    told = []
+    for one in broken:
+        why = one.reason.partition("\n")[0].removeprefix("Not run: ").rstrip(".")
+        told.append(f"{one.stage} {one.words.lower()}" + (f" ({why})" if why else ""))
+    lines = [f"Not whole: {'; '.join(told)}."] if told else []
+    return [*lines, *([f"Not asked for, and without a result: {', '.join(left_out)}."] if left_out else [])]
+
+
+def _methods(study: Study, outcomes: Mapping[str, Outcome]) -> Section:
+    """Paragraphs on the registrations alone, where no comparison tells how all was done."""
+    folders = {load: study.out / REGISTRATION / load for load in study.loads}
+    there = {load: at for load, at in folders.items() if outcomes[f"register {load}"].record is not None}
+    return Section(METHODS, paragraphs=methods_of_registrations(there) if there else ())
 
 
 def _stages(outcomes: Mapping[str, Outcome]) -> Section:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -53,6 +54,11 @@ def run(
     from mrstrain.running import forecast, report
     from mrstrain.running import run as start
 
+    given = {"--only": only, "--force": force, "--scheduler": scheduler, "--workers": workers}
+    if report_only:
+        _refuse_idle("--report-only runs nothing", given | {"--dry-run": dry_run})
+    if dry_run:
+        _refuse_idle("--dry-run runs nothing", {name: given[name] for name in ("--scheduler", "--workers")})
     if dry_run:
         for name, told in forecast(study, only=only or (), force=force or ()).items():
             typer.echo(f"{name}: {told}")
@@ -60,7 +66,7 @@ def run(
     if report_only:
         done = report(study)
     else:
-        with live() as progress:
+        with live(of_all=True) as progress:
             done = start(
                 study, only=only or (), force=force or (), scheduler=scheduler, workers=workers, progress=progress
             )
@@ -68,6 +74,15 @@ def run(
         typer.echo(line)
     if not done.complete:
         raise typer.Exit(1)
+
+
+def _refuse_idle(why: str, given: Mapping[str, object]) -> None:
+    """Refuse options that would change nothing."""
+    idle = [name for name, value in given.items() if value]
+    if idle:
+        from dvc.errors import ParameterError
+
+        raise ParameterError(f"{why}: leave out {', '.join(idle)}, or it.")
 
 
 def cohort(
@@ -80,7 +95,7 @@ def cohort(
     from mrstrain.progress import live
     from mrstrain.subjects import cohort as start
 
-    with live() as progress:
+    with live(of_all=True) as progress:
         done = start(studies, out=out, scheduler=scheduler, workers=workers, progress=progress)
     for line in done.summary():
         typer.echo(line)
@@ -100,7 +115,7 @@ def demo(
     from mrstrain.demo import demo as run
     from mrstrain.progress import live
 
-    with live() as progress:
+    with live(of_all=True) as progress:
         done = run(out, seed=seed, full=full, workers=workers, progress=progress)
     for line in done.lines:
         typer.echo(line)

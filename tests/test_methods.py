@@ -38,6 +38,30 @@ def simulated(folder: Path, name: str, made: object = None) -> Path:
     return place / "Load1.vtu"
 
 
+def driven(folder: Path, name: str, of: str) -> Path:
+    """A set whose outside goes where it was measured, as `drive` records it."""
+    place = folder / name
+    place.mkdir(parents=True)
+    record = {
+        "command": "drive",
+        "versions": VERSIONS,
+        "set": of,
+        "laws": {"fat": "Ogden, mu0 7 kPa"},
+        "parameters": {},
+    }
+    (place / "simulation.json").write_text(json.dumps(record))
+    return place / "Load1.vtu"
+
+
+def levelled(folder: Path, name: str, align: str) -> Path:
+    """A model that was sent through the measurement, with the registration of what it would have given."""
+    place = folder / f"{name}-levelled"
+    place.mkdir(parents=True)
+    (place / "provenance.json").write_text(json.dumps({"command": "level", "versions": VERSIONS, "parameters": {}}))
+    measured(folder / f"{name}-levelled-work" / "registered" / "Load1", "Load1", align)
+    return place / "Load1.vtu"
+
+
 def told(loads: dict[str, Path], models: dict[str, Path], error_known: bool = True) -> str:
     return "\n".join(methods(loads, models, 1234, (0.2, 0.5), (0.2, 0.3), 0.1, error_known=error_known, version="1.0"))
 
@@ -97,6 +121,32 @@ def test_borders_are_told(tmp_path: Path) -> None:
     text = told({"Load1": place}, {"ansys": tmp_path / "Load1.csv"})
     assert "vanishes on the borders of the label map's tissues" in text
     assert "strain of the skin penalised (weight chosen for each pair by cross-validation)" in text
+
+
+def test_driven_and_levelled_models_are_not_those_of_other_programs(tmp_path: Path) -> None:
+    loads = {"Load1": measured(tmp_path / "res", "Load1")}
+    models = {"mine-driven": driven(tmp_path, "mine-driven", "mine")}
+    models |= {"mine-levelled": levelled(tmp_path, "mine", "bone")}
+    text = told(loads, models)
+    for said in (
+        "moved by the measured displacement", "mine-driven: with mrstrain 9.8.7 (fat: Ogden, mu0 7 kPa)",
+        "mine-levelled: the model was sent through the measurement", "registered as the images were.",
+    ):  # fmt: skip
+        assert said in text, said
+    assert "other programs" not in text
+    assert "Trebbi" not in text
+    text = told(loads, {"x": driven(tmp_path, "trebbi-driven", "trebbi"), "y": levelled(tmp_path, "other", "image")})
+    assert "Published sets of laws are those that Trebbi 2023 compiled." in text
+    assert "registered as follows. The loaded image was aligned with the unloaded one rigidly on the whole" in text
+
+
+def test_the_correction_of_shading_is_told_where_it_was_done(tmp_path: Path) -> None:
+    models = {"ansys": tmp_path / "Load1.csv"}
+    text = told({"Load1": measured(tmp_path, "Load1")}, models)
+    assert "out of both images (N4, Tustison 2010)" in text
+    assert text.count("doi:10.1109/TMI.2010.2046908") == 1
+    (tmp_path / "given").mkdir()
+    assert "Tustison" not in told({"Load1": tmp_path / "given"}, models)
 
 
 def test_what_is_not_known_is_not_claimed(tmp_path: Path) -> None:

@@ -165,6 +165,14 @@ def test_only_and_force(folder):
     first, outcomes, _ = ran(folder, only=("mesh", "simulate", "compare"))
     assert first == []
     assert outcomes["register a"].reason.startswith("Made from other inputs")
+    assert outcomes["compare"].words == "OUT OF DATE"  # what builds on it is no newer
+    assert outcomes["compare"].reason == "Built on register a, out of date."
+    assert [name for name, one in outcomes.items() if not one.asked] == ["register a", "register b"]
+    assert [name for name, one in outcomes.items() if not one.whole] == ["register a", "compare"]
+    first, outcomes, _ = ran(folder, only=("compare",), force=("compare",))
+    assert first == ["compare"]
+    assert not outcomes["compare"].whole
+    assert all(one.whole for one in ran(folder)[1].values())
 
 
 def test_a_moved_study_stays_finished(folder, tmp_path_factory):
