@@ -247,6 +247,14 @@ def check(
                 f"called '{BONE}' and is fixed, the surface that the plate touches '{SURFACE}'."
             )
     check_laws(mesh, laws)
+    check_loads(plate, loads)
+    _check_held(mesh, fixed)
+    on_surface = np.setdiff1d(np.unique(mesh.facets[SURFACE]), _nodes_of(mesh, fixed))
+    Contact(plate, mesh.points_mm @ plate.axes, on_surface)
+
+
+def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
+    """Refuse loads that a plate cannot bring onto tissue."""
     if not loads:
         raise InputError("No load is given.")
     for load in loads:
@@ -259,9 +267,6 @@ def check(
             )
         if load.sheared and not plate.taped:
             raise InputError(f"{load.name}: a plate without friction carries no shear; got {load.told}.")
-    _check_held(mesh, fixed)
-    on_surface = np.setdiff1d(np.unique(mesh.facets[SURFACE]), _nodes_of(mesh, fixed))
-    Contact(plate, mesh.points_mm @ plate.axes, on_surface)
 
 
 def check_laws(mesh: TetMesh, laws: Mapping[str, Material]) -> None:

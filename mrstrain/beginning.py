@@ -24,6 +24,10 @@ _LABELS = re.compile(r"label|tissue|seg", re.IGNORECASE)
 _TO_MESH = re.compile(r"to[ _-]?mesh", re.IGNORECASE)
 _BONE = re.compile(r"calcaneus|calcaneum|bone", re.IGNORECASE)
 _VARIANT = "-as-published"  # a set in another reading of its numbers
+_ROLES = {
+    "labels": "the label map", "mesh_labels": "the label map to be meshed", "bone_mask": "the bone",
+    "repeat": "the repeat scan", "load": "that load",
+}  # fmt: skip
 _TABLES = (".csv", ".txt", ".label", ".ctbl")
 
 
@@ -40,6 +44,7 @@ class Found:
     mesh_labels: str | None = None
     mesh_names: str | None = None
     results: list[str] = field(default_factory=list)
+    passed_over: dict[str, str] = field(default_factory=dict)  # images without a role, and why
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +60,7 @@ class Begun:
         lines = [f"Load0: {found.load0 or 'NOT FOUND'}", f"Loads: {', '.join(found.loads.values()) or 'NONE FOUND'}"]
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
+        lines += [f"NOT USED: {name}, {why}" for name, why in found.passed_over.items()]
         return [
             *lines,
             f"Study file: {self.path}. Put the forces in; then: mrstrain check {self.path.parent}",
@@ -96,29 +102,37 @@ def _look(place: Path) -> Found:
     images = sorted(p.name for p in place.iterdir() if p.name.lower().endswith(IMAGES) and p.is_file())
     images += sorted(p.name for p in place.iterdir() if p.is_dir() and any(p.glob("*.dcm")))
     for name in images:
-        stem = _stem(name)
-        if _LABELS.search(stem):
-            if _TO_MESH.search(stem):
-                found.mesh_labels = found.mesh_labels or name
-            else:
-                found.labels = found.labels or name
-        elif _BONE.search(stem):
-            found.bone_mask = found.bone_mask or name
-        elif _UNLOADED.search(stem):
-            if _AGAIN.search(stem):
-                found.repeat = found.repeat or name
-                continue
-            if found.load0 is not None:
-                raise InputError(f"{place}: both {found.load0} and {name} seem to be the unloaded image; rename one.")
-            found.load0 = name
-        elif _LOADED.search(stem) and not _AGAIN.search(stem):
-            found.loads[stem] = name
+        role = _role(_stem(name))
+        if role == "load":
+            taken = found.loads.setdefault(_stem(name), name)
+        elif role is None:
+            found.passed_over[name] = "whose name tells no role"
+            continue
+        else:
+            taken = getattr(found, role) or name
+            setattr(found, role, taken)
+        if taken != name and role == "load0":
+            raise InputError(f"{place}: both {taken} and {name} seem to be the unloaded image; rename one.")
+        if taken != name:
+            found.passed_over[name] = f"since {taken} is taken for {_ROLES[role]}"
     found.names = _table(place, found.labels)
     found.mesh_names = _table(place, found.mesh_labels)
     for inside in sorted(p for p in place.iterdir() if p.is_dir() and p.name not in images):
         if any((inside / (load + ending)).is_file() for load in found.loads for ending in ENDINGS):
             found.results.append(inside.name)
     return found
+
+
+def _role(stem: str) -> str | None:
+    """What an image's name suggests that it is, as a field of `Found`, or "load"; None where it suggests nothing."""
+    if _LABELS.search(stem):
+        return "mesh_labels" if _TO_MESH.search(stem) else "labels"
+    if _BONE.search(stem):
+        return "bone_mask"
+    again = _AGAIN.search(stem) is not None
+    if _UNLOADED.search(stem):
+        return "repeat" if again else "load0"
+    return "load" if _LOADED.search(stem) and not again else None
 
 
 def _stem(name: str) -> str:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 
@@ -15,27 +14,28 @@ from dvc.image import Image, LabelMap
 from dvc.imagefile import read_image
 from dvc.kinematics import plate_axes
 from dvc.labels import fit_mask, read_labels, read_mask
+from dvc.mesh import TetMesh
 from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import usable_cores
 from fe.meshstore import read_tet_mesh
-from fe.published import material_set
+from fe.plate import Plate
+from fe.published import MaterialSet, material_set
+from fe.simulate import LoadStep, check_loads
+from fe.simulate import check as check_simulation
+from mrstrain.costs import cells_expected, costs
 from mrstrain.engines import settings_of
 from mrstrain.ledger import Ledger
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.pipeline import Pipeline
-from mrstrain.plan import Stage, plan
+from mrstrain.plan import load_step, plan
 from mrstrain.registering import REPEAT
 from mrstrain.studyfile import Study, read_study
 from validate.location import read_thresholds
+from validate.mapping import check_bones
+from validate.sources import check_overlap
 
-# Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
-_REGISTER_S, _MAPS_S_PER_MVOXEL = 50.0, 7.0
-_BORDERS = 2.5  # times as long with `borders = true` (docs/decisions/0009)
-_CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
-_MESH_S = 100.0
-_COMPARE_S, _MODEL_S = 8.0, 4.0
-_GB_STAGE, _BYTES_VOXEL, _MB_MODEL = 1.5, 40.0, 40.0
-_SHAPE = 0.1  # volume of a cell over its edge cubed, as meshes come out
+_T = TypeVar("_T")
+_P = ParamSpec("_P")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +58,23 @@ class Checked:
         return [*self.notes, *(f"WRONG: {one}" for one in self.wrong)] or ["Nothing is wrong."]
 
 
+@dataclass(slots=True)
+class _Findings:
+    """What was found so far; as in `Checked`."""
+
+    wrong: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def tried(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
+        """What a function gives; None where it refuses, which is noted once."""
+        try:
+            return read(*given, **options)
+        except (MrstrainError, OSError) as error:
+            if str(error) not in self.wrong:
+                self.wrong.append(str(error))
+            return None
+
+
 def check(study: Path | str, *, workers: int | None = None) -> Checked:
     """Read every input of a study, and tell all that is wrong and what a run will take.
 
@@ -66,88 +83,142 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     study : path
         The study file, or its folder.
     workers : int, optional
-        Stages at once, for the time; one for each core by default.
+        Stages at once, for time and memory; one for each core by default.
 
     Raises
     ------
     InputError
         If the study file itself cannot be read.
     """
-    told = read_study(study)
-    wrong: list[str] = []
-    notes: list[str] = []
-
-    def tried(read: Callable[[], Any]) -> Any:
-        try:
-            return read()
-        except (MrstrainError, OSError) as error:
-            if str(error) not in wrong:
-                wrong.append(str(error))
-            return None
-
-    images = told.images
-    reference = tried(lambda: _image(told, images.load0))
-    labels = tried(lambda: read_labels(told.path(images.labels), _optional(told, images.names)))
-    if isinstance(labels, LabelMap):
-        notes.append(f"Labels: {', '.join(labels.names.values())}")
-        if isinstance(reference, Image):
-            labels = tried(lambda: fit_mask(labels, reference.grid, images.labels)) or labels
-        if images.bone_mask is None:
-            tried(lambda: labels.region(images.bone))
-    if isinstance(reference, Image):
-        notes.insert(0, f"Load0: {reference.grid}")
-        for given in (images.bone_mask, images.tissue):
-            if given is not None:
-                tried(lambda given=given: read_mask(told.path(given), reference.grid))  # type: ignore[misc]
-    others = {load: one.image for load, one in told.loads.items()}
-    if images.repeat is not None:
-        others[REPEAT] = images.repeat
-    for name, given in others.items():
-        image = tried(lambda given=given: _image(told, given))  # type: ignore[misc]
-        if isinstance(image, Image):
-            notes.append(f"{name}: {image.grid}")
-            if isinstance(reference, Image) and _same(reference, image):
-                wrong.append(f"{name} is the unloaded image: every voxel is equal.")
-    how = told.registration
-    settings = tried(
-        lambda: settings_of(how.engine, how.preset, [told.path(p) for p in how.parameters], borders=how.borders)
-    )
-    if settings:
-        own = how.error_model
-        model = tried(lambda: error_model_of(settings.name) if own is None else read_error_model(told.path(own)))
-        if how.borders:
-            notes.append("With borders = true results will have no intervals: that error has not been measured yet.")
-        elif model is None:
-            notes.append(f"{settings.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
+    told, found = read_study(study), _Findings()
+    reference, labels = _images(told, found)
+    _registration(told, found)
+    found.tried(plate_axes, -np.asarray(told.plate.normal), told.plate.shear_direction)
+    if labels is not None and (told.models.sets or told.models.results):
+        found.tried(check_bones, labels, told.mesh.bones)
+    if labels is not None and told.models.results:
+        found.tried(_foreign, told, labels)
+    cells = _simulations(told, found, reference, labels) if told.models.sets else 0.0
     if told.compare.thresholds is not None:
-        tried(lambda: read_thresholds(told.path(str(told.compare.thresholds))))
-    for name in told.models.sets:
-        tried(lambda name=name: material_set(told.set_given(name)))  # type: ignore[misc]
-    if told.mesh.file is not None:
-        tried(lambda: read_tet_mesh(told.path(str(told.mesh.file))))
-    mapped = told.mesh.labels
-    if mapped is not None:
-        own_labels = tried(lambda: read_labels(told.path(mapped), _optional(told, told.mesh.names)))
-        labels = own_labels if isinstance(own_labels, LabelMap) else labels
-    if told.models.results and labels is not None:
-        tried(lambda: _foreign(told, labels))
-    tried(lambda: plate_axes(-np.asarray(told.plate.normal), told.plate.shear_direction))
+        found.tried(read_thresholds, told.path(told.compare.thresholds))
     low, high = told.compare.strains
     if not 0.0 <= low < high:
-        wrong.append(f"[compare] strains: the range rises from 0 or more; got {low:g} to {high:g}.")
-    if isinstance(labels, LabelMap) and told.mesh.file is None:
-        finer = [] if told.mesh.finer is None else [told.mesh.finer.region]
-        for region in (*told.mesh.bones, *finer):
-            tried(lambda region=region: labels.region(region))  # type: ignore[misc]
-        unknown = set(told.models.fixed) - {"bone", "skin", "cut"}
-        if unknown:
-            wrong.append(
-                f"[models] fixed: a mesh has the surfaces bone, skin and cut; got {', '.join(sorted(unknown))}."
-            )
-    planned = tried(lambda: plan(told))
-    if planned and not wrong:
-        notes += _cost(told, planned, reference, labels, workers or usable_cores())
-    return Checked(tuple(wrong), tuple(notes))
+        found.wrong.append(f"[compare] strains: the range rises from 0 or more; got {low:g} to {high:g}.")
+    planned = found.tried(plan, told)
+    if planned is not None and reference is not None and not found.wrong:
+        forecast = Pipeline(planned, Ledger(told.out, told.place)).forecast()
+        left = [stage for stage in planned if forecast[stage.name] == "run"]
+        voxels = float(np.prod(reference.grid.shape))
+        found.notes += (
+            costs(told, planned, left, voxels, cells, workers or usable_cores())
+            if left
+            else ["Everything is done already; a run only writes the report anew."]
+        )
+    return Checked(tuple(found.wrong), tuple(found.notes))
+
+
+def _images(study: Study, found: _Findings) -> tuple[Image | None, LabelMap | None]:
+    """Look at images, labels and masks; give the unloaded image, and the labels on it."""
+    images = study.images
+    reference = found.tried(_image, study, images.load0)
+    if reference is not None:
+        found.notes.append(f"Load0: {reference.grid}")
+    labels = found.tried(read_labels, study.path(images.labels), _optional(study, images.names))
+    if labels is not None:
+        found.notes.append(f"Labels: {', '.join(labels.names.values())}")
+        if reference is not None:
+            labels = found.tried(fit_mask, labels, reference.grid, images.labels) or labels
+        if images.bone_mask is None and study.bone is not None:
+            found.tried(labels.region, study.bone)
+    if reference is not None:
+        for mask in (images.bone_mask, images.tissue):
+            if mask is not None:
+                found.tried(read_mask, study.path(mask), reference.grid)
+    others = {load: one.image for load, one in study.loads.items()}
+    if images.repeat is not None:
+        others[REPEAT] = images.repeat
+    for name, other in others.items():
+        image = found.tried(_image, study, other)
+        if image is not None:
+            found.notes.append(f"{name}: {image.grid}")
+            if reference is not None and _same(reference, image):
+                found.wrong.append(f"{name} is the unloaded image: every voxel is equal.")
+    return reference, labels
+
+
+def _registration(study: Study, found: _Findings) -> None:
+    """Look at engine, parameters and error model."""
+    how = study.registration
+    settings = found.tried(
+        settings_of, how.engine, how.preset, [study.path(p) for p in how.parameters], borders=how.borders
+    )
+    if settings is None:
+        return
+    own = how.error_model
+    model = error_model_of(settings.name) if own is None else found.tried(read_error_model, study.path(own))
+    if how.borders:
+        found.notes.append("With borders = true results will have no intervals: that error has not been measured yet.")
+    elif model is None:
+        found.notes.append(f"{settings.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
+
+
+def _simulations(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> float:
+    """Look for what `simulate` would refuse; give about how many cells it will have."""
+    sets = [found.tried(material_set, study.set_given(name)) for name in study.models.sets]
+    laws = [one for one in sets if one is not None]
+    given = study.plate
+    plate = found.tried(Plate, given.normal, given.shear_direction, given.gap_mm, given.taped, given.turns)
+    steps = [found.tried(load_step, name, load) for name, load in study.loads.items()]
+    loads = [step for step in steps if step is not None]
+    if plate is not None and len(loads) == len(steps):
+        found.tried(check_loads, plate, loads)
+    if study.mesh.file is not None:
+        file = study.path(study.mesh.file)
+        mesh = found.tried(read_tet_mesh, file)
+        if mesh is None:
+            return 0.0
+        if reference is not None:
+            found.tried(check_overlap, file, mesh, reference.grid)
+        _on_mesh(found, mesh, laws, plate, loads, study.models.fixed)
+        return float(len(mesh.cells))
+    if study.mesh.labels is not None:
+        own = study.path(study.mesh.labels)
+        labels = found.tried(read_labels, own, _optional(study, study.mesh.names))
+    unknown = set(study.models.fixed) - {"bone", "skin", "cut"}
+    if unknown:
+        found.wrong.append(
+            f"[models] fixed: a mesh has the surfaces bone, skin and cut; got {', '.join(sorted(unknown))}."
+        )
+    if labels is None:
+        return 0.0
+    _on_labels(study, found, labels, laws)
+    return cells_expected(labels, study.mesh.bones, study.mesh.edge_mm)
+
+
+def _on_mesh(
+    found: _Findings,
+    mesh: TetMesh,
+    sets: Sequence[MaterialSet],
+    plate: Plate | None,
+    loads: Sequence[LoadStep],
+    fixed: Sequence[str],
+) -> None:
+    """Ask `simulate` itself about a mesh that was made elsewhere."""
+    for one in sets:
+        chosen = found.tried(one.for_regions, mesh.regions)
+        if chosen is not None and plate is not None and loads:
+            found.tried(check_simulation, mesh, chosen[0], plate, loads, fixed)
+
+
+def _on_labels(study: Study, found: _Findings, labels: LabelMap, sets: Sequence[MaterialSet]) -> None:
+    """Look whether a label map has the regions that are named, and each set a law for every tissue that is meshed."""
+    finer = [] if study.mesh.finer is None else [study.mesh.finer.region]
+    for region in (*study.mesh.bones, *finer):
+        found.tried(labels.region, region)
+    numbers = np.unique(labels.labels)
+    soft = [name for n, name in labels.names.items() if n != 0 and n in numbers and name not in study.mesh.bones]
+    for one in sets:
+        found.tried(one.for_regions, soft)
 
 
 def _image(study: Study, given: str) -> Image:
@@ -171,45 +242,3 @@ def _foreign(study: Study, labels: LabelMap) -> None:
     for of in files.values():
         for file in of:
             file.read(labels.grid)
-
-
-def _cost(study: Study, stages: tuple[Stage, ...], reference: Image, labels: LabelMap, workers: int) -> list[str]:
-    """About how long the stages that are not finished take, and how much memory and disk."""
-    told = Pipeline(stages, Ledger(study.out, study.place)).forecast()
-    left = [stage for stage in stages if told[stage.name] == "run"]
-    if not left:
-        return ["Everything is done already; a run only writes the report anew."]
-    voxels = float(np.prod(reference.grid.shape))
-    seconds = {stage.name: _seconds(stage, study, voxels, labels) for stage in left}
-    total = sum(seconds.values())
-    longest = max(seconds.values())
-    minutes = max(total / workers, longest) / 60.0
-    loads = len(study.loads)
-    models = sum(stage.kind in ("simulate", "drive") for stage in stages)
-    disk = (_BYTES_VOXEL * voxels * (loads + 1) + 1e6 * _MB_MODEL * loads * (models + 1)) / 1e9
-    free = shutil.disk_usage(study.place).free / 1e9
-    lines = [
-        f"To do: {len(left)} of {len(stages)} stages, about {minutes:.0f} minutes on {workers} cores, "
-        f"{_GB_STAGE * min(workers, len(left)):.1f} GB of memory, {disk:.1f} GB on the disk ({free:.0f} GB free)."
-    ]
-    if disk > free:
-        lines.append("CARE: the disk has too little room.")
-    return lines
-
-
-def _seconds(stage: Stage, study: Study, voxels: float, labels: LabelMap) -> float:
-    loads = len(study.loads)
-    registering = _REGISTER_S * (_BORDERS if study.registration.borders else 1.0) + _MAPS_S_PER_MVOXEL * voxels / 1e6
-    if stage.kind == "register":
-        return registering
-    if stage.kind == "level":
-        return 1.5 * registering
-    if stage.kind == "mesh":
-        return _MESH_S
-    if stage.kind == "compare":
-        models = len({value for of in (stage.some.get("models", {}),) for value in of.values()})
-        return loads * (_COMPARE_S + _MODEL_S * (models + len(study.models.results)))
-    soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in study.mesh.bones and n != 0])
-    volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3
-    cells = volume / (_SHAPE * study.mesh.edge_mm**3)
-    return float(loads * _LOAD_S * (max(cells, 0.9 * _CELLS) / _CELLS) ** _GROWTH)

@@ -180,7 +180,7 @@ def _cores() -> Finding:
 
 
 def _memory() -> Finding:
-    total = _memory_bytes()
+    total = usable_memory_bytes()
     if total is None:
         return Finding("memory", True, "not known on this system")
     detail = f"{total / _GIB:.1f} GiB"
@@ -193,7 +193,7 @@ def _memory() -> Finding:
     return Finding("memory", True, detail)
 
 
-def _memory_bytes() -> int | None:
+def usable_memory_bytes() -> int | None:
     """Memory that this process may use: the machine's, or less where a container limits it."""
     try:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

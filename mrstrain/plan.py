@@ -83,7 +83,8 @@ def plan(study: Study) -> tuple[Stage, ...]:
     Raises
     ------
     InputError
-        If two material sets or models would share a folder, or a load that is simulated has no force.
+        If two material sets or models would share a folder, a load that is simulated has no force, or models are
+        levelled without a bone.
     """
     stages = _registrations(study)
     loads = tuple(study.loads)
@@ -145,7 +146,7 @@ def _registrations(study: Study) -> list[Stage]:
     own = [study.path(p) for p in how.parameters]
     error_model = [] if how.error_model is None else [study.path(how.error_model)]
     shared: dict[str, Any] = {
-        "load0": str(load0), "images": aside, "bone": images.bone, "align": how.align,
+        "load0": str(load0), "images": aside, "bone": study.bone, "align": how.align,
         "engine": how.engine, "borders": how.borders, "preset": how.preset,
         "parameters": [str(p) for p in own], "error_model": str(error_model[0]) if error_model else None,
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
@@ -209,7 +210,7 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         raise InputError(f"The material set '{name}' of {one} needs {wrong}.") from wrong
     arguments = {
         "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
-        "loads": [asdict(_step(load, of)) for load, of in study.loads.items()],
+        "loads": [asdict(load_step(load, of)) for load, of in study.loads.items()],
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
         "fixed": study.models.fixed, "element": study.models.element, "decks": study.models.decks,
@@ -217,7 +218,14 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
     return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
 
 
-def _step(name: str, load: Load) -> LoadStep:
+def load_step(name: str, load: Load) -> LoadStep:
+    """A load of the study as it is simulated.
+
+    Raises
+    ------
+    InputError
+        If it has neither force nor travel along the normal, or both.
+    """
     if load.normal_n is None and load.normal_mm is None:
         raise InputError(f"[loads.{name}] normal_n is missing: sets are simulated ([models] sets) under every load.")
     return LoadStep(name, load.normal_n, load.shear_n, load.normal_mm, load.shear_mm)
@@ -233,6 +241,8 @@ def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
+    if study.bone is None and study.images.bone_mask is None:
+        raise InputError("[models] level = true needs a bone, where models are at rest: [images] bone, or bone_mask.")
     sent = _registrations(study)[-1].arguments
     arguments = {key: sent[key] for key in _AS_MEASURED}
     arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}

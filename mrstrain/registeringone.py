@@ -30,7 +30,7 @@ def register_one(
     out: Path,
     labels: Path,
     names: Path | None,
-    bone: str | Path,
+    bone: str | Path | None,
     tissue: Path | None = None,
     align: AlignOn = "bone",
     engine: str | None = None,
@@ -52,8 +52,8 @@ def register_one(
     ----------
     out : path
         Folder of this load's results; one that is called "repeat" is that of a repeat scan.
-    bone : str or path
-        Its name in ``labels``, or a mask.
+    bone : str, path or None
+        Its name in ``labels``, or a mask; None where the whole image is aligned on.
     repeat : path, optional
         Folder of the repeat scan's results: the noise floor.
     after : path, optional

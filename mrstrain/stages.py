@@ -43,7 +43,7 @@ class Given:
     retry: bool = False
 
 
-def register(tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone: str, **options: Any) -> Given:
+def register(tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone: str | None, **options: Any) -> Given:
     """One loaded image against the unloaded one; as `mrstrain.registeringone.register_one`."""
     from mrstrain.registeringone import register_one
 
@@ -114,7 +114,7 @@ def _driven(mesh: str, dvc: str, out: str, material: str, loads: Sequence[str]) 
 
 
 def level(
-    tell: Tell, *, out: str, load0: str, model: str, load: str, images: Paths, bone: str, **options: Any
+    tell: Tell, *, out: str, load0: str, model: str, load: str, images: Paths, bone: str | None, **options: Any
 ) -> Given:
     """One model's load sent through the measurement; as `mrstrain.level`."""
     from mrstrain.levelling import level as run

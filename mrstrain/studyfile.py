@@ -74,8 +74,8 @@ class Images(_Part):
         Unloaded image.
     labels, names : str
         Label map of the tissues on it, and the table of its names.
-    bone : str
-        Name of the label to align on; or ``bone_mask``, a mask of it.
+    bone : str, optional
+        Name of the label to align on, "bone" if it is not said; or ``bone_mask``, a mask of it.
     repeat : str, optional
         A second unloaded image: the noise floor.
     tissue : str, optional
@@ -85,7 +85,7 @@ class Images(_Part):
     load0: str
     labels: str
     names: str | None = None
-    bone: str = "bone"
+    bone: str | None = None
     bone_mask: str | None = None
     repeat: str | None = None
     tissue: str | None = None
@@ -153,7 +153,7 @@ class Meshing(_Part):
     edge_mm: Annotated[Real, Field(gt=0.0)] = 2.0
     labels: str | None = None
     names: str | None = None
-    bones: Names = ("bone",)
+    bones: Annotated[Names, Field(min_length=1)] = ("bone",)
     finer: Finer | None = None
     limit_minutes: Annotated[Real, Field(gt=0.0)] = 60.0
     file: str | None = None
@@ -221,6 +221,11 @@ class Study(_Part):
     def out(self) -> Path:
         """Folder of the results."""
         return self.place / self.study.out
+
+    @property
+    def bone(self) -> str | None:
+        """Name of the bone's label; None where the whole image is aligned on and none is named."""
+        return self.images.bone or ("bone" if self.registration.align == "bone" else None)
 
     def path(self, given: str) -> Path:
         """A path of the file, from the study's folder."""

@@ -103,13 +103,14 @@ def cohort(
     if len(ranges) > 1:
         raise InputError(f"The studies compare over different ranges of strain ([compare] strains): {sorted(ranges)}.")
     ran = run_studies(told, scheduler=scheduler, workers=workers, progress=progress)
-    areas = {one.study.study.name: _areas(one.study.out / COMPARISON / "areas.csv") for one in ran}
-    rows = [row for of in areas.values() for row in of]
-    if not rows:
+    without = {one.study.study.name: why for one in ran if (why := _uncounted(one))}
+    areas = {name: _areas(one.study.out) for one in ran if (name := one.study.study.name) not in without}
+    if not any(areas.values()):
         raise InputError(
             "No subject was compared with a model: " + "; ".join(line for r in ran for line in r.summary())
         )
     shares, notes = _shares(areas)
+    notes = [f"{name} is not counted: {why}" for name, why in without.items()] + notes
     notes += _doubts([one for one in ran if any(one.study.study.name in of for of in shares.values())])
     try:
         ranking = standings(shares)
@@ -124,11 +125,20 @@ def cohort(
     return Cohort(target, tuple(ran), ranking, tuple(notes))
 
 
-def _areas(path: Path) -> list[dict[str, str]]:
-    """The areas of all soft tissue in a study's table; none where it has not been compared."""
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
+def _uncounted(one: Ran) -> str:
+    """Why a study's areas are not ranked over; empty where they are.
+
+    A table may be there all the same: an earlier run's, of other inputs, where `compare` was not run now.
+    """
+    compared = one.outcomes.get("compare")
+    if compared is None:
+        return "its study compares no model ([models] sets, results)."
+    return "" if compared.whole else f"compare {compared.words}. {compared.reason}".rstrip()
+
+
+def _areas(out: Path) -> list[dict[str, str]]:
+    """The areas of all soft tissue in the table of a study's results."""
+    with (out / COMPARISON / "areas.csv").open(newline="", encoding="utf-8") as file:
         return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
 
 

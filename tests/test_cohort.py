@@ -2,11 +2,33 @@
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from dvc.errors import InputError
+from mrstrain.ledger import Record
+from mrstrain.pipeline import Outcome
+from mrstrain.running import Ran
+from mrstrain.stages import Given
+from mrstrain.studyfile import read_study
+from mrstrain.subjects import cohort
 from validate.cohort import standings
+
+STUDY = """
+[study]
+name = "{name}"
+[images]
+load0 = "Load0.nii.gz"
+labels = "tissues.nii.gz"
+[loads.Load1]
+image = "Load1.nii.gz"
+[models]
+results = ["near", "far"]
+"""
+HEAD = "load,tissue,model,ml,share,low_ml,high_ml,estimate_ml"
 
 
 def test_closed_form():
@@ -66,3 +88,47 @@ def test_one_subject_has_no_interval():
 def test_no_common_subject():
     with pytest.raises(InputError, match="ranked"):
         standings({"x": {"a": 0.1}, "y": {"b": 0.1}})
+
+
+def compared(folder: Path, name: str, near: float, far: float) -> Path:
+    """A study's folder with the table that a comparison leaves."""
+    comparison = folder / name / "results" / "comparison"
+    comparison.mkdir(parents=True)
+    (folder / name / "study.toml").write_text(STUDY.format(name=name))
+    rows = [f"Load1,all soft tissue,{model},{share},{share},,,nan" for model, share in (("near", near), ("far", far))]
+    (comparison / "areas.csv").write_text("\n".join([HEAD, *rows]) + "\n")
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    ("outcome", "why"),
+    [
+        (Outcome("compare", None, "Not run: none of register Load1 has a result."), "compare not run. Not run: none"),
+        (Outcome("compare", None, "The label map has no 'bone'."), "compare FAILED. The label map has no 'bone'."),
+        (None, "its study compares no model"),
+    ],
+)
+def test_a_table_that_an_earlier_run_left_is_not_ranked_over(tmp_path, monkeypatch, outcome, why):
+    places = [compared(tmp_path, "Ada", 0.1, 0.3), compared(tmp_path, "Ben", 0.9, 0.2)]
+    record = Record(stage="compare", key="k", made_utc="", seconds=1.0, files={}, given=Given(()), made_from={})
+    well = Outcome("compare", record)
+
+    def ended(studies, **_):
+        return [Ran(study, {} if one is None else {"compare": one}) for study, one in zip(studies, ends, strict=True)]
+
+    monkeypatch.setattr("mrstrain.subjects.run_studies", ended)
+    ends: list[Outcome | None] = [well, well]
+    both = cohort(places, out=tmp_path / "both")
+    assert (both.ranking[0].model, both.ranking[0].subjects) == ("far", 2)
+    assert not any("not counted" in note for note in both.notes)
+    ends[1] = outcome
+    one = cohort(places, out=tmp_path / "one")
+    assert (one.ranking[0].model, one.ranking[0].subjects) == ("near", 1)
+    assert any(note.startswith(f"Ben is not counted: {why}") for note in one.notes)
+    assert not any("not ranked over" in note for note in one.notes)  # said once
+    with (tmp_path / "one" / "cohort.csv").open() as file:
+        assert {row["subject"] for row in csv.DictReader(file)} == {"Ada"}
+    assert read_study(places[1]).study.name in (tmp_path / "one" / "report.html").read_text()
+    ends[0] = outcome
+    with pytest.raises(InputError, match="No subject was compared"):
+        cohort(places, out=tmp_path / "none")

@@ -128,7 +128,7 @@ def test_what_is_missing_or_short_is_found_with_advice(tmp_path: Path, monkeypat
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(doctor.importlib.metadata, "version", version)
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: usage(10, 9, 1))
-    monkeypatch.setattr(doctor, "_memory_bytes", lambda: 4 * 1024**3)
+    monkeypatch.setattr(doctor, "usable_memory_bytes", lambda: 4 * 1024**3)
     monkeypatch.setattr(doctor.sys, "version_info", (3, 10, 2, "final", 0))
     monkeypatch.setattr(doctor.tempfile, "TemporaryFile", read_only)
     findings = by_name(examine(tmp_path))

@@ -295,19 +295,6 @@ def test_check_tells_all_that_is_wrong_at_once(done, images, tmp_path):
         assert words in wrong, words
 
 
-def test_check_tells_that_borders_take_longer(images, tmp_path):
-    study = tmp_path / "study"
-    shutil.copytree(images, study)
-
-    def minutes(registration: str) -> int:
-        (study / "study.toml").write_text(STUDY.replace('parameters = ["quick.txt"]', registration))
-        told = check(study, workers=1)
-        assert told.wrong == ()
-        return next(int(found[1]) for note in told.notes if (found := re.search(r"about (\d+) minutes", note)))
-
-    assert minutes("borders = true") >= minutes("") + 3  # three registrations of 50 s, 2.5 times as long
-
-
 def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
     study = tmp_path / "study"
     shutil.copytree(images, study)

@@ -1,0 +1,105 @@
+"""What the rest of a study takes: minutes, memory and room on the disk, told before it is run."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+
+import numpy as np
+
+from dvc.image import LabelMap
+from mrstrain.doctor import usable_memory_bytes
+from mrstrain.plan import Stage
+from mrstrain.studyfile import Study
+
+# Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
+_REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 50.0 / 2.3, 7.0
+_BORDERS = 2.5  # times as long with `borders = true` (docs/decisions/0009)
+_CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
+_MESH_S = 100.0
+_COMPARE_S, _MODEL_S = 8.0, 4.0
+# GiB of all processes of a stage: registrations of 2.3 and 16.8 million voxels took 1.2 and 3.6, a factorisation at
+# 79,000 cells .84.
+_REGISTER_GIB, _REGISTER_GIB_PER_MVOXEL = 0.82, 0.166
+_SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
+_OTHER_GIB = 1.5
+_BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
+_SHAPE = 0.1  # volume of a cell over its edge cubed, as meshes come out
+_LEAST_CELLS = 0.9 * _CELLS  # thin tissues get shorter edges than are asked for
+_GIB = 1024.0**3
+
+
+def cells_expected(labels: LabelMap, bones: Sequence[str], edge_mm: float) -> float:
+    """About how many cells the mesh of a label map's soft tissue will have."""
+    soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in bones and n != 0])
+    volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3
+    return max(volume / (_SHAPE * edge_mm**3), _LEAST_CELLS)
+
+
+def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
+    """About how long a stage takes on one core.
+
+    Parameters
+    ----------
+    stage : Stage
+    study : Study
+    voxels : float
+        Of the unloaded image.
+    cells : float
+        Of the mesh.
+    """
+    loads = len(study.loads)
+    slower = _BORDERS if study.registration.borders else 1.0
+    registering = (slower * _REGISTER_S_PER_MVOXEL + _MAPS_S_PER_MVOXEL) * voxels / 1e6
+    if stage.kind == "register":
+        return registering
+    if stage.kind == "level":
+        return 1.5 * registering
+    if stage.kind == "mesh":
+        return _MESH_S
+    if stage.kind == "compare":
+        models = len({value for of in (stage.some.get("models", {}),) for value in of.values()})
+        return loads * (_COMPARE_S + _MODEL_S * (models + len(study.models.results)))
+    return float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
+
+
+def gib_of(stage: Stage, voxels: float, cells: float) -> float:
+    """About how much memory a stage takes, GiB, all its processes together; parameters as in `seconds_of`."""
+    if stage.kind in ("register", "level"):
+        return _REGISTER_GIB + _REGISTER_GIB_PER_MVOXEL * voxels / 1e6
+    if stage.kind in ("simulate", "drive"):
+        return _SIMULATE_GIB + _SIMULATE_GIB_PER_CELL * cells
+    return _OTHER_GIB
+
+
+def costs(
+    study: Study, stages: Sequence[Stage], left: Sequence[Stage], voxels: float, cells: float, workers: int
+) -> list[str]:
+    """About how long the stages that are ``left`` take, and how much memory and disk; in sentences.
+
+    Other parameters are those of `seconds_of`; ``workers`` are the stages at once.
+    """
+    seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
+    minutes = max(sum(seconds) / workers, *seconds) / 60.0
+    gib = sorted((gib_of(stage, voxels, cells) for stage in left), reverse=True)
+    needed = sum(gib[:workers])  # whichever of them meet
+    loads = len(study.loads)
+    models = sum(stage.kind in ("simulate", "drive") for stage in stages)
+    disk = (_BYTES_VOXEL * voxels * (loads + 1) + 1e6 * _MB_MODEL * loads * (models + 1)) / 1e9
+    free = shutil.disk_usage(study.place).free / 1e9
+    lines = [
+        f"To do: {len(left)} of {len(stages)} stages, about {minutes:.0f} minutes on {workers} cores, "
+        f"{needed:.1f} GiB of memory, {disk:.1f} GB on the disk ({free:.0f} GB free)."
+    ]
+    if disk > free:
+        lines.append("CARE: the disk has too little room.")
+    there = usable_memory_bytes()
+    if there is not None and needed > there / _GIB:
+        fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
+        advice = (
+            f"run with --workers {fitting}."
+            if fitting
+            else "one stage alone is too large: crop the images, take a coarser mesh, or a larger machine."
+        )
+        lines.append(f"CARE: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
+    return lines

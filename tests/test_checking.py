@@ -1,0 +1,157 @@
+"""`check`: what `simulate` would refuse later is told now, and what a run takes grows with what it is made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.errors import InputError, RegistrationError
+from dvc.image import Grid, Image, LabelMap
+from dvc.imagewrite import write_image, write_labels
+from dvc.mesh import TetMesh
+from fe.meshstore import write_tet_mesh
+from mrstrain import costs, stages
+from mrstrain.checking import check
+from mrstrain.plan import plan
+from mrstrain.studyfile import read_study
+from tests.test_simulate import dome
+
+GRID = Grid((16, 16, 16), (2.0, 2.0, 2.0), (-6.0, -6.0, -6.0))  # around the dome
+STUDY = """
+[study]
+name = "Heel"
+[images]
+load0 = "Load0.nii.gz"
+labels = "tissues.nii.gz"
+names = "tissues.csv"
+[loads.Load1]
+image = "Load1.nii.gz"
+normal_n = 15.0
+shear_n = 4.0
+[plate]
+normal = [-1.0, 0.0, 0.0]
+[registration]
+[mesh]
+[models]
+sets = ["mine.toml", "friedman"]
+"""
+MINE = '[mine]\n[mine.fat]\nlaw = "neo-Hooke"\nmu_kpa = 10.0\nnu = 0.49\n'
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """Two images of noise, a label map of bone, fat and tendon, and a set that has a law for fat alone."""
+    rng = np.random.default_rng(1)
+    for name in ("Load0", "Load1"):
+        write_image(tmp_path / f"{name}.nii.gz", Image(GRID, rng.uniform(0.0, 100.0, GRID.shape)))
+    values = np.ones(GRID.shape, dtype=np.int64)
+    values[:4], values[4:6] = 2, 3
+    write_labels(tmp_path / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 3: "tendon", 9: "skin"}))
+    (tmp_path / "mine.toml").write_text(MINE)
+    (tmp_path / "study.toml").write_text(STUDY)
+    return tmp_path
+
+
+def wrong(folder: Path, *changes: tuple[str, str]) -> str:
+    text = STUDY
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "study.toml").write_text(text)
+    return "\n".join(check(folder).wrong)
+
+
+def test_a_tissue_without_a_law_is_told_and_one_that_takes_anothers_is_not(study):
+    # tendon takes fat's; the table names a skin that no voxel has, so no cell will need its law
+    assert wrong(study) == ""
+    values = np.full(GRID.shape, 9)
+    values[:8], values[:4] = 1, 2
+    write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 9: "skin"}))
+    assert wrong(study).startswith("The set mine has no law for the region 'skin'")
+    assert wrong(study, ('"mine.toml", ', "")) == ""
+
+
+def test_a_plate_without_friction_carries_no_shear(study):
+    write_tet_mesh(study / "dome.vtu", dome((3, 4, 4)), {})
+    for mesh in ("[mesh]", '[mesh]\nfile = "dome.vtu"'):
+        told = wrong(
+            study, ("[registration]", "taped = false\n[registration]"), ("[mesh]", mesh), ('"mine.toml", ', "")
+        )
+        assert told.startswith("Load1: a plate without friction carries no shear")
+        assert told.count("\n") == 0
+
+
+def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
+    made = dome((3, 4, 4))
+    file, friedman = ("[mesh]", '[mesh]\nfile = "dome.vtu"'), ('"mine.toml", ', "")
+    write_tet_mesh(study / "dome.vtu", made, {})
+    assert wrong(study, file, friedman) == ""
+    assert "mine has no law for the region 'skin'" in wrong(study, file)
+    assert "no facets 'cut'" in wrong(study, file, friedman, ("sets", 'fixed = ["bone", "cut"]\nsets'))
+    far = TetMesh(made.points_mm + 400.0, made.cells, made.regions, made.facets)
+    write_tet_mesh(study / "dome.vtu", far, {})
+    assert "dome.vtu does not lie in the image" in wrong(study, file, friedman)
+
+
+def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(study, monkeypatch):
+    tissues = LabelMap(GRID, np.ones(GRID.shape, dtype=np.int64), {1: "fat"})
+    write_labels(study / "tissues.nii.gz", tissues)
+    align, measured = ("[registration]", '[registration]\nalign = "image"'), ('"mine.toml", "friedman"', "")
+    assert "no region 'bone'" in wrong(study, measured)
+    assert "no 'bone'" in wrong(study, align)  # a comparison needs one
+    assert "no region 'sacrum'" in wrong(study, align, measured, ("labels =", 'bone = "sacrum"\nlabels ='))
+    assert wrong(study, align, measured) == ""
+    (stage,) = plan(read_study(study))
+    asked = {}
+
+    def never(reference, loaded, *, bone, settings, **_):
+        asked.update(bone=bone, on=settings.align_on)
+        raise RegistrationError("enough")
+
+    monkeypatch.setattr("mrstrain.registeringone.register_pair", never)
+    body = np.zeros(GRID.shape, dtype=bool)
+    body[2:-2, 2:-2, 2:-2] = True
+    monkeypatch.setattr("mrstrain.registeringone.tissue_mask", lambda _: body)
+    with pytest.raises(RegistrationError, match="enough"):
+        stages.register(lambda *_: None, **stage.arguments, repeat=[])
+    assert asked == {"bone": None, "on": "image"}
+    (study / "study.toml").write_text(
+        STUDY.replace(*align).replace('sets = ["mine.toml", "friedman"]', 'sets = ["friedman"]\nlevel = true')
+    )
+    with pytest.raises(InputError, match="level = true needs a bone"):
+        plan(read_study(study))
+
+
+def test_larger_images_and_meshes_take_longer_and_more_memory(study):
+    told = read_study(study)
+    by_kind = {stage.kind: stage for stage in plan(told)}
+    small, large = 126.0 * 140 * 132, 256.0**3
+    registering, simulating = by_kind["register"], by_kind["simulate"]
+    assert costs.gib_of(registering, small, 0.0) == pytest.approx(1.2, abs=0.05)  # as measured
+    assert costs.gib_of(registering, large, 0.0) == pytest.approx(3.6, abs=0.05)
+    assert costs.seconds_of(registering, told, small, 0.0) == pytest.approx(66.0, rel=0.05)
+    assert costs.seconds_of(registering, told, 8 * small, 0.0) == pytest.approx(8 * 66.0, rel=0.05)
+    (study / "study.toml").write_text(STUDY.replace("[registration]", "[registration]\nborders = true"))
+    with_borders = costs.seconds_of(registering, read_study(study), small, 0.0)
+    assert with_borders == pytest.approx(2.5 * 50.0 + 16.3, rel=0.05)
+    assert costs.gib_of(simulating, 0.0, 79e3) == pytest.approx(1.2)
+    assert costs.gib_of(simulating, 0.0, 8 * 79e3) == pytest.approx(8.2)
+    assert costs.seconds_of(simulating, told, 0.0, 8 * 79e3) > 8 * costs.seconds_of(simulating, told, 0.0, 79e3)
+
+
+def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, monkeypatch):
+    told = read_study(study)
+    load = next(stage for stage in plan(told) if stage.kind == "register")
+    left = [replace(load, name=f"register {k}") for k in range(4)]
+
+    def care(gib: float, workers: int = 3) -> list[str]:
+        monkeypatch.setattr(costs, "usable_memory_bytes", lambda: int(gib * 1024**3))
+        return [line for line in costs.costs(told, left, left, 256.0**3, 0.0, workers) if line.startswith("CARE")]
+
+    assert care(11.0) == []  # three of 3.6 GiB
+    assert care(8.0) == ["CARE: this machine has 8.0 GiB of memory; run with --workers 2."]
+    assert care(8.0, workers=2) == []
+    assert "crop the images" in care(3.0)[0]
