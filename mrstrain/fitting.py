@@ -49,7 +49,8 @@ class Fitted:
             if p.at_bound:
                 lines.append(
                     f"These curves do not determine {p.name}: alone they would have it lower than a law may have it, "
-                    "and its value is that bound. Measure at stretches nearer to 1, or take a law with fewer parameters."
+                    "and its value is that bound. Measure nearer to a stretch of 1, or take a law with fewer "
+                    "parameters."
                 )
             elif p.low <= 0.0 <= p.high:
                 lines.append(
