@@ -308,10 +308,8 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     return Fit(
         material,
         tuple(
-            Parameter(name, *numbers, at_bound=bool(bound))
-            for name, *numbers, bound in zip(
-                sought.names, values.tolist(), low.tolist(), high.tolist(), at_bound, strict=True
-            )
+            Parameter(name, float(values[n]), float(low[n]), float(high[n]), bool(at_bound[n]))
+            for n, name in enumerate(sought.names)
         ),
         r2,
         float(np.sqrt(np.mean(residual**2))),

@@ -72,7 +72,8 @@ Output/plotfile | type=febio
 Output/plotfile/var | type=displacement,stress,Lagrange strain,reaction forces
 """
 """Tags, attributes and keywords that FEBio's reader of format 4.0 looks for, as far as decks use them: from its sources
-(github.com/febiosoftware/FEBio at 65622b5 of January 2026: FEBioXML's sections, the parameters that classes declare). A tag that it does not know, or an attribute, ends the reading. A type's name stands behind its tag."""
+(github.com/febiosoftware/FEBio at 65622b5 of January 2026: FEBioXML's sections, the parameters that classes declare).
+A tag that it does not know, or an attribute, ends the reading. A type's name stands behind its tag."""
 
 
 def foreign_to_febio(root: ElementTree.Element) -> list[str]:
