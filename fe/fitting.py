@@ -27,6 +27,8 @@ _STRESS = {
 _EXPONENTS = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # starts of an Ogden fit
 _MOSTLY = 0.8
 _MOST = 60.0  # an exponent beyond this is not one that a curve can tell
+_SOFTEST = 1e-3  # least C10 of a polynomial law, of that of the neo-Hookean law that suits the same curves best
+_ABSURD = 1e-4  # curves of a law with a positive modulus are refused less often than this
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,12 +52,19 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A fitted number and the interval that holds it with 95 % confidence."""
+    """A fitted number and the interval that holds it with 95 % confidence.
+
+    Attributes
+    ----------
+    at_bound : bool
+        Whether the curves alone would have it lower than a law may have it, so that ``value`` is the bound.
+    """
 
     name: str
     value: float
     low: float
     high: float
+    at_bound: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +110,7 @@ class _Law:
     vector: Callable[[FloatArray], FloatArray]
     material: Callable[[FloatArray, float], Material]
     exponents: int = 0  # of the last parameters, those in which the stress is not linear
+    bounded: bool = False  # the first parameter is kept positive, and the stress is linear in all
 
 
 def _polynomial(*names: str) -> _Law:
@@ -111,7 +121,7 @@ def _polynomial(*names: str) -> _Law:
         c10, c20, c30 = (*values.tolist(), 0.0)[:3]
         return Yeoh.of(c10, c20, c30, nu)
 
-    return _Law(names, vector, material)
+    return _Law(names, vector, material, bounded=True)
 
 
 def _ogden(terms: int) -> _Law:
@@ -206,7 +216,7 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     ------
     InputError
         If there are too few points, or none away from a stretch of 1; if no parameters can be told from these
-        curves; or if the best fit has no positive shear modulus.
+        curves; or if they say that the initial shear modulus is not positive.
 
     Notes
     -----
@@ -218,6 +228,13 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     standard deviation at every point, and claim nothing of errors that a curve shares, such as a wrong area.
     Parameters in which the stress is linear start at their best; an Ogden law's exponents from the four best of the
     combinations of eight values.
+
+    C10, half the initial shear modulus, is positive in any law; a curve that is steep only at its end may leave it
+    open, and the best fit then has it below 0 as often as not. It is kept at a thousandth or more of that of the
+    neo-Hookean law which suits the same curves best. An interval reaches w below the lower, and w above the higher, of
+    the values with and without that bound, w being the half width without it; C10's ends at 0. So it contains all of
+    the usual interval that a law can have, and holds the truth as often or more often. Curves are refused that would
+    have C10 so far below 0 that chance does it to less than one in 10,000 of the curves of a true law.
     """
     named = {name.lower(): name for name in LAWS}
     if law.lower() not in named:
@@ -260,11 +277,17 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     values = best.x
     if sought.exponents and np.abs(values[-sought.exponents :]).max() > _MOST:
         raise InputError(f"{law}: the best exponent is beyond {_MOST:g}; these curves cannot tell it. Use fewer terms.")
-    intervals = _intervals(values, best.jac, best.fun)
-    if intervals is None:
+    deviations = _deviations(values, best.jac, best.fun)
+    if deviations is None:
         raise InputError(
             f"{law}: its parameters cannot be told apart from these curves (singular); use a law with fewer."
         )
+    least = np.full(count, -np.inf)
+    freedom = len(stress) - count
+    if sought.bounded:
+        if values[0] + student.isf(_ABSURD, freedom) * deviations[0] > 0.0:
+            values = _not_softer(values, _softest(curves), best.jac * size, stress)
+        least[0] = 0.0
     try:
         material = sought.material(values, nu)
     except InputError as unusable:
@@ -272,18 +295,21 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
             f"The best fit is no law to compute with ({unusable}) Give points nearer to a stretch of 1, or use a law "
             "with fewer parameters."
         ) from unusable
-    residual = best.fun * size
+    residual = modelled(values) - stress
     ends = np.cumsum([0, *(len(c.stress_mpa) for c in curves)])
     r2, reached = {}, {}
     for curve, first, last in zip(curves, ends, ends[1:], strict=False):
         spread = float(((curve.stress_mpa - curve.stress_mpa.mean()) ** 2).sum())
         r2[curve.mode] = 1.0 - float((residual[first:last] ** 2).sum()) / spread if spread > 0 else float("nan")
         reached[curve.mode] = (float(min(1.0, curve.stretch.min())), float(max(1.0, curve.stretch.max())))
+    widths = student.ppf(0.975, freedom) * deviations
+    low, high = np.maximum(np.minimum(values, best.x) - widths, least), np.maximum(values, best.x) + widths
+    at_bound = (least > -np.inf) & (values > best.x)
     return Fit(
         material,
         tuple(
-            Parameter(n, float(v), float(v - w), float(v + w))
-            for n, v, w in zip(sought.names, values, intervals, strict=True)
+            Parameter(name, float(values[n]), float(low[n]), float(high[n]), bool(at_bound[n]))
+            for n, name in enumerate(sought.names)
         ),
         r2,
         float(np.sqrt(np.mean(residual**2))),
@@ -334,8 +360,22 @@ def _chosen(
     return different[0], tuple(different[1:])
 
 
-def _intervals(values: FloatArray, jacobian: FloatArray, residual: FloatArray) -> FloatArray | None:
-    """Half widths of the 95 % intervals; None where the parameters cannot be told apart."""
+def _softest(curves: Sequence[Curve]) -> float:
+    """The least C10 of a fit to these curves, MPa; not above 0 where they give no positive modulus at all."""
+    unit = np.concatenate([nominal_stress(np.array([1.0, 0.0, 0.0, 0.0]), c.stretch, c.mode) for c in curves])
+    return _SOFTEST * float(unit @ np.concatenate([c.stress_mpa for c in curves]) / (unit @ unit))
+
+
+def _not_softer(values: FloatArray, least: float, columns: FloatArray, stress: FloatArray) -> FloatArray:
+    """The best values with the first ``least`` or more; ``columns`` times the values is the stress."""
+    if values[0] >= least:
+        return values
+    rest, *_ = np.linalg.lstsq(columns[:, 1:], stress - columns[:, 0] * least, rcond=None)
+    return np.concatenate([[least], rest])
+
+
+def _deviations(values: FloatArray, jacobian: FloatArray, residual: FloatArray) -> FloatArray | None:
+    """Standard deviations of the values; None where the parameters cannot be told apart."""
     scaled = jacobian * np.maximum(np.abs(values), 1e-300)
     lengths = np.linalg.norm(scaled, axis=0)
     if not (lengths > 0.0).all():
@@ -346,5 +386,4 @@ def _intervals(values: FloatArray, jacobian: FloatArray, residual: FloatArray) -
     freedom = len(residual) - len(values)
     variance = float(residual @ residual) / freedom
     covariance = variance * (right.T / sizes**2) @ right
-    deviation = np.sqrt(np.diag(covariance)) / lengths * np.abs(values)
-    return np.asarray(student.ppf(0.975, freedom) * deviation)
+    return np.asarray(np.sqrt(np.diag(covariance)) / lengths * np.abs(values))

@@ -46,7 +46,13 @@ class Fitted:
             )
         lines += _in_programs(found.material)
         for p in found.parameters:
-            if p.low <= 0.0 <= p.high:
+            if p.at_bound:
+                lines.append(
+                    f"These curves do not determine {p.name}: alone they would have it lower than a law may have it, "
+                    "and its value is that bound. Measure nearer to a stretch of 1, or take a law with fewer "
+                    "parameters."
+                )
+            elif p.low <= 0.0 <= p.high:
                 lines.append(
                     f"These curves do not determine {p.name}: its interval holds 0. Take a law with fewer parameters."
                 )
@@ -131,5 +137,8 @@ def fit(
     write_whole(target / "fit.csv", text.getvalue())
     with whole_file(target / "fit.png") as part:
         part.write_bytes(figures.stress_stretch(curves, found))
-    write_whole(target / "material.toml", as_toml(path.stem, f"{law} fitted to {path.name}", {tissue: found.material}))
+    source = f"{law} fitted to {path.name}"
+    if at_bound := [p.name for p in found.parameters if p.at_bound]:
+        source += f", which does not determine {', '.join(at_bound)}"
+    write_whole(target / "material.toml", as_toml(path.stem, source, {tissue: found.material}))
     return Fitted(target, found)

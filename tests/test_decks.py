@@ -3,7 +3,9 @@
 import re
 import shutil
 import subprocess
+from functools import cache
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -18,6 +20,87 @@ from tests.blocks import block
 
 CCX = shutil.which("ccx")
 needs_calculix = pytest.mark.skipif(CCX is None, reason="CalculiX (ccx, Debian's calculix-ccx) is not installed")
+
+FEBIO_4 = """
+febio_spec | version=4.0
+Module | type=solid
+Control
+Control/analysis | text=STATIC,DYNAMIC
+Control/time_steps | text
+Control/step_size | text
+Control/time_stepper | type=default
+Control/time_stepper/max_retries | text
+Control/time_stepper/opt_iter | text
+Control/time_stepper/dtmin | text
+Control/time_stepper/dtmax | text
+Control/solver | type=solid
+Control/solver/symmetric_stiffness | text=non-symmetric,symmetric,symmetric structure,preferred
+Material
+Material/material Mooney-Rivlin | id | name | type
+Material/material Mooney-Rivlin/c[12] | text
+Material/material Yeoh | id | name | type
+Material/material Yeoh/c[1-6] | text
+Material/material Ogden | id | name | type
+Material/material Ogden/[cm][1-6] | text
+Material/material .*/k | text
+Material/material .*/pressure_model | text=default,NIKE3D,Abaqus,Abaqus (GOH)
+Mesh
+Mesh/Nodes | name
+Mesh/Nodes/node | id | text
+Mesh/Elements | name | type=tet4,tet10
+Mesh/Elements/elem | id | text
+Mesh/NodeSet | name | text
+MeshDomains
+MeshDomains/SolidDomain | name | mat
+MeshData
+MeshData/NodeData | name | node_set | data_type=scalar,vec3
+MeshData/NodeData/node | lid | text
+Boundary
+Boundary/bc zero displacement | name | node_set | type
+Boundary/bc zero displacement/[xyz]_dof | text=0,1
+Boundary/bc prescribed displacement | name | node_set | type
+Boundary/bc prescribed displacement/dof | text=x,y,z
+Boundary/bc prescribed displacement/value | lc | type=const,math,map | text
+Boundary/bc prescribed displacement/relative | text=0,1
+LoadData
+LoadData/load_controller loadcurve | id | type
+LoadData/load_controller loadcurve/interpolate | text=LINEAR,STEP,SMOOTH
+LoadData/load_controller loadcurve/points
+LoadData/load_controller loadcurve/points/pt | text
+Output
+Output/plotfile | type=febio
+Output/plotfile/var | type=displacement,stress,Lagrange strain,reaction forces
+"""
+"""Tags, attributes and keywords that FEBio's reader of format 4.0 looks for, as far as decks use them: from its sources
+(github.com/febiosoftware/FEBio at 65622b5 of January 2026: FEBioXML's sections, the parameters that classes declare).
+A tag that it does not know, or an attribute, ends the reading. A type's name stands behind its tag."""
+
+
+def foreign_to_febio(root: ElementTree.Element) -> list[str]:
+    """Tags, attributes and values of a deck that are not in `FEBIO_4`."""
+    rows = [line.split(" | ") for line in FEBIO_4.strip().splitlines()]
+    found = []
+
+    def visit(element: ElementTree.Element, path: str) -> None:
+        matches = [rest for pattern, *rest in rows if re.fullmatch(pattern, path)]
+        if not matches:
+            found.append(path)
+            return
+        asked = (row.partition("=") for row in matches[0])
+        allowed = {name: set(filter(None, values.split(","))) for name, _, values in asked}
+        given = dict(element.items()) | ({"text": text} if (text := (element.text or "").strip()) else {})
+        found.extend(f"{path} {name}" for name in given.keys() ^ allowed.keys())
+        for name in given.keys() & allowed.keys():
+            if allowed[name] and given[name] not in allowed[name]:
+                found.append(f"{path} {name}={given[name]}")
+        for child in element:
+            if isinstance(child.tag, str):
+                typed = child.tag in ("material", "bc", "load_controller")
+                name = f"{child.tag} {child.get('type')}" if typed else child.tag
+                visit(child, name if path == "febio_spec" else f"{path}/{name}")
+
+    visit(root, "febio_spec")
+    return found
 
 
 def slab(count: tuple[int, int, int] = (3, 4, 4)) -> TetMesh:
@@ -87,8 +170,6 @@ def test_a_deck_holds_the_mesh_the_laws_and_the_supports(tmp_path: Path) -> None
 
 
 def test_an_febio_deck_says_the_same(tmp_path: Path) -> None:
-    from xml.etree import ElementTree
-
     mesh, laws = slab(), {"skin": Yeoh.of(0.265, 1.923), "fat": Ogden.from_ansys(0.0034, 6.2)}
     state = states_of(mesh, laws, "P1")[0]
     write_febio(tmp_path / "a.feb", mesh, laws, state, quadratic=True)
@@ -110,6 +191,55 @@ def test_an_febio_deck_says_the_same(tmp_path: Path) -> None:
     assert x == pytest.approx([state.travel_mm[0]] * len(x))
     domains = {d.get("name"): d.get("mat") for d in root.iterfind("MeshDomains/SolidDomain")}
     assert domains == {"E1SKIN": "M1SKIN", "E2FAT": "M2FAT"}
+
+
+@cache
+def pressed() -> tuple[TetMesh, dict[str, Material], State]:
+    """A slab of all three laws that decks are written for, under a load."""
+    box, laws = slab(), {"skin": Yeoh.of(0.265, 1.923), "fat": Ogden.from_ansys(0.0034, 6.2), "core": NeoHooke.of(0.01)}
+    half = len(box.regions["fat"]) // 2
+    regions = {"skin": box.regions["skin"], "fat": box.regions["fat"][:half], "core": box.regions["fat"][half:]}
+    mesh = TetMesh(box.points_mm, box.cells, regions, box.facets)
+    return mesh, laws, states_of(mesh, laws, "P1")[0]
+
+
+@pytest.mark.parametrize("quadratic", [False, True])
+def test_an_febio_deck_has_only_words_that_febio_reads(tmp_path: Path, quadratic: bool) -> None:
+    mesh, laws, state = pressed()
+    write_febio(tmp_path / "a.feb", mesh, laws, state, quadratic=quadratic)
+    told = (tmp_path / "a.feb").read_text()
+    root = ElementTree.fromstring(told)
+    assert foreign_to_febio(root) == []
+    # Words of older formats, or of none, are seen.
+    for right, wrong in [
+        ('type="zero displacement"', 'type="fix"'),
+        ("x_dof>", "x>"),
+        ("<MeshDomains>", "<Domains>"),
+        ('lid="1"', 'id="1"'),
+        ("load_controller", "loadcurve"),
+        (">Abaqus<", ">abaqus<"),
+        ("<m1>", "<a1>"),
+    ]:
+        assert right in told
+        broken = told.replace(right, wrong).replace(right.replace("<", "</"), wrong.replace("<", "</"))
+        assert foreign_to_febio(ElementTree.fromstring(broken)) != [], wrong
+    # What the reader asks for beyond words: order of sections, rising numbers, names that are there.
+    order = [child.tag for child in root if isinstance(child.tag, str)]
+    assert order[0] == "Module"
+    assert order.index("Mesh") < order.index("MeshDomains") < order.index("MeshData") < order.index("Boundary")
+    for rows in [*root.iterfind("Mesh/Nodes"), *root.iterfind("Mesh/Elements")]:
+        numbers = [int(row.get("id", "0")) for row in rows]
+        assert (np.diff([0, *numbers]) > 0).all()
+    names = {kind: {e.get("name") for e in root.iterfind(kind)} for kind in ("Mesh/NodeSet", "Mesh/Elements")}
+    assert {e.get("node_set") for e in root.iter() if e.get("node_set")} == names["Mesh/NodeSet"]
+    assert {e.get("name") for e in root.iterfind("MeshDomains/SolidDomain")} == names["Mesh/Elements"]
+    assert [e.text for e in root.iterfind("Boundary/bc/value")] == [e.get("name") for e in root.iterfind("MeshData/*")]
+    assert {e.get("lc") for e in root.iterfind("Boundary/bc/value")} == {root[-2][0].get("id")}
+    if quadratic:  # nodes 5 to 10 of its tet10 lie between 1-2, 2-3, 3-1, 1-4, 2-4, 3-4
+        places = np.array([[float(v) for v in (n.text or "").split(",")] for n in root.iterfind("Mesh/Nodes/node")])
+        cell = np.array([[int(n) - 1 for n in (e.text or "").split(",")] for e in root.iterfind("Mesh/Elements/elem")])
+        first, second = cell[:, [0, 1, 2, 0, 1, 2]], cell[:, [1, 2, 0, 3, 3, 3]]
+        assert places[cell[:, 4:]] == pytest.approx(0.5 * (places[first] + places[second]), abs=1e-9)
 
 
 def test_a_law_that_a_solver_does_not_have_is_refused(tmp_path: Path) -> None:

@@ -39,6 +39,22 @@ def test_the_set_it_writes_is_the_law_that_made_the_curve(tmp_path: Path) -> Non
     assert rows[:, 1] == pytest.approx(rows[:, 2], abs=1e-6)
 
 
+def test_a_modulus_at_its_bound_is_told_and_goes_with_the_set(tmp_path: Path) -> None:
+    stretch = np.linspace(1.0, 1.4, 30)
+    muscle = material_set("trebbi").laws["muscle"].nominal_stress(stretch)
+    stress = muscle + np.random.default_rng(0).normal(0.0, 0.03 * muscle.max(), 30)
+    curve = tmp_path / "muscle.csv"
+    rows = "".join(f"{a},{b}\n" for a, b in zip(stretch, stress, strict=True))
+    curve.write_text("stretch,nominal_stress_mpa\n" + rows)
+    done = fit(curve, "Yeoh", out=tmp_path / "out", test="uniaxial", tissue="muscle")
+    assert [p.at_bound for p in done.found.parameters] == [True, False, False]
+    assert sum("do not determine C10: alone they would have it lower" in line for line in done.summary()) == 1
+    told = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert told["parameters"][0]["at_bound"] is True
+    assert told["parameters"][0]["low"] == 0.0
+    assert "does not determine C10" in (tmp_path / "out" / "material.toml").read_text()
+
+
 def test_a_curve_without_its_test_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     curve, out = write_curve(tmp_path / "fat.csv"), tmp_path / "out"
     with pytest.raises(InputError, match="say which test it is"):
