@@ -82,7 +82,8 @@ def mesh_labels(
     Returns
     -------
     mesh : TetMesh
-        LPS mm, with a region for each soft tissue, and the facets "bone", "skin" (the outer surface) and "cut".
+        LPS mm, with a region for each soft tissue, and the facets "bone", "skin" (the outer surface) and "cut" (outer
+        faces of tissues that a skin would cover; without a region called skin, in whatever case, they are "skin").
     quality : MeshQuality
 
     Raises
@@ -227,8 +228,9 @@ def _named(
     at_bone = _rows_in(triangles, bone_faces)
     free = ~at_bone
     cut = np.zeros(len(triangles), dtype=bool)
-    if OUTER in soft:
-        cut = free & (owner != soft[OUTER])
+    skins = [number for name, number in soft.items() if name.casefold() == OUTER]
+    if skins:
+        cut = free & ~np.isin(owner, skins)
         cut |= _rim(points, triangles, free & ~cut, cut, labels)
     facets = {BONE: triangles[at_bone], OUTER: triangles[free & ~cut], CUT: triangles[cut]}
     regions = {name: np.flatnonzero(tissue == number) for name, number in soft.items()}
@@ -285,17 +287,18 @@ def _quality(mesh: TetMesh, labels: LabelMap, soft: dict[str, int]) -> MeshQuali
 
 def _thin(mesh: TetMesh) -> tuple[tuple[str, float], ...]:
     """Share of the outer tissue's cells that reach from the outer surface to the tissue beneath."""
-    if OUTER not in mesh.regions or OUTER not in mesh.facets:
+    skin = next((name for name in mesh.regions if name.casefold() == OUTER), None)
+    if skin is None or OUTER not in mesh.facets:
         return ()
     outer = np.zeros(len(mesh.points_mm), dtype=bool)
     outer[mesh.facets[OUTER]] = True
     beneath = np.zeros(len(mesh.points_mm), dtype=bool)
     for name, cells in mesh.regions.items():
-        if name != OUTER:
+        if name != skin:
             beneath[mesh.cells[cells]] = True
-    skin = mesh.cells[mesh.regions[OUTER]]
-    across = outer[skin].any(axis=1) & beneath[skin].any(axis=1)
-    return ((OUTER, float(across.mean())),)
+    cells = mesh.cells[mesh.regions[skin]]
+    across = outer[cells].any(axis=1) & beneath[cells].any(axis=1)
+    return ((skin, float(across.mean())),)
 
 
 def dihedral_angles_deg(corners: FloatArray) -> FloatArray:

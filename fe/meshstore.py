@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import meshio
 import numpy as np
 
+from dvc.arrays import IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from dvc.meshfile import read_mesh
 from dvc.whole import whole_file, write_whole
+from fe.meshing import BONE, CUT, OUTER
 
 _FIRST_FACET = 101  # numbers of facets in the array "region"; those of tissues begin at 1
+_MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, beside its components
 
 
 def write_tet_mesh(path: Path, mesh: TetMesh, about: dict[str, object]) -> None:
@@ -40,12 +44,14 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
     """Read a mesh of tetrahedra with its named regions and facets, made here or elsewhere.
 
     Where a JSON file of the same name tells the names of the numbers in the array ``region``, they are used. A set of
-    all cells is left out where others divide them.
+    all cells is left out where others divide them, and so are the materials of ANSYS where components do. The facets
+    "bone", "skin" and "cut" are called so in whatever case the file has them: ANSYS knows capitals only.
 
     Raises
     ------
     InputError
-        If it cannot be used: as `dvc.meshfile.read_mesh`, or for elements other than tetrahedra.
+        If it cannot be used: as `dvc.meshfile.read_mesh`, for elements other than tetrahedra, or if two facets
+        have one name but for its case.
     """
     place = Path(path)
     read = read_mesh(place, unit=unit, frame=frame)
@@ -60,16 +66,24 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
             raise InputError(f"{_names_of(place)}: no table of regions in it ({damaged}).") from damaged
     mesh = read.tets
     regions = {names.get(name, name): cells for name, cells in mesh.regions.items()}
-    parts = {name: cells for name, cells in regions.items() if len(cells) < len(mesh.cells)}
-    if parts and len(np.unique(np.concatenate(list(parts.values())))) == len(mesh.cells):
-        regions = parts  # a set of all elements beside those of the tissues
-    return TetMesh(
-        mesh.points_mm,
-        mesh.cells,
-        regions,
-        {names.get(name, name): rows for name, rows in mesh.facets.items()},
-        mesh.node_ids,
-    )
+    count = len(mesh.cells)
+    regions = _without(regions, {name for name, cells in regions.items() if len(cells) == count}, count)
+    regions = _without(regions, {name for name in regions if _MATERIAL.fullmatch(name)}, count)
+    facets: dict[str, IntArray] = {}
+    for name, rows in mesh.facets.items():
+        called = names.get(name, name)
+        known = called.casefold() if called.casefold() in (BONE, OUTER, CUT) else called
+        if known in facets:
+            raise InputError(f"{place}: two sets of facets are called '{known}'; case does not count. Rename one.")
+        facets[known] = rows
+    return TetMesh(mesh.points_mm, mesh.cells, regions, facets, mesh.node_ids)
+
+
+def _without(regions: dict[str, IntArray], names: set[str], cell_count: int) -> dict[str, IntArray]:
+    """Regions but for some, if the others still hold every cell; if not, all of them."""
+    others = {name: cells for name, cells in regions.items() if name not in names}
+    held = np.unique(np.concatenate([*others.values(), np.empty(0, dtype=np.int64)]))
+    return others if len(held) == cell_count else regions
 
 
 def _names_of(path: Path) -> Path:

@@ -85,7 +85,9 @@ def simulate(
         tuple[float, float, float] | None,
         typer.Option(help="Point over which the plate's pivot lies, LPS mm. Default: where it touches first."),
     ] = None,
-    fix: Annotated[list[str] | None, typer.Option(help="Facets that do not move; repeat. Default: bone.")] = None,
+    fix: Annotated[
+        list[str] | None, typer.Option(help="Facets that do not move, beside the bone's, such as cut; repeat.")
+    ] = None,
     element: Annotated[str, typer.Option(help="P1 (fast), MINI, or P2 (quadratic: more exact, slow).")] = "P1",
     decks: Annotated[bool, typer.Option("--decks", help="Also write each load for CalculiX and FEBio.")] = False,
     mesh_unit: MeshUnit = Unit.MM,
@@ -109,7 +111,7 @@ def simulate(
             gap_mm=gap_mm,
             turns=turns,
             pivot_mm=pivot,
-            fixed=fix or ("bone",),
+            fixed=fix or (),
             element=element,
             decks=decks,
             mesh_unit=mesh_unit.value,

@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from dvc.errors import OutputError
 from dvc.mesh import TetMesh
 from dvc.whole import write_whole
 from fe.leg import Kept
@@ -30,11 +31,22 @@ def simulated_path(
     share: Path,
     threads: int,
 ) -> list[State]:
-    """Run one path in a worker: each load's files are written as soon as it is there.
+    """Run one path in a worker: each load's files are written as soon as it is there, and each step's line in the log.
 
     It goes on from where an earlier run came to, if that was made from the same.
     """
-    log: list[str] = []
+    log = folder / f"log-{path[0].name}.txt"
+    write_whole(log, "")
+
+    def tell(line: str) -> None:
+        try:
+            with log.open(
+                "a", encoding="utf-8"
+            ) as file:  # closed each time: there to be read meanwhile, and after a kill
+                file.write(line + "\n")
+        except OSError as error:
+            raise OutputError(f"{log}: cannot be written ({error.strerror or error}). Has the disk room?") from error
+
     made_from = {
         load.name: fingerprint(mesh, laws, plate, path[: n + 1], fixed, element) for n, load in enumerate(path)
     }
@@ -43,7 +55,7 @@ def simulated_path(
         found = read_kept(folder / f"{load.name}{ENDING}", made_from[load.name])
         if found is None:
             break
-        log.append(f"{load.name}: {found.reached:.0%} of it was there from an earlier run")
+        tell(f"{load.name}: {found.reached:.0%} of it was there from an earlier run")
         earlier.append(found)
         if found.reached < 1.0:
             break
@@ -60,13 +72,10 @@ def simulated_path(
             write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
             write_kept(folder / f"{state.load.name}{ENDING}", state.kept, made_from[state.load.name])
 
-    try:
-        return solve(
-            mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=log.append, keep=keep,
-            settled=settled, earlier=earlier, progress=lambda done: _replaced(share, f"{done:.4f}"),
-        )  # fmt: skip
-    finally:
-        write_whole(folder / f"log-{path[0].name}.txt", "\n".join(log) + "\n")
+    return solve(
+        mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=tell, keep=keep,
+        settled=settled, earlier=earlier, progress=lambda done: _replaced(share, f"{done:.4f}"),
+    )  # fmt: skip
 
 
 def _replaced(path: Path, text: str) -> None:

@@ -110,7 +110,7 @@ def simulate(
     gap_mm: float = 0.0,
     turns: bool = False,
     pivot_mm: Sequence[float] | None = None,
-    fixed: Sequence[str] = (BONE,),
+    fixed: Sequence[str] = (),
     element: str = "P1",
     mesh_unit: str = "mm",
     mesh_frame: str = "LPS",
@@ -124,7 +124,7 @@ def simulate(
     Parameters
     ----------
     mesh : path
-        As `mesh` writes it, or made elsewhere; with facets "skin" and those that are fixed.
+        As `mesh` writes it, or made elsewhere; with facets "skin", "bone", and those that are fixed as well.
     out : path
         Gets a folder for each set: a VTU file for each load, ``curve.csv`` (force and travel of the plate),
         ``regions.csv``, ``simulation.json`` and pictures.
@@ -144,7 +144,7 @@ def simulate(
     pivot_mm : (3,), optional
         As in `fe.plate.Plate`.
     fixed : sequence of str
-        Facets that do not move.
+        Facets that do not move, beside the bone's; case does not count.
     element : {"P1", "MINI", "P2"}
         As in `fe.elements`.
     decks : bool
@@ -168,9 +168,11 @@ def simulate(
     if not names or len(set(names)) < len(names):
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
     paths = paths_of(loads)
+    spelt = {name.casefold(): name for name in read.facets} | {name: name for name in read.facets}
+    held = tuple(dict.fromkeys([BONE, *(spelt.get(name, spelt.get(name.casefold(), name)) for name in fixed)]))
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
-        check(read, region_laws, plate, loads, fixed)
+        check(read, region_laws, plate, loads, held)
     refuse_touching_inputs(target, names, [place])
     make_output(target)
     for name in names:
@@ -180,7 +182,7 @@ def simulate(
             if left.name.removesuffix(ENDING) not in {load.name for load in loads}:
                 left.unlink()
     files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
-    given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(fixed)}
+    given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(held)}
     given |= {"turns": turns, "pivot_mm": None if pivot_mm is None else list(pivot_mm), "mesh_made": _mesh_made(place)}
     jobs = [(one, path) for one in chosen for path in paths]
     at_once = max(1, min(workers or usable_cores(), len(jobs)))
@@ -204,8 +206,8 @@ def simulate(
 
             try:
                 states = worker.run(
-                    f"simulating {case}", simulated_path, read, laws[name][0], plate, path, fixed, element,
-                    target / name, share, each,                     watch=watch,
+                    f"simulating {case}", simulated_path, read, laws[name][0], plate, path, held, element,
+                    target / name, share, each, watch=watch,
                 )  # fmt: skip
             except MrstrainError as failure:
                 states, failures[case] = [], str(failure)
@@ -216,7 +218,7 @@ def simulate(
                 ordered = [s for p in paths for load in p for s in found[name] if s.load.name == load.name]
                 record = provenance("simulate", files, given | _told(chosen_set, laws[name][0], paths, plate, element))
                 done[name] = _written(
-                    target / name, name, read, ordered, *laws[name], loads, plate, record, fixed if decks else None
+                    target / name, name, read, ordered, *laws[name], loads, plate, record, held if decks else None
                 )
         tell(case, "simulating", 1.0)
 

@@ -170,7 +170,7 @@ class Models(_Part):
         Folders with results of other codes, a file for each load, as `compare` takes them.
     element : {"P1", "MINI", "P2"}
     fixed : tuple of str
-        Surfaces that do not move.
+        Surfaces that do not move, beside the bone's.
     drive : bool
         Also the sets driven by the measured displacement of the outside.
     level : bool
@@ -182,7 +182,7 @@ class Models(_Part):
     sets: Names = ()
     results: Names = ()
     element: Literal["P1", "MINI", "P2"] = "P1"
-    fixed: Names = ("bone",)
+    fixed: Names = ()
     drive: Flag = False
     level: Flag = False
     decks: Flag = False

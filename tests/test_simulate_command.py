@@ -12,11 +12,14 @@ from typer.testing import CliRunner
 from dvc.deformation import Deformation
 from dvc.errors import InputError
 from dvc.kinematics import StrainField
+from dvc.mesh import TetMesh
 from fe.meshstore import read_tet_mesh, write_tet_mesh
 from fe.result import cauchy_stress, deformation, patch_volumes, volume_percentiles
 from fe.simulate import LoadStep, simulate
 from mrstrain.cli import app
 from mrstrain.loads import load_named, paths_of
+from tests.blocks import block
+from tests.test_mesh_names import abaqus, ansys
 from tests.test_simulate import DOWN, FAT, LAWS, PRESS, block_under_plate, dome, press
 
 PLATE = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0"]
@@ -31,6 +34,18 @@ nu = 0.4999
 law = "neo-Hooke"
 mu_kpa = 200
 nu = 0.4999
+"""
+
+SOFTENING = """
+[soft.skin]
+law = "neo-Hooke"
+mu_kpa = 200
+nu = 0.49
+[soft.fat]
+law = "Yeoh"
+c10_kpa = 10
+c20_kpa = -4
+nu = 0.49
 """
 
 
@@ -127,6 +142,66 @@ def test_tissue_squeezed_beyond_its_law_is_told(mesh_file: Path, tmp_path: Path)
         r"a: \d+\.\d% of fat is squeezed below det F 0\.4, .*its bulk modulus \(0\.029 MPa\)", told["friedman"]
     )
     assert "squeezed below" not in told["luboz"]
+
+
+def test_a_law_that_is_not_stable_at_the_strain_reached_is_told_and_ends_with_status_1(tmp_path: Path) -> None:
+    write_tet_mesh(tmp_path / "block.vtu", block_under_plate(), {})
+    (tmp_path / "soft.toml").write_text(SOFTENING)
+    told = {}
+    for travel in ("0.2mm", "1.4mm"):
+        given = ["simulate", str(tmp_path / "block.vtu"), "--set", str(tmp_path / "soft.toml"), "--load", f"a={travel}"]
+        told[travel] = CliRunner().invoke(app, [*given, *PLATE, "--out", str(tmp_path / travel)])
+        outcome = json.loads((tmp_path / travel / "soft" / "simulation.json").read_text())
+        assert outcome["outcome"]["a"]["reached"] == 1.0  # so it is the law alone that counts
+        told[travel + " noted"] = outcome["notes"]
+    assert told["0.2mm"].exit_code == 0, told["0.2mm"].output
+    assert told["1.4mm"].exit_code == 1, told["1.4mm"].output
+    note = r"a: the law of fat is not stable \(Drucker\) in \d+\.\d% of its volume\."
+    assert re.search("soft: " + note, told["1.4mm"].output)
+    assert any(re.fullmatch(note, line) for line in told["1.4mm noted"])
+    assert "Drucker" not in told["0.2mm"].output
+
+
+def test_more_is_fixed_beside_the_bone_and_what_law_stands_in_is_told(tmp_path: Path) -> None:
+    mesh = dome((3, 4, 4))
+    regions = {"skin": mesh.regions["skin"], "fat": mesh.regions["fat"][::2], "muscle": mesh.regions["fat"][1::2]}
+    cut = block((3, 4, 4), (10.0, 20.0, 20.0)).facets["y0"]
+    facets = dict(mesh.facets) | {"cut": cut}
+    write_tet_mesh(tmp_path / "dome.vtu", TetMesh(mesh.points_mm, mesh.cells, regions, facets), {})
+    bone, cut = np.unique(facets["bone"]), np.unique(cut)
+    (tmp_path / "mine.toml").write_text(MINE)
+    moved = {}
+    for name, fix in (("free", []), ("fixed", ["--fix", "CUT"])):
+        given = ["--set", str(tmp_path / "mine.toml"), "--load", "a=1mm", *PLATE, *fix, "--out", str(tmp_path / name)]
+        done = CliRunner().invoke(app, ["simulate", str(tmp_path / "dome.vtu"), *given])
+        assert done.exit_code == 0, done.output
+        moved[name] = np.abs(meshio.read(tmp_path / name / "mine" / "a.vtu").point_data["displacement_mm"])
+        told = json.loads((tmp_path / name / "mine" / "simulation.json").read_text())
+        assert told["parameters"]["fixed"] == ["bone", "cut"][: 1 + len(fix)]
+        instead = "mine has no law for muscle; fat's is used."
+        assert instead in told["notes"]
+        assert f"mine: {instead}" in done.output
+    assert moved["free"][bone].max() == moved["fixed"][bone].max() == moved["fixed"][cut].max() == 0.0
+    assert moved["free"][cut].max() > 0.02
+    assert moved["fixed"].max() == pytest.approx(1.0, abs=0.2)
+    refused = CliRunner().invoke(app, ["simulate", str(tmp_path / "dome.vtu"), *PLATE, "--fix", "side", "--out", "x"])
+    assert "no facets 'side'; it has bone, skin, cut" in str(refused.exception)
+
+
+def test_meshes_of_ansys_and_abaqus_give_what_the_same_mesh_gives_as_vtu(mesh_file: Path, tmp_path: Path) -> None:
+    ansys(tmp_path / "dome.cdb", dome((3, 4, 4)))
+    abaqus(tmp_path / "dome.inp", dome((3, 4, 4)))
+    told = {}
+    for place in (mesh_file, tmp_path / "dome.cdb", tmp_path / "dome.inp"):
+        out = tmp_path / place.suffix[1:]
+        given = ["--set", "luboz", "--load", "a=1", *PLATE, "--out", str(out)]
+        done = CliRunner().invoke(app, ["simulate", str(place), *given])
+        assert done.exit_code == 0, done.output
+        told[out.name] = json.loads((out / "luboz" / "simulation.json").read_text())["outcome"]["a"]
+    for name in ("cdb", "inp"):
+        assert told[name]["plate_travel_mm"] == pytest.approx(told["vtu"]["plate_travel_mm"], abs=1e-7)
+        assert told[name]["nodes_on_plate"] == told["vtu"]["nodes_on_plate"]
+    assert told["vtu"]["plate_travel_mm"][0] > 0.5
 
 
 @pytest.mark.parametrize(
