@@ -226,12 +226,12 @@ def _named(
     triangles, owner = faces[outer], np.tile(tissue, 4)[outer]
     bone_faces = np.sort(np.concatenate([cells[np.isin(found, bones)][:, face] for face in _FACES]), axis=1)
     at_bone = _rows_in(triangles, bone_faces)
-    free = ~at_bone
+    free: BoolArray = np.logical_not(at_bone)
     cut = np.zeros(len(triangles), dtype=bool)
     skins = [number for name, number in soft.items() if name.casefold() == OUTER]
     if skins:
-        cut = free & ~np.isin(owner, skins)
-        cut |= _rim(points, triangles, free & ~cut, cut, labels)
+        cut = free & np.isin(owner, skins, invert=True)
+        cut |= _rim(points, triangles, free & np.logical_not(cut), cut, labels)
     facets = {BONE: triangles[at_bone], OUTER: triangles[free & ~cut], CUT: triangles[cut]}
     regions = {name: np.flatnonzero(tissue == number) for name, number in soft.items()}
     return TetMesh(points, body, regions, {name: rows for name, rows in facets.items() if len(rows)})
