@@ -284,8 +284,10 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         )
     least = np.full(count, -np.inf)
     freedom = len(stress) - count
+    widths = student.ppf(0.975, freedom) * deviations
     if sought.bounded:
-        if values[0] + student.isf(_ABSURD, freedom) * deviations[0] > 0.0:
+        absurd = values[0] + student.isf(_ABSURD, freedom) * deviations[0] <= 0.0
+        if values[0] <= widths[0] and not absurd:  # zero is in its interval: the curves leave it open
             values = _not_softer(values, _softest(curves), best.jac * size, stress)
         least[0] = 0.0
     try:
@@ -302,7 +304,6 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         spread = float(((curve.stress_mpa - curve.stress_mpa.mean()) ** 2).sum())
         r2[curve.mode] = 1.0 - float((residual[first:last] ** 2).sum()) / spread if spread > 0 else float("nan")
         reached[curve.mode] = (float(min(1.0, curve.stretch.min())), float(max(1.0, curve.stretch.max())))
-    widths = student.ppf(0.975, freedom) * deviations
     low, high = np.maximum(np.minimum(values, best.x) - widths, least), np.maximum(values, best.x) + widths
     at_bound = (least > -np.inf) & (values > best.x)
     return Fit(

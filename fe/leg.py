@@ -57,11 +57,11 @@ class Leg:
     earlier : Kept, optional
         Where this load came to in an earlier simulation.
     settled : callable
-        Gets what it takes to go on, at each equilibrium on the way.
+        Gets what it takes to go on, and the share that is done, at each equilibrium on the way.
     """
 
     def __init__(
-        self, path: Path, goal: Goal, before: Goal | None, earlier: Kept | None, settled: Callable[[Kept], None]
+        self, path: Path, goal: Goal, before: Goal | None, earlier: Kept | None, settled: Callable[[Kept, float], None]
     ) -> None:
         self._path, self._goal, self._first = path, goal, before is None
         self._before = path.reached(goal)
@@ -75,7 +75,7 @@ class Leg:
             path.curve = list(earlier.curve)
             path.stand(Standing(earlier.unknowns, earlier.curve[-1], earlier.hold))
             self._stages, self._counted = earlier.stages, path.iterations - earlier.iterations
-        path.settled = lambda: settled(self.kept())
+        path.settled = lambda: settled(self.kept(), float(np.clip(self._shares(), 0.0, 1.0).mean()))
 
     def go(self) -> bool:
         """Go to the goal, normal first and then shear; whether it is there."""
@@ -94,10 +94,9 @@ class Leg:
 
     def kept(self) -> Kept:
         """Where it is now."""
-        path, way = self._path, self._goal.values - self._before
-        shares = (path.reached(self._goal) - self._before)[way != 0.0] / way[way != 0.0]
+        path = self._path
         return Kept(
-            1.0 if self._whole else float(shares.min(initial=1.0)),
+            1.0 if self._whole else float(self._shares().min(initial=1.0)),
             self._stages,
             tuple(path.curve),
             path.iterations - self._counted,
@@ -105,3 +104,11 @@ class Leg:
             path.state,
             path.contact.hold,
         )
+
+    def _shares(self) -> FloatArray:
+        """Of each of the plate's axes along which the load adds something, the share of it that is reached."""
+        way = self._goal.values - self._before
+        adds = way != 0.0
+        if not adds.any():
+            return np.ones(1)
+        return np.asarray((self._path.reached(self._goal) - self._before)[adds] / way[adds])

@@ -82,8 +82,9 @@ def mesh_labels(
     Returns
     -------
     mesh : TetMesh
-        LPS mm, with a region for each soft tissue, and the facets "bone", "skin" (the outer surface) and "cut" (outer
-        faces of tissues that a skin would cover; without a region called skin, in whatever case, they are "skin").
+        LPS mm, with a region for each soft tissue, and the facets "bone", "skin" (the outer surface) and "cut" (where
+        the label map ends: outer faces of other tissues than skin, and the skin's own edge there). Without a region
+        called skin, in whatever case, there is no "cut", and all of them are "skin".
     quality : MeshQuality
 
     Raises

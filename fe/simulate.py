@@ -192,8 +192,8 @@ def simulate(
     try:
         for number, load in enumerate(loads):
 
-            def stands(kept: Kept, number: int = number, load: LoadStep = load) -> None:
-                progress((number + max(kept.reached, 0.0)) / len(loads))
+            def stands(kept: Kept, share: float, number: int = number, load: LoadStep = load) -> None:
+                progress((number + share) / len(loads))
                 settled(load, kept)
 
             leg = Leg(
@@ -250,7 +250,15 @@ def check(
     check_loads(plate, loads)
     _check_held(mesh, fixed)
     on_surface = np.setdiff1d(np.unique(mesh.facets[SURFACE]), _nodes_of(mesh, fixed))
+    if not len(on_surface):
+        raise InputError(f"All of '{SURFACE}' is fixed ({', '.join(fixed)}): the plate has nothing to touch.")
     Contact(plate, mesh.points_mm @ plate.axes, on_surface)
+
+
+def held_facets(mesh: TetMesh, beside: Sequence[str]) -> tuple[str, ...]:
+    """The bone's facets and others beside them, as the mesh spells them; case does not count."""
+    spelt = {name.casefold(): name for name in mesh.facets} | {name: name for name in mesh.facets}
+    return tuple(dict.fromkeys([BONE, *(spelt.get(name, spelt.get(name.casefold(), name)) for name in beside)]))
 
 
 def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:

@@ -26,7 +26,7 @@ _BONE = re.compile(r"calcaneus|calcaneum|bone", re.IGNORECASE)
 _VARIANT = "-as-published"  # a set in another reading of its numbers
 _ROLES = {
     "labels": "the label map", "mesh_labels": "the label map to be meshed", "bone_mask": "the bone",
-    "repeat": "the repeat scan", "load": "that load",
+    "repeat": "the repeat scan", "load": "the load of that name",
 }  # fmt: skip
 _TABLES = (".csv", ".txt", ".label", ".ctbl")
 

@@ -20,7 +20,7 @@ from dvc.worker import usable_cores
 from fe.meshstore import read_tet_mesh
 from fe.plate import Plate
 from fe.published import MaterialSet, material_set
-from fe.simulate import BONE, LoadStep, check_loads
+from fe.simulate import LoadStep, check_loads, held_facets
 from fe.simulate import check as check_simulation
 from mrstrain.costs import cells_expected, costs
 from mrstrain.engines import settings_of
@@ -184,10 +184,10 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
     if study.mesh.labels is not None:
         own = study.path(study.mesh.labels)
         labels = found.tried(read_labels, own, _optional(study, study.mesh.names))
-    unknown = {name.casefold() for name in study.models.fixed} - {"bone", "skin", "cut"}
+    unknown = {name.casefold() for name in study.models.fixed} - {"bone", "cut"}
     if unknown:
         found.wrong.append(
-            f"[models] fixed: a mesh has the surfaces bone, skin and cut; got {', '.join(sorted(unknown))}."
+            f"[models] fixed: beside the bone's surface the cut may be fixed; got {', '.join(sorted(unknown))}."
         )
     if labels is None:
         return 0.0
@@ -207,7 +207,7 @@ def _on_mesh(
     for one in sets:
         chosen = found.tried(one.for_regions, mesh.regions)
         if chosen is not None and plate is not None and loads:
-            found.tried(check_simulation, mesh, chosen[0], plate, loads, tuple(dict.fromkeys([BONE, *fixed])))
+            found.tried(check_simulation, mesh, chosen[0], plate, loads, held_facets(mesh, fixed))
 
 
 def _on_labels(study: Study, found: _Findings, labels: LabelMap, sets: Sequence[MaterialSet]) -> None:
@@ -219,6 +219,10 @@ def _on_labels(study: Study, found: _Findings, labels: LabelMap, sets: Sequence[
     soft = [name for n, name in labels.names.items() if n != 0 and n in numbers and name not in study.mesh.bones]
     for one in sets:
         found.tried(one.for_regions, soft)
+    if "cut" in {name.casefold() for name in study.models.fixed} and "skin" not in {name.casefold() for name in soft}:
+        found.wrong.append(
+            "[models] fixed: 'cut' needs a tissue called skin in the label map, which tells it from the outer surface."
+        )
 
 
 def _image(study: Study, given: str) -> Image:

@@ -40,9 +40,8 @@ def simulated_path(
 
     def tell(line: str) -> None:
         try:
-            with log.open(
-                "a", encoding="utf-8"
-            ) as file:  # closed each time: there to be read meanwhile, and after a kill
+            # closed each time: there to be read meanwhile, and after a kill
+            with log.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
         except OSError as error:
             raise OutputError(f"{log}: cannot be written ({error.strerror or error}). Has the disk room?") from error

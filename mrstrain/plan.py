@@ -9,7 +9,7 @@ from typing import Any
 
 from dvc.errors import InputError
 from fe.published import material_set
-from fe.simulate import LoadStep
+from fe.simulate import BONE, LoadStep
 from mrstrain.driving import ENDING
 from mrstrain.modelfiles import files_named
 from mrstrain.registering import REPEAT
@@ -213,7 +213,8 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         "loads": [asdict(load_step(load, of)) for load, of in study.loads.items()],
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
-        "fixed": study.models.fixed, "element": study.models.element, "decks": study.models.decks,
+        "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))), "element": study.models.element,
+        "decks": study.models.decks,
     }  # fmt: skip
     return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
 

@@ -155,7 +155,7 @@ def run_studies(
             if name in minutes:
                 ended += minutes[name]
                 tell(prefix + name, "ended", 1.0)  # one that failed has not told so
-                tell(ALL, stages_told, ended / total)
+                tell(ALL, stages_told, round(ended / total, 9))
 
         return line
 

@@ -30,7 +30,7 @@ from fe.result import (
     write_curve_csv,
     write_regions_csv,
 )
-from fe.simulate import BONE, LoadStep, State, check
+from fe.simulate import LoadStep, State, check, held_facets
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.loads import LOADS, paths_of
 from mrstrain.onepath import simulated_path
@@ -168,8 +168,7 @@ def simulate(
     if not names or len(set(names)) < len(names):
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
     paths = paths_of(loads)
-    spelt = {name.casefold(): name for name in read.facets} | {name: name for name in read.facets}
-    held = tuple(dict.fromkeys([BONE, *(spelt.get(name, spelt.get(name.casefold(), name)) for name in fixed)]))
+    held = held_facets(read, fixed)
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
         check(read, region_laws, plate, loads, held)

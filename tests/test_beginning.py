@@ -33,7 +33,7 @@ def test_what_has_no_role_is_told_and_stands_in_the_study_file(tmp_path):
     for name, why in (
         ("tissues.nii.gz", "since labels.nii.gz is taken for the label map"),
         ("other-bone.nii.gz", "since calcaneus.nii.gz is taken for the bone"),
-        ("Load1.nrrd", "since Load1.nii.gz is taken for that load"),
+        ("Load1.nrrd", "since Load1.nii.gz is taken for the load of that name"),
         ("Load1-again.nii.gz", "whose name tells no role"),
         ("T1 <scout>.nii.gz", "whose name tells no role"),
     ):

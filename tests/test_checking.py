@@ -91,6 +91,8 @@ def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
     assert wrong(study, file, friedman) == ""
     assert "mine has no law for the region 'skin'" in wrong(study, file)
     assert "no facets 'cut'" in wrong(study, file, friedman, ("sets", 'fixed = ["bone", "cut"]\nsets'))
+    assert wrong(study, file, friedman, ("sets", 'fixed = ["Bone"]\nsets')) == ""  # case does not count
+    assert "nothing to touch" in wrong(study, file, friedman, ("sets", 'fixed = ["skin"]\nsets'))
     far = TetMesh(made.points_mm + 400.0, made.cells, made.regions, made.facets)
     write_tet_mesh(study / "dome.vtu", far, {})
     assert "dome.vtu does not lie in the image" in wrong(study, file, friedman)
@@ -155,3 +157,18 @@ def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, mo
     assert care(8.0) == ["CARE: this machine has 8.0 GiB of memory; run with --workers 2."]
     assert care(8.0, workers=2) == []
     assert "crop the images" in care(3.0)[0]
+
+
+def test_what_is_fixed_beside_the_bone_has_to_be_there_and_decides_what_is_done_anew(study):
+    friedman = ('"mine.toml", ', "")
+    assert "beside the bone's surface the cut may be fixed" in wrong(
+        study, friedman, ("sets", 'fixed = ["skin"]\nsets')
+    )
+    assert "needs a tissue called skin" in wrong(study, friedman, ("sets", 'fixed = ["Cut"]\nsets'))
+
+    def held(fixed: str) -> object:
+        wrong(study, friedman, ("sets", f"{fixed}sets"))
+        return next(stage.arguments["fixed"] for stage in plan(read_study(study)) if stage.kind == "simulate")
+
+    assert held("") == held('fixed = ["bone"]\n') == ("bone",)
+    assert held('fixed = ["cut"]\n') == ("bone", "cut")

@@ -84,6 +84,13 @@ def test_a_curve_that_leaves_the_initial_stiffness_open_is_fitted_and_says_so() 
     assert (held / tries < 0.99).all(), held / tries
 
 
+def test_a_small_initial_stiffness_that_the_curve_tells_is_kept() -> None:
+    law = Yeoh.of(1e-3, 0.0, 20.0)
+    found = fit([curve_of(law, np.linspace(1.0, 1.6, 30))], "Yeoh").parameters
+    assert [p.value for p in found] == pytest.approx([1e-3, 0.0, 20.0], abs=1e-6)
+    assert not any(p.at_bound for p in found)
+
+
 def test_at_the_bound_the_rest_is_the_best_there_is() -> None:
     stretch = np.linspace(1.0, 1.4, 30)
     exact = curve_of(material_set("trebbi").laws["muscle"], stretch)

@@ -315,3 +315,11 @@ def test_how_much_is_done_is_told_from_the_first_touch_on() -> None:
     assert shares[-1] == 1.0
     assert sum(0.0 < share < 0.4 for share in shares) > 2  # on the way of the plate to the first load
     assert any(0.5 < share < 1.0 for share in shares)
+    at_once: list[float] = []
+    press(dome(), [SHEARED], progress=at_once.append)  # normal first, and half of it all
+    assert sum(0.0 < share < 0.5 for share in at_once) > 2
+
+
+def test_a_plate_needs_a_surface_that_is_free() -> None:
+    with pytest.raises(InputError, match="nothing to touch"):
+        press(dome(), PRESS, fixed=("bone", "skin"))
