@@ -68,8 +68,8 @@ def simulated_path(
 
     def keep(state: State) -> None:
         if state.reached > 0.0 and state.kept is not None:
-            write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
             write_kept(folder / f"{state.load.name}{ENDING}", state.kept, made_from[state.load.name])
+            write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
 
     return solve(
         mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=tell, keep=keep,
