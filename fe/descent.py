@@ -26,8 +26,9 @@ _MOST_STEPS = 400
 _LARGEST_MM, _TOO_FAR_MM = 1.0, 3.0  # a longer step is shortened to that; a step that long is damped more
 _MOST_GROWTH = 3.0, 1.5  # of the forces out of balance in one step: far from balance, and near it
 _NEAR = 10.0  # times what is asked
-# Of d after a step, by the share of those forces that was not foretold, of which no node counts more than _CLIPPED.
-_CHANGES = ((0.1, 0.2), (0.5, 1.0 / 3.0), (1.0, 0.5), (3.0, 1.0), (np.inf, 2.0))
+# Of d after a step, by the share of those forces that was not foretold: no node counts more than _CLIPPED, those on the
+# plate not at all.
+_CHANGES = ((0.1, 0.2), (0.5, 1.0 / 3.0), (1.0, 0.5), (np.inf, 1.0))
 _CLIPPED = 0.1
 _RISE = 4.0  # of d for a step that goes uphill, too far, or folds a cell
 # For one after which forces are far larger, of d, and of the medium's thickness at the nodes that did most of it.

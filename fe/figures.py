@@ -20,10 +20,11 @@ from dvc.mesh import TetMesh
 from dvc.planes import letters
 from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.convergence import Limit
+from fe.facets import BONE
 from fe.fitting import Curve, Fit
 from fe.plate import Plate
 from fe.result import volume_percentiles
-from fe.simulate import BONE, State
+from fe.simulate import State
 
 _POINTS = 200
 _FLAT_MM = 0.1

@@ -15,10 +15,8 @@ from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.image import LabelMap
 from dvc.mesh import TetMesh
 from dvc.worker import Worker
+from fe.facets import BONE, CUT, SKIN
 from fe.surfaces import Borders, borders_of, labels_at
-
-BONE, OUTER, CUT = "bone", "skin", "cut"
-"""Named facets: the interface with bone, the body's outer surface, and where the label map was cut off."""
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
 _SURE = 0.8
@@ -229,11 +227,11 @@ def _named(
     at_bone = _rows_in(triangles, bone_faces)
     free: BoolArray = np.logical_not(at_bone)
     cut = np.zeros(len(triangles), dtype=bool)
-    skins = [number for name, number in soft.items() if name.casefold() == OUTER]
+    skins = [number for name, number in soft.items() if name.casefold() == SKIN]
     if skins:
         cut = free & np.isin(owner, skins, invert=True)
         cut |= _rim(points, triangles, free & np.logical_not(cut), cut, labels)
-    facets = {BONE: triangles[at_bone], OUTER: triangles[free & ~cut], CUT: triangles[cut]}
+    facets = {BONE: triangles[at_bone], SKIN: triangles[free & ~cut], CUT: triangles[cut]}
     regions = {name: np.flatnonzero(tissue == number) for name, number in soft.items()}
     return TetMesh(points, body, regions, {name: rows for name, rows in facets.items() if len(rows)})
 
@@ -288,11 +286,11 @@ def _quality(mesh: TetMesh, labels: LabelMap, soft: dict[str, int]) -> MeshQuali
 
 def _thin(mesh: TetMesh) -> tuple[tuple[str, float], ...]:
     """Share of the outer tissue's cells that reach from the outer surface to the tissue beneath."""
-    skin = next((name for name in mesh.regions if name.casefold() == OUTER), None)
-    if skin is None or OUTER not in mesh.facets:
+    skin = next((name for name in mesh.regions if name.casefold() == SKIN), None)
+    if skin is None or SKIN not in mesh.facets:
         return ()
     outer = np.zeros(len(mesh.points_mm), dtype=bool)
-    outer[mesh.facets[OUTER]] = True
+    outer[mesh.facets[SKIN]] = True
     beneath = np.zeros(len(mesh.points_mm), dtype=bool)
     for name, cells in mesh.regions.items():
         if name != skin:

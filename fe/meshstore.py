@@ -14,7 +14,7 @@ from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from dvc.meshfile import read_mesh
 from dvc.whole import whole_file, write_whole
-from fe.meshing import BONE, CUT, OUTER
+from fe.facets import known_name
 
 _FIRST_FACET = 101  # numbers of facets in the array "region"; those of tissues begin at 1
 _MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, beside its components
@@ -71,8 +71,7 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
     regions = _without(regions, {name for name in regions if _MATERIAL.fullmatch(name)}, count)
     facets: dict[str, IntArray] = {}
     for name, rows in mesh.facets.items():
-        called = names.get(name, name)
-        known = called.casefold() if called.casefold() in (BONE, OUTER, CUT) else called
+        known = known_name(names.get(name, name))
         if known in facets:
             raise InputError(f"{place}: two sets of facets are called '{known}'; case does not count. Rename one.")
         facets[known] = rows

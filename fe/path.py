@@ -13,14 +13,12 @@ from dvc.mesh import TetMesh
 from fe.assembly import Assembler
 from fe.descent import descend
 from fe.elements import edges_of
+from fe.facets import SKIN
 from fe.linear import Solver
 from fe.model import Model
 from fe.newton import Converged, Tolerance, equilibrium
 from fe.plate import Contact, Hold, Plate
 from fe.turning import Turning
-
-SURFACE = "skin"
-"""Name of the facets that the plate may touch."""
 
 _FIRST_STEP = 0.25
 _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
@@ -130,13 +128,13 @@ class Path:
         self.model, self.tolerance, self.tell = model, tolerance, tell
         self.settled: Callable[[], None] = lambda: None  # called at each equilibrium from which one can go on
         held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in fixed]))
-        touching = np.setdiff1d(_nodes_on(model, mesh, SURFACE), held)
+        touching = np.setdiff1d(_nodes_on(model, mesh, SKIN), held)
         self.contact = Contact(plate, model.space.nodes_mm, touching)
         self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), self.contact.may_follow)
         self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
         self.extent_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
         self.state = np.zeros(model.unknowns)
-        self._faces = mesh.facets[SURFACE]
+        self._faces = mesh.facets[SKIN]
         self.plate = PlateState(np.array([plate.gap_mm, 0.0, 0.0]), np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
         self.curve = [self.plate]
         self.iterations = 0

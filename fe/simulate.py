@@ -13,15 +13,13 @@ from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from fe.elements import element
+from fe.facets import BONE, SKIN
 from fe.leg import Kept, Leg
 from fe.materials import Material
 from fe.model import Model
 from fe.newton import Tolerance
-from fe.path import SURFACE, Goal, Path, PlateState
+from fe.path import Goal, Path, PlateState
 from fe.plate import Contact, Plate
-
-BONE = "bone"
-"""Name of the facets that are fixed."""
 
 _TOLERANCE = Tolerance()
 
@@ -240,25 +238,19 @@ def check(
     """Refuse what `simulate` cannot do, before anything is computed; errors as there."""
     if not fixed:
         raise InputError("No facets are fixed: tissue that nothing holds cannot be pressed.")
-    for name in (*fixed, SURFACE):
+    for name in (*fixed, SKIN):
         if name not in mesh.facets:
             raise InputError(
                 f"The mesh has no facets '{name}'; it has {', '.join(mesh.facets) or 'none'}. The bone's interface is "
-                f"called '{BONE}' and is fixed, the surface that the plate touches '{SURFACE}'."
+                f"called '{BONE}' and is fixed, the surface that the plate touches '{SKIN}'."
             )
     check_laws(mesh, laws)
     check_loads(plate, loads)
     _check_held(mesh, fixed)
-    on_surface = np.setdiff1d(np.unique(mesh.facets[SURFACE]), _nodes_of(mesh, fixed))
+    on_surface = np.setdiff1d(np.unique(mesh.facets[SKIN]), _nodes_of(mesh, fixed))
     if not len(on_surface):
-        raise InputError(f"All of '{SURFACE}' is fixed ({', '.join(fixed)}): the plate has nothing to touch.")
+        raise InputError(f"All of '{SKIN}' is fixed ({', '.join(fixed)}): the plate has nothing to touch.")
     Contact(plate, mesh.points_mm @ plate.axes, on_surface)
-
-
-def held_facets(mesh: TetMesh, beside: Sequence[str]) -> tuple[str, ...]:
-    """The bone's facets and others beside them, as the mesh spells them; case does not count."""
-    spelt = {name.casefold(): name for name in mesh.facets} | {name: name for name in mesh.facets}
-    return tuple(dict.fromkeys([BONE, *(spelt.get(name, spelt.get(name.casefold(), name)) for name in beside)]))
 
 
 def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:

@@ -17,10 +17,11 @@ from dvc.labels import fit_mask, read_labels, read_mask
 from dvc.mesh import TetMesh
 from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import usable_cores
+from fe.facets import fixed_facets
 from fe.meshstore import read_tet_mesh
 from fe.plate import Plate
 from fe.published import MaterialSet, material_set
-from fe.simulate import LoadStep, check_loads, held_facets
+from fe.simulate import LoadStep, check_loads
 from fe.simulate import check as check_simulation
 from mrstrain.costs import cells_expected, costs
 from mrstrain.engines import settings_of
@@ -207,7 +208,7 @@ def _on_mesh(
     for one in sets:
         chosen = found.tried(one.for_regions, mesh.regions)
         if chosen is not None and plate is not None and loads:
-            found.tried(check_simulation, mesh, chosen[0], plate, loads, held_facets(mesh, fixed))
+            found.tried(check_simulation, mesh, chosen[0], plate, loads, fixed_facets(mesh, fixed))
 
 
 def _on_labels(study: Study, found: _Findings, labels: LabelMap, sets: Sequence[MaterialSet]) -> None:

@@ -16,7 +16,7 @@ from dvc.labels import read_labels
 from dvc.whole import whole_file, write_whole
 from fe import figures
 from fe.convergence import Limit, extrapolated, size_mm
-from fe.meshing import BONE
+from fe.facets import BONE
 from fe.meshstore import read_tet_mesh
 from fe.published import material_set
 from fe.simulate import LoadStep

@@ -11,7 +11,8 @@ from dvc.labels import read_labels
 from dvc.mesh import TetMesh
 from dvc.whole import whole_file
 from fe import figures
-from fe.meshing import BONE, OUTER, MeshQuality, mesh_labels
+from fe.facets import BONE, SKIN
+from fe.meshing import MeshQuality, mesh_labels
 from fe.meshstore import write_tet_mesh
 from fe.plate import Plate
 from mrstrain.inputs import make_output
@@ -51,7 +52,7 @@ class Meshed:
             f"{share:.0%} of the cells of {name} reach through it, one cell thick; --finer makes it thicker."
             for name, share in q.thin
         ]
-        if not any(name.casefold() == OUTER for name in self.mesh.regions):
+        if not any(name.casefold() == SKIN for name in self.mesh.regions):
             lines.append(
                 "CARE: no tissue is called skin, so the cut (where the label map ends) cannot be told from the outer "
                 "surface: it counts as 'skin', which the plate may touch, and there are no facets 'cut'."

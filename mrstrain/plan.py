@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from dvc.errors import InputError
+from fe.facets import BONE
 from fe.published import material_set
-from fe.simulate import BONE, LoadStep
+from fe.simulate import LoadStep
 from mrstrain.driving import ENDING
 from mrstrain.modelfiles import files_named
 from mrstrain.registering import REPEAT

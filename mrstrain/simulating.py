@@ -17,6 +17,7 @@ from fe import figures
 from fe.decks import write_calculix, write_febio
 from fe.elements import TOLD
 from fe.elements import element as formulation
+from fe.facets import fixed_facets
 from fe.materials import MODES, Material
 from fe.meshstore import read_tet_mesh
 from fe.model import CROWDED
@@ -30,7 +31,7 @@ from fe.result import (
     write_curve_csv,
     write_regions_csv,
 )
-from fe.simulate import LoadStep, State, check, held_facets
+from fe.simulate import LoadStep, State, check
 from mrstrain.inputs import make_output, refuse_touching_inputs
 from mrstrain.loads import LOADS, paths_of
 from mrstrain.onepath import simulated_path
@@ -168,7 +169,7 @@ def simulate(
     if not names or len(set(names)) < len(names):
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
     paths = paths_of(loads)
-    held = held_facets(read, fixed)
+    held = fixed_facets(read, fixed)
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
         check(read, region_laws, plate, loads, held)

@@ -21,11 +21,12 @@ from dvc.meshfile import MM_PER_UNIT, TO_LPS
 from dvc.whole import write_whole
 from fe.assembly import Assembler
 from fe.elements import element
+from fe.facets import BONE
 from fe.linear import Solver
 from fe.materials import Material
 from fe.model import Model
 from fe.newton import Tolerance, equilibrium
-from fe.simulate import BONE, LoadStep, State, check_laws
+from fe.simulate import LoadStep, State, check_laws
 from validate.mapping import filled_from_nearest
 
 _FIRST_STEP, _LEAST_STEP = 0.25, 1.0 / 64.0
