@@ -37,8 +37,8 @@ from dvc.worker import Worker
 Progress = Callable[[str, float], None]
 _Scan = TypeVar("_Scan", Image, Mask, LabelMap)
 
-GAUSS_NEWTON = "gauss-newton"
-"""Name of our own engine, where elastix has presets."""
+GAUSS_NEWTON, AT_BORDERS = "gauss-newton", "gauss-newton-borders"
+"""Names of our own engine, without and with borders of tissues, where elastix has presets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +88,10 @@ class Settings:
 
     @property
     def name(self) -> str:
-        """What an error model is known by: the engine gauss-newton, or the last preset of elastix."""
-        return GAUSS_NEWTON if self.gauss_newton is not None else self.presets[-1].name
+        """What an error model is known by: one of the two names of our own engine, or the last preset of elastix."""
+        if self.gauss_newton is None:
+            return self.presets[-1].name
+        return GAUSS_NEWTON if self.borders is None else AT_BORDERS
 
     @property
     def needs_one_contrast(self) -> bool:
@@ -115,9 +117,10 @@ class Settings:
 
     @classmethod
     def of(cls, name: str = GAUSS_NEWTON, **others: object) -> Settings:
-        """Settings by name: "gauss-newton", a preset of elastix, or the path of a parameter file (.txt)."""
-        if name == GAUSS_NEWTON:
-            return replace(cls(gauss_newton=GaussNewton()), **others)  # type: ignore[arg-type]
+        """Settings by name: our own engine's, a preset of elastix, or the path of a parameter file (.txt)."""
+        if name in {GAUSS_NEWTON, AT_BORDERS}:
+            own = cls(gauss_newton=GaussNewton(), borders=AtBorders() if name == AT_BORDERS else None)
+            return replace(own, **others)  # type: ignore[arg-type]
         return replace(cls(presets=(preset_or_file(name),)), **others)  # type: ignore[arg-type]
 
 

@@ -157,9 +157,7 @@ def _registration(study: Study, found: _Findings) -> None:
         return
     own = how.error_model
     model = error_model_of(settings.name) if own is None else found.tried(read_error_model, study.path(own))
-    if how.borders:
-        found.notes.append("With borders = true results will have no intervals: that error has not been measured yet.")
-    elif model is None:
+    if model is None:
         found.notes.append(f"{settings.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
 
 

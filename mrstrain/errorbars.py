@@ -162,11 +162,6 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
 
 def _otherwise(used: Settings) -> str:
     """Why an error model of this engine or preset does not hold for these settings of it."""
-    if used.borders is not None:
-        return (
-            f"The error of {used.name} was measured without borders of tissues, and with them its error is another; it "
-            "has not been measured yet."
-        )
     if used.gauss_newton is not None and used.gauss_newton.bending is not None:
         return (
             f"The error of {used.name} was measured with the weight of the bending chosen by its rule, as for a loaded "

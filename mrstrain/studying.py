@@ -15,7 +15,7 @@ import numpy as np
 
 from dvc.errors import InputError, MrstrainError
 from dvc.presets import load_preset
-from dvc.registration import GAUSS_NEWTON, Settings
+from dvc.registration import AT_BORDERS, GAUSS_NEWTON, Settings
 from dvc.whole import write_whole
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.inputs import make_output, refuse_small_disk
@@ -50,6 +50,8 @@ CONDITIONS: tuple[tuple[tuple[float, float, float], float], ...] = (
 """Voxel (mm) and signal-to-noise ratio of the default study."""
 SEEDS = (1, 2)
 """Published figures come from 9000 to 9999, on which nothing is ever tuned."""
+LABELS_OFF = (0.0, 1.0)
+"""By how many voxels label maps are off, half of the registrations each, where the engine believes them."""
 
 # What makes the images: a study goes on only with runs made by the same.
 _MAKING = {"anatomy.py", "bodies.py", "flow.py", "heel.py", "motions.py", "mri.py", "study.py"}
@@ -60,11 +62,14 @@ _ENGINE = {
     "imageterm.py",
     "smoothness.py",
     "splinesums.py",
+    "borders.py",
+    "sharpen.py",
     "nonrigid.py",
     "shading.py",
     "registration.py",
 }
 _SECONDS = 36.0  # of one run on one core, as measured, half of it to make and to score the pair
+_BORDERS_SECONDS = 80.0  # with borders of tissues
 _ELASTIX_SECONDS = 75.0  # as measured: 3,500 iterations, whatever the voxel
 _MEGABYTES = 5.0  # of one run's samples, as measured at 0.8 mm
 
@@ -110,20 +115,25 @@ def cases_of(
 ) -> list[Case]:
     """Every preset with every condition (voxel in mm, SNR), motion and seed; waves with the first seed alone.
 
-    By default seven motions with two heels each and eight waves, at five conditions: 110 registrations.
+    By default seven motions with two heels each and eight waves, at five conditions: 110 registrations. With borders of
+    tissues each motion is registered with exact labels and with labels that are off, and a wave, which moves bone as
+    it moves tissue, not at all.
     """
     return [
-        Case(preset, spacing, snr, motion, seed)
+        Case(preset, spacing, snr, motion, seed, labels_off)
         for preset in presets
         for spacing, snr in conditions
         for motion in motions
+        if not (preset == AT_BORDERS and motion.startswith("wave-"))
         for seed in (seeds[:1] if motion.startswith("wave-") else seeds)
+        for labels_off in (LABELS_OFF if preset == AT_BORDERS else (0.0,))
     ]
 
 
 def expected_minutes(cases: Sequence[Case], workers: int) -> float:
     """About how long registrations take, so many at once."""
-    return sum(_SECONDS if c.preset == GAUSS_NEWTON else _ELASTIX_SECONDS for c in cases) / workers / 60.0
+    own = {GAUSS_NEWTON: _SECONDS, AT_BORDERS: _BORDERS_SECONDS}
+    return sum(own.get(case.preset, _ELASTIX_SECONDS) for case in cases) / workers / 60.0
 
 
 def accuracy(
@@ -239,7 +249,9 @@ def _key(case: Case) -> str:
     """What a run's result depends on beside its case."""
     told = versions()
     text = Settings.of(case.preset).text + load_preset("bone-rigid").text
-    sources = _sources("phantoms", _MAKING) + (_sources("dvc", _ENGINE) if case.preset == GAUSS_NEWTON else "")
+    sources = _sources("phantoms", _MAKING) + (
+        _sources("dvc", _ENGINE) if case.preset in {GAUSS_NEWTON, AT_BORDERS} else ""
+    )
     return hashlib.sha256((text + told["mrstrain"] + told["itk-elastix"] + sources).encode()).hexdigest()
 
 
@@ -293,6 +305,9 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
             seeds = sorted({r.case.seed for r in plain})
             motions = ", ".join(dict.fromkeys(r.case.motion for r in plain))
             source = f"{len(plain)} registrations of phantom heels, seeds {seeds}, motions {motions}"
+            if any(r.case.labels_off for r in plain):
+                off = " or ".join(f"{by:g}" for by in sorted({r.case.labels_off for r in plain}))
+                source += f", label maps off by {off} voxels"
             fit_error_model(some, Settings.of(preset).text, source).write(
                 target / f"error_model_{Path(preset).stem}.json"
             )

@@ -22,7 +22,8 @@ _CLOSING = (
             "Motions: still (foot moved, no strain), smooth (a flow without jumps of strain), sliding (the fat pad "
             "slides inside bone and skin at rest: strain jumps at both borders), Load1 to Load4 (both together, as "
             "strong as the forces of the published experiment), wave-L (shear that varies as a cosine of wavelength L "
-            "mm).",
+            "mm). Where labels are off, patches of 5 mm of the label map that the registration was given are moved by "
+            "up to so many voxels along each axis.",
             "Spatial resolution is the wavelength of which a share of the strain is recovered. A smaller wavelength is "
             "bought with more noise: give both, or none.",
             "SD and bias in the error model are given the shear that was found. They hold for tissue strained and "
@@ -61,7 +62,7 @@ def _sections(
             ("motion", "tissue", "true shear: median", "p95", "error: bias", "SD", "RMSE", "p95", "u, mm: RMSE", "p95"),
             tuple(
                 (
-                    r.motion, r.tissue, r.true_p50, r.true_p95, r.shear_bias, r.shear_sd, r.shear_rmse, r.shear_p95,
+                    _motion(r), r.tissue, r.true_p50, r.true_p95, r.shear_bias, r.shear_sd, r.shear_rmse, r.shear_p95,
                     r.u_rmse_mm, r.u_p95_mm,
                 )
                 for r in rows
@@ -88,6 +89,10 @@ def _sections(
         rows_of = tuple((name, reason) for name, reason in failures.items())
         sections.append(Section("Without a result", tables=(Table("Failures", ("case", "reason"), rows_of),)))
     return sections
+
+
+def _motion(row: ErrorRow) -> str:
+    return f"{row.motion}, labels off by {row.labels_off:g}" if row.labels_off else row.motion
 
 
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:

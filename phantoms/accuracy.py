@@ -29,6 +29,8 @@ class ErrorRow:
     voxel_mm : str
         Such as "0.8" or "0.8 x 0.8 x 1.6".
     snr : float
+    labels_off : float
+        As in `phantoms.study.Case`.
     motion, tissue : str
     by : {"all", "distance to bone, mm", "distance to a border, mm", "true maximal shear"}
     low, high : float
@@ -46,6 +48,7 @@ class ErrorRow:
     preset: str
     voxel_mm: str
     snr: float
+    labels_off: float
     motion: str
     tissue: str
     by: str
@@ -114,18 +117,18 @@ def run_rows(runs: Sequence[Samples]) -> list[RunRow]:
 
 
 def error_rows(runs: Sequence[Samples]) -> list[ErrorRow]:
-    """Errors by condition, motion and tissue: over all, by distance to bone and to a border, and by true strain.
+    """Errors by condition, labels, motion and tissue: over all, by distance to bone, to a border, and by true strain.
 
     Waves are left out: they have rows of their own (`resolution_rows`).
     """
     rows = []
     for condition, some in by_condition(runs):
         plain = [r for r in some if r.case.wavelength_mm is None]
-        for motion in dict.fromkeys(r.case.motion for r in plain):
-            alike = [r for r in plain if r.case.motion == motion]
+        for off, motion in dict.fromkeys((r.case.labels_off, r.case.motion) for r in plain):
+            alike = [r for r in plain if (r.case.labels_off, r.case.motion) == (off, motion)]
             for tissue in (*TISSUES.values(), POOLED):
                 for by, low, high, kept in _bins(alike, [of_tissue(r, tissue) for r in alike]):
-                    row = _row(condition, (motion, tissue, by, low, high), alike, kept)
+                    row = _row((*condition, off), (motion, tissue, by, low, high), alike, kept)
                     rows += [] if row is None else [row]
     return rows
 
@@ -212,7 +215,7 @@ def _bins(runs: Sequence[Samples], tissue: Sequence[BoolArray]) -> Iterator[tupl
 
 
 def _row(
-    condition: tuple[str, str, float],
+    condition: tuple[str, str, float, float],
     place: tuple[str, str, str, float, float],
     runs: Sequence[Samples],
     kept: Sequence[BoolArray],
@@ -226,12 +229,13 @@ def _row(
     mean = u.mean(axis=0)
     length = np.linalg.norm(u, axis=1)
     p50, p95 = (float(p) for p in np.percentile(true, [50, 95]))
-    preset, voxel, snr = condition
+    preset, voxel, snr, labels_off = condition
     motion, tissue, by, low, high = place
     return ErrorRow(
         preset=preset,
         voxel_mm=voxel,
         snr=snr,
+        labels_off=labels_off,
         motion=motion,
         tissue=tissue,
         by=by,

@@ -27,6 +27,7 @@ from dvc.worker import Worker
 from phantoms.anatomy import Heel
 from phantoms.heel import (
     LOADS,
+    badly_drawn,
     covering,
     drawn_motion,
     heel_grid,
@@ -53,7 +54,7 @@ class Case:
     Attributes
     ----------
     preset : str
-        Name of a preset of elastix, path of a parameter file (.txt), or "gauss-newton".
+        Name of a preset of elastix, path of a parameter file (.txt), "gauss-newton" or "gauss-newton-borders".
     spacing_mm : (3,)
         Of the voxels, mm.
     snr : float
@@ -63,6 +64,8 @@ class Case:
         "Load4", or "wave-L" with a wavelength L in mm.
     seed : int
         Of the heel, its images and the foot's motion.
+    labels_off : float
+        By how many voxels the label map that the registration gets is off, as `phantoms.heel.badly_drawn` makes it.
     """
 
     preset: str
@@ -70,12 +73,14 @@ class Case:
     snr: float
     motion: str
     seed: int
+    labels_off: float = 0.0
 
     @property
     def name(self) -> str:
         """For a file and for people."""
         spacing = "x".join(f"{s:g}" for s in self.spacing_mm)
-        return f"{Path(self.preset).stem}_{spacing}mm_snr{self.snr:g}_{self.motion}_{self.seed}"
+        off = f"_off{self.labels_off:g}" if self.labels_off else ""
+        return f"{Path(self.preset).stem}_{spacing}mm_snr{self.snr:g}_{self.motion}_{self.seed}{off}"
 
     @property
     def keeps_volume(self) -> bool:
@@ -242,6 +247,7 @@ def measure(
         number = zlib.crc32(f"{case.motion} {case.spacing_mm} {case.snr}".encode())
         foot = RigidMotion.identity() if wave else drawn_motion(case.seed, number)
         labels = labels_of(heel, grid)
+        drawn = badly_drawn(labels, case.labels_off, case.seed) if case.labels_off else labels
         bone, body = labels.region("bone"), Mask(grid, labels.labels > 0)
         reference = scan(heel, grid, snr=case.snr, number=number)
         where = covering(grid, foot.apply(bone.points()))
@@ -256,8 +262,9 @@ def measure(
     found = register(
         reference,
         loaded,
-        bone=bone,
-        tissue=body,
+        bone=drawn.region("bone"),
+        tissue=Mask(grid, drawn.labels > 0),
+        labels=drawn,
         settings=settings,
         worker=worker,
         progress=lambda stage, fraction: progress(fraction if stage != "aligning" else 0.0),

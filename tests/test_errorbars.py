@@ -138,11 +138,10 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     assert "phantoms that keep their volume" in error_bars(found, subject, maps, own).told
     found.settings = Settings(gauss_newton=GaussNewton(bending=2.0))
     assert "fixed at 2/mm" in error_bars(found, subject, maps, own).told
-    found.settings = replace(Settings.of("gauss-newton"), borders=AtBorders())
-    bars = error_bars(found, subject, maps, error_model_of("gauss-newton"))
-    assert bars.uncertainty is None
-    assert "without borders" in bars.told
-    assert "without borders" in error_bars(found, subject, maps, own).told
+    found.settings, found.choice = replace(Settings.of("gauss-newton"), borders=AtBorders()), None
+    assert "gauss-newton-borders was used" in error_bars(found, subject, maps, own).told
+    with_borders = model("gauss-newton-borders", text=found.settings.text)
+    assert error_bars(found, subject, maps, with_borders).uncertainty is not None
 
 
 def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import binary_dilation, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from dvc.deformation import RigidMotion
@@ -12,7 +12,17 @@ from dvc.errors import InputError
 from dvc.image import Grid, Image
 from dvc.kinematics import StrainField
 from phantoms.anatomy import FAT_SIGNAL, Heel
-from phantoms.heel import LOADS, HeelPair, default_motion, heel_pair, loaded_signal, octants, pressed, under_load
+from phantoms.heel import (
+    LOADS,
+    HeelPair,
+    badly_drawn,
+    default_motion,
+    heel_pair,
+    loaded_signal,
+    octants,
+    pressed,
+    under_load,
+)
 from phantoms.mri import acquire
 
 COARSE = {"shape": (50, 56, 53), "spacing_mm": 2.0}
@@ -183,3 +193,19 @@ def test_load_scales_the_strain(heel: Heel, tissue_points: np.ndarray) -> None:
 def test_refuses_what_cannot_be_made(arguments: dict, says: str) -> None:
     with pytest.raises(InputError, match=says):
         heel_pair(**{"shape": (12, 12, 12), "spacing_mm": 8.0, **arguments})
+
+
+def test_a_label_map_that_is_badly_drawn_is_off_by_no_more_than_asked(pair: HeelPair) -> None:
+    labels = pair.labels
+    off = badly_drawn(labels, 1.0, seed=1)
+    moved = off.labels != labels.labels
+    assert 0.005 < moved.mean() < 0.05
+    for number in labels.names:
+        near = binary_dilation(labels.labels == number, np.ones((3, 3, 3)))
+        assert not np.any((off.labels == number) & ~near)
+        both = np.count_nonzero((off.labels == number) & (labels.labels == number))
+        dice = 2 * both / np.count_nonzero([off.labels == number, labels.labels == number])
+        assert 0.7 < dice < 0.995
+    np.testing.assert_array_equal(off.labels, badly_drawn(labels, 1.0, seed=1).labels)
+    assert np.any(off.labels != badly_drawn(labels, 1.0, seed=2).labels)
+    np.testing.assert_array_equal(badly_drawn(labels, 0.0, seed=1).labels, labels.labels)

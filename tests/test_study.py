@@ -20,7 +20,7 @@ from dvc.image import Grid, LabelMap
 from dvc.uncertainty import POOLED
 from dvc.worker import Worker
 from mrstrain import accuracy
-from mrstrain.studying import cases_of, expected_minutes
+from mrstrain.studying import MOTIONS, cases_of, expected_minutes
 from phantoms.accuracy import error_rows, floor_rows, resolution_rows, wavelength_recovered
 from phantoms.anatomy import TISSUES, Heel
 from phantoms.errormodel import coverage_rows, fit_error_model
@@ -209,9 +209,30 @@ def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
     assert {"still", "sliding", "Load1", "wave-8"} <= {c.motion for c in cases}
 
 
+def test_borders_are_studied_with_labels_that_are_right_and_labels_that_are_off() -> None:
+    """Waves move bone as they move tissue, which the engine holds still there."""
+    cases = cases_of(("gauss-newton", "gauss-newton-borders"), conditions=(((0.8, 0.8, 0.8), 25.0),), seeds=(1,))
+    with_borders = [c for c in cases if c.preset == "gauss-newton-borders"]
+    assert {(c.motion, c.labels_off) for c in with_borders} == {(m, off) for m in MOTIONS for off in (0.0, 1.0)}
+    assert {c.labels_off for c in cases if c not in with_borders} == {0.0}
+    assert len({c.name for c in cases}) == len(cases)
+
+
+def test_rows_of_labels_that_are_off_stand_apart_and_the_error_model_has_both() -> None:
+    exact, off = (replace(CASE, preset="gauss-newton-borders", labels_off=by) for by in (0.0, 1.0))
+    runs = [samples(exact, sd=0.01), samples(off, sd=0.03)]
+    told = {r.labels_off: r.shear_rmse for r in error_rows(runs) if (r.by, r.tissue) == ("all", "fat")}
+    assert told == {0.0: pytest.approx(0.01, rel=0.1), 1.0: pytest.approx(0.03, rel=0.1)}
+    _, sd = fit_error_model(runs, "", "").tables[0].expected("fat", np.array([0.2]), np.array([6.0], dtype=np.float32))
+    assert sd[0] == pytest.approx(np.sqrt((0.01**2 + 0.03**2) / 2), rel=0.15)
+
+
 def test_the_time_told_beforehand_is_that_of_the_engine() -> None:
-    ours, elastix = (expected_minutes([replace(CASE, preset=p)] * 10, 2) for p in ("gauss-newton", "heel-mr"))
+    ours, borders, elastix = (
+        expected_minutes([replace(CASE, preset=p)] * 10, 2) for p in ("gauss-newton", "gauss-newton-borders", "heel-mr")
+    )
     assert 1.0 < ours < 0.6 * elastix < 6.0
+    assert borders > 2.0 * ours
     assert expected_minutes([CASE] * 10, 1) == pytest.approx(2.0 * elastix)
 
 
@@ -348,7 +369,7 @@ def test_two_parameter_files_of_one_name_are_never_taken_for_each_other(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["heel-mr", "gauss-newton"])
+@pytest.mark.parametrize("preset", ["heel-mr", "gauss-newton", "gauss-newton-borders"])
 def test_a_run_is_that_of_its_case(preset: str, worker: Worker) -> None:
     """Still: the truth is zero and what is found is noise; the same case gives the same samples."""
     case = replace(CASE, preset=preset, motion="still")
