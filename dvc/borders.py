@@ -86,12 +86,15 @@ class Borders:
         spacing = labels.grid.spacing_mm
         nearest = distance_transform_edt(values == 0, sampling=spacing, return_distances=False, return_indices=True)
         tissues, own = np.unique(values[tuple(nearest)], return_inverse=True)
-        own = own.reshape(values.shape)
-        depth = np.stack(
-            [spline_filter(_depth_mm(own == n, spacing), order=3, mode="mirror") for n in range(tissues.size)]
-        )
         rest = int(np.flatnonzero(tissues == -1)[0]) if bool((tissues == -1).any()) else -1
-        return cls(labels.grid, frozen(depth, np.float64), frozen(own, np.int64), rest, float(reach_mm))
+        return cls.between(labels.grid, frozen(own.reshape(values.shape), np.int64), rest, float(reach_mm))
+
+    @classmethod
+    def between(cls, grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Borders:
+        """Borders between tissues that are numbered from 0 on; parameters as the attributes."""
+        depths = [_depth_mm(own == number, grid.spacing_mm) for number in range(int(own.max()) + 1)]
+        depth = np.stack([spline_filter(depth, order=3, mode="mirror") for depth in depths])
+        return cls(grid, frozen(depth, np.float64), own, rest, reach_mm)
 
     def turned(self, rotation: FloatArray) -> Borders:
         """The borders of a body that is turned about the world's origin."""

@@ -16,6 +16,7 @@ import numpy as np
 import SimpleITK as sitk
 
 from dvc.arrays import FloatArray
+from dvc.borderfile import read_bordered_spline
 from dvc.bspline import BSpline
 from dvc.deformation import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
 from dvc.displacementfile import grid_of
@@ -48,7 +49,7 @@ class Added:
 
 
 def read_transform(path: StrPath) -> Deformation:
-    """Read a transform file: elastix' TransformParameters (.txt), or ITK's (.h5, .tfm, .mat, .txt).
+    """Read a transform file: elastix' TransformParameters (.txt), ITK's (.h5, .tfm, .mat, .txt), or ours (.npz).
 
     elastix' chain of initial transforms is followed, combined as each file says: "Compose" (T(x) =
     T1(T0(x))) or "Add". An initial transform's name is looked for beside the file that names it.
@@ -70,6 +71,8 @@ def read_transform(path: StrPath) -> Deformation:
     place = Path(path)
     if not place.is_file():
         raise InputError(f"{place}: no such transform file. Check the path.")
+    if place.suffix.lower() == ".npz":
+        return read_bordered_spline(place)
     if place.suffix.lower() in _ITK_SUFFIXES or place.read_bytes()[: len(_ITK_TEXT)] == _ITK_TEXT:
         return _read_itk(place)
     return _read_elastix(place, ())

@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvc.deformation import Deformation
+from dvc.borderfile import NAME as BORDERS
+from dvc.deformation import Deformation, Within
 from dvc.displacementfile import read_displacement
 from dvc.errors import InputError
+from dvc.labels import read_mask
+from dvc.transformfile import read_transform
 from dvc.uncertainty import ErrorTable, read_error_model
 from dvc.verdict import Verdict, worst
 
@@ -44,7 +47,10 @@ class Measurement:
         return self.folder / _FIELD
 
     def deformation(self) -> Deformation:
-        """Displacement of tissue relative to its bone."""
+        """Displacement of tissue relative to its bone: with its jumps of strain at borders, where it has any."""
+        jumping = self.folder / BORDERS
+        if jumping.is_file():
+            return Within(read_transform(jumping), read_mask(self.folder / "valid.nii.gz"), margin_voxels=0)
         return read_displacement(self.field)
 
 

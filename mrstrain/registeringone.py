@@ -7,9 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from dvc.align import AlignOn
-from dvc.bspline import BSpline
-from dvc.deformation import Composed, Deformation
-from dvc.errors import InputError
+from dvc.borderfile import NAME as BORDERS
+from dvc.deformation import Deformation
 from dvc.imagefile import read_image
 from dvc.quality import read_noise_floor
 from dvc.registration import register as register_pair
@@ -20,7 +19,7 @@ from dvc.worker import Worker
 from mrstrain.engines import settings_of
 from mrstrain.inputs import read_subject
 from mrstrain.registering import REPEAT, record_of
-from mrstrain.results import ITK_FILE, Case, write_case
+from mrstrain.results import Case, write_case
 
 
 def register_one(
@@ -108,12 +107,6 @@ def register_one(
 
 
 def _found(folder: Path) -> Deformation:
-    """What another load's folder holds: its B-spline, or displacements at voxels where that one has borders."""
-    text = folder / "TransformParameters.0.txt"
-    if text.is_file():
-        found = read_transform(text)
-        if not isinstance(found, BSpline):
-            raise InputError(f"{text}: no B-spline to start from.")
-        return found
-    whole = read_transform(folder / ITK_FILE)
-    return whole.parts[0] if isinstance(whole, Composed) else whole  # the bone's motion comes last
+    """What another load's folder holds."""
+    jumping = folder / BORDERS
+    return read_transform(jumping if jumping.is_file() else folder / "TransformParameters.0.txt")

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray
+from dvc.borderfile import NAME as BORDERS
+from dvc.borderfile import write_bordered_spline
 from dvc.bspline import BSpline
 from dvc.deformation import Deformation, RigidMotion
 from dvc.errors import InputError
@@ -159,6 +161,8 @@ def write_case(
         write_image(partial / "registered.nii.gz", Image(grid, registered))
         if isinstance(found.bspline, BSpline):
             write_elastix_transform(partial, found.bspline, motion, grid)
+        else:
+            write_bordered_spline(partial / BORDERS, found.bspline)
         write_itk_transform(partial / ITK_FILE, found.bspline, motion)
         bars.write(partial, maps, quality.verdict)
 

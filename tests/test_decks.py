@@ -14,7 +14,9 @@ from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from fe.decks import write_calculix, write_febio
 from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
+from fe.model import Model
 from fe.plate import Plate
+from fe.result import cauchy_stress
 from fe.simulate import LoadStep, State, simulate
 from tests.blocks import block
 
@@ -150,6 +152,41 @@ def test_calculix_finds_the_same_state(tmp_path: Path, fat: Material) -> None:
     assert np.sqrt(np.mean((u - state.u_mm) ** 2)) < 0.003 * size
     assert np.abs(u - state.u_mm).max() < 0.03 * size
     assert force == pytest.approx([1.5, 1.0, 0.0], abs=0.005 * np.hypot(1.5, 1.0))
+
+
+@needs_calculix
+@pytest.mark.parametrize("nu", [0.3, 0.49])
+@pytest.mark.parametrize("law", ["neo-Hooke", "Ogden", "Yeoh"])
+def test_with_the_same_element_calculix_has_our_stress_and_force(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, law: str, nu: float
+) -> None:
+    """C3D4 has no pressure of its own: all of the bulk modulus acts in each cell, of which our P1 leaves it a part.
+
+    Left with 0.99 and not 0.9999 of it, this test fails; with that, stress differs by 6e-5 and displacement by 2e-6.
+    """
+    monkeypatch.setattr(Model, "own_bulk_mpa", property(lambda self: 0.9999 * self.bulk_mpa))
+    fat: dict[str, Material] = {
+        "neo-Hooke": NeoHooke.of(0.01, nu=nu),
+        "Ogden": Ogden.from_ansys(0.0034, 6.2, nu=nu),
+        "Yeoh": Yeoh.of(0.005, 0.069, 1.967, nu=nu),
+    }
+    mesh, laws = slab((6, 8, 8)), {"skin": NeoHooke.of(0.1, nu=nu), "fat": fat[law]}
+    state = states_of(mesh, laws, "P1")[-1]
+    deck = tmp_path / "sheared.inp"
+    write_calculix(deck, mesh, laws, state)
+    every = f"*ELSET, ELSET=EALL, GENERATE\n1, {len(mesh.cells)}\n*MATERIAL"
+    asked = deck.read_text().replace("*MATERIAL", every, 1).replace("*END STEP", "*EL PRINT, ELSET=EALL\nS\n*END STEP")
+    deck.write_text(asked)
+    u, force = calculix(deck, len(mesh.points_mm))
+    told = deck.with_suffix(".dat").read_text()
+    number = r"(-?\d\.\d+E[+-]\d+)"
+    rows = re.findall(r"^ +(\d+) +1 +" + " +".join([number] * 6), told[told.rindex("stresses") :], re.MULTILINE)
+    assert [int(row[0]) for row in rows] == list(range(1, len(mesh.cells) + 1))
+    theirs = np.array([row[1:] for row in rows], dtype=np.float64)  # xx, yy, zz, xy, xz, yz
+    ours = cauchy_stress(state, mesh, laws)[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    assert np.abs(u - state.u_mm).max() < 1e-4 * np.abs(state.u_mm).max()
+    assert np.abs(theirs - ours).max() < 1e-3 * np.abs(ours).max()
+    assert force == pytest.approx([1.5, 1.0, 0.0], abs=1e-3)
 
 
 def test_a_deck_holds_the_mesh_the_laws_and_the_supports(tmp_path: Path) -> None:
