@@ -136,7 +136,7 @@ def run_studies(
         )
     planned = [plan(study) for study in studies]
     for stages in planned:
-        refuse_unknown(stages, (*only, *force))
+        refuse_unknown(stages, only, force)
         refuse_missing(stages)
     tell, ended = progress or (lambda *_: None), 0.0
     total = sum(stage.minutes for stages in planned for stage in stages)
@@ -205,17 +205,20 @@ def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequ
     """What `run` would do with each stage: "done already", "run" or "left out"; parameters and errors are its own."""
     told = study if isinstance(study, Study) else read_study(study)
     stages = plan(told)
-    refuse_unknown(stages, (*only, *force))
+    refuse_unknown(stages, only, force)
     refuse_missing(stages)
     return Pipeline(stages, Ledger(told.out, told.place), only=only, force=force).forecast()
 
 
-def refuse_unknown(stages: Sequence[Stage], names: Sequence[str]) -> None:
-    """Refuse names that no stage and no kind of stage has."""
+def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:
+    """Refuse names that no stage and no kind of stage has, and to make anew what is not to be run at all."""
     known = [*(stage.name for stage in stages), *KINDS]
-    for name in names:
+    for name in (*only, *force):
         if name not in known:
             raise InputError(f"No stage is called '{name}'. There are: {', '.join(known)}.")
+    for name in force if only else ():
+        if not any({stage.name, stage.kind} & {name} and {stage.name, stage.kind} & {*only} for stage in stages):
+            raise InputError(f"--force {name} makes nothing anew: --only {', '.join(only)} leaves it out.")
 
 
 def refuse_missing(stages: Sequence[Stage]) -> None:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
+from dvc.errors import InputError
+from mrstrain import __version__
+from mrstrain.cluster import _refuse_unfit
 from mrstrain.ledger import Ledger
 from mrstrain.pipeline import Pipeline, run_all
 from mrstrain.plan import Stage
+from mrstrain.running import refuse_unknown
 from mrstrain.stages import Given
 
 
@@ -173,6 +177,54 @@ def test_only_and_force(folder):
     assert first == ["compare"]
     assert not outcomes["compare"].whole
     assert all(one.whole for one in ran(folder)[1].values())
+
+
+@pytest.mark.parametrize(
+    ("only", "force", "says"),
+    [
+        (("registr",), (), "No stage is called 'registr'. There are: register a"),
+        (("register",), ("mesh",), "--force mesh makes nothing anew: --only register leaves it out"),
+        (("register a",), ("register b",), "--force register b makes nothing"),
+    ],
+)
+def test_what_no_stage_answers_to_is_refused(folder, only, force, says):
+    with pytest.raises(InputError, match=says):
+        refuse_unknown(stages_in(folder), only, force)
+    for fine in (((), force), (("register",), ("register a",)), (("register b",), ("register",))):
+        refuse_unknown(stages_in(folder), *fine)
+
+
+@dataclass
+class Workers:
+    """A client of one worker that gives a certain answer."""
+
+    answer: tuple[str, bool, bool] | None
+    threads: int = 1
+
+    def run(self, *_: object) -> dict[str, tuple[str, bool, bool]]:
+        if self.answer is None:
+            raise ModuleNotFoundError("No module named 'mrstrain'")
+        return {"tcp://far:1": self.answer}
+
+    def nthreads(self) -> dict[str, int]:
+        return {"tcp://far:1": self.threads}
+
+
+@pytest.mark.parametrize(
+    ("workers", "says"),
+    [
+        (Workers(None), "have no mrstrain"),
+        (Workers(("0.0.1", False, True)), "has mrstrain 0.0.1, and here is"),
+        (Workers((__version__, False, False)), "does not see"),
+        (Workers((__version__, False, True), threads=4), "runs 4 stages at once"),
+        (Workers((__version__, True, True)), "may not start processes"),
+    ],
+)
+def test_workers_that_would_not_do_are_refused_by_what_they_lack(tmp_path, workers, says):
+    with pytest.raises(InputError, match=says):
+        _refuse_unfit(workers, "tcp://far:0", [tmp_path])
+    assert not list(tmp_path.iterdir())
+    _refuse_unfit(Workers((__version__, False, True)), "tcp://far:0", [tmp_path])
 
 
 def test_a_moved_study_stays_finished(folder, tmp_path_factory):
