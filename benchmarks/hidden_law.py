@@ -21,18 +21,17 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.borderfile import NAME as BORDERS
 from dvc.deformation import SampledDisplacement, evaluate_on_grid
 from dvc.image import Grid, LabelMap
 from dvc.imagewrite import write_image, write_labels
 from dvc.labels import read_labels, read_mask
 from dvc.mesh import TetMesh
 from dvc.randomfield import GaussianField
-from dvc.transformfile import read_transform
 from fe.meshstore import read_tet_mesh, write_tet_mesh
 from mrstrain import mesh as make_mesh
 from mrstrain import run, simulate
 from mrstrain.loads import LOADS
+from mrstrain.measurements import spline_in
 from mrstrain.provenance import versions
 from phantoms.anatomy import Heel
 from phantoms.heel import covering, drawn_motion, heel_grid, labels_of, labels_to_mesh, scan
@@ -209,8 +208,7 @@ def scores(study: Path, hidden: Path, labels: LabelMap) -> dict[str, object]:
     for load in (x.name for x in LOADS):
         model = read_result("hidden", hidden / f"{load}.vtu")
         folder = results / "registration" / load
-        jumping = folder / BORDERS
-        found = read_transform(jumping if jumping.is_file() else folder / "TransformParameters.0.txt")
+        found = spline_in(folder)
         inside = read_mask(folder / "valid.nii.gz").inside & _in(model, labels)
         of = [
             error

@@ -123,6 +123,8 @@ class Choice:
     asked : float or None
         The change of volume that a hundredth of the soft tissue exceeds if only its gradient is held; None where the
         weight of the change of volume was fixed beforehand.
+    in_bone : (root mean square displacement in mm, 95th percentile of the maximal shear), optional
+        Within the bone, of the smooth displacement that came before one that holds the bone at rest.
     """
 
     weights: Weights
@@ -131,6 +133,7 @@ class Choice:
     tried_in_skin: tuple[tuple[float, float], ...] = ()
     rigidity_of: str = "bone"
     asked: float | None = None
+    in_bone: tuple[float, float] | None = None
 
     @property
     def frees_volume(self) -> bool:

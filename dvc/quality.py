@@ -199,6 +199,7 @@ def assess(
     offset: Callable[[float], float] | None = None,
     landmark_errors_mm: FloatArray | None = None,
     floor: NoiseFloor | None = None,
+    in_bone: tuple[float, float] | None = None,
     limits: Limits | None = None,
 ) -> Quality:
     """Judge a registration by its strain maps and the images' similarity.
@@ -215,6 +216,9 @@ def assess(
     offset : callable, optional
         Between the registered images, as a share of brightness, at the noise and at a multiple of it
         (`dvc.similarity.brightness_offset`). It is not trusted where it is too much for half as much noise again.
+    in_bone : (mm, shear), optional
+        Root mean square displacement and 95th percentile of the maximal shear in the bone, as the images alone would
+        have them, where the maps hold it at rest.
     """
     lines = limits or Limits()
     jacobian = maps.jacobian
@@ -222,7 +226,9 @@ def assess(
     lowest, at = _lowest(jacobian, maps.grid)
     undefined = 1.0 - int(np.count_nonzero(maps.valid & tissue.inside)) / max(int(np.count_nonzero(tissue.inside)), 1)
     bone_shift = bone_shear = float("nan")
-    if bone is not None:
+    if in_bone is not None:
+        bone_shift, bone_shear = in_bone
+    elif bone is not None:
         kept = bone.inside & maps.valid
         if kept.any():
             squared = (maps.displacement_mm[kept].astype(np.float64) ** 2).sum(axis=1)

@@ -26,6 +26,7 @@ from dvc.descent import Level
 from dvc.errors import ParameterError
 from dvc.gaussnewton import LEVELS, Choice, GaussNewton, choose, fit, scaled, turned
 from dvc.image import Image, LabelMap, Mask
+from dvc.kinematics import StrainField
 
 _SKIN = "skin"
 USUAL_SKIN = 3.0
@@ -132,12 +133,29 @@ def fit_with_borders(
     if options.bending is None:
         choice = choose(slab, found, choice.weights)
     rule = f"{choice.rule}; in skin {in_skin.rule}" if skin.any() else choice.rule
-    choice = replace(choice, rule=rule, tried_in_skin=in_skin.tried, rigidity_of=_SKIN, asked=first.asked)
+    choice = replace(
+        choice,
+        rule=rule,
+        tried_in_skin=in_skin.tried,
+        rigidity_of=_SKIN,
+        asked=first.asked,
+        in_bone=None if bone is None else _moved(smooth, bone),
+    )
     progress(_SMOOTH_SHARE + 0.5)
     found = whole.descend(found, choice.weights, steps=_STEPS, stop_mm=stop_mm)
     progress(1.0)
     smooth, jump = (BSpline(control, turned(axes, c)) for c in np.split(found, 2))
     return BorderedSpline(smooth, jump, borders), choice
+
+
+def _moved(smooth: BSpline, bone: Mask) -> tuple[float, float] | None:
+    """Root mean square displacement (mm) and 95th percentile of the maximal shear in the bone."""
+    u, H = smooth.evaluate_on_grid(bone.grid, bone.inside)
+    known = np.isfinite(u).all(axis=1)
+    if not known.any():
+        return None
+    shear = StrainField.from_gradient(H[known]).max_shear
+    return float(np.sqrt((u[known] ** 2).sum(axis=1).mean())), float(np.percentile(shear, 95))
 
 
 def _slab(inside: BoolArray) -> BoolArray:

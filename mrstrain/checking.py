@@ -151,8 +151,9 @@ def _registration(study: Study, found: _Findings) -> None:
     """Look at engine, parameters and error model."""
     how = study.registration
     settings = found.tried(
-        settings_of, how.engine, how.preset, [study.path(p) for p in how.parameters], borders=how.borders
-    )
+        settings_of, how.engine, how.preset, [study.path(p) for p in how.parameters], borders=how.borders,
+        labelled=study.images.labels is not None,
+    )  # fmt: skip
     if settings is None:
         return
     own = how.error_model

@@ -88,7 +88,7 @@ def register(
     engine: EngineName = None,
     bending: Bending = None,
     volume: Volume = None,
-    borders: Borders = False,
+    borders: Borders = None,
     preset: Preset = None,
     parameters: Parameters = None,
     allow_unknown_parameters: Annotated[

@@ -14,13 +14,13 @@ from mrstrain.studyfile import Study
 
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
 _REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 50.0 / 2.3, 7.0
-_BORDERS = 2.5  # times as long with `borders = true` (docs/decisions/0009)
+_BORDERS = 2.5  # times as long with borders of tissues (docs/decisions/0009)
 _CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
 _MESH_S = 100.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
-# GiB of all processes of a stage: registrations of 2.3 and 16.8 million voxels took 1.2 and 3.6, a factorisation at
-# 79,000 cells .84.
-_REGISTER_GIB, _REGISTER_GIB_PER_MVOXEL = 0.82, 0.166
+# GiB of all processes of a stage: registrations of 2.3 and 16.8 million voxels took 1.2 and 3.6, one of 2.3 with
+# borders 1.6, a factorisation at 79,000 cells .84.
+_REGISTER_GIB, _REGISTER_GIB_PER_MVOXEL, _BORDERS_GIB_PER_MVOXEL = 0.82, 0.166, 0.14
 _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
 _OTHER_GIB = 1.5
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
@@ -49,7 +49,7 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
         Of the mesh.
     """
     loads = len(study.loads)
-    slower = _BORDERS if study.registration.borders else 1.0
+    slower = _BORDERS if _with_borders(study) else 1.0
     registering = (slower * _REGISTER_S_PER_MVOXEL + _MAPS_S_PER_MVOXEL) * voxels / 1e6
     if stage.kind == "register":
         return registering
@@ -63,13 +63,20 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
     return float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
 
 
-def gib_of(stage: Stage, voxels: float, cells: float) -> float:
+def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
     """About how much memory a stage takes, GiB, all its processes together; parameters as in `seconds_of`."""
     if stage.kind in ("register", "level"):
-        return _REGISTER_GIB + _REGISTER_GIB_PER_MVOXEL * voxels / 1e6
+        more = _BORDERS_GIB_PER_MVOXEL if _with_borders(study) else 0.0
+        return _REGISTER_GIB + (_REGISTER_GIB_PER_MVOXEL + more) * voxels / 1e6
     if stage.kind in ("simulate", "drive"):
         return _SIMULATE_GIB + _SIMULATE_GIB_PER_CELL * cells
     return _OTHER_GIB
+
+
+def _with_borders(study: Study) -> bool:
+    how = study.registration
+    elastix = how.engine == "elastix" or how.preset is not None or bool(how.parameters)
+    return not elastix and how.borders is not False and study.images.labels is not None
 
 
 def costs(
@@ -81,7 +88,7 @@ def costs(
     """
     seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
     minutes = max(sum(seconds) / workers, *seconds) / 60.0
-    gib = sorted((gib_of(stage, voxels, cells) for stage in left), reverse=True)
+    gib = sorted((gib_of(stage, study, voxels, cells) for stage in left), reverse=True)
     needed = sum(gib[:workers])  # whichever of them meet
     loads = len(study.loads)
     models = sum(stage.kind in ("simulate", "drive") for stage in stages)

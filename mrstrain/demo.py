@@ -10,11 +10,11 @@ from pathlib import Path
 from dvc.errors import OutputError
 from dvc.imagewrite import write_labels
 from dvc.labels import read_labels, read_mask
-from dvc.transformfile import read_transform
 from dvc.whole import write_whole
 from mrstrain.againsttruth import TABLE, write_errors
 from mrstrain.loads import LOADS
 from mrstrain.making import phantom
+from mrstrain.measurements import spline_in
 from mrstrain.plan import REGISTRATION
 from mrstrain.running import REPORT, Ran, run
 from mrstrain.runpage import write_run_report
@@ -146,7 +146,7 @@ def _errors(target: Path, seed: int, ran: Ran) -> dict[str, tuple[TissueError, .
         folder = ran.study.out / REGISTRATION / load
         if ran.outcomes[f"register {load}"].record is None:
             continue
-        found = read_transform(folder / "TransformParameters.0.txt")  # of tissue relative to bone, whose motion follows
+        found = spline_in(folder)
         valid = read_mask(folder / "valid.nii.gz").inside
         errors[load] = errors_by_tissue(labels, under_load(heel, load), found, valid)
     return errors

@@ -19,12 +19,20 @@ def settings_of(
     *,
     bending: float | None = None,
     volume: float | None = None,
-    borders: bool = False,
+    borders: bool | None = None,
+    labelled: bool = False,
     allow_unknown: bool = False,
 ) -> Settings:
     """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused.
 
-    Where none is asked for: elastix if a preset or parameter files are given, else our own.
+    Where none is asked for: elastix if a preset or parameter files are given, else our own. This one lets strain jump
+    at the borders of tissues where ``labelled``, a label map tells them, unless it is told not to.
+
+    Raises
+    ------
+    ParameterError
+    InputError
+        For borders of tissues that no label map tells.
     """
     if engine is None:
         engine = "elastix" if preset or parameters else GAUSS_NEWTON
@@ -46,16 +54,7 @@ def settings_of(
         raise ParameterError(
             f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
         )
-    own = GaussNewton(bending=bending, volume=volume)
-    return Settings(gauss_newton=own, borders=AtBorders() if borders else None)
-
-
-def refuse_without_labels(labels: Path | str | None) -> None:
-    """Refuse borders of tissues that nobody has told.
-
-    Raises
-    ------
-    InputError
-    """
-    if labels is None:
+    if borders and not labelled:
         raise InputError("--borders needs the tissues: give a label map of the unloaded image with --labels.")
+    own = GaussNewton(bending=bending, volume=volume)
+    return Settings(gauss_newton=own, borders=AtBorders() if labelled and borders is not False else None)

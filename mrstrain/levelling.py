@@ -15,7 +15,7 @@ from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.imagewrite import write_image
 from dvc.tissue import tissue_mask
 from dvc.whole import whole_file, write_whole
-from mrstrain.engines import refuse_without_labels, settings_of
+from mrstrain.engines import settings_of
 from mrstrain.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.modelfiles import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.provenance import provenance, write_json
@@ -52,7 +52,7 @@ def level(
     names: Path | str | None = None,
     loads: Sequence[str] = (),
     engine: str | None = None,
-    borders: bool = False,
+    borders: bool | None = None,
     preset: str | None = None,
     parameters: Sequence[Path | str] = (),
     model_mesh: Path | str | None = None,
@@ -97,9 +97,7 @@ def level(
     """
     target, place = Path(out), Path(model)
     # Refused now rather than after the images are made.
-    settings_of(engine, preset, parameters, borders=borders, allow_unknown=True)
-    if borders:
-        refuse_without_labels(labels)
+    settings_of(engine, preset, parameters, borders=borders, labelled=labels is not None, allow_unknown=True)
     if not place.is_dir():
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
     subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)

@@ -48,10 +48,15 @@ class Measurement:
 
     def deformation(self) -> Deformation:
         """Displacement of tissue relative to its bone: with its jumps of strain at borders, where it has any."""
-        jumping = self.folder / BORDERS
-        if jumping.is_file():
-            return Within(read_transform(jumping), read_mask(self.folder / "valid.nii.gz"), margin_voxels=0)
+        if (self.folder / BORDERS).is_file():
+            return Within(spline_in(self.folder), read_mask(self.folder / "valid.nii.gz"), margin_voxels=0)
         return read_displacement(self.field)
+
+
+def spline_in(folder: Path) -> Deformation:
+    """The displacement of tissue relative to its bone that `register` found for one load, with its own gradient."""
+    jumping = folder / BORDERS
+    return read_transform(jumping if jumping.is_file() else folder / "TransformParameters.0.txt")
 
 
 def measurements_in(place: Path, loads: Sequence[str] = ()) -> list[Measurement]:

@@ -228,7 +228,7 @@ def level(
     names: Names = None,
     load: Annotated[list[str] | None, typer.Option(help="Name of a load; repeat. Default: all of the model's.")] = None,
     engine: EngineName = None,
-    borders: Borders = False,
+    borders: Borders = None,
     preset: Preset = None,
     parameters: Parameters = None,
     model_mesh: ModelMesh = None,

@@ -71,9 +71,9 @@ Bending = Annotated[
     typer.Option(help="gauss-newton: weight of bending, 1/mm. Default: chosen for each pair by cross-validation."),
 ]
 Borders = Annotated[
-    bool,
+    bool | None,
     typer.Option(
-        "--borders", help="gauss-newton: strain may jump where the tissues of --labels meet. No error bars yet."
+        help="gauss-newton: strain may jump where the tissues of --labels meet. Default: where there are labels."
     ),
 ]
 Volume = Annotated[

@@ -21,10 +21,10 @@ from mrstrain.inputs import Subject
 
 _SHEAR_SCALE = 0.5
 WITH_BORDERS = (
-    "Strain may jump where the tissues of the label map meet (--borders), and bone that was aligned on does not move "
-    "at all, by the making of it: that it is at rest says nothing on this registration. It believes the labels to half "
-    "a voxel. The whole motion is in transform.h5, as displacements at voxels; text files of elastix are not written, "
-    "since elastix knows no spline with borders."
+    "Strain may jump where the tissues of the label map meet, and bone that was aligned on does not move at all: the "
+    "figures of the bone are those of the smooth spline that came before. Labels that are off by more than a voxel "
+    "spoil it (then take --no-borders). The whole motion is in transform.h5, as displacements at voxels; text files of "
+    "elastix are not written, since elastix knows no spline with borders."
 )
 """What a load's part of the report says of it."""
 _CLOSING = (
@@ -40,7 +40,7 @@ _CLOSING = (
             "A verdict judges the registration, not the tissue. It cannot see everything: inside a uniform region, and "
             "along a smooth skin, an image does not show how tissue slides. Small shears are lifted by noise; a repeat "
             "scan without load (--repeat) tells by how much. Strain that jumps at a border of tissues is smeared over "
-            "about one spacing of the control points (3 to 5 mm), unless --borders was asked for. "
+            "about one spacing of the control points (3 to 5 mm), unless a label map told where tissues meet. "
             "Scanner distortion and creep between scans are not seen at all.",
             "A noise floor is what a repeat scan shows where there is no strain. MAER is the mean over voxels of the "
             "mean absolute value of the six strain components, SDER the standard deviation of the same.",

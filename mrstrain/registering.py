@@ -23,7 +23,7 @@ from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
 from dvc.uncertainty import ErrorModel, error_model_of, read_error_model
 from dvc.worker import Worker, each_in_workers, usable_cores
-from mrstrain.engines import refuse_without_labels, settings_of
+from mrstrain.engines import settings_of
 from mrstrain.inputs import (
     Subject,
     case_names,
@@ -83,7 +83,7 @@ def register(
     engine: str | None = None,
     bending: float | None = None,
     volume: float | None = None,
-    borders: bool = False,
+    borders: bool | None = None,
     preset: str | None = None,
     parameters: Sequence[Path | str] = (),
     allow_unknown_parameters: bool = False,
@@ -123,9 +123,9 @@ def register(
     engine : {"gauss-newton", "elastix"}, optional
         What finds the non-rigid part: our own, unless a preset or parameter files of elastix are given. ``bending``
         (1/mm) and ``volume`` (1/mm3) fix our own engine's weights, which are otherwise chosen for each pair.
-    borders : bool
-        Our own engine: strain may jump where the tissues of ``labels`` meet, and the bone stays exactly at rest. For
-        labels that are right to half a voxel; it has no error bars yet.
+    borders : bool, optional
+        Our own engine: strain may jump where the tissues of ``labels`` meet, and the bone stays exactly at rest. By
+        default where labels are given; False for a label map that is off by more than a voxel.
     preset : str, optional
         Named parameters of elastix, heel-mr by default; or ``parameters``, files of your own, applied one after the
         other.
@@ -178,11 +178,9 @@ def register(
         if value is not None and len(loads) != 1:
             raise InputError(f"{option}: belongs to one loaded image; {len(loads)} are given. Register that one alone.")
     settings = settings_of(
-        engine, preset, parameters, bending=bending, volume=volume, borders=borders,
+        engine, preset, parameters, bending=bending, volume=volume, borders=borders, labelled=labels is not None,
         allow_unknown=allow_unknown_parameters,
     )  # fmt: skip
-    if borders:
-        refuse_without_labels(labels)
     if start_frame is not None and start is None:
         raise ParameterError("--start-frame is the frame of --start, which is not given.")
     if start is not None and settings.gauss_newton is None:
@@ -218,7 +216,7 @@ def register(
     refuse_one_image_twice(
         [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
     )
-    each_voxel = _BYTES_PER_VOXEL + (_BYTES_WITH_BORDERS if borders else 0)
+    each_voxel = _BYTES_PER_VOXEL + (0 if settings.borders is None else _BYTES_WITH_BORDERS)
     needed = each_voxel * int(np.prod(subject.reference.grid.shape)) * len(cases)
     refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
     make_output(target)

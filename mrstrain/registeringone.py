@@ -7,17 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from dvc.align import AlignOn
-from dvc.borderfile import NAME as BORDERS
-from dvc.deformation import Deformation
 from dvc.imagefile import read_image
 from dvc.quality import read_noise_floor
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
-from dvc.transformfile import read_transform
 from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import Worker
 from mrstrain.engines import settings_of
 from mrstrain.inputs import read_subject
+from mrstrain.measurements import spline_in
 from mrstrain.registering import REPEAT, record_of
 from mrstrain.results import Case, write_case
 
@@ -33,7 +31,7 @@ def register_one(
     tissue: Path | None = None,
     align: AlignOn = "bone",
     engine: str | None = None,
-    borders: bool = False,
+    borders: bool | None = None,
     preset: str | None = None,
     parameters: Sequence[Path] = (),
     error_model: Path | None = None,
@@ -74,11 +72,14 @@ def register_one(
     )
     loaded = read_image(load)
     settings = replace(
-        settings_of(engine, preset, parameters, borders=borders), align_on=align, seed=seed, threads=threads
+        settings_of(engine, preset, parameters, borders=borders, labelled=labels is not None),
+        align_on=align,
+        seed=seed,
+        threads=threads,
     )
     model = error_model_of(settings.name) if error_model is None else read_error_model(error_model)
     floor = None if repeat is None else read_noise_floor(repeat / "quality.json")
-    start = None if after is None else _found(after)
+    start = None if after is None else spline_in(after)
     record = record_of(
         subject,
         {"loads": [load], "error_model": [] if error_model is None else [error_model]},
@@ -104,9 +105,3 @@ def register_one(
             progress=tell,
         )
     return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model)
-
-
-def _found(folder: Path) -> Deformation:
-    """What another load's folder holds."""
-    jumping = folder / BORDERS
-    return read_transform(jumping if jumping.is_file() else folder / "TransformParameters.0.txt")

@@ -145,6 +145,7 @@ def write_case(
         offset=offset,
         landmark_errors_mm=errors,
         floor=floor,
+        in_bone=None if found.choice is None else found.choice.in_bone,
     )
     quality = replace(quality, verdict=with_volume(quality.verdict, found.choice))
     view = page.view_of(subject, maps)

@@ -118,7 +118,7 @@ class Registering(_Part):
     """How images are registered; as the options of `register`."""
 
     engine: Literal["gauss-newton", "elastix"] | None = None
-    borders: Flag = False
+    borders: Flag | None = None
     preset: str | None = None
     parameters: tuple[str, ...] = ()
     chain: Flag = False

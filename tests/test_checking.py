@@ -128,23 +128,28 @@ def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(stu
 
 
 def test_larger_images_and_meshes_take_longer_and_more_memory(study):
+    (study / "study.toml").write_text(STUDY.replace("[registration]", "[registration]\nborders = false"))
     told = read_study(study)
     by_kind = {stage.kind: stage for stage in plan(told)}
     small, large = 126.0 * 140 * 132, 256.0**3
     registering, simulating = by_kind["register"], by_kind["simulate"]
-    assert costs.gib_of(registering, small, 0.0) == pytest.approx(1.2, abs=0.05)  # as measured
-    assert costs.gib_of(registering, large, 0.0) == pytest.approx(3.6, abs=0.05)
+    assert costs.gib_of(registering, told, small, 0.0) == pytest.approx(1.2, abs=0.05)  # as measured
+    assert costs.gib_of(registering, told, large, 0.0) == pytest.approx(3.6, abs=0.05)
     assert costs.seconds_of(registering, told, small, 0.0) == pytest.approx(66.0, rel=0.05)
     assert costs.seconds_of(registering, told, 8 * small, 0.0) == pytest.approx(8 * 66.0, rel=0.05)
-    (study / "study.toml").write_text(STUDY.replace("[registration]", "[registration]\nborders = true"))
-    with_borders = costs.seconds_of(registering, read_study(study), small, 0.0)
-    assert with_borders == pytest.approx(2.5 * 50.0 + 16.3, rel=0.05)
-    assert costs.gib_of(simulating, 0.0, 79e3) == pytest.approx(1.2)
-    assert costs.gib_of(simulating, 0.0, 8 * 79e3) == pytest.approx(8.2)
+    for text, slower in ((STUDY, 2.5), (STUDY.replace("[registration]", '[registration]\npreset = "heel-mr"'), 1.0)):
+        (study / "study.toml").write_text(text)
+        usual = read_study(study)
+        seconds, gib = (of(registering, usual, small, 0.0) for of in (costs.seconds_of, costs.gib_of))
+        assert seconds == pytest.approx(slower * 50.0 + 16.3, rel=0.05)
+        assert gib == pytest.approx(1.58 if slower > 1.0 else 1.2, abs=0.05)
+    assert costs.gib_of(simulating, told, 0.0, 79e3) == pytest.approx(1.2)
+    assert costs.gib_of(simulating, told, 0.0, 8 * 79e3) == pytest.approx(8.2)
     assert costs.seconds_of(simulating, told, 0.0, 8 * 79e3) > 8 * costs.seconds_of(simulating, told, 0.0, 79e3)
 
 
 def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, monkeypatch):
+    (study / "study.toml").write_text(STUDY.replace("[registration]", "[registration]\nborders = false"))
     told = read_study(study)
     load = next(stage for stage in plan(told) if stage.kind == "register")
     left = [replace(load, name=f"register {k}") for k in range(4)]

@@ -156,7 +156,7 @@ def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:
     assert folded.reasons == ("It folds.", doubted.reasons[0])
 
 
-@pytest.mark.parametrize("name", ["gauss-newton", "heel-mr"])
+@pytest.mark.parametrize("name", ["gauss-newton", "gauss-newton-borders", "heel-mr"])
 def test_our_own_engine_and_the_preset_for_heels_come_with_their_error(name: str) -> None:
     stored = error_model_of(name)
     assert stored is not None

@@ -16,6 +16,7 @@ from dvc.imagewrite import write_image, write_mask
 from dvc.labels import read_mask
 from dvc.presets import load_preset
 from dvc.registration import Settings
+from dvc.sharpen import AtBorders
 from mrstrain.engines import settings_of
 from mrstrain.registering import register as run
 from mrstrain.registeringone import register_one
@@ -166,6 +167,10 @@ def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_pat
     (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
     assert settings_of(None, None).gauss_newton == GaussNewton()
     assert settings_of(None, None, bending=2.0).gauss_newton == GaussNewton(bending=2.0)
+    assert settings_of(None, None, labelled=True).borders == AtBorders()
+    for without in ({}, {"labelled": True, "borders": False}):
+        assert settings_of(None, None, **without).borders is None
+    assert settings_of("elastix", None, labelled=True).borders is None
     for engine, preset, files, name in (
         (None, "heel-mr", [], "heel-mr"),
         ("elastix", None, [], "heel-mr"),

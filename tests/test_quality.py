@@ -153,6 +153,11 @@ def test_a_bone_that_moves_costs_trust():
     quality = assess(shifted, WHOLE, core(), similarity=(0.3, 0.5, 0.9))
     assert quality.bone_shift_mm == pytest.approx(0.5, rel=1e-6)
     assert quality.verdict.level == "caution"
+    at_rest = strain_maps(RigidMotion.identity(), WHOLE)
+    for in_bone, level in (((0.0, 0.0), "trust"), ((0.5, 0.0), "caution"), ((0.0, 0.3), "distrust")):
+        held = assess(at_rest, WHOLE, core(), similarity=(0.3, 0.5, 0.9), in_bone=in_bone)
+        assert held.verdict.level == level
+        assert (held.bone_shift_mm, held.bone_shear_p95) == in_bone
 
 
 def test_no_evidence_is_no_trust():

@@ -84,11 +84,10 @@ def asked(pad: Pad, **more: object) -> dict[str, object]:
 
 @pytest.fixture(scope="module")
 def out(pad) -> Path:
-    """The load registered with borders."""
+    """The load registered with a label map, and so with borders."""
     results = run(
-        pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"], out=pad.folder / "out", borders=True, threads=1,
-        **asked(pad),
-    )  # fmt: skip
+        pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"], out=pad.folder / "out", threads=1, **asked(pad)
+    )
     assert not results.failures
     return results.out
 
@@ -153,6 +152,13 @@ def test_quality_and_report_tell_the_weights_and_that_there_are_no_error_bars(ou
         assert sentence in report, sentence
     given = json.loads((out / "Load1" / "provenance.json").read_text())["parameters"]
     assert given["borders"] == {"skin": None}
+
+
+def test_the_bone_that_is_held_is_judged_by_what_the_images_would_have_it_do(out):
+    told = json.loads((out / "Load1" / "quality.json").read_text())
+    assert 0.001 < told["bone_shift_rms_mm"] < 0.3
+    assert 0.001 < told["bone_shear_p95"] < 0.1
+    assert np.nanmax(np.abs(nibabel.load(out / "Load1" / "displacement.nii.gz").dataobj)) > 2.0
 
 
 def test_what_is_read_again_has_the_jumps_that_the_maps_have(pad, out):
@@ -305,6 +311,8 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
         AtBorders(0.0)
     with pytest.raises(ParameterError, match="--borders is for --engine gauss-newton"):
         settings_of(None, "heel-mr", borders=True)
+    with pytest.raises(InputError, match="--borders needs the tissues"):
+        settings_of(None, None, borders=True)
     for wrong, kind, said in (
         ({"bone": pad.folder / "bone.nrrd"}, InputError, "--labels"),
         (asked(pad, preset="heel-mr"), ParameterError, "--borders"),
