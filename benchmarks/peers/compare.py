@@ -42,7 +42,10 @@ HERE = Path(__file__).parent
 PEERS_PYTHON = ROOT / ".venv-peers" / "bin" / "python"
 OURS = [sys.executable, "-m"]
 PEERS: dict[str, tuple[list[str], list[str]]] = {  # command, and what follows FOLDER THREADS
-    **{name: ([*OURS, "benchmarks.peers.with_mrstrain"], [name]) for name in ("gauss-newton", "heel-mr")},
+    **{
+        name: ([*OURS, "benchmarks.peers.with_mrstrain"], [name])
+        for name in ("gauss-newton", "gauss-newton-borders", "heel-mr")
+    },
     "elastix default, as acquired": ([*OURS, "benchmarks.peers.with_elastix"], ["as-acquired"]),
     "elastix default": ([*OURS, "benchmarks.peers.with_elastix"], []),
     **{
@@ -61,10 +64,11 @@ def main() -> None:
     parser.add_argument("--limit-s", type=float, default=900.0, help="wall time after which a peer is stopped")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
-    if not PEERS_PYTHON.exists():
+    theirs = any(PEERS[peer][0][0] != sys.executable for peer in given.peers)
+    if theirs and not PEERS_PYTHON.exists():
         parser.error("the peers' environment is not there: run 'make peers' first")
-    kept = json.loads(given.out.read_text())["runs"] if given.out.exists() else []
-    about = versions() | _peer_versions()
+    earlier = json.loads(given.out.read_text()) if given.out.exists() else {"runs": [], "versions": {}}
+    kept, about = earlier["runs"], earlier["versions"] | versions() | (_peer_versions() if theirs else {})
     for name in given.pairs:
         missing = [p for p in given.peers if not any(r["pair"] == name and r["peer"] == p for r in kept)]
         if not missing:
@@ -126,10 +130,11 @@ def _children_cpu_s() -> float:
 
 def _found(folder: Path) -> Deformation:
     """The displacement or transform that an adapter has left (see `exchange`)."""
-    image, text = folder / "found.mha", folder / "found.txt"
+    image = folder / "found.mha"
     if image.exists():
         return read_displacement(image)
-    return read_transform(text if text.exists() else folder / "found.tfm")
+    ours = (folder / f"found.{ending}" for ending in ("txt", "npz"))
+    return read_transform(next((file for file in ours if file.exists()), folder / "found.tfm"))
 
 
 def _last_line(log: Path) -> str:

@@ -2,8 +2,8 @@
 
 An adapter is a script, run as ``python with_tool.py FOLDER THREADS``. It reads the images of `pairs.write_pair` from
 the folder and leaves there the displacement u(X) of the reference configuration, LPS mm, as ``found.mha`` (a vector
-image on any grid; between its voxels it is taken as a cubic spline), or as a transform: ``found.txt`` (elastix) or
-``found.tfm`` (ITK).
+image on any grid; between its voxels it is taken as a cubic spline), or as a transform: ``found.txt`` (elastix),
+``found.tfm`` (ITK) or ``found.npz`` (ours).
 """
 
 from __future__ import annotations

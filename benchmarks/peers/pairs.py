@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.registration_accuracy import without_motion
 from dvc.image import Grid, Image, Mask
-from dvc.imagewrite import write_image, write_mask
+from dvc.imagewrite import write_image, write_labels, write_mask
 from dvc.resample import carry, fill_missing
 from dvc.shading import without_shading
 from phantoms.anatomy import Heel
@@ -33,7 +33,8 @@ def pair_named(name: str) -> HeelPair:
 def write_pair(pair: HeelPair, folder: Path) -> None:
     """Write what the peers read: MetaImages, whose header is LPS mm as ITK has it.
 
-    ``scan0``, ``scan1`` (as acquired), ``bone`` and ``body`` on the reference's grid are what mrstrain is given;
+    ``scan0``, ``scan1`` (as acquired), ``bone`` and ``body`` on the reference's grid are what mrstrain is given (and
+    ``labels``, where it lets strain jump at borders of tissues);
     ``scan1-moved`` is scan1 with the foot's true motion taken out in its header. The others are prepared, so that every
     peer has the help that mrstrain has or finds for itself: shading removed, the foot's *true* motion taken out of the
     loaded image, and only the body's box.
@@ -47,6 +48,7 @@ def write_pair(pair: HeelPair, folder: Path) -> None:
     write_image(folder / "scan1.mha", pair.loaded)
     write_mask(folder / "bone.mha", pair.bone)
     write_mask(folder / "body.mha", body)
+    write_labels(folder / "labels.mha", pair.labels)
     grid = _box(body)
     write_image(folder / "scan1-moved.mha", without_motion(pair.loaded, pair.foot_motion))
     loaded = without_motion(without_shading(pair.loaded), pair.foot_motion)

@@ -1,5 +1,7 @@
 """mrstrain by its own engine or a preset: the scans as acquired, body and bone; the foot's motion it finds for itself.
 
+By the engine that knows borders it gets the label map as well.
+
 Runs in mrstrain's environment, as ``python -m benchmarks.peers.with_mrstrain FOLDER THREADS NAME``.
 """
 
@@ -8,8 +10,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from dvc.borderfile import write_bordered_spline
+from dvc.bspline import BSpline
 from dvc.image import Mask
 from dvc.imagefile import read_image
+from dvc.labels import read_labels
 from dvc.registration import Settings, register
 from dvc.transformwrite import write_elastix_transform
 
@@ -21,8 +26,12 @@ def main() -> None:
         Mask(mask.grid, mask.values > 0) for mask in (read_image(folder / f"{name}.mha") for name in ("bone", "body"))
     )
     settings = Settings.of(sys.argv[3], threads=threads)
-    found = register(reference, loaded, bone=bone, tissue=body, settings=settings)
-    write_elastix_transform(folder, found.bspline, None, reference.grid)[0].rename(folder / "found.txt")
+    labels = None if settings.borders is None else read_labels(folder / "labels.mha", folder / "labels.csv")
+    found = register(reference, loaded, bone=bone, tissue=body, labels=labels, settings=settings)
+    if isinstance(found.bspline, BSpline):
+        write_elastix_transform(folder, found.bspline, None, reference.grid)[0].rename(folder / "found.txt")
+    else:
+        write_bordered_spline(folder / "found.npz", found.bspline)
 
 
 if __name__ == "__main__":
