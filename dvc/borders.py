@@ -23,7 +23,8 @@ _SURE = 0.03  # of the blurred mask: between that and its complement the border'
 _NEAR = 1.0  # voxels
 _EVEN = 0.7  # voxels
 _LEAST_MM = 0.05  # every voxel stays on its own side of the border
-NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm": _LEAST_MM}
+_GAP_MM = 3.0  # from a tissue: what has no label there belongs to it
+NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm": _LEAST_MM, "gap_mm": _GAP_MM}
 """Every number that decides where a border lies, for a record."""
 
 
@@ -58,7 +59,7 @@ class Borders:
     reach_mm: float
 
     @classmethod
-    def of(cls, labels: LabelMap, bone: Mask | None, reach_mm: float) -> Borders:
+    def of(cls, labels: LabelMap, bone: Mask | None, reach_mm: float, body: Mask | None = None) -> Borders:
         """Borders of the tissues in a label map.
 
         Parameters
@@ -68,22 +69,28 @@ class Borders:
             Bone that does not move, on the same grid; it counts as a tissue of its own, whatever its labels are.
         reach_mm : float
             L: about the spacing of the control points.
+        body : Mask, optional
+            On the same grid. What of it has no label belongs to the nearest tissue within 3 mm, the bone at rest never
+            being that; and is a tissue of its own beyond.
 
         Raises
         ------
         GeometryError
-            If the bone is not on the grid of the labels.
+            If bone or body are not on the grid of the labels.
         InputError
             If no voxel has a label, or the reach is not above zero.
         """
-        if bone is not None and not bone.grid.same_as(labels.grid):
-            raise GeometryError("The bone is not on the grid of the label map; bring it there (fit_mask).")
+        for name, mask in (("bone", bone), ("body", body)):
+            if mask is not None and not mask.grid.same_as(labels.grid):
+                raise GeometryError(f"The {name} is not on the grid of the label map; bring it there (fit_mask).")
         if not (np.isfinite(reach_mm) and reach_mm > 0):
             raise InputError(f"The reach of a border must be above 0 mm; got {reach_mm}.")
         values = labels.labels if bone is None else np.where(bone.inside, -1, labels.labels)
         if not values.any():
             raise InputError("The label map has no tissue in the part of the image that is registered.")
         spacing = labels.grid.spacing_mm
+        if body is not None:
+            values = _labelled(values, body.inside & (values == 0), spacing)
         nearest = distance_transform_edt(values == 0, sampling=spacing, return_distances=False, return_indices=True)
         tissues, own = np.unique(values[tuple(nearest)], return_inverse=True)
         rest = int(np.flatnonzero(tissues == -1)[0]) if bool((tissues == -1).any()) else -1
@@ -150,6 +157,15 @@ class Borders:
     def _slopes_at_voxels(self, coefficients: FloatArray, where: BoolArray) -> FloatArray:
         per_voxel = evaluate_spline(coefficients[None], np.argwhere(where).astype(np.float64), mirror=True)[1][:, 0]
         return np.asarray(per_voxel / self.grid.spacing_mm)
+
+
+def _labelled(values: IntArray, unknown: BoolArray, spacing_mm: FloatArray) -> IntArray:
+    """Labels with those of unknown voxels of the body filled in; -1 is the bone at rest."""
+    filled = np.where(unknown, values.max() + 1, values)
+    if unknown.any() and (values > 0).any():
+        gap_mm, nearest = distance_transform_edt(values <= 0, sampling=spacing_mm, return_indices=True)
+        filled = np.where(unknown & (gap_mm <= _GAP_MM), values[tuple(nearest)], filled)
+    return np.asarray(filled)
 
 
 def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:

@@ -107,7 +107,7 @@ def fit_with_borders(
         progress=lambda share: progress(_SMOOTH_SHARE * share),
     )  # fmt: skip
     axes, control = np.array(fixed.grid.direction), smooth.control
-    borders = Borders.of(labels, bone, float(control.spacing_mm.mean()))
+    borders = Borders.of(labels, bone, float(control.spacing_mm.mean()), body)
     soft = body.inside & (borders.own != borders.rest)
     skin = soft & np.isin(labels.labels, [number for number, name in labels.names.items() if name.lower() == _SKIN])
     usual = USUAL_SKIN if at_borders.skin is None else at_borders.skin

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -46,6 +48,23 @@ def inner_points(count: int, seed: int = 1) -> np.ndarray:
 @pytest.fixture(scope="module")
 def borders() -> Borders:
     return borders_of(layers())
+
+
+def test_what_has_no_label_in_the_body_never_is_the_bone_at_rest():
+    """A gap belongs to the tissue beside it; a large part is a tissue of its own; so is all beside a bone alone."""
+    labels = layers()
+    bone, body = labels.region("bone"), Mask(GRID, np.ones(GRID.shape, dtype=bool))
+    values = labels.labels.copy()
+    z = height(GRID.points())
+    gap, far = (z > BONE_MM) & (z < BONE_MM + 2.0), z > SKIN_MM + 4.0
+    values[gap] = 0
+    whole, with_gap = (Borders.of(replace(labels, labels=v), bone, REACH_MM, body) for v in (labels.labels, values))
+    np.testing.assert_array_equal(with_gap.own, whole.own)
+    assert set(np.unique(whole.own[far])) == {2, 3}  # the skin, and what lies more than 3 mm outside it
+    assert np.count_nonzero(whole.own[far] == 3) > 100
+    assert np.unique(Borders.of(replace(labels, labels=values), bone, REACH_MM).own[gap]).tolist() == [0, 1]
+    alone = Borders.of(replace(labels, labels=bone.inside.astype(np.int64)), bone, REACH_MM, body)
+    assert np.all((alone.own == alone.rest) == bone.inside)
 
 
 @pytest.fixture(scope="module")

@@ -273,6 +273,21 @@ def test_threads_do_not_change_a_bit(layers):
     np.testing.assert_array_equal(one.borders.depth, two.borders.depth)
 
 
+def test_labels_of_the_bone_alone_hold_nothing_but_the_bone(layers, worker):
+    """Tissue without a label is none that is at rest, though no label is nearer than the bone's."""
+    fixed, moving, body, bone = (layers[name] for name in ("reference", "loaded", "tissue", "bone"))
+    alone = LabelMap(fixed.grid, bone.inside.astype(np.int64), {1: "bone"})
+    found, _ = by_gauss_newton(
+        fixed, moving, body, bone, not_aligned(fixed, moving, body), FIXED, None, worker, lambda _: None,
+        (AtBorders(), alone),
+    )  # fmt: skip
+    fat = layers["labels"].region("fat").points()
+    true = sheared(fat, 0.0)
+    u = found.displacement(fat)
+    assert np.median(np.linalg.norm(u - true, axis=1)) < 0.15 * np.median(np.linalg.norm(true, axis=1))
+    assert not found.displacement(bone.points()).any()
+
+
 def test_a_result_with_borders_may_be_a_start(layers, worker):
     """Images of one texture, 19 mm apart, which no search from nothing finds; no bone is held."""
     far = np.array([14.0, -10.0, 9.0])
