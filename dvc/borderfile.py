@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
+import json
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from dvc.arrays import FloatArray, frozen
-from dvc.borders import BorderedSpline, Borders
+from dvc.borders import NUMBERS, BorderedSpline, Borders
 from dvc.bspline import BSpline
 from dvc.errors import InputError, MrstrainError
 from dvc.image import Grid
@@ -17,6 +19,7 @@ from dvc.whole import whole_file
 
 NAME = "spline_with_borders.npz"
 _FORMAT = 1
+_UNREADABLE = OSError, EOFError, zlib.error, zipfile.BadZipFile, ValueError, KeyError, TypeError
 
 
 def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
@@ -28,6 +31,7 @@ def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
         np.savez_compressed(
             file,
             format=_FORMAT,
+            numbers=json.dumps(NUMBERS),
             smooth=spline.smooth.coefficients_mm,
             jump=spline.jump.coefficients_mm,
             own=spline.borders.own.astype(np.int16),
@@ -50,13 +54,15 @@ def read_bordered_spline(path: Path | str) -> BorderedSpline:
         with np.load(io.BytesIO(Path(path).read_bytes())) as file:
             if int(file["format"]) != _FORMAT:
                 raise ValueError(f"format {int(file['format'])}, not {_FORMAT}")
+            if json.loads(str(file["numbers"])) != NUMBERS:
+                raise ValueError(f"borders found with {file['numbers']}, not {NUMBERS}; register again")
             control = _grid(file["control"])
             own = frozen(file["own"], np.int64)
             borders = Borders.between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
             return BorderedSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, MrstrainError) as failure:
+    except (*_UNREADABLE, MrstrainError) as failure:
         raise InputError(
-            f"{path}: no displacement with borders as `register --borders` writes it ({type(failure).__name__}: "
+            f"{path}: no displacement with borders as `mrstrain register` writes it ({type(failure).__name__}: "
             f"{failure})."
         ) from failure
 

@@ -89,6 +89,8 @@ class Quality:
         Root mean square displacement left inside the bone, which is rigid: zero is the truth. NaN without a bone.
     bone_shear_p95 : float
         95th percentile of the apparent maximal shear inside the bone; NaN without.
+    bone_held : bool
+        Whether these two are of a displacement before the bone was held at rest, as it is in the maps.
     landmark_errors_mm : (n,) or None
         Distance between each registered and each given landmark.
     noise_floor : NoiseFloor or None
@@ -104,6 +106,7 @@ class Quality:
     undefined_fraction: float
     bone_shift_mm: float
     bone_shear_p95: float
+    bone_held: bool
     landmark_errors_mm: FloatArray | None
     noise_floor: NoiseFloor | None
     verdict: Verdict
@@ -129,6 +132,7 @@ class Quality:
             "undefined_fraction_of_tissue": plain(self.undefined_fraction),
             "bone_shift_rms_mm": plain(self.bone_shift_mm),
             "bone_shear_p95": plain(self.bone_shear_p95),
+            "bone_figures_before_it_was_held_at_rest": self.bone_held,
             "landmarks": None
             if errors is None
             else {
@@ -217,8 +221,8 @@ def assess(
         Between the registered images, as a share of brightness, at the noise and at a multiple of it
         (`dvc.similarity.brightness_offset`). It is not trusted where it is too much for half as much noise again.
     in_bone : (mm, shear), optional
-        Root mean square displacement and 95th percentile of the maximal shear in the bone, as the images alone would
-        have them, where the maps hold it at rest.
+        Where the maps hold the bone at rest: root mean square displacement and 95th percentile of the maximal shear
+        in it before that was asked.
     """
     lines = limits or Limits()
     jacobian = maps.jacobian
@@ -226,11 +230,11 @@ def assess(
     lowest, at = _lowest(jacobian, maps.grid)
     undefined = 1.0 - int(np.count_nonzero(maps.valid & tissue.inside)) / max(int(np.count_nonzero(tissue.inside)), 1)
     bone_shift = bone_shear = float("nan")
-    if in_bone is not None:
-        bone_shift, bone_shear = in_bone
-    elif bone is not None:
+    if bone is not None:
         kept = bone.inside & maps.valid
-        if kept.any():
+        if kept.any() and in_bone is not None:
+            bone_shift, bone_shear = in_bone
+        elif kept.any():
             squared = (maps.displacement_mm[kept].astype(np.float64) ** 2).sum(axis=1)
             bone_shift = float(np.sqrt(squared.mean()))
             bone_shear = float(np.percentile(maps.max_shear[kept], 95))
@@ -344,6 +348,7 @@ def assess(
         float(undefined),
         bone_shift,
         bone_shear,
+        in_bone is not None,
         landmark_errors_mm,
         floor,
         _together(findings),

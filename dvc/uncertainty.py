@@ -129,7 +129,8 @@ class ErrorModel:
             raise InputError(
                 f"The error of {self.preset} is known for voxels of {known}. These images have voxels of "
                 f"{_told(spacing_mm)} mm at SNR {snr:.0f}, too far from any of these: measure it with `mrstrain "
-                "accuracy` (--spacing, --slice-spacing, --snr) and give its file as --error-model."
+                f"accuracy --preset {self.preset}` (--spacing, --slice-spacing, --snr) and give its file as "
+                "--error-model."
             )
         return nearest
 

@@ -160,6 +160,11 @@ def _registration(study: Study, found: _Findings) -> None:
     model = error_model_of(settings.name) if own is None else found.tried(read_error_model, study.path(own))
     if model is None:
         found.notes.append(f"{settings.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
+    elif model.preset != settings.name:
+        found.notes.append(
+            f"The error model is that of {model.preset}, and {settings.name} will be used: results will have no "
+            f"intervals (`mrstrain accuracy --preset {settings.name}` makes one)."
+        )
 
 
 def _simulations(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> float:

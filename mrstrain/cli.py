@@ -295,7 +295,7 @@ def accuracy(
     out: Out,
     preset: Annotated[
         list[str] | None,
-        typer.Option(help="Preset of elastix, its parameter file (.txt), or gauss-newton; repeatable."),
+        typer.Option(help="gauss-newton, gauss-newton-borders (labels), elastix' preset or file (.txt); repeatable."),
     ] = None,
     spacing: Annotated[list[float] | None, typer.Option(help="Edge of the voxels, mm; repeat for several.")] = None,
     slice_spacing: Annotated[

@@ -43,10 +43,10 @@ _CLOSING = Section(
         "behind the measured field, and the model's area to each is taken. Where an interval does not hold the area "
         "as found, noise and smoothing have moved the measured curve. Two models are told apart where the area of one "
         "is the smaller in 97.5 % of the draws, widened as the intervals are.",
-        "A measurement smears strain that jumps at a border of tissues over about 4 mm, and noise lifts small shears; "
-        "a model does neither. What the measurement cannot see, no comparison can: scanner distortion, creep during "
-        "a scan, tissue that slides along a smooth skin or inside a uniform region. Levels of strain are no "
-        "thresholds of injury unless the table of thresholds says so and why.",
+        "A measurement without a label map smears strain that jumps at a border of tissues over about 4 mm, and noise "
+        "lifts small shears; a model does neither. What the measurement cannot see, no comparison can: scanner "
+        "distortion, creep during a scan, tissue that slides along a smooth skin or inside a uniform region. Levels of "
+        "strain are no thresholds of injury unless the table of thresholds says so and why.",
     ),
 )  # fmt: skip
 

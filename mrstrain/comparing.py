@@ -190,7 +190,7 @@ def compare(
     record = provenance(
         "compare",
         {
-            "measured": [m.field for m in measurements], "models": given, "labels": Path(labels),
+            "measured": [f for m in measurements for f in m.files], "models": given, "labels": Path(labels),
             "names": [] if names is None else [Path(names)], "mesh": [] if mesh is None else [Path(mesh)],
             "error_models": [f for m in measurements if (f := m.folder / "error_model.json").is_file()],
         },

@@ -103,7 +103,7 @@ def drive(
     own = [Path(s) for s in sets if str(s).endswith(".toml")]
     record = provenance(
         "drive",
-        {"mesh": place, "measured": [m.field for m in found], "sets": own},
+        {"mesh": place, "measured": [f for m in found for f in m.files], "sets": own},
         {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame},
     )
     lines = [

@@ -40,6 +40,7 @@ from mrstrain.page import said
 _BONES = {"bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform"}
 _SOFT = {"fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage"}
 _MOSTLY = 0.5
+_UNLABELLED = 0.1
 _SIGMA_SCALE = 0.1
 
 
@@ -114,6 +115,7 @@ def error_bars(found: Registration, subject: Subject, maps: StrainMaps, model: E
     grid = maps.grid
     try:
         chosen = _model_for(found, model)
+        _refuse_unlabelled(found, subject)
         table = chosen.table_for(*_poorer(found))
     except InputError as reason:
         return ErrorBars(None, str(reason))
@@ -147,17 +149,38 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
     if len(used.presets) > 1:
         raise InputError("The error of several stages, one after the other, has not been measured.")
     if given is None:
-        raise InputError(f"The error of {used.name} has not been measured; `mrstrain accuracy` does that.")
+        raise InputError(
+            f"The error of {used.name} has not been measured; `mrstrain accuracy --preset {used.name}` does that."
+        )
     if given.preset != used.name:
-        raise InputError(f"The error model is that of {given.preset}, and {used.name} was used.")
+        raise InputError(
+            f"The error model is that of {given.preset}, and {used.name} was used: `mrstrain accuracy --preset "
+            f"{used.name}` measures that."
+        )
     if given.parameters_sha256 != hashlib.sha256(used.text.encode()).hexdigest():
         raise InputError(_otherwise(used))
+    if used.borders is not None and used.align_on != "bone":
+        raise InputError(
+            f"The error of {used.name} was measured with the bone held at rest; here nothing was aligned on a bone."
+        )
     if found.choice is not None and found.choice.frees_volume:
         raise InputError(
             f"The error of {used.name} was measured on phantoms that keep their volume; here the images ask for a "
             "change of volume, which was allowed."
         )
     return given
+
+
+def _refuse_unlabelled(found: Registration, subject: Subject) -> None:
+    """Refuse a registration with borders of tissues of which a part has no label."""
+    if found.settings.borders is None or subject.labels is None:
+        return
+    share = float(np.mean(subject.labels.labels[found.tissue.inside] == 0))
+    if share > _UNLABELLED:
+        raise InputError(
+            f"{share:.0%} of the body has no label: the error of {found.settings.name} was measured on bodies of which "
+            "every tissue has one. Label it, or take one smooth spline (--no-borders)."
+        )
 
 
 def _otherwise(used: Settings) -> str:

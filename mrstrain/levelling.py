@@ -10,13 +10,13 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from dvc.displacementfile import read_displacement
 from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.imagewrite import write_image
 from dvc.tissue import tissue_mask
 from dvc.whole import whole_file, write_whole
 from mrstrain.engines import settings_of
 from mrstrain.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.measurements import measurements_in
 from mrstrain.modelfiles import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.provenance import provenance, write_json
 from mrstrain.registering import register
@@ -165,17 +165,18 @@ def level(
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")
         else:
-            _write(target / name / f"{load}.vtu", result, registered / load / load / "displacement.nii.gz")
+            _write(target / name / f"{load}.vtu", result, registered / load)
     if len(failures) == len(results):
         raise RegistrationError(" ".join(failures))
     notes += failures
     return Levelled(target / name, tuple(notes))
 
 
-def _write(path: Path, result: FeResult, field: Path) -> None:
+def _write(path: Path, result: FeResult, registered: Path) -> None:
     """The measured displacement at the nodes of the model's mesh; where it is not defined, that of the nearest node."""
     mesh = result.mesh
-    u = filled_from_nearest(read_displacement(field).displacement(mesh.points_mm), mesh.points_mm)
+    (measured,) = measurements_in(registered)
+    u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)
     region = np.zeros(len(mesh.cells), dtype=np.int64)
     for number, cells in enumerate(mesh.regions.values(), start=1):
         region[cells] = number

@@ -16,7 +16,8 @@ from dvc.transformfile import read_transform
 from dvc.uncertainty import ErrorTable, read_error_model
 from dvc.verdict import Verdict, worst
 
-_FIELD, _REPEAT = "displacement.nii.gz", "repeat"  # a repeat scan is no load
+_FIELD, _VALID = "displacement.nii.gz", "valid.nii.gz"
+_REPEAT = "repeat"  # a repeat scan is no load
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,17 +47,25 @@ class Measurement:
         """The displacement image."""
         return self.folder / _FIELD
 
+    @property
+    def files(self) -> list[Path]:
+        """What is read of the displacement."""
+        jumping = self.folder / BORDERS
+        return [jumping, self.folder / _VALID] if jumping.is_file() else [self.field]
+
     def deformation(self) -> Deformation:
         """Displacement of tissue relative to its bone: with its jumps of strain at borders, where it has any."""
         if (self.folder / BORDERS).is_file():
-            return Within(spline_in(self.folder), read_mask(self.folder / "valid.nii.gz"), margin_voxels=0)
+            return Within(spline_in(self.folder), read_mask(self.folder / _VALID), margin_voxels=0)
         return read_displacement(self.field)
 
 
 def spline_in(folder: Path) -> Deformation:
     """The displacement of tissue relative to its bone that `register` found for one load, with its own gradient."""
-    jumping = folder / BORDERS
-    return read_transform(jumping if jumping.is_file() else folder / "TransformParameters.0.txt")
+    for name in (BORDERS, "TransformParameters.0.txt"):
+        if (folder / name).is_file():
+            return read_transform(folder / name)
+    raise InputError(f"{folder} has neither {BORDERS} nor TransformParameters.0.txt: register this load again.")
 
 
 def measurements_in(place: Path, loads: Sequence[str] = ()) -> list[Measurement]:

@@ -163,8 +163,8 @@ def _weights(own: Record, borders: Record | None, on_bone: bool) -> str:
     weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
     return (
         f"{told}; from there a second B-spline was added that vanishes on the borders of the label map's tissues, so "
-        f"that strain may jump there, {'the bone held at rest and ' if on_bone else ''}strain of the skin penalised "
-        f"(weight {weight})"
+        f"that strain may jump there, {'the bone held at rest and ' if on_bone else ''}strain of a tissue called skin "
+        f"penalised (weight {weight})"
     )
 
 

@@ -168,9 +168,10 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
         for said, value in zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True):
             rows.append((f"Local similarity in the tissue, {said}", float(value), ""))
         rows.append(("Local similarity that noise as in the air allows, about", quality.most_similarity, ""))
+    bone = "in the bone, before it was held at rest" if quality.bone_held else "left in the bone"
     rows += [
-        ("Displacement left in the bone (truth: 0), rms", quality.bone_shift_mm, "mm"),
-        ("Apparent maximal shear in the bone (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
+        (f"Displacement {bone} (truth: 0), rms", quality.bone_shift_mm, "mm"),
+        (f"Apparent maximal shear {bone} (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
         ("Folded voxels (det F <= 0)", quality.folded_voxels, "voxels"),
         ("Lowest det F", quality.lowest_jacobian, ""),
         ("Tissue without a result", 100.0 * quality.undefined_fraction, "%"),

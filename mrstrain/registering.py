@@ -118,7 +118,8 @@ def register(
     tissue : path, optional
         Mask of the body, bone included; found by a threshold where it is not given.
     labels, names : path, optional
-        Label map of the tissues on the unloaded image and the table of its names, for statistics by region.
+        Label map of the tissues on the unloaded image and the table of its names, for statistics by region, and for
+        ``borders``.
     align : {"bone", "image", "none"}
     engine : {"gauss-newton", "elastix"}, optional
         What finds the non-rigid part: our own, unless a preset or parameter files of elastix are given. ``bending``

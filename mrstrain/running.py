@@ -217,7 +217,8 @@ def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence
         if name not in known:
             raise InputError(f"No stage is called '{name}'. There are: {', '.join(known)}.")
     for name in force if only else ():
-        if not any({stage.name, stage.kind} & {name} and {stage.name, stage.kind} & {*only} for stage in stages):
+        meant = [stage for stage in stages if name in (stage.name, stage.kind)]
+        if meant and not any({stage.name, stage.kind} & {*only} for stage in meant):
             raise InputError(f"--force {name} makes nothing anew: --only {', '.join(only)} leaves it out.")
 
 

@@ -18,7 +18,7 @@ from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
 from mrstrain.results import Case, Measured, write_measured
 
-_TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm")
+_TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm", ".npz")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,8 +121,8 @@ def strain(
     reference : path
         Unloaded image (reference configuration): gives the voxels.
     deformation : path
-        An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), or a displacement
-        image. All map points of the reference to points of the loaded image.
+        An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), a spline with borders of
+        tissues (.npz), or a displacement image. All map points of the reference to points of the loaded image.
     out : path
     bone, bone_label, labels, names
         With a bone, its rigid motion (least squares over its voxels) is taken out of the displacement.

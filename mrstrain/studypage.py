@@ -22,8 +22,8 @@ _CLOSING = (
             "Motions: still (foot moved, no strain), smooth (a flow without jumps of strain), sliding (the fat pad "
             "slides inside bone and skin at rest: strain jumps at both borders), Load1 to Load4 (both together, as "
             "strong as the forces of the published experiment), wave-L (shear that varies as a cosine of wavelength L "
-            "mm). Where labels are off, patches of 5 mm of the label map that the registration was given are moved by "
-            "up to so many voxels along each axis.",
+            "mm). Labels +1 or -1: in the label map that the registration was given bones and skin are too large, or "
+            "too small, by so many voxels.",
             "Spatial resolution is the wavelength of which a share of the strain is recovered. A smaller wavelength is "
             "bought with more noise: give both, or none.",
             "SD and bias in the error model are given the shear that was found. They hold for tissue strained and "
@@ -92,7 +92,7 @@ def _sections(
 
 
 def _motion(row: ErrorRow) -> str:
-    return f"{row.motion}, labels off by {row.labels_off:g}" if row.labels_off else row.motion
+    return f"{row.motion}, labels {row.labels_off:+d}" if row.labels_off else row.motion
 
 
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:

@@ -29,7 +29,7 @@ class ErrorRow:
     voxel_mm : str
         Such as "0.8" or "0.8 x 0.8 x 1.6".
     snr : float
-    labels_off : float
+    labels_off : int
         As in `phantoms.study.Case`.
     motion, tissue : str
     by : {"all", "distance to bone, mm", "distance to a border, mm", "true maximal shear"}
@@ -48,7 +48,7 @@ class ErrorRow:
     preset: str
     voxel_mm: str
     snr: float
-    labels_off: float
+    labels_off: int
     motion: str
     tissue: str
     by: str
@@ -215,7 +215,7 @@ def _bins(runs: Sequence[Samples], tissue: Sequence[BoolArray]) -> Iterator[tupl
 
 
 def _row(
-    condition: tuple[str, str, float, float],
+    condition: tuple[str, str, float, int],
     place: tuple[str, str, str, float, float],
     runs: Sequence[Samples],
     kept: Sequence[BoolArray],

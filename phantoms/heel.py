@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
+from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.spatial.transform import Rotation
-from skimage.transform import resize
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation import Composed, Motion, RigidMotion
@@ -42,7 +42,7 @@ _FIELD_MM = (100.8, 112.0, 105.6)
 _FINEST_MM, _COARSEST_MM, _LARGEST = 0.3, 4.0, 512
 _CHUNK = 300_000
 _COARSE = 4
-_PATCH_MM = 5.0  # of a label map whose borders are off
+_STIFF = ("bone", "ankle", "skin")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,15 +172,17 @@ def labels_of(heel: Heel, grid: Grid) -> LabelMap:
     return LabelMap(grid, heel.tissue_at(grid.points().reshape(-1, 3)).reshape(grid.shape), TISSUES)
 
 
-def badly_drawn(labels: LabelMap, voxels: float, seed: int) -> LabelMap:
-    """A label map as a hurried hand draws it: patches of 5 mm are moved by up to so many voxels along each axis."""
-    grid = labels.grid
-    patches = [max(2, int(np.ceil(n * s / _PATCH_MM)) + 1) for n, s in zip(grid.shape, grid.spacing_mm, strict=True)]
-    random = np.random.default_rng([seed, 5])
-    at = np.indices(grid.shape, dtype=np.float32)
-    moved = [resize(random.uniform(-voxels, voxels, patches), grid.shape, order=1, mode="edge") for _ in range(3)]
-    nearest = [np.clip(np.rint(a + m), 0, n - 1).astype(np.intp) for a, m, n in zip(at, moved, grid.shape, strict=True)]
-    return LabelMap(grid, labels.labels[tuple(nearest)], labels.names)
+def badly_drawn(labels: LabelMap, voxels: int) -> LabelMap:
+    """A label map whose bones and skin are drawn too large by so many voxels or, below zero, too small.
+
+    They grow into the softer tissue beside them, or that into them; the body stays as large as it is.
+    """
+    stiff = np.isin(labels.labels, [number for number, name in labels.names.items() if name in _STIFF])
+    soft = (labels.labels > 0) & ~stiff
+    growing, yielding = (stiff, soft) if voxels > 0 else (soft, stiff)
+    moved = binary_dilation(growing, iterations=abs(voxels)) & yielding if voxels else np.zeros_like(stiff)
+    nearest = distance_transform_edt(~growing, return_distances=False, return_indices=True)
+    return LabelMap(labels.grid, np.where(moved, labels.labels[tuple(nearest)], labels.labels), labels.names)
 
 
 def labels_to_mesh(heel: Heel, labels: LabelMap) -> LabelMap:

@@ -64,8 +64,9 @@ class Case:
         "Load4", or "wave-L" with a wavelength L in mm.
     seed : int
         Of the heel, its images and the foot's motion.
-    labels_off : float
-        By how many voxels the label map that the registration gets is off, as `phantoms.heel.badly_drawn` makes it.
+    labels_off : int
+        By how many voxels bones and skin are too large in the label map that the registration gets, or too small
+        (`phantoms.heel.badly_drawn`).
     """
 
     preset: str
@@ -73,13 +74,13 @@ class Case:
     snr: float
     motion: str
     seed: int
-    labels_off: float = 0.0
+    labels_off: int = 0
 
     @property
     def name(self) -> str:
         """For a file and for people."""
         spacing = "x".join(f"{s:g}" for s in self.spacing_mm)
-        off = f"_off{self.labels_off:g}" if self.labels_off else ""
+        off = f"_labels{self.labels_off:+d}" if self.labels_off else ""
         return f"{Path(self.preset).stem}_{spacing}mm_snr{self.snr:g}_{self.motion}_{self.seed}{off}"
 
     @property
@@ -107,9 +108,9 @@ class Samples:
     unknown : int
         Voxels of the heel without a result, of those sampled.
     tissue : (n,)
-        Label numbers of `phantoms.anatomy.TISSUES`.
+        Label numbers of `phantoms.anatomy.TISSUES`, in the label map that the registration was given.
     to_bone_mm, to_border_mm : (n,)
-        Distance to the surface of the nearest bone (0 in it) and to that of another tissue, mm.
+        Distance to the surface of the nearest bone (0 in it) and to that of another tissue in that map, mm.
     true_shear, shear : (n,)
         Maximal shear (E_1 - E_3) / 2, true and found.
     u_error_mm : (n, 3)
@@ -246,11 +247,11 @@ def measure(
         # Every pair is scanned anew, with noise, shading and foot motion of its own; presets see the same pairs.
         number = zlib.crc32(f"{case.motion} {case.spacing_mm} {case.snr}".encode())
         foot = RigidMotion.identity() if wave else drawn_motion(case.seed, number)
-        labels = labels_of(heel, grid)
-        drawn = badly_drawn(labels, case.labels_off, case.seed) if case.labels_off else labels
+        exact = labels_of(heel, grid)
+        labels = badly_drawn(exact, case.labels_off)
         bone, body = labels.region("bone"), Mask(grid, labels.labels > 0)
         reference = scan(heel, grid, snr=case.snr, number=number)
-        where = covering(grid, foot.apply(bone.points()))
+        where = covering(grid, foot.apply(exact.region("bone").points()))
         loaded = scan(heel, where, motion, foot, snr=case.snr, number=number + 1)
     # A wave moves the bone too: nothing there to align on.
     settings = Settings.of(case.preset, align_on="none" if wave else "bone", threads=worker.threads)
@@ -262,9 +263,9 @@ def measure(
     found = register(
         reference,
         loaded,
-        bone=drawn.region("bone"),
-        tissue=Mask(grid, drawn.labels > 0),
-        labels=drawn,
+        bone=bone,
+        tissue=body,
+        labels=labels,
         settings=settings,
         worker=worker,
         progress=lambda stage, fraction: progress(fraction if stage != "aligning" else 0.0),

@@ -142,6 +142,12 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     assert "gauss-newton-borders was used" in error_bars(found, subject, maps, own).told
     with_borders = model("gauss-newton-borders", text=found.settings.text)
     assert error_bars(found, subject, maps, with_borders).uncertainty is not None
+    unlabelled = subject.labels.labels.copy()
+    unlabelled[12:20] = 0
+    partly = replace(subject, labels=replace(subject.labels, labels=unlabelled))
+    assert "of the body has no label" in error_bars(found, partly, maps, with_borders).told
+    found.settings = replace(found.settings, align_on="image")
+    assert "with the bone held at rest" in error_bars(found, subject, maps, with_borders).told
 
 
 def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:

@@ -157,7 +157,7 @@ def test_a_bone_that_moves_costs_trust():
     for in_bone, level in (((0.0, 0.0), "trust"), ((0.5, 0.0), "caution"), ((0.0, 0.3), "distrust")):
         held = assess(at_rest, WHOLE, core(), similarity=(0.3, 0.5, 0.9), in_bone=in_bone)
         assert held.verdict.level == level
-        assert (held.bone_shift_mm, held.bone_shear_p95) == in_bone
+        assert (held.bone_shift_mm, held.bone_shear_p95, held.bone_held) == (*in_bone, True)
 
 
 def test_no_evidence_is_no_trust():

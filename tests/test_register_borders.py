@@ -30,10 +30,10 @@ from dvc.sharpen import USUAL_SKIN, AtBorders
 from dvc.transformfile import read_transform
 from dvc.worker import Worker
 from mrstrain.engines import settings_of
-from mrstrain.measurements import measurements_in
+from mrstrain.measurements import measurements_in, spline_in
 from mrstrain.registering import register as run
 from mrstrain.registeringone import register_one
-from mrstrain.straining import strain
+from mrstrain.straining import read_any, strain
 from phantoms.anatomy import Heel
 from phantoms.heel import drawn_motion, labels_of, scan, sliding
 from phantoms.study import distances_mm
@@ -158,6 +158,8 @@ def test_the_bone_that_is_held_is_judged_by_what_the_images_would_have_it_do(out
     told = json.loads((out / "Load1" / "quality.json").read_text())
     assert 0.001 < told["bone_shift_rms_mm"] < 0.3
     assert 0.001 < told["bone_shear_p95"] < 0.1
+    assert told["bone_figures_before_it_was_held_at_rest"] is True
+    assert "in the bone, before it was held at rest" in (out / "report.html").read_text()
     assert np.nanmax(np.abs(nibabel.load(out / "Load1" / "displacement.nii.gz").dataobj)) > 2.0
 
 
@@ -171,18 +173,25 @@ def test_what_is_read_again_has_the_jumps_that_the_maps_have(pad, out):
     np.testing.assert_allclose(shear[valid], shear_of(out / "Load1")[valid], atol=1e-5)
     assert np.isnan(shear[~valid]).all()
     assert np.isnan(u.reshape(*GRID.shape, 3)[~valid]).all()
-    spline = read_transform(out / "Load1" / NAME)
+    spline = read_any(out / "Load1" / NAME)
     assert isinstance(spline, BorderedSpline)
     assert spline.borders.rest >= 0
+    assert [file.name for file in measured.files] == [NAME, "valid.nii.gz"]
 
 
-def test_a_damaged_spline_is_refused_by_name(out, tmp_path):
+def test_a_damaged_spline_is_refused_by_name(out, tmp_path, monkeypatch):
     whole = (out / "Load1" / NAME).read_bytes()
     place = tmp_path / NAME
     for damaged in (whole[: len(whole) // 2], b"", b"PK"):
         place.write_bytes(damaged)
         with pytest.raises(InputError, match=NAME):
             read_transform(place)
+    place.write_bytes(whole)
+    monkeypatch.setattr("dvc.borderfile.NUMBERS", {"blur": 2.0})
+    with pytest.raises(InputError, match="register again"):  # its depths would be others today
+        read_transform(place)
+    with pytest.raises(InputError, match="register this load again"):
+        spline_in(tmp_path / "nothing")
 
 
 def test_a_study_begins_a_load_where_the_one_before_ended(pad, out, monkeypatch):
