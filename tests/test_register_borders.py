@@ -137,18 +137,18 @@ def test_its_transform_is_the_whole_motion_to_itk_and_to_us(pad, out, tmp_path):
     assert np.nanmax(apart) > 0.1  # a jump between two voxels is lost in displacements at voxels
 
 
-def test_quality_and_report_tell_the_weights_and_that_there_are_no_error_bars(out):
+def test_quality_and_report_tell_the_weights_and_error_bars_are_its_own(out):
     told = json.loads((out / "Load1" / "quality.json").read_text())
     weights = told["regularisation"]
     assert (weights["borders"], weights["rigidity_of"]) == (True, "skin")
     assert min(tried["left_out_over_best"] for tried in weights["tried_in_skin"]) == 1.0
     assert len(weights["tried_in_skin"]) >= 3
     assert weights["weights"]["rigidity"] > 10.0
-    assert told["error_of_max_shear"]["known"] is False
-    assert "gauss-newton-borders has not been measured" in json.dumps(told["error_of_max_shear"])
-    assert not (out / "Load1" / "intervals.csv").exists()
+    assert told["error_of_max_shear"]["known"] is True
+    assert "Error model of gauss-newton-borders" in told["error_of_max_shear"]["source"]
+    assert "fat,p95," in (out / "Load1" / "intervals.csv").read_text()
     report = (out / "report.html").read_text()
-    for sentence in ("has not been measured", "text files of elastix are not written", "strain of skin"):
+    for sentence in ("Error model of gauss-newton-borders", "text files of elastix are not written", "strain of skin"):
         assert sentence in report, sentence
     given = json.loads((out / "Load1" / "provenance.json").read_text())["parameters"]
     assert given["borders"] == {"skin": None}
