@@ -22,6 +22,7 @@ from fe.turning import Turning
 
 _FIRST_STEP = 0.25
 _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
+_TIPPING = 0.5  # of how far a plate was in when it was level: it sinks in when it is let go
 _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
@@ -164,14 +165,21 @@ class Path:
         return False
 
     def _let_go(self) -> bool:
-        """Take the moment away that kept the plate level, under the force that it has."""
+        """Take the moment away that kept the plate level, under the force that it has.
+
+        A plate that is held less sinks in further; one that comes back out instead tips over on too few nodes.
+        """
         level, force, moment = self.standing, self.plate.force_n, self.plate.moment_nmm
         self.contact.hold = replace(self.contact.hold, loose=True)
+        gap_mm, level_mm = self.contact.plate.gap_mm, level.plate.travel_mm[0]
+        least_mm = gap_mm + _TIPPING * (level_mm - gap_mm)
         left, step = 1.0, 0.5
         while left > 0.0 and step > _LEAST_STEP:
             kept = self.standing
             least = max(0.0, left - step)
             if self._go(np.zeros(3, dtype=bool), force, least * moment):
+                if self.plate.travel_mm[0] < least_mm:
+                    break
                 left, step = least, step * _GROWTH
                 self._told(f"{1.0 - left:.0%} let go")
             else:

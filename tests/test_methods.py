@@ -120,7 +120,7 @@ def test_borders_are_told(tmp_path: Path) -> None:
     (place / "provenance.json").write_text(json.dumps(record))
     text = told({"Load1": place}, {"ansys": tmp_path / "Load1.csv"})
     assert "vanishes on the borders of the label map's tissues" in text
-    assert "strain of the skin penalised (weight chosen for each pair by cross-validation)" in text
+    assert "strain of a tissue called skin penalised (weight chosen for each pair by cross-validation)" in text
 
 
 def test_driven_and_levelled_models_are_not_those_of_other_programs(tmp_path: Path) -> None:
