@@ -8,7 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from dvc.image import LabelMap
+from dvc.registration import GAUSS_NEWTON
 from mrstrain.doctor import usable_memory_bytes
+from mrstrain.engines import engine_of
 from mrstrain.plan import Stage
 from mrstrain.studyfile import Study
 
@@ -75,8 +77,8 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
 
 def _with_borders(study: Study) -> bool:
     how = study.registration
-    elastix = how.engine == "elastix" or how.preset is not None or bool(how.parameters)
-    return not elastix and how.borders is not False and study.images.labels is not None
+    ours = engine_of(how.engine, how.preset, how.parameters) == GAUSS_NEWTON
+    return ours and how.borders is not False and study.images.labels is not None
 
 
 def costs(

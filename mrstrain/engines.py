@@ -12,6 +12,11 @@ from dvc.registration import GAUSS_NEWTON, Settings
 from dvc.sharpen import AtBorders
 
 
+def engine_of(engine: str | None, preset: str | None, parameters: Sequence[Path | str]) -> str:
+    """The engine asked for; where none is, elastix if a preset or parameter files are given, else our own."""
+    return engine or ("elastix" if preset or parameters else GAUSS_NEWTON)
+
+
 def settings_of(
     engine: str | None,
     preset: str | None,
@@ -25,8 +30,8 @@ def settings_of(
 ) -> Settings:
     """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused.
 
-    Where none is asked for: elastix if a preset or parameter files are given, else our own. This one lets strain jump
-    at the borders of tissues where ``labelled``, a label map tells them, unless it is told not to.
+    Our own engine lets strain jump at the borders of tissues where ``labelled``, a label map tells them, unless it is
+    told not to.
 
     Raises
     ------
@@ -34,8 +39,7 @@ def settings_of(
     InputError
         For borders of tissues that no label map tells.
     """
-    if engine is None:
-        engine = "elastix" if preset or parameters else GAUSS_NEWTON
+    engine = engine_of(engine, preset, parameters)
     if engine not in {"elastix", GAUSS_NEWTON}:
         raise ParameterError(f"No engine '{engine}'; there are elastix and {GAUSS_NEWTON}.")
     if engine == "elastix":

@@ -73,7 +73,8 @@ Bending = Annotated[
 Borders = Annotated[
     bool | None,
     typer.Option(
-        help="gauss-newton: strain may jump where the tissues of --labels meet. Default: where there are labels."
+        help="gauss-newton: strain may jump where the tissues of --labels meet. Default: where there are labels; "
+        "--no-borders for labels that are off by more than a voxel."
     ),
 ]
 Volume = Annotated[
