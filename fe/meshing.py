@@ -13,16 +13,16 @@ from scipy.spatial import cKDTree
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.image import LabelMap
-from dvc.mesh import TetMesh
+from dvc.mesh import FACES, TetMesh
 from dvc.worker import Worker
 from fe.facets import BONE, CUT, SKIN
+from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.surfaces import Borders, borders_of, labels_at
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
 _SURE = 0.8
 _SECONDS_PER_TRIANGLE, _SECONDS_PER_CELL = 6e-4, 1e-4  # as measured on one core
 _MOST_LOST = 0.2  # of a tissue's volume
-_FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 _ALIGNED = 0.8  # cosine between a face and the plane of a cut that it goes on in
 _RIM_VOXELS = 6.0  # how far the section of a skin may reach
 _REFINED_MM = 2.0  # spacing of the lattice that carries a finer edge length
@@ -94,8 +94,9 @@ def mesh_labels(
 
     Notes
     -----
-    The tetrahedra are fTetWild's (Hu and others 2020, doi:10.1145/3386569.3392385). They differ a little from one run
-    to the next: keep a mesh, and its hash, with what was computed on it.
+    The tetrahedra are fTetWild's (Hu and others 2020, doi:10.1145/3386569.3392385); where it leaves one with an angle
+    under 12 degrees, nodes are moved until there is none or no move helps. They differ a little from one run to the
+    next: keep a mesh, and its hash, with what was computed on it.
     """
     spacing = float(labels.grid.spacing_mm.min())
     if not 0.5 * spacing <= edge_mm <= 20.0:
@@ -113,6 +114,8 @@ def mesh_labels(
     lattice = None if finer is None else _lattice(labels, numbers[finer[0]], edge_mm, finer[1])
     points, cells = _limited(borders, edge_mm, _ENVELOPE * spacing, lattice, limit_s, watch)
     found = labels_at(borders, points[cells].mean(axis=1))
+    body = np.isin(found, list(soft.values()))
+    points = without_slivers(points, cells[body], found[body])
     mesh = _named(points, cells, found, soft, [numbers[b] for b in bones], labels)
     quality = _quality(mesh, labels, soft)
     for name, made, given in quality.volumes_ml:
@@ -219,11 +222,11 @@ def _named(
             "label to a neighbour."
         )
     body, tissue = cells[kept], found[kept]
-    faces = np.sort(np.concatenate([body[:, face] for face in _FACES]), axis=1)
+    faces = np.sort(np.concatenate([body[:, face] for face in FACES]), axis=1)
     _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
     outer = first[count == 1]
     triangles, owner = faces[outer], np.tile(tissue, 4)[outer]
-    bone_faces = np.sort(np.concatenate([cells[np.isin(found, bones)][:, face] for face in _FACES]), axis=1)
+    bone_faces = np.sort(np.concatenate([cells[np.isin(found, bones)][:, face] for face in FACES]), axis=1)
     at_bone = _rows_in(triangles, bone_faces)
     free: BoolArray = np.logical_not(at_bone)
     cut = np.zeros(len(triangles), dtype=bool)
@@ -298,15 +301,3 @@ def _thin(mesh: TetMesh) -> tuple[tuple[str, float], ...]:
     cells = mesh.cells[mesh.regions[skin]]
     across = outer[cells].any(axis=1) & beneath[cells].any(axis=1)
     return ((skin, float(across.mean())),)
-
-
-def dihedral_angles_deg(corners: FloatArray) -> FloatArray:
-    """The six angles between the faces of tetrahedra (m, 6), degrees, from their corners (m, 4, 3)."""
-    normals = []
-    for a, b, c, d in ((1, 2, 3, 0), (0, 2, 3, 1), (0, 1, 3, 2), (0, 1, 2, 3)):
-        normal = np.cross(corners[:, b] - corners[:, a], corners[:, c] - corners[:, a])
-        inward = np.einsum("ij,ij->i", normal, corners[:, d] - corners[:, a]) > 0
-        normal[inward] *= -1.0
-        normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-    cosines = [np.einsum("ij,ij->i", normals[i], normals[j]) for i in range(4) for j in range(i)]
-    return np.asarray(180.0 - np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))).T

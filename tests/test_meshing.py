@@ -10,8 +10,9 @@ from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.image import Grid, LabelMap
 from dvc.imagewrite import write_labels
 from dvc.mesh import TetMesh
-from fe.meshing import _guessed, dihedral_angles_deg, mesh_labels
+from fe.meshing import _guessed, mesh_labels
 from fe.meshstore import read_tet_mesh, write_tet_mesh
+from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.surfaces import borders_of, labels_at
 from tests.blocks import block
 
@@ -83,6 +84,37 @@ def test_dihedral_angles_of_known_shapes() -> None:
     assert sorted(dihedral_angles_deg(corner)[0]) == pytest.approx([np.degrees(np.arccos(3**-0.5))] * 3 + [90.0] * 3)
     regular = np.array([[[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]])
     assert dihedral_angles_deg(regular)[0] == pytest.approx(np.degrees(np.arccos(1 / 3)))
+
+
+def _spoiled(free: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two tissues one upon the other, and one node shoved until cells beside it are nearly flat."""
+    box = block((4, 4, 4), (4.0, 4.0, 4.0), layers=2)
+    points, tissue = box.points_mm.copy(), np.zeros(len(box.cells), dtype=int)
+    tissue[box.regions["layer 1"]] = 1
+    at = points.min(axis=0) + ([1.0, 2.0, 1.0] if free else [2.0, 2.0, 2.0])
+    node = int(np.argmin(np.linalg.norm(points - at, axis=1)))
+    points[node] += [0.0, 0.93, 0.0]
+    return points, box.cells, tissue
+
+
+def test_a_flat_cell_is_mended_and_borders_stay_where_they_are() -> None:
+    def least(points: np.ndarray, cells: np.ndarray) -> float:
+        return float(dihedral_angles_deg(points[cells]).min())
+
+    for free in (True, False):
+        points, cells, tissue = _spoiled(free)
+        assert least(points, cells) < 8.0
+        mended = without_slivers(points, cells, tissue)
+        assert least(mended, cells) > 12.0
+        assert np.count_nonzero((mended != points).any(axis=1)) < 8
+        faces, halves = block((4, 4, 4), (4.0, 4.0, 4.0)).facets, points[:, 0] == 2.0
+        assert np.array_equal(mended[halves, 0], points[halves, 0])  # the border between the tissues
+        for name, rows in faces.items():
+            axis = "xyz".index(name[0])
+            assert np.array_equal(mended[np.unique(rows), axis], points[np.unique(rows), axis]), name
+    # a node where all that is near belongs to borders that meet stays: the mesh keeps its flat cell and its shape
+    points, cells, _ = _spoiled(False)
+    assert np.array_equal(without_slivers(points, cells, np.arange(len(cells))), points)
 
 
 def test_what_cannot_be_meshed_is_refused() -> None:
