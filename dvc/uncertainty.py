@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -298,6 +299,7 @@ def uncertainty_of(
     *,
     thresholds: Sequence[float] = SHEAR_THRESHOLDS,
     seed: int = 1,
+    wider: Mapping[str, float] = MappingProxyType({}),
 ) -> Uncertainty:
     """Error of a map of maximal shear by an error table.
 
@@ -315,6 +317,8 @@ def uncertainty_of(
         Strains for which the volume above is wanted.
     seed : int
         Of the draws.
+    wider : mapping of name to float
+        Factors on the deviation and the intervals of some regions, beside `ErrorTable.widening`.
 
     Notes
     -----
@@ -331,8 +335,9 @@ def uncertainty_of(
         if not where.any():
             continue
         _, sd = table.expected(name, max_shear[where].astype(np.float64), to_bone_mm[where])
-        sigma[where] = sd
-        intervals += _intervals(name, where, max_shear, to_bone_mm, grid, table, thresholds, random)
+        factor = wider.get(name, 1.0)
+        sigma[where] = factor * sd
+        intervals += _intervals(name, where, max_shear, to_bone_mm, grid, table, thresholds, random, factor)
     return Uncertainty(sigma, tuple(intervals), table)
 
 
@@ -345,6 +350,7 @@ def _intervals(
     table: ErrorTable,
     thresholds: Sequence[float],
     random: np.random.Generator,
+    factor: float,
 ) -> list[Interval]:
     """Of one region, from draws on a lattice coarse enough to be quick."""
     box = tuple(slice(int(a.min()), int(a.max()) + 1) for a in np.nonzero(where))
@@ -361,7 +367,7 @@ def _intervals(
     for draw in range(_DRAWS):
         bias, sd = expected[random.integers(len(expected))]
         drawn[draw] = figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds)
-    low, middle, high = widened(drawn, table.factor)
+    low, middle, high = widened(drawn, factor * table.factor)
     high[3:] = np.minimum(high[3:], volume)
     measured = figures_of(max_shear[where].astype(np.float64), volume, thresholds)
     names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]

@@ -113,6 +113,10 @@ def register(
     error_model: Annotated[
         Path | None, typer.Option(help="Error model that `mrstrain accuracy` wrote, instead of the preset's own.")
     ] = None,
+    twin: Annotated[
+        bool,
+        typer.Option("--twin", help="Also register each pair's twin, whose strain is known: judges error bars."),
+    ] = False,
     allow_missing: Annotated[
         bool,
         typer.Option("--allow-missing", help="Leave NaN or infinite voxels out instead of refusing the image."),
@@ -160,6 +164,7 @@ def register(
             plate_normal=plate_normal,
             shear_direction=shear_direction,
             error_model=error_model,
+            twin=twin,
             allow_missing=allow_missing,
             workers=workers,
             threads=threads,

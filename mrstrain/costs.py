@@ -17,6 +17,7 @@ from mrstrain.studyfile import Study
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
 _REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 50.0 / 2.3, 7.0
 _BORDERS = 2.5  # times as long with borders of tissues (docs/decisions/0009)
+_TWIN = 1.3  # times as long again: the twin is made and registered
 _CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
 _MESH_S = 100.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
@@ -54,7 +55,7 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
     slower = _BORDERS if _with_borders(study) else 1.0
     registering = (slower * _REGISTER_S_PER_MVOXEL + _MAPS_S_PER_MVOXEL) * voxels / 1e6
     if stage.kind == "register":
-        return registering
+        return (1.0 + _TWIN * study.registration.twin) * registering
     if stage.kind == "level":
         return 1.5 * registering
     if stage.kind == "mesh":

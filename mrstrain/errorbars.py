@@ -6,8 +6,8 @@ import csv
 import hashlib
 import io
 import re
-from collections.abc import Mapping
-from dataclasses import astuple, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
 from dvc.image import Image
 from dvc.imagewrite import write_image
+from dvc.judged import Judged, judged
 from dvc.noise import signal_to_noise
 from dvc.planes import View
 from dvc.registration import Registration, Settings
@@ -36,12 +37,20 @@ from dvc.verdict import Verdict
 from dvc.whole import write_whole
 from mrstrain.inputs import Subject
 from mrstrain.page import said
+from mrstrain.twincheck import TwinCheck
 
 _BONES = {"bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform"}
 _SOFT = {"fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage"}
 _MOSTLY = 0.5
 _UNLABELLED = 0.1
 _SIGMA_SCALE = 0.1
+_TWIN = (
+    "The unloaded image was moved by what was measured, its noise drawn anew, and the pair registered as the real one: "
+    "its true strain is the one above. What came back tells what these images' own noise and texture cost. It tells "
+    "nothing of strain that a registration smooths away before it is measured, so it is a least error. Where fewer "
+    "than 95 % of a tissue's voxels lie in their intervals, or a percentile does not, these have been made wider by "
+    "the factor."
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,19 +64,23 @@ class ErrorBars:
         Where the figures come from, or the reason why there are none.
     model : ErrorModel or None
         With the one table that was used.
+    twin : tuple of Judged
+        How the shear came back from the pair's twin, by tissue; empty where there is none.
     """
 
     uncertainty: Uncertainty | None
     told: str
     model: ErrorModel | None = None
+    twin: tuple[Judged, ...] = ()
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
+        twin = {"twin": [asdict(row) for row in self.twin]} if self.twin else {}
         if self.uncertainty is None:
-            return {"known": False, "reason": self.told}
+            return {"known": False, "reason": self.told} | twin
         table = self.uncertainty.table
         voxel = table.spacing_mm.tolist()
-        return {"known": True, "source": self.told, "voxel_mm": voxel, "snr": round(table.snr, 1)}
+        return {"known": True, "source": self.told, "voxel_mm": voxel, "snr": round(table.snr, 1)} | twin
 
     def write(self, folder: Path, maps: StrainMaps, verdict: Verdict) -> None:
         """Write ``sigma_max_shear.nii.gz``, ``intervals.csv`` and the ``error_model.json`` used, if there are any.
@@ -88,13 +101,22 @@ class ErrorBars:
         )
         write_whole(folder / "intervals.csv", text.getvalue())
 
-    def table(self) -> Table | None:
-        """The intervals as the report shows them."""
-        if self.uncertainty is None:
-            return None
-        rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in self.uncertainty.intervals)
-        columns = ("region", "figure", "as found", "95 % from", "to")
-        return Table("Maximal shear with its error", columns, rows, self.told)
+    def tables(self) -> list[Table]:
+        """The intervals, and what came back from the twin, as the report shows them."""
+        tables = []
+        if self.uncertainty is not None:
+            rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in self.uncertainty.intervals)
+            columns = ("region", "figure", "as found", "95 % from", "to")
+            tables.append(Table("Maximal shear with its error", columns, rows, self.told))
+        if self.twin:
+            known = self.uncertainty is not None
+            columns = ("region", "error (rms)", "bias", *(("in its interval", "wider") if known else ()))
+            judgements = ((f"{row.held:.0%}", row.factor) if row.held is not None else () for row in self.twin)
+            judged = tuple(
+                (row.region, row.rms_error, row.bias, *more) for row, more in zip(self.twin, judgements, strict=True)
+            )
+            tables.append(Table("The twin of this pair, measured again", columns, judged, _TWIN))
+        return tables
 
     def pictures(self, view: View, reference: Image) -> dict[str, Picture]:
         """The map of the standard deviation."""
@@ -104,34 +126,64 @@ class ErrorBars:
         return {"sigma": Picture("How sure the maximal shear is", said(figures.sigma_slices), drawn)}
 
 
-def error_bars(found: Registration, subject: Subject, maps: StrainMaps, model: ErrorModel | None) -> ErrorBars:
+def error_bars(
+    found: Registration,
+    subject: Subject,
+    maps: StrainMaps,
+    model: ErrorModel | None,
+    twin: TwinCheck | None = None,
+) -> ErrorBars:
     """Error of a registered load's maximal shear.
 
     Parameters
     ----------
     model : ErrorModel or None
         The user's own or the preset's; None where there is neither.
+    twin : TwinCheck or None
+        The pair's twin: error bars that do not hold there are made wider.
     """
     grid = maps.grid
+    bone, regions = _bone_and_tissues(subject, found.tissue.inside, model)
     try:
         chosen = _model_for(found, model)
         _refuse_unlabelled(found, subject)
         table = chosen.table_for(*_poorer(found))
+        if not bone.any():
+            raise InputError("The error depends on the distance to bone, and no bone was given.")
     except InputError as reason:
-        return ErrorBars(None, str(reason))
-    bone, regions = _bone_and_tissues(subject, found.tissue.inside, table)
-    if not bone.any():
-        return ErrorBars(None, "The error depends on the distance to bone, and no bone was given.")
+        again = None if twin is None else twin.max_shear
+        rows = () if again is None else judged(maps.max_shear, again, regions)
+        return ErrorBars(None, f"{reason}{_without_twin(twin)}", twin=rows)
     to_bone = to_surface_mm(bone, grid.spacing_mm)
-    sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=found.settings.seed)
+    rows, seed = (), found.settings.seed
+    if twin is not None and twin.max_shear is not None:
+        of_twin = uncertainty_of(twin.max_shear, grid, regions, to_bone, table, seed=seed)
+        rows = judged(maps.max_shear, twin.max_shear, regions, to_bone, of_twin)
+    wider = {row.region: row.factor for row in rows if row.factor is not None}
+    sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=seed, wider=wider)
     known = ", ".join(name for name in regions if name in table.whole and name != POOLED)
     voxel = " x ".join(f"{s:.2g}" for s in table.spacing_mm)
     told = (
         f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}: "
         f"{chosen.source}. Tissues with figures of their own: {known or 'none'}; others take those of soft tissue "
         f"together. {_held(table)} All this is for tissue that is strained and imaged like those phantoms."
+        f"{_widened(rows)}{_without_twin(twin)}"
     )
-    return ErrorBars(sure, told, replace(chosen, tables=(table,)))
+    return ErrorBars(sure, told, replace(chosen, tables=(table,)), rows)
+
+
+def _widened(twin: Sequence[Judged]) -> str:
+    """By how much the pair's twin has made intervals wider, in a sentence after others; empty without a twin."""
+    if not twin:
+        return ""
+    some = ", ".join(
+        f"{row.region} {row.factor:.1f} times" for row in twin if row.factor is not None and row.factor > 1.0
+    )
+    return f" The twin of this pair has made them wider: {some}." if some else " They hold in the twin of this pair."
+
+
+def _without_twin(twin: TwinCheck | None) -> str:
+    return f" There is no twin of this pair: {twin.failure}" if twin is not None and twin.failure else ""
 
 
 def _held(table: ErrorTable) -> str:
@@ -204,9 +256,10 @@ def _poorer(found: Registration) -> tuple[FloatArray, float]:
 
 
 def _bone_and_tissues(
-    subject: Subject, tissue: BoolArray, table: ErrorTable
+    subject: Subject, tissue: BoolArray, model: ErrorModel | None
 ) -> tuple[BoolArray, Mapping[str, BoolArray]]:
     """Every bone that is known, and the soft tissues by name."""
+    known = set() if model is None else set(model.tables[0].whole)
     bone = np.zeros(tissue.shape, dtype=bool) if subject.bone is None else subject.bone.inside.copy()
     soft: dict[str, BoolArray] = {}
     if subject.labels is not None:
@@ -218,7 +271,7 @@ def _bone_and_tissues(
             if named or (count and np.count_nonzero(inside & bone) > _MOSTLY * count):
                 bone |= inside
             elif count:
-                soft[name.lower() if name.lower() in table.whole else name] = inside
+                soft[name.lower() if name.lower() in known else name] = inside
     if not soft:
         soft = {POOLED: tissue & ~bone}
     return bone, {name: inside & ~bone for name, inside in soft.items()}

@@ -11,10 +11,12 @@ import meshio
 import numpy as np
 
 from dvc.errors import InputError, RegistrationError, WorkerError
+from dvc.gaussnewton import USUAL_VOLUME
 from dvc.imagewrite import write_image
+from dvc.registration import GAUSS_NEWTON
 from dvc.tissue import tissue_mask
 from dvc.whole import whole_file, write_whole
-from mrstrain.engines import settings_of
+from mrstrain.engines import engine_of, settings_of
 from mrstrain.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.measurements import measurements_in
 from mrstrain.modelfiles import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
@@ -97,7 +99,11 @@ def level(
     """
     target, place = Path(out), Path(model)
     # Refused now rather than after the images are made.
-    settings_of(engine, preset, parameters, borders=borders, labelled=labels is not None, allow_unknown=True)
+    # Beyond its mesh a model is carried on without regard to volume: what the images then ask for is no tissue's.
+    volume = USUAL_VOLUME if engine_of(engine, preset, parameters) == GAUSS_NEWTON else None
+    settings_of(
+        engine, preset, parameters, volume=volume, borders=borders, labelled=labels is not None, allow_unknown=True
+    )
     if not place.is_dir():
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
     subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
@@ -139,6 +145,7 @@ def level(
         },
         {
             "engine": engine,
+            "volume": volume,
             "borders": borders,
             "preset": preset,
             "threads": threads,
@@ -159,7 +166,7 @@ def level(
             register(
                 load0, [target / work / "images" / f"{load}.nii.gz"], out=registered / load, bone=bone,
                 bone_label=bone_label, tissue=tissue, labels=labels, names=names, engine=engine,
-                borders=borders, preset=preset, parameters=parameters, allow_unknown_parameters=True,
+                volume=volume, borders=borders, preset=preset, parameters=parameters, allow_unknown_parameters=True,
                 threads=threads, seed=seed, progress=progress,
             )  # fmt: skip
         except (RegistrationError, WorkerError) as failed:

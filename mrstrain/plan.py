@@ -152,7 +152,7 @@ def _registrations(study: Study) -> list[Stage]:
         "parameters": [str(p) for p in own], "error_model": str(error_model[0]) if error_model else None,
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "seed": study.study.seed, "threads": 1,
-    }  # fmt: skip
+    } | ({"twin": True} if how.twin else {})  # fmt: skip
     files = (load0, *(Path(p) for p in aside.values()), *own, *error_model)
     folder = study.out / REGISTRATION
 

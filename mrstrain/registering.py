@@ -36,6 +36,7 @@ from mrstrain.page import write_series_report
 from mrstrain.provenance import provenance, write_json
 from mrstrain.results import Case, write_case
 from mrstrain.straining import read_any, without_motion
+from mrstrain.twincheck import TwinCheck, twin_check
 
 Told = Callable[[str, str, float], None]
 REPEAT = "repeat"
@@ -98,6 +99,7 @@ def register(
     plate_normal: Sequence[float] | None = None,
     shear_direction: Sequence[float] | None = None,
     error_model: Path | str | None = None,
+    twin: bool = False,
     allow_missing: bool = False,
     workers: int | None = None,
     threads: int | None = None,
@@ -146,6 +148,9 @@ def register(
         strain is written in the plate's axes as well.
     error_model : path, optional
         Error model of the preset or parameters, as `accuracy` writes it; by default the one that comes with the preset.
+    twin : bool
+        Also register each pair's twin, the unloaded image moved by what was found: its true strain is known, and error
+        bars that do not hold there are made wider. Twice the time.
     allow_missing : bool
         Leave NaN or infinite voxels out instead of refusing the image.
     workers, threads : int, optional
@@ -238,6 +243,7 @@ def register(
         settings,
         {
             "chain": chain,
+            "twin": twin,
             "start_frame": start_frame,
             "bone_label": bone_label,
             "shear_direction_lps": None if shear_direction is None else list(shear_direction),
@@ -246,7 +252,9 @@ def register(
             "allow_missing": allow_missing,
         },
     )
-    run = _Run(target, subject, images, settings, body, record, points, model, begun_at, progress or (lambda *_: None))
+    run = _Run(
+        target, subject, images, settings, body, record, points, model, begun_at, twin, progress or (lambda *_: None)
+    )
     run.all(at_once, chain)
     finished = [run.cases[name] for name in cases if name in run.cases]
     if not finished:
@@ -295,10 +303,12 @@ class _Run:
         landmarks: tuple[FloatArray, FloatArray] | None,
         model: ErrorModel | None,
         start: Deformation | None,
+        twin: bool,
         tell: Told,
     ) -> None:
         self.out, self.subject, self.images, self.settings, self.body = out, subject, images, settings, body
-        self.record, self.landmarks, self.model, self.start, self._tell = record, landmarks, model, start, tell
+        self.record, self.landmarks, self.model, self.start = record, landmarks, model, start
+        self.twin, self._tell = twin, tell
         self.cases: dict[str, Case] = {}
         self.failures: dict[str, str] = {}
         self._telling, self._writing = threading.Lock(), threading.Lock()
@@ -311,6 +321,10 @@ class _Run:
 
         def one(name: str, worker: Worker) -> None:
             start = None if name == REPEAT else last[-1] if chain and last else self.start
+
+            def told(stage: str, fraction: float) -> None:
+                self._told(name, stage, fraction)
+
             try:
                 found = register_pair(
                     self.subject.reference,
@@ -321,12 +335,14 @@ class _Run:
                     settings=self.settings.of_repeat() if name == REPEAT else self.settings,
                     start=start,
                     worker=worker,
-                    progress=lambda stage, fraction: self._told(name, stage, fraction),
+                    progress=told,
                 )
+                made = None
                 if name != REPEAT:
                     last.append(found.bspline)
+                    made = twin_check(found, self.subject, worker, told) if self.twin else None
                     self._floor_known.wait()
-                self._write(name, found)
+                self._write(name, found, made)
             except MrstrainError as error:
                 self.failures[name] = str(error)
             finally:
@@ -336,7 +352,7 @@ class _Run:
         names = sorted(self.images, key=lambda name: name != REPEAT)  # its floor is waited for
         each_in_workers(names, one, at_once=at_once, threads=self.settings.threads)
 
-    def _write(self, name: str, found: Registration) -> None:
+    def _write(self, name: str, found: Registration, twin: TwinCheck | None) -> None:
         stage = "strain and figures"
         with self._writing:
             self._told(name, stage, 0.0)
@@ -351,6 +367,7 @@ class _Run:
                 floor,
                 is_repeat=name == REPEAT,
                 model=self.model,
+                twin=twin,
             )
             self._told(name, stage, 1.0)
 

@@ -18,6 +18,7 @@ from mrstrain.inputs import read_subject
 from mrstrain.measurements import spline_in
 from mrstrain.registering import REPEAT, record_of
 from mrstrain.results import Case, write_case
+from mrstrain.twincheck import twin_check
 
 
 def register_one(
@@ -39,6 +40,7 @@ def register_one(
     shear_direction: Sequence[float] | None = None,
     repeat: Path | None = None,
     after: Path | None = None,
+    twin: bool = False,
     threads: int = 1,
     seed: int = 1,
     tell: Callable[[str, float], None] = lambda *_: None,
@@ -86,6 +88,7 @@ def register_one(
         settings,
         {
             "chain": after is not None,
+            "twin": twin,
             "bone_label": bone if isinstance(bone, str) else None,
             "shear_direction_lps": None if shear_direction is None else list(shear_direction),
         },
@@ -104,4 +107,5 @@ def register_one(
             worker=worker,
             progress=tell,
         )
-    return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model)
+        made = twin_check(found, subject, worker, tell) if twin and not is_repeat else None
+    return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model, twin=made)

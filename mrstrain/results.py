@@ -36,6 +36,7 @@ from mrstrain import page
 from mrstrain.errorbars import ErrorBars, error_bars
 from mrstrain.inputs import Subject
 from mrstrain.provenance import write_json
+from mrstrain.twincheck import TwinCheck
 
 ITK_FILE = "transform.h5"
 """Name of the whole motion's file."""
@@ -110,10 +111,12 @@ def write_case(
     *,
     is_repeat: bool,
     model: ErrorModel | None = None,
+    twin: TwinCheck | None = None,
 ) -> Case:
     """Maps, quality and figures of a registered load; its folder is written whole or not at all.
 
-    A repeat scan is judged by its own noise floor; the error bars are those of ``model``, if there is one.
+    A repeat scan is judged by its own noise floor; the error bars are those of ``model``, if there is one, judged by
+    the pair's ``twin``.
     """
     reference, loaded, motion = found.reference, found.loaded, found.alignment.motion
     grid = reference.grid
@@ -150,7 +153,7 @@ def write_case(
     quality = replace(quality, verdict=with_volume(quality.verdict, found.choice))
     view = page.view_of(subject, maps)
     labels = _regions(measured)
-    bars = error_bars(found, subject, maps, model)
+    bars = error_bars(found, subject, maps, model, twin)
     pictures = {
         **page.agreement_pictures(view, reference, aligned, registered, local_rigid, local_after),
         **page.strain_pictures(view, subject, labels, maps, aligned, floor),
@@ -231,7 +234,7 @@ def _written(
         tables.append(page.weights_table(choice))
     if bars is not None:
         told["error_of_max_shear"] = bars.as_dict()
-        tables += [table for table in (bars.table(),) if table is not None]
+        tables += bars.tables()
     with whole_folder(folder) as partial:
         write_maps(partial, maps, subject.axes, quality.verdict)
         write_regions_csv(partial / "regions.csv", regions, quality.verdict)

@@ -124,6 +124,7 @@ class Registering(_Part):
     chain: Flag = False
     align: Literal["bone", "image"] = "bone"
     error_model: str | None = None
+    twin: Flag = False
 
 
 class Finer(_Part):

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import foldnorm
 
 from dvc.gaussnewton import Choice, GaussNewton
 from dvc.image import Grid, Image, LabelMap, Mask
@@ -21,6 +22,7 @@ from dvc.verdict import Verdict
 from mrstrain.errorbars import error_bars
 from mrstrain.inputs import Subject
 from mrstrain.results import with_volume
+from mrstrain.twincheck import TwinCheck
 
 GRID = Grid((40, 40, 40), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))
 NAMES = {1: "Calcaneus", 2: "fat", 3: "Left talus"}
@@ -92,7 +94,7 @@ def test_where_the_error_is_not_known_the_reason_is_told(
     assert bars.as_dict() == {"known": False, "reason": bars.told}
     bars.write(tmp_path, maps, Verdict("trust"))
     assert not list(tmp_path.iterdir())
-    assert bars.table() is None
+    assert bars.tables() == []
 
 
 def test_a_muscle_named_after_a_bone_is_no_bone() -> None:
@@ -148,6 +150,63 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     assert "of the body has no label" in error_bars(found, partly, maps, with_borders).told
     found.settings = replace(found.settings, align_on="image")
     assert "with the bone held at rest" in error_bars(found, subject, maps, with_borders).told
+
+
+def twin_of(maps: StrainMaps, sd: float, bias: float = 0.03) -> TwinCheck:
+    """What comes back with an error of that bias and deviation; the measured shear is made to vary from .05 to .45."""
+    maps.max_shear[:] += np.linspace(-0.05, 0.35, GRID.shape[2], dtype=np.float32)
+    random = np.random.default_rng(4)
+    return TwinCheck((maps.max_shear + bias + sd * random.standard_normal(GRID.shape)).astype(np.float32))
+
+
+def test_error_bars_that_hold_in_the_pairs_twin_stay_and_others_are_made_wider() -> None:
+    # the model of fat: bias and deviation .02
+    claimed = 1.96 * np.hypot(0.02, 0.02)
+    for sd in (0.019, 0.06):
+        errors = foldnorm(0.02 / sd, scale=sd)
+        factor = max(1.0, errors.ppf(0.95) / claimed)
+        found, subject, maps = given()
+        bars = error_bars(found, subject, maps, model(), twin_of(maps, sd, 0.02))
+        alone = error_bars(found, subject, maps, model())
+        (row,) = bars.twin
+        assert row.region == "fat"
+        assert row.factor == pytest.approx(factor, rel=0.05)
+        assert row.held == pytest.approx(errors.cdf(claimed), abs=0.01)
+        assert row.rms_error == pytest.approx(np.hypot(0.02, sd), rel=0.05)
+        assert row.bias == pytest.approx(0.02, abs=0.002)
+        assert np.nanmax(bars.uncertainty.sigma) == pytest.approx(row.factor * np.nanmax(alone.uncertainty.sigma))
+        for now, before in zip(bars.uncertainty.intervals, alone.uncertainty.intervals, strict=True):
+            if before.high < 1.0 and before.low > 0.0:
+                wider = (now.high - now.low) / (before.high - before.low)
+                assert wider == pytest.approx(row.factor, rel=0.01), now.figure
+        assert ("made them wider: fat 2.2" in bars.told) == (factor > 1.0)
+        assert ("hold in the twin" in bars.told) == (factor == 1.0)
+        assert bars.as_dict()["twin"][0]["factor"] == row.factor
+        assert bars.tables()[1].title.startswith("The twin")
+
+
+def test_a_percentile_outside_of_its_interval_makes_error_bars_wider_though_voxels_hold() -> None:
+    found, subject, maps = given()
+    # voxels are off by two deviations all alike: each is within what is claimed of it, and the median is not
+    bars = error_bars(found, subject, maps, model(), twin_of(maps, 0.0, 0.04))
+    (row,) = bars.twin
+    assert row.held == 1.0
+    assert row.factor > 1.4
+
+
+def test_without_an_error_model_the_twin_tells_the_least_error() -> None:
+    found, subject, maps = given()
+    bars = error_bars(found, subject, maps, None, twin_of(maps, 0.05))
+    assert bars.uncertainty is None
+    (row,) = bars.twin
+    assert (row.held, row.factor) == (None, None)
+    assert row.rms_error == pytest.approx(np.hypot(0.03, 0.05), rel=0.05)
+    (table,) = bars.tables()
+    assert table.columns == ("region", "error (rms)", "bias")
+    failed = error_bars(found, subject, maps, model(), TwinCheck(None, "The deformation folds."))
+    assert failed.twin == ()
+    assert failed.told.endswith("There is no twin of this pair: The deformation folds.")
+    assert failed.uncertainty is not None
 
 
 def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:

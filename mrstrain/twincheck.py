@@ -1,0 +1,64 @@
+"""The twin of a registered pair: the unloaded image moved by what was measured, and measured again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from dvc.arrays import Float32Array
+from dvc.errors import MrstrainError
+from dvc.registration import Registration, register
+from dvc.resample import shows
+from dvc.strainmaps import strain_maps
+from dvc.worker import Worker
+from mrstrain.inputs import Subject
+from phantoms.twin import loaded_twin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwinCheck:
+    """What came back from the twin, or why nothing did.
+
+    Attributes
+    ----------
+    max_shear : (ni, nj, nk) or None
+        Found in the twin, on the unloaded image's grid; NaN where not defined.
+    failure : str
+    """
+
+    max_shear: Float32Array | None
+    failure: str = ""
+
+
+def twin_check(found: Registration, subject: Subject, worker: Worker, tell: Callable[[str, float], None]) -> TwinCheck:
+    """Move the unloaded image by what was found, draw its noise anew, and register it as the pair was.
+
+    Parameters
+    ----------
+    found : Registration
+        Of the pair. Its strain is the twin's true one.
+    subject : Subject
+    worker : Worker
+    tell : callable
+        ``tell(stage, fraction)``.
+    """
+    tell("making the twin", 0.0)
+    motion, seed = found.alignment.motion, found.settings.seed
+    try:
+        twin = loaded_twin(found.reference, found.tissue, found.total, near=motion, seed=seed).image
+        tell("making the twin", 1.0)
+        again = register(
+            found.reference,
+            twin,
+            bone=subject.bone,
+            tissue=found.tissue,
+            labels=subject.labels,
+            settings=found.settings,
+            worker=worker,
+            progress=lambda stage, fraction: tell(f"twin: {stage}", fraction),
+        )
+    except MrstrainError as reason:
+        return TwinCheck(None, str(reason))
+    placed, edge = again.alignment.motion, float(again.bspline.control.spacing_mm.min())
+    maps = strain_maps(again.deformation, again.tissue, lambda x: shows(twin, placed.apply(x), edge))
+    return TwinCheck(maps.max_shear)
