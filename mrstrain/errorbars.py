@@ -66,16 +66,21 @@ class ErrorBars:
         With the one table that was used.
     twin : tuple of Judged
         How the shear came back from the pair's twin, by tissue; empty where there is none.
+    of_twin : str
+        What it did to the error bars.
     """
 
     uncertainty: Uncertainty | None
     told: str
     model: ErrorModel | None = None
     twin: tuple[Judged, ...] = ()
+    of_twin: str = ""
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
-        twin = {"twin": [asdict(row) for row in self.twin]} if self.twin else {}
+        twin = (
+            {"twin": [asdict(row) for row in self.twin], "of_twin": self.of_twin} if self.twin or self.of_twin else {}
+        )
         if self.uncertainty is None:
             return {"known": False, "reason": self.told} | twin
         table = self.uncertainty.table
@@ -107,7 +112,8 @@ class ErrorBars:
         if self.uncertainty is not None:
             rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in self.uncertainty.intervals)
             columns = ("region", "figure", "as found", "95 % from", "to")
-            tables.append(Table("Maximal shear with its error", columns, rows, self.told))
+            note = f"{self.told} {self.of_twin}".strip()
+            tables.append(Table("Maximal shear with its error", columns, rows, note))
         if self.twin:
             known = self.uncertainty is not None
             columns = ("region", "error (rms)", "bias", *(("in its interval", "wider") if known else ()))
@@ -153,37 +159,32 @@ def error_bars(
     except InputError as reason:
         again = None if twin is None else twin.max_shear
         rows = () if again is None else judged(maps.max_shear, again, regions)
-        return ErrorBars(None, f"{reason}{_without_twin(twin)}", twin=rows)
+        return ErrorBars(None, str(reason), twin=rows, of_twin=_of_twin(rows, twin))
     to_bone = to_surface_mm(bone, grid.spacing_mm)
     rows, seed = (), found.settings.seed
     if twin is not None and twin.max_shear is not None:
         of_twin = uncertainty_of(twin.max_shear, grid, regions, to_bone, table, seed=seed)
         rows = judged(maps.max_shear, twin.max_shear, regions, to_bone, of_twin)
-    wider = {row.region: row.factor for row in rows if row.factor is not None}
-    sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, table, seed=seed, wider=wider)
+    wider = table.wider({row.region: row.factor for row in rows if row.factor is not None and row.factor > 1.0})
+    sure = uncertainty_of(maps.max_shear, grid, regions, to_bone, wider, seed=seed)
     known = ", ".join(name for name in regions if name in table.whole and name != POOLED)
     voxel = " x ".join(f"{s:.2g}" for s in table.spacing_mm)
     told = (
         f"Error model of {chosen.preset} for voxels of {voxel} mm at SNR {table.snr:.0f}: "
         f"{chosen.source}. Tissues with figures of their own: {known or 'none'}; others take those of soft tissue "
         f"together. {_held(table)} All this is for tissue that is strained and imaged like those phantoms."
-        f"{_widened(rows)}{_without_twin(twin)}"
     )
-    return ErrorBars(sure, told, replace(chosen, tables=(table,)), rows)
+    return ErrorBars(sure, told, replace(chosen, tables=(wider,)), rows, _of_twin(rows, twin))
 
 
-def _widened(twin: Sequence[Judged]) -> str:
-    """By how much the pair's twin has made intervals wider, in a sentence after others; empty without a twin."""
-    if not twin:
+def _of_twin(rows: Sequence[Judged], twin: TwinCheck | None) -> str:
+    """What the pair's twin did to the error bars, or why there is none; empty where none was asked for."""
+    if twin is not None and twin.failure:
+        return f"There is no twin of this pair: {twin.failure}"
+    if not any(row.factor is not None for row in rows):
         return ""
-    some = ", ".join(
-        f"{row.region} {row.factor:.1f} times" for row in twin if row.factor is not None and row.factor > 1.0
-    )
-    return f" The twin of this pair has made them wider: {some}." if some else " They hold in the twin of this pair."
-
-
-def _without_twin(twin: TwinCheck | None) -> str:
-    return f" There is no twin of this pair: {twin.failure}" if twin is not None and twin.failure else ""
+    some = ", ".join(f"{row.region} {row.factor:.1f} times" for row in rows if row.factor and row.factor > 1.0)
+    return f"The twin of this pair has made them wider: {some}." if some else "They hold in the twin of this pair."
 
 
 def _held(table: ErrorTable) -> str:

@@ -222,6 +222,10 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
     return told
 
 
+_TWIN = (
+    "They were judged by a twin of each pair, the unloaded image moved by what was measured and registered once more, "
+    "and made wider in tissues where they did not hold. "
+)
 _DRIVEN = (
     "Driven models bear no force: each node on the outside of the mesh was moved by the measured displacement, or held "
     "where the mesh names it bone, and those inside follow from the laws."
@@ -277,14 +281,18 @@ def _compared(
 
 
 def _doubt(measured: Mapping[str, Path]) -> str:
-    known = _sources(measured)
+    known, twin = _sources(measured), _TWIN if any(of.get("twin") for of in _errors(measured)) else ""
     return (
         f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATED} draws) come from truths drawn by the "
-        f"registration's error model: bias, spatially correlated noise. {known} Displacement has no error model."
+        f"registration's error model: bias, spatially correlated noise. {known} {twin}Displacement has no error model."
     )
 
 
 def _sources(measured: Mapping[str, Path]) -> str:
     """Where the registrations' error models come from, each told once."""
-    records = (_record(folder / "quality.json").get("error_of_max_shear", {}) for folder in measured.values())
-    return " ".join(sorted({str(one["source"]) for one in records if one.get("source")}))
+    return " ".join(sorted({str(one["source"]) for one in _errors(measured) if one.get("source")}))
+
+
+def _errors(measured: Mapping[str, Path]) -> list[Record]:
+    """What each registration tells of the error of its maximal shear."""
+    return [_record(folder / "quality.json").get("error_of_max_shear", {}) for folder in measured.values()]

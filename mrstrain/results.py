@@ -254,7 +254,11 @@ def _written(
         tuple(pictures.values()),
         (
             *((page.WITH_BORDERS,) if borders else ()),
-            *(() if bars is None or bars.uncertainty is not None else (f"No error bars. {bars.told}",)),
+            *(
+                ()
+                if bars is None or bars.uncertainty is not None
+                else (f"No error bars. {bars.told} {bars.of_twin}".strip(),)
+            ),
         ),
     )
     without = "" if bars is None or bars.uncertainty is not None else bars.told

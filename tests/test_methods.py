@@ -123,6 +123,18 @@ def test_borders_are_told(tmp_path: Path) -> None:
     assert "strain of a tissue called skin penalised (weight chosen for each pair by cross-validation)" in text
 
 
+def test_a_twin_that_judged_the_error_bars_is_told(tmp_path: Path) -> None:
+    loads = {load: measured(tmp_path, load) for load in ("Load1", "Load2")}
+    assert "twin" not in told(loads, {})
+    rows = [{"region": "fat", "factor": 1.2}]
+    for load, more in (("Load1", {"twin": rows}), ("Load2", {"twin": [], "of_twin": "There is none."})):
+        error = {"source": "A study of 3 heels."} | more
+        (loads[load] / "quality.json").write_text(json.dumps({"error_of_max_shear": error}))
+    assert told(loads, {}).count("judged by a twin of each pair") == 1
+    (loads["Load1"] / "quality.json").write_text((loads["Load2"] / "quality.json").read_text())
+    assert "twin" not in told(loads, {})
+
+
 def test_driven_and_levelled_models_are_not_those_of_other_programs(tmp_path: Path) -> None:
     loads = {"Load1": measured(tmp_path / "res", "Load1")}
     models = {"mine-driven": driven(tmp_path, "mine-driven", "mine")}
