@@ -224,8 +224,8 @@ def scores(study: Path, hidden: Path, labels: LabelMap) -> dict[str, object]:
         models = [read_result(s, results / "models" / s / f"{load}.vtu") for s in SETS]
         one = compare(load, model.deformation, models, names, bones=("bone",), normal=np.array([0.0, 0.0, -1.0]))
         true.append(one)
-        comparisons[load] = {a.model: a.ml for a in one.areas if a.tissue == ALL}
-    comparisons[ALL_LOADS] = {a.model: a.ml for a in total(true).areas}
+        comparisons[load] = {a.model: a.ml for a in one.areas if a.tissue == ALL and a.model in SETS}
+    comparisons[ALL_LOADS] = {a.model: a.ml for a in total(true).areas if a.model in SETS}
     measured: dict[str, dict[str, list[float]]] = {}
     with (results / "comparison" / "areas.csv").open() as file:
         for row in csv.DictReader(file):

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -71,25 +72,6 @@ class ErrorTable:
     def factor(self) -> float:
         """`widening`, and 1 where it is not known."""
         return 1.0 if np.isnan(self.widening) else self.widening
-
-    def wider(self, factors: Mapping[str, float]) -> ErrorTable:
-        """The table with larger errors in some tissues, each by its factor.
-
-        Deviations are multiplied, and so is what sets the bias of one registration apart from that of all: then figures
-        of a whole tissue are less sure too.
-        """
-
-        def of(cells: Mapping[str, FloatArray], tissue: str) -> FloatArray:
-            return cells[tissue if tissue in cells else POOLED]
-
-        whole, runs = dict(self.whole), [dict(run) for run in self.runs]
-        for tissue, factor in factors.items():
-            bias, sd = of(self.whole, tissue)
-            whole[tissue] = np.stack([bias, factor * sd])
-            for run, own in zip(runs, self.runs, strict=True):
-                own_bias, own_sd = of(own, tissue)
-                run[tissue] = np.stack([bias + factor * (own_bias - bias), factor * own_sd])
-        return replace(self, whole=whole, runs=tuple(runs))
 
     def expected(
         self, tissue: str, shear: FloatArray, to_bone_mm: Float32Array, run: int | None = None
@@ -317,6 +299,7 @@ def uncertainty_of(
     *,
     thresholds: Sequence[float] = SHEAR_THRESHOLDS,
     seed: int = 1,
+    wider: Mapping[str, float] = MappingProxyType({}),
 ) -> Uncertainty:
     """Error of a map of maximal shear by an error table.
 
@@ -334,6 +317,8 @@ def uncertainty_of(
         Strains for which the volume above is wanted.
     seed : int
         Of the draws.
+    wider : mapping of name to float
+        Factors on the deviation and the intervals of some regions, beside `ErrorTable.widening`.
 
     Notes
     -----
@@ -350,8 +335,9 @@ def uncertainty_of(
         if not where.any():
             continue
         _, sd = table.expected(name, max_shear[where].astype(np.float64), to_bone_mm[where])
-        sigma[where] = sd
-        intervals += _intervals(name, where, max_shear, to_bone_mm, grid, table, thresholds, random)
+        factor = wider.get(name, 1.0)
+        sigma[where] = factor * sd
+        intervals += _intervals(name, where, max_shear, to_bone_mm, grid, table, thresholds, random, factor)
     return Uncertainty(sigma, tuple(intervals), table)
 
 
@@ -364,6 +350,7 @@ def _intervals(
     table: ErrorTable,
     thresholds: Sequence[float],
     random: np.random.Generator,
+    factor: float,
 ) -> list[Interval]:
     """Of one region, from draws on a lattice coarse enough to be quick."""
     box = tuple(slice(int(a.min()), int(a.max()) + 1) for a in np.nonzero(where))
@@ -380,7 +367,7 @@ def _intervals(
     for draw in range(_DRAWS):
         bias, sd = expected[random.integers(len(expected))]
         drawn[draw] = figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds)
-    low, middle, high = widened(drawn, table.factor)
+    low, middle, high = widened(drawn, factor * table.factor)
     high[3:] = np.minimum(high[3:], volume)
     measured = figures_of(max_shear[where].astype(np.float64), volume, thresholds)
     names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]

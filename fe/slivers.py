@@ -34,7 +34,7 @@ def without_slivers(points_mm: FloatArray, cells: IntArray, tissue: IntArray, go
     ----------
     points_mm : (n, 3)
     cells : (m, 4) int
-        Tetrahedra of positive or of negative volume, which each keep their sign.
+        Tetrahedra, all counted the same way round; one that is quite flat is taken to be as well.
     tissue : (m,) int
         Cells of different tissues have a border between them, on which nodes stay: they slide in its plane, or
         along its edge, and do not move at its corners.
@@ -54,12 +54,15 @@ def without_slivers(points_mm: FloatArray, cells: IntArray, tissue: IntArray, go
     """
     points = points_mm.copy()
     free = _freedom(points, cells, tissue)
-    signs = np.sign(_volumes(points[cells]))
+    sign = float(np.sign(np.median(_volumes(points[cells]))))
+    owners = np.argsort(cells, axis=None, kind="stable") // cells.shape[1]
+    first = np.concatenate([[0], np.cumsum(np.bincount(cells.ravel(), minlength=len(points)))])
     for _ in range(_PASSES):
-        flat = _goodness(points[cells], signs) < goal_deg
+        flat = _goodness(points[cells], sign) < goal_deg
         moved = False
         for node in np.unique(cells[flat]):
-            moved |= _move(points, points_mm[node], cells, signs, free[node], int(node), goal_deg)
+            star = cells[owners[first[node] : first[node + 1]]]
+            moved |= _move(points, points_mm[node], star, sign, free[node], int(node), goal_deg)
         if not moved:
             break
     return points
@@ -70,11 +73,11 @@ def _volumes(corners: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.det(edges))
 
 
-def _goodness(corners: FloatArray, signs: FloatArray) -> FloatArray:
+def _goodness(corners: FloatArray, sign: float) -> FloatArray:
     """Distance of the dihedral angles from flat (...), degrees; negative where a cell is turned inside out."""
     angles = dihedral_angles_deg(corners)
     worst = np.minimum(angles, 180.0 - angles).min(axis=-1)
-    return np.asarray(np.where(_volumes(corners) * signs > 0, worst, -1.0))
+    return np.asarray(np.where(_volumes(corners) * sign > 0, worst, -1.0))
 
 
 def _freedom(points: FloatArray, cells: IntArray, tissue: IntArray) -> FloatArray:
@@ -100,17 +103,15 @@ def _freedom(points: FloatArray, cells: IntArray, tissue: IntArray) -> FloatArra
 
 
 def _move(
-    points: FloatArray, start: FloatArray, cells: IntArray, signs: FloatArray, free: FloatArray, node: int, goal: float
+    points: FloatArray, start: FloatArray, star: IntArray, sign: float, free: FloatArray, node: int, goal: float
 ) -> bool:
-    """Take one node where the worst of its cells is best, if one is flat; whether it went anywhere."""
+    """Take one node where the worst of its cells (the star) is best, if one is flat; whether it went anywhere."""
     directions = _DIRECTIONS @ free
     if not directions.any():
         return False
-    rows = np.flatnonzero((cells == node).any(axis=1))
-    corners, signs = points[cells[rows]], signs[rows]
-    own = cells[rows] == node
+    corners, own = points[star], star == node
     edge = float(np.linalg.norm(corners - points[node], axis=-1)[~own].mean())
-    now, moved = float(_goodness(corners, signs).min()), False
+    now, moved = float(_goodness(corners, sign).min()), False
     if now >= goal:
         return False
     for step in _STEPS:
@@ -120,7 +121,7 @@ def _move(
             if not len(tried):
                 break
             stars = np.where(own[..., None], tried[:, None, None, :], corners)
-            worst = _goodness(stars, signs).min(axis=1)
+            worst = _goodness(stars, sign).min(axis=1)
             best = int(worst.argmax())
             if worst[best] < now + 0.1:
                 break

@@ -222,10 +222,6 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
     return told
 
 
-_TWIN = (
-    "They were judged by a twin of each pair, the unloaded image moved by what was measured and registered once more, "
-    "and made wider in tissues where they did not hold. "
-)
 _DRIVEN = (
     "Driven models bear no force: each node on the outside of the mesh was moved by the measured displacement, or held "
     "where the mesh names it bone, and those inside follow from the laws."
@@ -281,7 +277,7 @@ def _compared(
 
 
 def _doubt(measured: Mapping[str, Path]) -> str:
-    known, twin = _sources(measured), _TWIN if any(of.get("twin") for of in _errors(measured)) else ""
+    known, twin = _sources(measured), _twins(measured)
     return (
         f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATED} draws) come from truths drawn by the "
         f"registration's error model: bias, spatially correlated noise. {known} {twin}Displacement has no error model."
@@ -290,9 +286,24 @@ def _doubt(measured: Mapping[str, Path]) -> str:
 
 def _sources(measured: Mapping[str, Path]) -> str:
     """Where the registrations' error models come from, each told once."""
-    return " ".join(sorted({str(one["source"]) for one in _errors(measured) if one.get("source")}))
+    return " ".join(sorted({str(one["source"]) for one in _errors(measured).values() if one.get("source")}))
 
 
-def _errors(measured: Mapping[str, Path]) -> list[Record]:
+def _twins(measured: Mapping[str, Path]) -> str:
+    """Which registrations' error bars a twin judged; a sentence with a space after it, or nothing."""
+    judged = [
+        load
+        for load, of in _errors(measured).items()
+        if any(row.get("factor") is not None for row in of.get("twin", []))
+    ]
+    if not judged:
+        return ""
+    return (
+        f"The error bars of {_listed(judged)} were judged by a twin of the pair (the unloaded image moved by what was "
+        "measured, and registered once more), and made wider where they did not hold. "
+    )
+
+
+def _errors(measured: Mapping[str, Path]) -> dict[str, Record]:
     """What each registration tells of the error of its maximal shear."""
-    return [_record(folder / "quality.json").get("error_of_max_shear", {}) for folder in measured.values()]
+    return {load: _record(folder / "quality.json").get("error_of_max_shear", {}) for load, folder in measured.items()}

@@ -152,7 +152,7 @@ def _registrations(study: Study) -> list[Stage]:
         "parameters": [str(p) for p in own], "error_model": str(error_model[0]) if error_model else None,
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "seed": study.study.seed, "threads": 1,
-    } | ({"twin": True} if how.twin else {})  # fmt: skip
+    }  # fmt: skip
     files = (load0, *(Path(p) for p in aside.values()), *own, *error_model)
     folder = study.out / REGISTRATION
 
@@ -161,7 +161,7 @@ def _registrations(study: Study) -> list[Stage]:
         more = {
             "load": str(place), "out": str(folder / load),
             "after": None if after is None else str(folder / after),
-        }  # fmt: skip
+        } | ({"twin": True} if how.twin and load != REPEAT else {})  # fmt: skip
         waits = () if after is None else (f"register {after}",)
         floor = {"repeat": {f"register {REPEAT}": str(folder / REPEAT)} if repeat else {}}
         return Stage(f"register {load}", shared | more, (*files, place), (folder / load,), waits, {}, floor)

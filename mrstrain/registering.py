@@ -340,7 +340,7 @@ class _Run:
                 made = None
                 if name != REPEAT:
                     last.append(found.bspline)
-                    made = twin_check(found, self.subject, worker, told) if self.twin else None
+                    made = twin_check(found, self.subject, start, worker, told) if self.twin else None
                     self._floor_known.wait()
                 self._write(name, found, made)
             except MrstrainError as error:

@@ -107,5 +107,5 @@ def register_one(
             worker=worker,
             progress=tell,
         )
-        made = twin_check(found, subject, worker, tell) if twin and not is_repeat else None
+        made = twin_check(found, subject, start, worker, tell) if twin and not is_repeat else None
     return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model, twin=made)

@@ -6,10 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from dvc.arrays import Float32Array
-from dvc.errors import MrstrainError
+from dvc.deformation import Deformation
+from dvc.errors import InputError, MrstrainError
+from dvc.noise import signal_to_noise
 from dvc.registration import Registration, register
 from dvc.resample import shows
 from dvc.strainmaps import strain_maps
+from dvc.tissue import tissue_mask
 from dvc.worker import Worker
 from mrstrain.inputs import Subject
 from phantoms.twin import loaded_twin
@@ -30,14 +33,24 @@ class TwinCheck:
     failure: str = ""
 
 
-def twin_check(found: Registration, subject: Subject, worker: Worker, tell: Callable[[str, float], None]) -> TwinCheck:
+def twin_check(
+    found: Registration,
+    subject: Subject,
+    start: Deformation | None,
+    worker: Worker,
+    tell: Callable[[str, float], None],
+) -> TwinCheck:
     """Move the unloaded image by what was found, draw its noise anew, and register it as the pair was.
+
+    The twin lies on the loaded image's grid, and is as noisy as the noisier of the two.
 
     Parameters
     ----------
     found : Registration
         Of the pair. Its strain is the twin's true one.
     subject : Subject
+    start : Deformation or None
+        What the pair's registration started from.
     worker : Worker
     tell : callable
         ``tell(stage, fraction)``.
@@ -45,7 +58,15 @@ def twin_check(found: Registration, subject: Subject, worker: Worker, tell: Call
     tell("making the twin", 0.0)
     motion, seed = found.alignment.motion, found.settings.seed
     try:
-        twin = loaded_twin(found.reference, found.tissue, found.total, near=motion, seed=seed).image
+        twin = loaded_twin(
+            found.reference,
+            found.tissue,
+            found.total,
+            near=motion,
+            seed=seed,
+            onto=found.loaded.grid,
+            noisier=_noisier(found),
+        ).image
         tell("making the twin", 1.0)
         again = register(
             found.reference,
@@ -54,6 +75,7 @@ def twin_check(found: Registration, subject: Subject, worker: Worker, tell: Call
             tissue=found.tissue,
             labels=subject.labels,
             settings=found.settings,
+            start=start,
             worker=worker,
             progress=lambda stage, fraction: tell(f"twin: {stage}", fraction),
         )
@@ -61,4 +83,15 @@ def twin_check(found: Registration, subject: Subject, worker: Worker, tell: Call
         return TwinCheck(None, str(reason))
     placed, edge = again.alignment.motion, float(again.bspline.control.spacing_mm.min())
     maps = strain_maps(again.deformation, again.tissue, lambda x: shows(twin, placed.apply(x), edge))
+    if (maps.jacobian[found.tissue.inside] <= 0.0).any():
+        return TwinCheck(None, "Its registration folds, so it tells nothing.")
     return TwinCheck(maps.max_shear)
+
+
+def _noisier(found: Registration) -> float:
+    """How many times noisier the loaded image is than the unloaded one, for its signal; at least 1."""
+    try:
+        loaded = signal_to_noise(found.loaded, tissue_mask(found.loaded))
+    except InputError:  # no threshold finds the body there
+        return 1.0
+    return max(1.0, signal_to_noise(found.reference, found.tissue) / loaded)

@@ -37,9 +37,8 @@ class Twin:
     Attributes
     ----------
     image : Image
-        On the unloaded image's grid.
     noise_sd : float
-        Of the unloaded image and of the twin, in the image's own unit.
+        Of the twin, in the image's own unit.
     shown : float
         Share of the tissue whose deformed place is known and lies in the image.
     """
@@ -57,6 +56,8 @@ def loaded_twin(
     near: RigidMotion | None = None,
     seed: int,
     shading: bool = True,
+    onto: Grid | None = None,
+    noisier: float = 1.0,
 ) -> Twin:
     """Form the image of tissue after a deformation.
 
@@ -78,6 +79,10 @@ def loaded_twin(
         Of noise and receive field.
     shading : bool
         Whether the twin has a receive field of its own.
+    onto : Grid, optional
+        Of the twin; the unloaded image's by default.
+    noisier : float
+        Times the unloaded image's noise that the twin gets.
 
     Raises
     ------
@@ -105,7 +110,8 @@ def loaded_twin(
     points = tissue.points()
     moved = points + u
     known = np.flatnonzero(np.all(np.isfinite(moved), axis=1))
-    in_view = np.count_nonzero(reference.grid.contains(moved[known])) / len(points)
+    grid = onto or reference.grid
+    in_view = np.count_nonzero(grid.contains(moved[known])) / len(points)
     if in_view < 0.5:
         raise InputError(
             f"The deformation moves {1 - in_view:.0%} of the tissue out of the unloaded image's field of view, or is "
@@ -115,14 +121,14 @@ def loaded_twin(
     clean = _without_noise(reference, tissue, sigma)
     # With the rim of air around it the skin keeps its partial volume, wherever the deformation is defined there.
     drawn = Mask(tissue.grid, binary_dilation(tissue.inside, iterations=_RIM_VOXELS))
-    values = _carried(clean, drawn, whole, near or RigidMotion.identity())
+    values = _carried(clean, drawn, whole, near or RigidMotion.identity(), grid)
     if shading:
-        values *= sensitivity(reference.grid, seed + 1)
+        values *= sensitivity(grid, seed + 1)
     random = np.random.default_rng(seed)
-    noise = np.float32(sigma)
+    noise = np.float32(noisier * sigma)
     values += noise * random.standard_normal(values.shape, dtype=np.float32)
     values = np.hypot(values, noise * random.standard_normal(values.shape, dtype=np.float32))
-    return Twin(Image(reference.grid, values), sigma, in_view)
+    return Twin(Image(grid, values), float(noise), in_view)
 
 
 def found_back(whole: Deformation, points_mm: FloatArray, start_mm: FloatArray) -> FloatArray:
@@ -180,8 +186,7 @@ def _without_noise(image: Image, tissue: Mask, sigma: float) -> Image:
     return Image(image.grid.part(box), values.astype(np.float32))
 
 
-def _carried(clean: Image, tissue: Mask, whole: Deformation, near: RigidMotion) -> Float32Array:
-    grid = tissue.grid
+def _carried(clean: Image, tissue: Mask, whole: Deformation, near: RigidMotion, grid: Grid) -> Float32Array:
     coefficients = spline_filter(clean.values.astype(np.float64), order=3, mode="mirror")
     back = _known_inverse(whole)
     # Newton's method begins at the voxel that lands nearest: one in eight of them is near enough.

@@ -86,14 +86,14 @@ def test_dihedral_angles_of_known_shapes() -> None:
     assert dihedral_angles_deg(regular)[0] == pytest.approx(np.degrees(np.arccos(1 / 3)))
 
 
-def _spoiled(free: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _spoiled(free: bool, by: float = 0.93) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Two tissues one upon the other, and one node shoved until cells beside it are nearly flat."""
     box = block((4, 4, 4), (4.0, 4.0, 4.0), layers=2)
     points, tissue = box.points_mm.copy(), np.zeros(len(box.cells), dtype=int)
     tissue[box.regions["layer 1"]] = 1
     at = points.min(axis=0) + ([1.0, 2.0, 1.0] if free else [2.0, 2.0, 2.0])
     node = int(np.argmin(np.linalg.norm(points - at, axis=1)))
-    points[node] += [0.0, 0.93, 0.0]
+    points[node] += [0.0, by, 0.0]
     return points, box.cells, tissue
 
 
@@ -106,6 +106,7 @@ def test_a_flat_cell_is_mended_and_borders_stay_where_they_are() -> None:
         assert least(points, cells) < 8.0
         mended = without_slivers(points, cells, tissue)
         assert least(mended, cells) > 12.0
+        assert least(without_slivers(*_spoiled(free, 1.0)), cells) > 12.0  # quite flat
         assert np.count_nonzero((mended != points).any(axis=1)) < 8
         faces, halves = block((4, 4, 4), (4.0, 4.0, 4.0)).facets, points[:, 0] == 2.0
         assert np.array_equal(mended[halves, 0], points[halves, 0])  # the border between the tissues
