@@ -76,6 +76,16 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
     return _OTHER_GIB
 
 
+def disk_bytes(stage: Stage, study: Study, voxels: float) -> float:
+    """About how much room the results of a stage take; parameters as in `seconds_of`."""
+    loads = len(study.loads)
+    if stage.kind == "register":
+        return _BYTES_VOXEL * voxels
+    if stage.kind == "level":
+        return loads * (_BYTES_VOXEL * voxels + 1e6 * _MB_MODEL)
+    return 1e6 * _MB_MODEL * (1 if stage.kind == "mesh" else loads)
+
+
 def _with_borders(study: Study) -> bool:
     how = study.registration
     ours = engine_of(how.engine, how.preset, how.parameters) == GAUSS_NEWTON
@@ -93,9 +103,7 @@ def costs(
     minutes = max(sum(seconds) / workers, *seconds) / 60.0
     gib = sorted((gib_of(stage, study, voxels, cells) for stage in left), reverse=True)
     needed = sum(gib[:workers])  # whichever of them meet
-    loads = len(study.loads)
-    models = sum(stage.kind in ("simulate", "drive") for stage in stages)
-    disk = (_BYTES_VOXEL * voxels * (loads + 1) + 1e6 * _MB_MODEL * loads * (models + 1)) / 1e9
+    disk = sum(disk_bytes(stage, study, voxels) for stage in left) / 1e9
     free = shutil.disk_usage(study.place).free / 1e9
     lines = [
         f"To do: {len(left)} of {len(stages)} stages, about {minutes:.0f} minutes on {workers} cores, "

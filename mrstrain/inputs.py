@@ -175,7 +175,7 @@ def refuse_touching_inputs(out: Path, case_folders: Sequence[str], inputs: Seque
                 )
 
 
-def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") -> None:
+def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "", option: str = "--out") -> None:
     """Refuse an output folder, made or not yet made, on a disk with too little room for ``needed`` bytes.
 
     Parameters
@@ -184,13 +184,15 @@ def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") ->
         "the set needs", say.
     instead : str
         More that can be done about it, as it follows "choose another --out".
+    option : str
+        What names the folder.
     """
     there = next(place for place in (out.resolve(), *out.resolve().parents) if place.exists())
     free = shutil.disk_usage(there).free
     if free < needed:
         raise OutputError(
             f"{out}: {what} about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. Free some, choose "
-            f"another --out{instead}."
+            f"another {option}{instead}."
         )
 
 

@@ -9,10 +9,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from filelock import FileLock, Timeout
 
 from dvc.errors import InputError, OutputError, ParameterError
-from mrstrain.inputs import make_output
+from dvc.imagefile import read_image
+from mrstrain.costs import disk_bytes
+from mrstrain.inputs import make_output, refuse_small_disk
 from mrstrain.ledger import Ledger
 from mrstrain.pipeline import Outcome, Pipeline, run_all
 from mrstrain.plan import KINDS, Stage, plan
@@ -168,6 +171,7 @@ def run_studies(
         for prefix, study, stages in zip(prefixes, studies, planned, strict=True):
             stack.enter_context(_alone(study.out))
             pipelines[prefix] = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
+            _refuse_small_disk(study, pipelines[prefix])
             log = stack.enter_context(_log(study.out / LOG))
             log(f"Study '{study.study.name}': {len(stages)} stages")
             lines[prefix] = line_of(prefix, log, stages)
@@ -179,6 +183,21 @@ def run_studies(
             lines[prefix](f"Report: {study.out / REPORT}")
             done.append(Ran(study, outcomes))
     return done
+
+
+def _refuse_small_disk(study: Study, pipeline: Pipeline) -> None:
+    """Refuse a run whose results would not fit, before any of it is made."""
+    forecast = pipeline.forecast()
+    left = [stage for stage in pipeline.stages if forecast[stage.name] == "run"]
+    if not left:
+        return
+    try:
+        reference = read_image(study.path(study.images.load0), allow_missing=True)
+    except InputError:
+        return  # the stages that read it say what is wrong with it
+    voxels = float(np.prod(reference.grid.shape))
+    needed = sum(disk_bytes(stage, study, voxels) for stage in left)
+    refuse_small_disk(study.out, needed, f"the results of {len(left)} stages need", "", "[study] out")
 
 
 def report(study: Path | str | Study) -> Ran:

@@ -138,6 +138,15 @@ def test_run_again_does_nothing_in_under_ten_seconds(done):
     assert (folder / "results" / "mesh" / "mesh.vtu").stat().st_mtime_ns == before
 
 
+def test_a_disk_with_too_little_room_is_refused_before_anything_is_made(done, images, tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5 * 10**7))
+    shutil.copytree(images, tmp_path / "study")
+    with pytest.raises(OutputError, match=r"the results of 6 stages need about \d+ MB and the disk has 50 MB left"):
+        run(tmp_path / "study")
+    assert not (tmp_path / "study" / "results" / "registration").exists()
+    assert run(done[0]).complete  # where all is there already, none is needed
+
+
 def test_the_report_alone(done):
     folder, _ = done
     first = (folder / "results" / "report.html").read_text()
