@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from dvc.arrays import Float32Array
 from dvc.deformation import Deformation
 from dvc.errors import InputError, MrstrainError
@@ -16,6 +18,8 @@ from dvc.tissue import tissue_mask
 from dvc.worker import Worker
 from mrstrain.inputs import Subject
 from phantoms.twin import loaded_twin
+
+_FOLDED = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,8 +87,9 @@ def twin_check(
         return TwinCheck(None, str(reason))
     placed, edge = again.alignment.motion, float(again.bspline.control.spacing_mm.min())
     maps = strain_maps(again.deformation, again.tissue, lambda x: shows(twin, placed.apply(x), edge))
-    if (maps.jacobian[found.tissue.inside] <= 0.0).any():
-        return TwinCheck(None, "Its registration folds, so it tells nothing.")
+    folded = float(np.mean(maps.jacobian[found.tissue.inside] <= 0.0))
+    if folded > _FOLDED:
+        return TwinCheck(None, f"Its registration folds in {folded:.1%} of the tissue, so it tells nothing.")
     return TwinCheck(maps.max_shear)
 
 
