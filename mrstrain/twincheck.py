@@ -70,6 +70,7 @@ def twin_check(
             seed=seed,
             onto=found.loaded.grid,
             noisier=_noisier(found),
+            beyond_missing=True,
         ).image
         tell("making the twin", 1.0)
         again = register(

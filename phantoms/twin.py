@@ -58,6 +58,7 @@ def loaded_twin(
     shading: bool = True,
     onto: Grid | None = None,
     noisier: float = 1.0,
+    beyond_missing: bool = False,
 ) -> Twin:
     """Form the image of tissue after a deformation.
 
@@ -83,6 +84,9 @@ def loaded_twin(
         Of the twin; the unloaded image's by default.
     noisier : float
         Times the unloaded image's noise that the twin gets.
+    beyond_missing : bool
+        Whether the twin has no value, instead of air, where the unloaded image did not look (as ``near`` has it): a
+        body goes on beyond an image's end, and a registration would follow an end that moves.
 
     Raises
     ------
@@ -128,6 +132,9 @@ def loaded_twin(
     noise = np.float32(noisier * sigma)
     values += noise * random.standard_normal(values.shape, dtype=np.float32)
     values = np.hypot(values, noise * random.standard_normal(values.shape, dtype=np.float32))
+    if beyond_missing:
+        came_from = (near or RigidMotion.identity()).inverse().apply(grid.points().reshape(-1, 3))
+        values[~reference.grid.contains(came_from).reshape(grid.shape)] = np.nan
     return Twin(Image(grid, values), float(noise), in_view)
 
 

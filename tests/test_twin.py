@@ -163,3 +163,15 @@ def test_command_writes_the_twin_and_its_truth(unloaded: tuple[Image, Mask], hee
     # a displacement sampled every 1.6 mm blurs the jumps of the strain
     assert np.median(np.abs(found[fat] - true)) < 0.01
     assert (tmp_path / "out" / "truth" / "twin" / "displacement.nii.gz").exists()
+
+
+def test_where_the_unloaded_image_did_not_look_the_twin_has_no_value(unloaded: tuple[Image, Mask]) -> None:
+    image, body = unloaded
+    foot = RigidMotion(np.eye(3), np.array([0.0, 0.0, -3.0 * SPACING]))  # the leg's end comes into view
+    given = {"near": foot, "seed": 1, "onto": image.grid}
+    missing = ~np.isfinite(loaded_twin(image, body, foot, beyond_missing=True, **given).image.values)
+    assert missing[..., -3:].all()
+    assert not missing[..., :-3].any()
+    assert np.isfinite(loaded_twin(image, body, foot, **given).image.values).all()
+    noisier = loaded_twin(image, body, foot, noisier=2.0, **given)
+    assert noisier.noise_sd == pytest.approx(2.0 * noise_sd(image, body), rel=1e-3)
