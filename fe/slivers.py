@@ -33,6 +33,7 @@ def without_slivers(points_mm: FloatArray, cells: IntArray, tissue: IntArray, go
     Parameters
     ----------
     points_mm : (n, 3)
+        Nodes, mm, in any frame.
     cells : (m, 4) int
         Tetrahedra, all counted the same way round; one that is quite flat is taken to be as well.
     tissue : (m,) int

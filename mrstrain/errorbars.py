@@ -113,22 +113,12 @@ class ErrorBars:
         if self.uncertainty is not None:
             rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in self.uncertainty.intervals)
             columns = ("region", "figure", "as found", "95 % from", "to")
-            note = f"{self.told} {self.of_twin}".strip()
-            tables.append(Table("Maximal shear with its error", columns, rows, note))
+            tables.append(Table("Maximal shear with its error", columns, rows, self.told))
         if self.twin:
-            known = self.uncertainty is not None
-            more = ("within the claim", "expected, at least", "wider") if known else ()
-            columns = ("region", "error (rms)", "bias", *more)
-            judgements = (
-                (f"{row.held:.0%}", f"{row.expected:.0%}", row.factor)
-                if row.held is not None and row.expected is not None
-                else ()
-                for row in self.twin
-            )
-            judged = tuple(
-                (row.region, row.rms_error, row.bias, *more) for row, more in zip(self.twin, judgements, strict=True)
-            )
-            tables.append(Table("The twin of this pair, measured again", columns, judged, _TWIN))
+            claims = self.uncertainty is not None
+            head = ("region", "error (rms)", "bias", *(("within the claim", "expected, at least", "wider") * claims))
+            lines = tuple((row.region, row.rms_error, row.bias, *_against_claims(row)) for row in self.twin)
+            tables.append(Table("The twin of this pair, measured again", head, lines, _TWIN))
         return tables
 
     def pictures(self, view: View, reference: Image) -> dict[str, Picture]:
@@ -197,11 +187,14 @@ def _used(chosen: ErrorModel, table: ErrorTable, wider: Mapping[str, float]) -> 
 def _of_twin(rows: Sequence[Judged], twin: TwinCheck | None) -> str:
     """What the pair's twin did to the error bars, or why there is none; empty where none was asked for."""
     if twin is not None and twin.failure:
-        return f"There is no twin of this pair: {twin.failure}"
-    if not any(row.factor is not None for row in rows):
+        return f"there is no twin of this pair. {twin.failure}"
+    if not rows:
         return ""
+    if all(row.factor is None for row in rows):
+        errors = ", ".join(f"{row.region} {row.rms_error:.3f}" for row in rows)
+        return f"not known; the twin of this pair came back with an error (rms) of {errors}."
     some = ", ".join(f"{row.region} {row.factor:.1f} times" for row in rows if row.factor and row.factor > 1.0)
-    return f"The twin of this pair has made them wider: {some}." if some else "They hold in the twin of this pair."
+    return f"made wider by the twin of this pair: {some}." if some else "they hold in the twin of this pair."
 
 
 def _held(table: ErrorTable) -> str:
@@ -293,6 +286,13 @@ def _bone_and_tissues(
     if not soft:
         soft = {POOLED: tissue & ~bone}
     return bone, {name: inside & ~bone for name, inside in soft.items()}
+
+
+def _against_claims(row: Judged) -> tuple[str | float, ...]:
+    """What the twin says of a tissue's error bars, as a table shows it; nothing where there are none."""
+    if row.held is None or row.expected is None or row.factor is None:
+        return ()
+    return f"{row.held:.0%}", f"{row.expected:.0%}", row.factor
 
 
 def _words(figure: str) -> str:

@@ -58,6 +58,8 @@ class Case:
         What this case's strain amounts to as a noise floor; meaningful for a repeat scan only.
     without_error_bars : str
         Why it has none; empty where it has.
+    of_twin : str
+        What the pair's twin did to them; empty where none was asked for.
     """
 
     name: str
@@ -66,6 +68,7 @@ class Case:
     shear: dict[str, tuple[float, float]]
     own_floor: NoiseFloor | None
     without_error_bars: str = ""
+    of_twin: str = ""
 
     def summary(self) -> list[str]:
         """The verdict with its reasons and the strain, for a person."""
@@ -75,6 +78,7 @@ class Case:
             *(f"    {reason}" for reason in self.verdict.reasons),
             f"    maximal shear, median / 95th percentile: {shear}",
             *([f"    no error bars: {self.without_error_bars}"] if self.without_error_bars else []),
+            *([f"    error bars: {self.of_twin}"] if self.of_twin else []),
         ]
 
 
@@ -254,15 +258,14 @@ def _written(
         tuple(pictures.values()),
         (
             *((page.WITH_BORDERS,) if borders else ()),
-            *(
-                ()
-                if bars is None or bars.uncertainty is not None
-                else (f"No error bars. {bars.told} {bars.of_twin}".strip(),)
-            ),
+            *(() if bars is None or bars.uncertainty is not None else (f"No error bars. {bars.told}",)),
+            *(() if bars is None or not bars.of_twin else (f"Error bars: {bars.of_twin}",)),
         ),
     )
     without = "" if bars is None or bars.uncertainty is not None else bars.told
-    return Case(measured.name, section, quality.verdict, shear, noise_floor(maps, _soft(measured)), without)
+    of_twin = "" if bars is None else bars.of_twin
+    floor = noise_floor(maps, _soft(measured))
+    return Case(measured.name, section, quality.verdict, shear, floor, without, of_twin)
 
 
 def _soft(measured: Measured) -> BoolArray:

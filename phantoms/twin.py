@@ -118,7 +118,7 @@ def loaded_twin(
     in_view = np.count_nonzero(grid.contains(moved[known])) / len(points)
     if in_view < 0.5:
         raise InputError(
-            f"The deformation moves {1 - in_view:.0%} of the tissue out of the unloaded image's field of view, or is "
+            f"The deformation moves {1 - in_view:.0%} of the tissue out of the image's field of view, or is "
             "not defined there. Give one of this image, bone motion included, or a mask that fits."
         )
     sigma = noise_sd(reference, tissue)

@@ -178,12 +178,12 @@ def test_error_bars_that_hold_in_the_pairs_twin_stay_and_others_are_made_wider(s
     assert bars.tables()[1].title.startswith("The twin")
     if sd < 0.02:
         assert row.factor == 1.0
-        assert bars.of_twin == "They hold in the twin of this pair."
+        assert bars.of_twin == "they hold in the twin of this pair."
         assert bars.uncertainty.intervals == alone.uncertainty.intervals
         assert np.isnan(bars.model.tables[0].widening)  # as it was: of one heel
         return
     assert row.factor == pytest.approx(np.sqrt((errors.ppf(0.95) / 1.96) ** 2 - 0.02**2) / 0.02, rel=0.02)
-    assert bars.of_twin.startswith("The twin of this pair has made them wider: fat 1.")
+    assert bars.of_twin.startswith("made wider by the twin of this pair: fat 1.")
     assert np.nanmax(bars.uncertainty.sigma) == pytest.approx(0.02 * row.factor, rel=1e-5)
     for now, before in zip(bars.uncertainty.intervals, alone.uncertainty.intervals, strict=True):
         assert now.estimate == before.estimate
@@ -246,9 +246,10 @@ def test_without_an_error_model_the_twin_tells_the_least_error() -> None:
     assert row.rms_error == pytest.approx(np.hypot(0.03, 0.05), rel=0.05)
     (table,) = bars.tables()
     assert table.columns == ("region", "error (rms)", "bias")
+    assert bars.of_twin.startswith("not known; the twin of this pair came back with an error (rms) of fat 0.05")
     failed = error_bars(found, subject, maps, model(), TwinCheck(None, "The deformation folds."))
     assert failed.twin == ()
-    assert failed.of_twin == "There is no twin of this pair: The deformation folds."
+    assert failed.of_twin == "there is no twin of this pair. The deformation folds."
     assert failed.uncertainty is not None
 
 

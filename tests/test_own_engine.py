@@ -197,6 +197,7 @@ def test_the_twin_of_a_pair_is_measured_again_and_told(tiny_pair, tmp_path):
     shear = read_image(tmp_path / "out" / "Load1" / "max_shear.nii.gz", allow_missing=True).values
     # much of the shear is found again, and not all: a twin that was not moved, or is the pair itself, would show here
     assert 0.003 < row["rms_error"] < 0.6 * float(np.sqrt(np.nanmean(shear**2)))
+    assert any("the twin of this pair came back with" in line for line in results.summary())
     assert "The twin of this pair" in (tmp_path / "out" / "report.html").read_text()
     record = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert record["parameters"]["twin"] is True
