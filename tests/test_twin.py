@@ -132,7 +132,7 @@ def test_what_no_image_can_show_is_refused(unloaded: tuple[Image, Mask]) -> None
     image, body = unloaded
     with pytest.raises(InputError, match="folds"):
         loaded_twin(image, body, Affine(np.diag([-1.0, 1.0, 1.0]), np.zeros(3)), seed=1)
-    with pytest.raises(InputError, match="out of the unloaded image"):
+    with pytest.raises(InputError, match="field of view"):
         loaded_twin(image, body, RigidMotion(np.eye(3), np.array([90.0, 0.0, 0.0])), seed=1)
     other = Mask(Grid(body.grid.shape, body.grid.spacing_mm, body.grid.origin_mm + 1.0), body.inside)
     with pytest.raises(InputError, match="not on the unloaded image"):
