@@ -71,6 +71,7 @@ def descend(
     changed: Callable[[FloatArray, FloatArray], bool] = lambda _state, _forces: False,
     told: Callable[[str], None] = lambda _: None,
     farthest_mm: float = np.inf,
+    over: Callable[[], bool] = lambda: False,
 ) -> Converged | None:
     """Find the state in balance with forces from outside to which a body in a viscous medium comes.
 
@@ -82,6 +83,8 @@ def descend(
         As there; asked after every step.
     farthest_mm : float
         Given up where a node has moved by more, mm.
+    over : callable
+        Asked before every step; given up where it is true.
 
     Returns
     -------
@@ -96,6 +99,8 @@ def descend(
         return None
     tangent = assembler.tangent(now)
     for count in range(1, _MOST_STEPS + 1):
+        if over():
+            return None
         before_n = max(out_of_balance(outside - residual, assembler), 1e-300)
         by_node = np.repeat(damping * thickness * model.node_volumes_mm3, 3)
         medium = assembler.by_equation(np.concatenate([by_node, np.zeros(model.space.pressures)]))

@@ -18,8 +18,10 @@ from dvc.worker import Worker
 from fe.facets import BONE, CUT, SKIN
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.surfaces import Borders, borders_of, labels_at
+from fe.volumes import with_volumes
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
+_FARTHEST = 0.1  # of the smallest voxel edge: how far a node may move at once to keep the tissues' volumes
 _SURE = 0.8
 _SECONDS_PER_TRIANGLE, _SECONDS_PER_CELL = 6e-4, 1e-4  # as measured on one core
 _MOST_LOST = 0.2  # of a tissue's volume
@@ -115,6 +117,9 @@ def mesh_labels(
     points, cells = _limited(borders, edge_mm, _ENVELOPE * spacing, lattice, limit_s, watch)
     found = labels_at(borders, points[cells].mean(axis=1))
     body = np.isin(found, list(soft.values()))
+    voxel_mm3 = labels.grid.voxel_volume_mm3
+    volumes_mm3 = {number: voxel_mm3 * float((labels.labels == number).sum()) for number in numbers.values()}
+    points = with_volumes(points, cells, found, volumes_mm3, _FARTHEST * spacing)
     points = without_slivers(points, cells[body], found[body])
     mesh = _named(points, cells, found, soft, [numbers[b] for b in bones], labels)
     quality = _quality(mesh, labels, soft)

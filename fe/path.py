@@ -125,8 +125,10 @@ class Path:
         threads: int,
         tolerance: Tolerance,
         tell: Callable[[str], None],
+        over: Callable[[], bool] = lambda: False,
     ) -> None:
         self.model, self.tolerance, self.tell = model, tolerance, tell
+        self.over = over  # whether to stop where it stands
         self.settled: Callable[[], None] = lambda: None  # called at each equilibrium from which one can go on
         held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in fixed]))
         touching = np.setdiff1d(_nodes_on(model, mesh, SKIN), held)
@@ -199,7 +201,8 @@ class Path:
         way = goal.values - before
         largest = _MOST_APPROACH_MM / max(float(np.abs(way[goal.travels]).max(initial=0.0)), 1e-12)
         done, step, downhill = 0.0, _FIRST_STEP, False
-        while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else min(_LEAST_STEP, 0.01 * largest)):
+        least = min(_LEAST_STEP, 0.01 * largest)
+        while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.over():
             step = min(step, largest)
             share = min(1.0, done + step)
             kept = self.standing
@@ -218,7 +221,7 @@ class Path:
         """Move the plate along its normal until its force is enough, or no more can be had; never past the most."""
         farthest = self.plate.travel_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
         step, growth = _APPROACH_MM, _GROWTH
-        while self.plate.force_n[0] < enough_n and step > _LEAST_APPROACH_MM:
+        while self.plate.force_n[0] < enough_n and step > _LEAST_APPROACH_MM and not self.over():
             if farthest - self.plate.travel_mm[0] < step:
                 break
             kept = self.standing
@@ -290,8 +293,9 @@ class Path:
             return touched
 
         return descend(
-            self.assembler, self.solver, self.state, outside, self.tolerance, changed, self.tell, self.extent_mm
-        )
+            self.assembler, self.solver, self.state, outside, self.tolerance, changed, self.tell, self.extent_mm,
+            self.over,
+        )  # fmt: skip
 
     def _area_mm2(self) -> float:
         """Area of the faces of which every corner holds to the plate, as they are now."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -97,6 +98,8 @@ class State:
         Nodes that hold to the plate.
     kept : Kept, optional
         What the next load goes on from.
+    out_of_time : bool
+        Whether it ends here because its time was over.
     """
 
     load: LoadStep
@@ -109,6 +112,7 @@ class State:
     iterations: int
     seconds: float
     kept: Kept | None = None
+    out_of_time: bool = False
 
     @property
     def plate(self) -> PlateState:
@@ -136,6 +140,7 @@ def simulate(
     formulation: str = "P1",
     threads: int = 1,
     tolerance: Tolerance = _TOLERANCE,
+    limit_s: float = np.inf,
     earlier: Sequence[Kept] = (),
     keep: Callable[[State], None] = lambda _: None,
     settled: Callable[[LoadStep, Kept], None] = lambda *_: None,
@@ -160,6 +165,9 @@ def simulate(
         Of the linear algebra.
     tolerance : Tolerance
         When a state counts as in equilibrium.
+    limit_s : float
+        Time after which it ends at the last equilibrium; a step downhill that is under way is not finished, one of
+        Newton's is.
     earlier : sequence of Kept
         Of the first loads, from an earlier simulation of the same model, plate and loads: they are not solved again.
         The last may have been on its way.
@@ -185,7 +193,8 @@ def simulate(
     check(mesh, laws, plate, loads, fixed)
     turned = TetMesh(mesh.points_mm @ plate.axes, mesh.cells, mesh.regions, mesh.facets)
     model = Model.of(turned, laws, element(formulation))
-    path = Path(model, turned, plate, fixed, threads, tolerance, tell)
+    deadline = time.monotonic() + limit_s
+    path = Path(model, turned, plate, fixed, threads, tolerance, tell, lambda: time.monotonic() > deadline)
     states: list[State] = []
     try:
         for number, load in enumerate(loads):
@@ -218,6 +227,7 @@ def simulate(
                     iterations=kept.iterations,
                     seconds=kept.seconds,
                     kept=kept,
+                    out_of_time=not whole and path.over(),
                 )
             )
             keep(states[-1])

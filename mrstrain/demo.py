@@ -48,7 +48,8 @@ names = "{to_mesh}.csv"
 
 [models]
 sets = {sets}
-"""
+{limit}"""
+_LIMIT = "limit_minutes = 20  # Friedman's fat, the softest, would take hours\n"
 _LOAD = """[loads.{name}]
 image = "{name}.nii.gz"
 normal_n = {normal_n}
@@ -133,7 +134,7 @@ def _text(seed: int, full: bool) -> str:
     loads = "".join(_LOAD.format(name=load.name, normal_n=load.normal_n, shear_n=load.shear_n or 0.0) for load in LOADS)
     return _STUDY.format(
         seed=seed, loads=loads, edge_mm=2.8 if full else 4.0, to_mesh="tissues_to_mesh" if full else _COARSE,
-        sets=json.dumps(_ALL_SETS if full else _SETS),
+        sets=json.dumps(_ALL_SETS if full else _SETS), limit=_LIMIT if full else "",
     )  # fmt: skip
 
 

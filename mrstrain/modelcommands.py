@@ -90,6 +90,10 @@ def simulate(
     ] = None,
     element: Annotated[str, typer.Option(help="P1 (fast), MINI, or P2 (quadratic: more exact, slow).")] = "P1",
     decks: Annotated[bool, typer.Option("--decks", help="Also write each load for CalculiX and FEBio.")] = False,
+    limit_minutes: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Time after which a path of loads ends where it stands. Default: none."),
+    ] = None,
     mesh_unit: MeshUnit = Unit.MM,
     mesh_frame: MeshFrame = Frame.LPS,
     workers: Annotated[int | None, typer.Option(min=1, help="Simulations at once. Default: one for each core.")] = None,
@@ -114,6 +118,7 @@ def simulate(
             fixed=fix or (),
             element=element,
             decks=decks,
+            limit_s=None if limit_minutes is None else 60.0 * limit_minutes,
             mesh_unit=mesh_unit.value,
             mesh_frame=mesh_frame.value,
             workers=workers,

@@ -30,6 +30,7 @@ def simulated_path(
     folder: Path,
     share: Path,
     threads: int,
+    limit_s: float,
 ) -> list[State]:
     """Run one path in a worker: each load's files are written as soon as it is there, and each step's line in the log.
 
@@ -73,7 +74,7 @@ def simulated_path(
 
     return solve(
         mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=tell, keep=keep,
-        settled=settled, earlier=earlier, progress=lambda done: _replaced(share, f"{done:.4f}"),
+        settled=settled, earlier=earlier, limit_s=limit_s, progress=lambda done: _replaced(share, f"{done:.4f}"),
     )  # fmt: skip
 
 

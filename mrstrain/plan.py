@@ -216,6 +216,7 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
         "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))), "element": study.models.element,
         "decks": study.models.decks,
+        "limit_s": None if study.models.limit_minutes is None else 60.0 * study.models.limit_minutes,
     }  # fmt: skip
     return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
 

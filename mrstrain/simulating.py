@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+
 from dvc.errors import InputError, MrstrainError
 from dvc.mesh import TetMesh
 from dvc.whole import whole_file
@@ -116,6 +118,7 @@ def simulate(
     mesh_unit: str = "mm",
     mesh_frame: str = "LPS",
     decks: bool = False,
+    limit_s: float | None = None,
     workers: int | None = None,
     threads: int | None = None,
     progress: Told | None = None,
@@ -150,6 +153,8 @@ def simulate(
         As in `fe.elements`.
     decks : bool
         Also write each load as decks for CalculiX (C3D10) and FEBio 4 (tet10); see `fe.decks`.
+    limit_s : float, optional
+        Time after which a set's path of loads ends at its last equilibrium; with more time it goes on from there.
     workers, threads : int, optional
         Simulations at once, and threads of each; by default all cores are used.
     progress : callable, optional
@@ -183,7 +188,12 @@ def simulate(
                 left.unlink()
     files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
     given = {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(held)}
-    given |= {"turns": turns, "pivot_mm": None if pivot_mm is None else list(pivot_mm), "mesh_made": _mesh_made(place)}
+    given |= {
+        "limit_s": limit_s,
+        "turns": turns,
+        "pivot_mm": None if pivot_mm is None else list(pivot_mm),
+        "mesh_made": _mesh_made(place),
+    }
     jobs = [(one, path) for one in chosen for path in paths]
     at_once = max(1, min(workers or usable_cores(), len(jobs)))
     each = threads or max(1, usable_cores() // at_once)
@@ -207,7 +217,7 @@ def simulate(
             try:
                 states = worker.run(
                     f"simulating {case}", simulated_path, read, laws[name][0], plate, path, held, element,
-                    target / name, share, each, watch=watch,
+                    target / name, share, each, np.inf if limit_s is None else limit_s, watch=watch,
                 )  # fmt: skip
             except MrstrainError as failure:
                 states, failures[case] = [], str(failure)
@@ -308,6 +318,11 @@ def _written(
         for row in rows
         if row.crowded_share > _CROWD
     )
+    notes += tuple(
+        f"{state.load.name}: its time was over at {state.reached:.0%} of the load; given more, it goes on from there."
+        for state in states
+        if state.out_of_time
+    )
     tried = {state.load.name for state in states}
     notes += tuple(
         f"{load.name} was not tried: the load before it was not reached." for load in loads if load.name not in tried
@@ -331,6 +346,7 @@ def _written(
             )
         outcome[state.load.name] = {
             "reached": state.reached,
+            "out_of_time": state.out_of_time,
             "plate_travel_mm": state.travel_mm.tolist(),
             "plate_force_n": state.force_n.tolist(),
             "plate_turn_deg": state.plate.turn_deg.tolist(),

@@ -178,6 +178,8 @@ class Models(_Part):
         Also every simulated set sent through the measurement.
     decks : bool
         Also write each load as decks for CalculiX and FEBio.
+    limit_minutes : float, optional
+        Time after which a set's path of loads ends at its last equilibrium.
     """
 
     sets: Names = ()
@@ -187,6 +189,7 @@ class Models(_Part):
     drive: Flag = False
     level: Flag = False
     decks: Flag = False
+    limit_minutes: Annotated[Real, Field(gt=0.0)] | None = None
 
 
 class Comparing(_Part):

@@ -5,7 +5,9 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import meshio
 import numpy as np
@@ -70,6 +72,31 @@ def test_going_on_from_the_middle_of_a_load(whole, load: str) -> None:
         assert other.reached == 1.0
         assert other.force_n == pytest.approx(state.force_n, abs=2e-3)
         assert np.abs(other.u_mm - state.u_mm).max() < 0.02 * np.abs(state.u_mm).max()  # other steps, other places
+
+
+def test_a_path_whose_time_is_over_ends_where_it_stands_and_goes_on(
+    whole, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("fe.simulate.time", SimpleNamespace(monotonic=count().__next__))
+    cut, _, _ = run(limit_s=2)  # asked before every step: two are made
+    assert [state.load.name for state in cut] == ["a"]
+    assert cut[0].out_of_time
+    assert 0.0 < cut[0].reached < 1.0
+    assert cut[0].force_n[0] == pytest.approx(2.0 * cut[0].reached, rel=0.01)
+    write_kept(tmp_path / "a.npz", cut[0].kept, "this")
+    on, _, _ = run(earlier=[read_kept(tmp_path / "a.npz", "this")])
+    for state, other in zip(whole[0], on, strict=True):
+        assert (other.reached, other.out_of_time, state.out_of_time) == (1.0, False, False)
+        assert other.force_n == pytest.approx(state.force_n, abs=2e-3)
+
+
+def test_the_command_tells_that_time_was_over(tmp_path: Path) -> None:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
+    given = [*GIVEN, "--out", str(tmp_path / "out"), "--limit-minutes", "0.00001"]
+    ended = CliRunner().invoke(app, ["simulate", str(tmp_path / "dome.vtu"), *given])
+    assert ended.exit_code == 1
+    assert "a: its time was over at 0% of the load" in ended.output
+    assert "b was not tried" in ended.output
 
 
 def test_what_was_made_from_something_else_is_not_used(whole, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """A plate pressed and sheared against a dome of tissue on fixed bone: balance, tape, symmetry, frame, refusals."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -303,6 +304,12 @@ def test_where_stiff_skin_buckles_over_soft_fat_the_way_goes_downhill(monkeypatc
     crowded = {row.region: row.crowded_share for row in region_figures(dome((5, 8, 8)), there, soft)}
     assert crowded["skin"] == 0.0
     assert 0.01 < crowded["fat"] < 0.5
+    with monkeypatch.context() as clock:  # time is asked before every step, those downhill as well
+        clock.setattr("fe.simulate.time", SimpleNamespace(monotonic=itertools.count().__next__))
+        (cut,) = press(dome((5, 8, 8)), loads, soft, limit_s=60.0)
+    assert cut.out_of_time
+    assert 0.0 < cut.reached < there.reached
+    assert cut.iterations < 0.9 * there.iterations
     monkeypatch.setattr("fe.path.descend", lambda *_: None)
     (before,) = press(dome((5, 8, 8)), loads, soft)
     assert before.reached < 0.5
