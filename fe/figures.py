@@ -28,6 +28,7 @@ from fe.simulate import State
 
 _POINTS = 200
 _FLAT_MM = 0.1
+_STEEPEST = 0.05  # cosine between a plate's normal and the slice's: beyond, it is not drawn
 _MARGIN_MM = 7.0  # around what is drawn; the letters stand there
 _UNKNOWN = "#c9ced6"
 
@@ -56,27 +57,34 @@ def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
     return png_bytes(figure)
 
 
-def sagittal_slice(mesh: TetMesh, states: Sequence[State], plate: Plate) -> bytes:
+def sagittal_slice(mesh: TetMesh, states: Sequence[State]) -> bytes:
     """Maximal shear on the slice through the bone's lowest point, along the plate's normal and the shear's direction.
 
-    Cells are cut in the unloaded configuration and drawn where they are under load; the dashed line is the plate. The
-    colours end where a hundredth of the volume is above, over all loads.
+    Those of the first load, where loads have directions of their own. Cells are cut in the unloaded configuration and
+    drawn where they are under load; the dashed line is the plate. The colours end where a hundredth of the volume is
+    above, over all loads.
     """
-    panels, middle = [], _lowest_bone_point(mesh, plate)
+    axes = states[0].plate_axes
+    assert axes is not None
+    panels, middle = [], _lowest_bone_point(mesh, axes)
     for state in states:
         load = state.load
         part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%})"
         told = f"{load.name}: {load.told}{part}"
-        along = _along_plate(mesh, state, plate, middle)
+        along = _along_plate(mesh, state, axes, middle)
         panels.append(Slice(told, state.u_mm, StrainField.from_gradient(state.gradients).max_shear, along))
-    return slice_sheet(mesh, panels, plate.axes, middle)
+    return slice_sheet(mesh, panels, axes, middle)
 
 
-def _along_plate(mesh: TetMesh, state: State, plate: Plate, on_slice_mm: FloatArray) -> tuple[float, float]:
-    """Height of the plate where the slice's shear coordinate is 0, and its slope."""
-    on_plate = ((mesh.points_mm + state.u_mm)[state.on_plate] @ plate.axes).mean(axis=0)
-    normal = Rotation.from_rotvec(state.plate.turn_deg, degrees=True).as_matrix()[:, 0]
-    off = np.array([0.0, 0.0, float(on_slice_mm @ plate.axes[:, 2])]) - on_plate
+def _along_plate(mesh: TetMesh, state: State, axes: FloatArray, on_slice_mm: FloatArray) -> tuple[float, float] | None:
+    """Height of the plate where the slice's shear coordinate is 0, and its slope; None for one along the slice."""
+    assert state.plate_axes is not None
+    on_plate = ((mesh.points_mm + state.u_mm)[state.on_plate] @ axes).mean(axis=0)
+    turned = Rotation.from_rotvec(state.plate.turn_deg, degrees=True).as_matrix()[:, 0]
+    normal = axes.T @ state.plate_axes @ turned
+    if abs(normal[0]) < _STEEPEST:
+        return None
+    off = np.array([0.0, 0.0, float(on_slice_mm @ axes[:, 2])]) - on_plate
     return float(-(off @ normal) / normal[0]), float(-normal[1] / normal[0])
 
 
@@ -151,10 +159,10 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
     return png_bytes(figure)
 
 
-def _lowest_bone_point(mesh: TetMesh, plate: Plate) -> FloatArray:
+def _lowest_bone_point(mesh: TetMesh, axes: FloatArray) -> FloatArray:
     """Where the bone's surface lies furthest along the plate's outward normal, LPS mm; the middle of a flat bone."""
     points = mesh.points_mm[np.unique(mesh.facets[BONE])] if BONE in mesh.facets else mesh.points_mm
-    height = points @ plate.axes[:, 0]
+    height = points @ axes[:, 0]
     return np.asarray(points[height < height.min() + _FLAT_MM].mean(axis=0))
 
 
@@ -212,7 +220,7 @@ def force_travel(states: Sequence[State]) -> bytes:
 def mesh_slice(mesh: TetMesh, plate: Plate) -> bytes:
     """The mesh on a slice through the bone's lowest point, coloured by tissue."""
     figure, (panel,) = chart()
-    cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, _lowest_bone_point(mesh, plate))
+    cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, _lowest_bone_point(mesh, plate.axes))
     for number, (name, members) in enumerate(mesh.regions.items()):
         mine = [c for c, inside in zip(corners, np.isin(cells, members), strict=True) if inside]
         colour = REGION_COLOURS[number % len(REGION_COLOURS)]

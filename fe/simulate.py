@@ -100,6 +100,9 @@ class State:
         What the next load goes on from.
     out_of_time : bool
         Whether it ends here because its time was over.
+    plate_axes : (3, 3), optional
+        Columns: the directions of the normal force, of shear, and their cross product at the start, LPS; those of the
+        plate's vectors.
     """
 
     load: LoadStep
@@ -113,6 +116,7 @@ class State:
     seconds: float
     kept: Kept | None = None
     out_of_time: bool = False
+    plate_axes: FloatArray | None = None
 
     @property
     def plate(self) -> PlateState:
@@ -228,6 +232,7 @@ def simulate(
                     seconds=kept.seconds,
                     kept=kept,
                     out_of_time=not whole and path.over(),
+                    plate_axes=plate.axes,
                 )
             )
             keep(states[-1])

@@ -28,9 +28,9 @@ from mrstrain.engines import settings_of
 from mrstrain.ledger import Ledger
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.pipeline import Pipeline
-from mrstrain.plan import load_step, plan
+from mrstrain.plan import load_step, plan, towards
 from mrstrain.registering import REPEAT
-from mrstrain.studyfile import Study, read_study
+from mrstrain.studyfile import Study, Vector, read_study
 from validate.location import read_thresholds
 from validate.mapping import check_bones
 from validate.sources import check_overlap
@@ -171,12 +171,18 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
     """Look for what `simulate` would refuse; give about how many cells it will have."""
     sets = [found.tried(material_set, study.set_given(name)) for name in study.models.sets]
     laws = [one for one in sets if one is not None]
-    given = study.plate
-    plate = found.tried(Plate, given.normal, given.shear_direction, given.gap_mm, given.taped, given.turns)
-    steps = [found.tried(load_step, name, load) for name, load in study.loads.items()]
-    loads = [step for step in steps if step is not None]
-    if plate is not None and len(loads) == len(steps):
-        found.tried(check_loads, plate, loads)
+    given, own = study.plate, towards(study)
+    by_direction: dict[tuple[Vector, Vector], list[LoadStep]] = {}
+    for name, load in study.loads.items():
+        step = found.tried(load_step, name, load)
+        if step is not None:
+            by_direction.setdefault(own.get(name, (given.normal, given.shear_direction)), []).append(step)
+    loads: list[tuple[Plate, list[LoadStep]]] = []
+    for directions, steps in by_direction.items():
+        plate = found.tried(Plate, *directions, given.gap_mm, given.taped, given.turns)
+        if plate is not None:
+            found.tried(check_loads, plate, steps)
+            loads.append((plate, steps))
     if study.mesh.file is not None:
         file = study.path(study.mesh.file)
         mesh = found.tried(read_tet_mesh, file)
@@ -184,11 +190,11 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
             return 0.0
         if reference is not None:
             found.tried(check_overlap, file, mesh, reference.grid)
-        _on_mesh(found, mesh, laws, plate, loads, study.models.fixed)
+        _on_mesh(found, mesh, laws, loads, study.models.fixed)
         return float(len(mesh.cells))
     if study.mesh.labels is not None:
-        own = study.path(study.mesh.labels)
-        labels = found.tried(read_labels, own, _optional(study, study.mesh.names))
+        to_mesh = study.path(study.mesh.labels)
+        labels = found.tried(read_labels, to_mesh, _optional(study, study.mesh.names))
     unknown = {name.casefold() for name in study.models.fixed} - {"bone", "cut"}
     if unknown:
         found.wrong.append(
@@ -204,15 +210,16 @@ def _on_mesh(
     found: _Findings,
     mesh: TetMesh,
     sets: Sequence[MaterialSet],
-    plate: Plate | None,
-    loads: Sequence[LoadStep],
+    loads: Sequence[tuple[Plate, Sequence[LoadStep]]],
     fixed: Sequence[str],
 ) -> None:
     """Ask `simulate` itself about a mesh that was made elsewhere."""
     for one in sets:
         chosen = found.tried(one.for_regions, mesh.regions)
-        if chosen is not None and plate is not None and loads:
-            found.tried(check_simulation, mesh, chosen[0], plate, loads, fixed_facets(mesh, fixed))
+        if chosen is None:
+            continue
+        for plate, steps in loads:
+            found.tried(check_simulation, mesh, chosen[0], plate, steps, fixed_facets(mesh, fixed))
 
 
 def _on_labels(study: Study, found: _Findings, labels: LabelMap, sets: Sequence[MaterialSet]) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -18,11 +19,14 @@ LOADS = (
 )
 """The published experiment's."""
 
+_ALIKE: Mapping[str, Hashable] = MappingProxyType({})
 
-def paths_of(loads: Sequence[LoadStep]) -> list[tuple[LoadStep, ...]]:
+
+def paths_of(loads: Sequence[LoadStep], towards: Mapping[str, Hashable] = _ALIKE) -> list[tuple[LoadStep, ...]]:
     """Loads by path: pressed alike and sheared to the same side, by force or by travel, in the order of the shear.
 
-    A load without shear lies on the path of the first that is pressed like it and sheared.
+    A load without shear lies on the path of the first that is pressed like it and sheared. ``towards`` has the loads
+    that go in directions of their own; only those of the same directions lie on one path.
 
     Examples
     --------
@@ -33,19 +37,18 @@ def paths_of(loads: Sequence[LoadStep]) -> list[tuple[LoadStep, ...]]:
     if not names or len(set(names)) < len(names):
         raise InputError(f"Loads are needed, each with a name of its own; got {', '.join(names) or 'none'}.")
 
-    def key(load: LoadStep) -> tuple[float | bool, ...]:
-        like = next((x for x in loads if x.sheared and _pressed(x) == _pressed(load)), load)
+    def pressed(load: LoadStep) -> tuple[float, bool, Hashable]:
+        return float(load.goal.values[0]), bool(load.goal.travels[0]), towards.get(load.name)
+
+    def key(load: LoadStep) -> tuple[Hashable, ...]:
+        like = next((x for x in loads if x.sheared and pressed(x) == pressed(load)), load)
         shear = load if load.sheared else like
-        return *_pressed(load), bool(shear.goal.travels[1]), bool(shear.goal.values[1] < 0.0)
+        return *pressed(load), bool(shear.goal.travels[1]), bool(shear.goal.values[1] < 0.0)
 
     return [
         tuple(sorted((x for x in loads if key(x) == one), key=lambda x: (x.sheared, abs(float(x.goal.values[1])))))
         for one in dict.fromkeys(key(load) for load in loads)
     ]
-
-
-def _pressed(load: LoadStep) -> tuple[float, bool]:
-    return float(load.goal.values[0]), bool(load.goal.travels[0])
 
 
 def load_named(text: str) -> LoadStep:

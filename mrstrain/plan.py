@@ -14,7 +14,7 @@ from fe.simulate import LoadStep
 from mrstrain.driving import ENDING
 from mrstrain.modelfiles import files_named
 from mrstrain.registering import REPEAT
-from mrstrain.studyfile import Load, Study, as_folder
+from mrstrain.studyfile import Load, Study, Vector, as_folder
 from validate.levelled import LEVELLED
 
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
@@ -154,14 +154,18 @@ def _registrations(study: Study) -> list[Stage]:
         "seed": study.study.seed, "threads": 1,
     }  # fmt: skip
     files = (load0, *(Path(p) for p in aside.values()), *own, *error_model)
-    folder = study.out / REGISTRATION
+    folder, own_directions = study.out / REGISTRATION, towards(study)
 
     def one(load: str, image: str, repeat: bool, after: str | None) -> Stage:
         place = study.path(image)
-        more = {
+        more: dict[str, Any] = {
             "load": str(place), "out": str(folder / load),
             "after": None if after is None else str(folder / after),
-        } | ({"twin": True} if how.twin and load != REPEAT else {})  # fmt: skip
+        }  # fmt: skip
+        if load in own_directions:
+            more["plate_normal"], more["shear_direction"] = own_directions[load]
+        if how.twin and load != REPEAT:
+            more["twin"] = True
         waits = () if after is None else (f"register {after}",)
         floor = {"repeat": {f"register {REPEAT}": str(folder / REPEAT)} if repeat else {}}
         return Stage(f"register {load}", shared | more, (*files, place), (folder / load,), waits, {}, floor)
@@ -213,12 +217,22 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
         "loads": [asdict(load_step(load, of)) for load, of in study.loads.items()],
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
-        "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
+        "towards": towards(study), "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
         "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))), "element": study.models.element,
         "decks": study.models.decks,
         "limit_s": None if study.models.limit_minutes is None else 60.0 * study.models.limit_minutes,
     }  # fmt: skip
     return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
+
+
+def towards(study: Study) -> dict[str, tuple[Vector, Vector]]:
+    """Plate's normal and direction of shear of the loads that go in directions of their own."""
+    plate = study.plate
+    return {
+        name: (load.plate_normal or plate.normal, load.shear_direction or plate.shear_direction)
+        for name, load in study.loads.items()
+        if load.plate_normal is not None or load.shear_direction is not None
+    }
 
 
 def load_step(name: str, load: Load) -> LoadStep:

@@ -1,4 +1,4 @@
-"""What a result was made from: versions, parameters, seeds, hashes. Nothing that names a person or a machine."""
+"""What a result was made from: versions, kind of machine, parameters, seeds, hashes. No name of a person or a host."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from dvc.whole import write_whole
+from dvc.worker import usable_cores
+from mrstrain.doctor import usable_memory_bytes
 
 _PACKAGES = (
     "mrstrain",
@@ -82,6 +84,24 @@ def versions() -> dict[str, str]:
     return found
 
 
+def machine() -> dict[str, object]:
+    """The kind of machine that this is: processor, cores and memory that may be used."""
+    memory = usable_memory_bytes()
+    return {
+        "processor": _processor(),
+        "cores": usable_cores(),
+        "memory_gib": None if memory is None else round(memory / 2**30, 1),
+    }
+
+
+def _processor() -> str:
+    try:  # where Linux has its name; `platform` has none there
+        told = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
+    except OSError:
+        told = None
+    return told[1].strip() if told else platform.processor() or platform.machine()
+
+
 def provenance(
     command: str, inputs: Mapping[str, Path | list[Path]], parameters: Mapping[str, object]
 ) -> dict[str, object]:
@@ -104,6 +124,7 @@ def provenance(
         "command": command,
         "made_utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "versions": versions(),
+        "machine": machine(),
         "inputs": files,
         "parameters": dict(parameters),
     }

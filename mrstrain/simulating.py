@@ -40,6 +40,7 @@ from mrstrain.onepath import simulated_path
 from mrstrain.provenance import provenance, write_json
 
 Told = Callable[[str, str, float], None]
+Vector = tuple[float, float, float]
 
 _TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
 _FAR = 0.05  # det F of a patch further from 1 than this is counted
@@ -109,6 +110,7 @@ def simulate(
     loads: Sequence[LoadStep] = LOADS,
     plate_normal: Sequence[float] = (0.0, 0.0, -1.0),
     shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
+    towards: Mapping[str, tuple[Vector, Vector]] | None = None,
     taped: bool = True,
     gap_mm: float = 0.0,
     turns: bool = False,
@@ -139,6 +141,8 @@ def simulate(
         published experiment.
     plate_normal, shear_direction : (3,)
         The plate's outward normal, and the direction of the shear force on the tissue, LPS.
+    towards : mapping, optional
+        The same two for loads, by name, that go in directions of their own.
     taped : bool
         Whether skin that has touched the plate holds to it; if not, it slides without friction.
     gap_mm : float
@@ -166,18 +170,26 @@ def simulate(
         If the mesh, a set or a load cannot be used; before anything is computed.
     """
     place, target = Path(mesh), Path(out)
-    plate = Plate(plate_normal, shear_direction, gap_mm, taped, turns, pivot_mm)
+    towards = dict(towards or {})
     formulation(element)
     read = read_tet_mesh(place, unit=mesh_unit, frame=mesh_frame)
     chosen = [material_set(name) for name in sets]
     names = [one.name for one in chosen]
     if not names or len(set(names)) < len(names):
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
-    paths = paths_of(loads)
+    paths = paths_of(loads, towards)
+    strangers = towards.keys() - {load.name for load in loads}
+    if strangers:
+        raise InputError(f"Directions are given for {', '.join(sorted(strangers))}, which is none of the loads.")
+    plates = [
+        Plate(*towards.get(path[0].name, (plate_normal, shear_direction)), gap_mm, taped, turns, pivot_mm)
+        for path in paths
+    ]
     held = fixed_facets(read, fixed)
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
-        check(read, region_laws, plate, loads, held)
+        for path, plate in zip(paths, plates, strict=True):
+            check(read, region_laws, plate, path, held)
     refuse_touching_inputs(target, names, [place])
     make_output(target)
     for name in names:
@@ -194,7 +206,7 @@ def simulate(
         "pivot_mm": None if pivot_mm is None else list(pivot_mm),
         "mesh_made": _mesh_made(place),
     }
-    jobs = [(one, path) for one in chosen for path in paths]
+    jobs = [(one, path, plate) for one in chosen for path, plate in zip(paths, plates, strict=True)]
     at_once = max(1, min(workers or usable_cores(), len(jobs)))
     each = threads or max(1, usable_cores() // at_once)
     found: dict[str, list[State]] = {name: [] for name in names}
@@ -203,8 +215,8 @@ def simulate(
     failures: dict[str, str] = {}
     tell, writing = progress or (lambda *_: None), threading.Lock()
 
-    def one(job: tuple[MaterialSet, tuple[LoadStep, ...]], worker: Worker) -> None:
-        chosen_set, path = job
+    def one(job: tuple[MaterialSet, tuple[LoadStep, ...], Plate], worker: Worker) -> None:
+        chosen_set, path, plate = job
         name = chosen_set.name
         case = f"{name}, {' '.join(step.name for step in path)}"
         with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
@@ -226,9 +238,9 @@ def simulate(
             waiting[name] -= 1
             if waiting[name] == 0 and found[name]:
                 ordered = [s for p in paths for load in p for s in found[name] if s.load.name == load.name]
-                record = provenance("simulate", files, given | _told(chosen_set, laws[name][0], paths, plate, element))
+                record = provenance("simulate", files, given | _told(chosen_set, laws[name][0], paths, turns, element))
                 done[name] = _written(
-                    target / name, name, read, ordered, *laws[name], loads, plate, record, held if decks else None
+                    target / name, name, read, ordered, *laws[name], loads, record, held if decks else None
                 )
         tell(case, "simulating", 1.0)
 
@@ -268,7 +280,7 @@ def _mesh_made(place: Path) -> dict[str, object] | None:
 
 
 def _told(
-    chosen: MaterialSet, laws: Mapping[str, Material], paths: Sequence[Sequence[LoadStep]], plate: Plate, element: str
+    chosen: MaterialSet, laws: Mapping[str, Material], paths: Sequence[Sequence[LoadStep]], turns: bool, element: str
 ) -> dict[str, object]:
     return {
         "set": chosen.name,
@@ -285,9 +297,8 @@ def _told(
         },
         "region_numbers_in_vtu": {number: name for number, name in enumerate(laws, start=1)},
         "paths": [[asdict(load) for load in path] for path in paths],
-        "plate_axes_lps": plate.axes.tolist(),
         "plate": "rigid; moved to the tissue, then to the forces and travels asked for, no force along the third axis; "
-        + ("let go to turn about its pivot once it presses" if plate.turns else "rotation locked"),
+        + ("let go to turn about its pivot once it presses" if turns else "rotation locked"),
         "element": f"{element}: {TOLD[element]}",
     }
 
@@ -300,7 +311,6 @@ def _written(
     laws: Mapping[str, Material],
     notes: tuple[str, ...],
     loads: Sequence[LoadStep],
-    plate: Plate,
     record: dict[str, object],
     decks_fixed: Sequence[str] | None,
 ) -> Simulated:
@@ -338,6 +348,7 @@ def _written(
     write_curve_csv(folder / "curve.csv", states)
     outcome = {}
     for state in states:
+        assert state.plate_axes is not None
         share = volume_share_off(mesh, state, laws, _FAR)
         if share > _MUCH:
             notes += (
@@ -347,6 +358,7 @@ def _written(
         outcome[state.load.name] = {
             "reached": state.reached,
             "out_of_time": state.out_of_time,
+            "plate_axes_lps": state.plate_axes.tolist(),
             "plate_travel_mm": state.travel_mm.tolist(),
             "plate_force_n": state.force_n.tolist(),
             "plate_turn_deg": state.plate.turn_deg.tolist(),
@@ -360,7 +372,7 @@ def _written(
         }
     write_json(folder / "simulation.json", {"outcome": outcome, "notes": list(notes)} | record)
     pictures = {
-        "slices.png": figures.sagittal_slice(mesh, states, plate),
+        "slices.png": figures.sagittal_slice(mesh, states),
         "force_travel.png": figures.force_travel(states),
     }
     for file, drawn in pictures.items():

@@ -94,7 +94,8 @@ class Images(_Part):
 class Load(_Part):
     """One loaded image, and the plate's forces, N, or in their place its travels, mm; as in `fe.simulate.LoadStep`.
 
-    Without either along the normal it is measured and not simulated.
+    Without either along the normal it is measured and not simulated. Directions, LPS, are those of the plate where none
+    are given here.
     """
 
     image: str
@@ -102,6 +103,8 @@ class Load(_Part):
     shear_n: Real | None = None
     normal_mm: Annotated[Real, Field(gt=0.0)] | None = None
     shear_mm: Real | None = None
+    plate_normal: Vector | None = None
+    shear_direction: Vector | None = None
 
 
 class PlateOf(_Part):

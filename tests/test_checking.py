@@ -84,6 +84,12 @@ def test_a_plate_without_friction_carries_no_shear(study):
         assert told.count("\n") == 0
 
 
+def test_directions_of_one_load_are_looked_at_like_those_of_the_plate(study):
+    of_load = ("shear_n = 4.0", "shear_n = 4.0\nshear_direction = [2.0, 0.0, 0.0]")
+    assert "shear" in wrong(study, of_load)
+    assert wrong(study, (of_load[0], of_load[1].replace("2.0, 0.0, 0.0", "0.0, 2.0, 0.0"))) == ""
+
+
 def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
     made = dome((3, 4, 4))
     file, friedman = ("[mesh]", '[mesh]\nfile = "dome.vtu"'), ('"mine.toml", ', "")

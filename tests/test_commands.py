@@ -26,6 +26,7 @@ from dvc.resample import carry
 from dvc.similarity import local_correlation
 from dvc.transformfile import read_transform
 from dvc.uncertainty import POOLED, ErrorModel, ErrorTable
+from dvc.worker import usable_cores
 from mrstrain.registering import register
 from mrstrain.straining import strain
 from tests.quick import QUICK
@@ -233,6 +234,8 @@ def test_provenance_holds_hashes_versions_parameters_and_no_path(results, study)
     assert told["inputs"]["load0"][0]["name"] == "Load0.nii.gz"
     assert len(told["inputs"]["load0"][0]["sha256"]) == 64
     assert told["versions"]["itk-elastix"].startswith("0.25")
+    assert told["machine"]["cores"] == usable_cores()
+    assert told["machine"]["processor"]
     assert told["parameters"]["stages"][0]["text"] == QUICK
     assert str(study) not in text
 

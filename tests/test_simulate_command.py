@@ -7,17 +7,20 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from dvc.deformation import Deformation
 from dvc.errors import InputError
 from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
+from fe.figures import _along_plate
 from fe.meshstore import read_tet_mesh, write_tet_mesh
 from fe.result import cauchy_stress, deformation, patch_volumes, volume_percentiles
 from fe.simulate import LoadStep, simulate
 from mrstrain.cli import app
 from mrstrain.loads import load_named, paths_of
+from mrstrain.simulating import simulate as run
 from tests.blocks import block
 from tests.test_mesh_names import abaqus, ansys
 from tests.test_simulate import DOWN, FAT, LAWS, PRESS, block_under_plate, dome, press
@@ -239,6 +242,38 @@ def test_loads_lie_on_paths_by_their_normal_force() -> None:
     assert [[x.name for x in path] for path in paths_of(both_ways)] == [["a", "b"], ["c"]]
     with pytest.raises(InputError, match="a name of its own"):
         paths_of([])
+
+
+def test_a_load_may_go_in_directions_of_its_own(mesh_file: Path, tmp_path: Path) -> None:
+    loads = [LoadStep("pressed", 2.0), LoadStep("forth", 2.0, 1.0), LoadStep("aside", 2.0, 1.0)]
+    plate = {"plate_normal": DOWN, "shear_direction": (0.0, 1.0, 0.0)}
+    aside = (tuple(DOWN), (0.0, 0.0, -1.0))
+    assert [[x.name for x in p] for p in paths_of(loads, {"aside": aside})] == [["pressed", "forth"], ["aside"]]
+    done = run(mesh_file, out=tmp_path / "out", loads=loads, **plate, towards={"aside": aside}, threads=1).sets[0]
+    there = {state.load.name: state for state in done.states}
+    alone = {"plate_normal": DOWN, "shear_direction": aside[1]}
+    only = run(mesh_file, out=tmp_path / "only", loads=loads[2:], **alone, threads=1).sets[0].states[0]
+    assert np.abs(there["aside"].u_mm - only.u_mm).max() < 1e-9
+    assert np.abs(there["aside"].u_mm - there["forth"].u_mm).max() > 0.5 * np.abs(only.u_mm).max()
+    force = there["aside"].plate_axes @ there["aside"].force_n
+    assert force == pytest.approx(-2.0 * np.array(DOWN) + [0.0, 0.0, -1.0], abs=5e-3)
+    told = json.loads((tmp_path / "out" / done.name / "simulation.json").read_text())["outcome"]
+    assert np.array(told["aside"]["plate_axes_lps"])[:, 1].tolist() == [0.0, 0.0, -1.0]
+    assert np.array(told["forth"]["plate_axes_lps"])[:, 1].tolist() == [0.0, 1.0, 0.0]
+    with pytest.raises(InputError, match="Load9, which is none of the loads"):
+        run(mesh_file, out=tmp_path / "no", loads=loads, **plate, towards={"Load9": aside})
+
+
+def test_the_dashed_line_lies_on_the_tissue_that_a_plate_from_elsewhere_presses() -> None:
+    """In the slice of another load; a plate along the slice is left out."""
+    state = press(dome((3, 4, 4)), PRESS)[0]
+    mesh, tilted = dome((3, 4, 4)), Rotation.from_rotvec([0.0, 0.0, 20.0], degrees=True).as_matrix()
+    axes = tilted @ state.plate_axes
+    height, slope = _along_plate(mesh, state, axes, np.zeros(3))
+    on_plate = (mesh.points_mm + state.u_mm)[state.on_plate] @ axes
+    assert on_plate[:, 0] == pytest.approx(height + slope * on_plate[:, 1], abs=1e-6)
+    assert abs(slope) == pytest.approx(np.tan(np.radians(20.0)))
+    assert _along_plate(mesh, state, state.plate_axes[:, [1, 0, 2]], np.zeros(3)) is None
 
 
 def test_a_simulation_is_a_deformation() -> None:

@@ -119,6 +119,22 @@ def test_a_simulated_load_needs_its_force(tmp_path):
     assert [s.kind for s in plan(read_study(written(tmp_path, measured)))] == ["register", "register", "compare"]
 
 
+def test_a_load_has_the_plates_directions_or_its_own(tmp_path):
+    text = WHOLE.replace("shear_n = 45.0", "shear_n = 45.0\nshear_direction = [1.0, 0.0, 0.0]")
+    (found,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "simulate trebbi")
+    assert found.arguments["towards"] == {"Load2": ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0))}
+    measured = {s.name: s.arguments["shear_direction"] for s in plan(read_study(tmp_path)) if s.kind == "register"}
+    assert measured == {"register Load1": (0.0, -1.0, 0.0), "register Load2": (1.0, 0.0, 0.0)}
+    (found,) = (s for s in plan(read_study(written(tmp_path, WHOLE))) if s.name == "simulate trebbi")
+    assert found.arguments["towards"] == {}
+
+
+def test_a_simulation_may_have_a_limit_of_time(tmp_path):
+    for text, limit in ((WHOLE + "limit_minutes = 2.5\n", 150.0), (WHOLE, None)):
+        (simulated,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "simulate trebbi")
+        assert simulated.arguments["limit_s"] == limit
+
+
 def test_two_models_of_one_name_are_refused(tmp_path):
     with pytest.raises(InputError, match="rename the folder"):
         plan(read_study(written(tmp_path, WHOLE.replace('["ansys"]', '["other/trebbi"]'))))
