@@ -19,6 +19,9 @@ _REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 50.0 / 2.3, 7.0
 _BORDERS = 2.5  # times as long with borders of tissues (docs/decisions/0009)
 _TWIN = 1.3  # times as long again: the twin is made and registered
 _CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
+# Of P1's time and memory, at 50,000 to 60,000 cells (docs/decisions/0007).
+_ELEMENT_TIMES = {"P1": 1.0, "MINI": 8.0, "P2": 20.0}
+_ELEMENT_GIB = {"P1": 1.0, "MINI": 2.0, "P2": 5.0}
 _MESH_S = 100.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
 # GiB of all processes of a stage: registrations of 2.3 and 16.8 million voxels took 1.2 and 3.6, one of 2.3 with
@@ -63,7 +66,10 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
     if stage.kind == "compare":
         models = len({value for of in (stage.some.get("models", {}),) for value in of.values()})
         return loads * (_COMPARE_S + _MODEL_S * (models + len(study.models.results)))
-    return float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
+    times = _ELEMENT_TIMES[study.models.element] if stage.kind == "simulate" else 1.0
+    seconds = times * float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
+    limit = study.models.limit_minutes
+    return seconds if limit is None or stage.kind != "simulate" else min(seconds, 60.0 * loads * limit)
 
 
 def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
@@ -72,7 +78,8 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
         more = _BORDERS_GIB_PER_MVOXEL if _with_borders(study) else 0.0
         return _REGISTER_GIB + (_REGISTER_GIB_PER_MVOXEL + more) * voxels / 1e6
     if stage.kind in ("simulate", "drive"):
-        return _SIMULATE_GIB + _SIMULATE_GIB_PER_CELL * cells
+        times = _ELEMENT_GIB[study.models.element] if stage.kind == "simulate" else 1.0
+        return _SIMULATE_GIB + times * _SIMULATE_GIB_PER_CELL * cells
     return _OTHER_GIB
 
 

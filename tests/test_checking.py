@@ -152,6 +152,14 @@ def test_larger_images_and_meshes_take_longer_and_more_memory(study):
     assert costs.gib_of(simulating, told, 0.0, 79e3) == pytest.approx(1.2)
     assert costs.gib_of(simulating, told, 0.0, 8 * 79e3) == pytest.approx(8.2)
     assert costs.seconds_of(simulating, told, 0.0, 8 * 79e3) > 8 * costs.seconds_of(simulating, told, 0.0, 79e3)
+    (study / "study.toml").write_text(STUDY.replace("[models]", '[models]\nelement = "P2"'))
+    exact = read_study(study)
+    assert costs.seconds_of(simulating, exact, 0.0, 6e4) == pytest.approx(
+        20.0 * costs.seconds_of(simulating, told, 0.0, 6e4)
+    )
+    assert costs.gib_of(simulating, exact, 0.0, 6e4) > 3.0 * costs.gib_of(simulating, told, 0.0, 6e4)
+    (study / "study.toml").write_text(STUDY.replace("[models]", "[models]\nlimit_minutes = 0.5"))
+    assert costs.seconds_of(simulating, read_study(study), 0.0, 6e4) == 30.0
 
 
 def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, monkeypatch):
