@@ -167,11 +167,12 @@ def run_studies(
 
         return cluster(tell, [study.out for study in studies], scheduler=scheduler, workers=workers)
 
+    on_disk: dict[int, tuple[int, float]] = {}
     with ExitStack() as stack:
         for prefix, study, stages in zip(prefixes, studies, planned, strict=True):
             stack.enter_context(_alone(study.out))
             pipelines[prefix] = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
-            _refuse_small_disk(study, pipelines[prefix])
+            _refuse_small_disk(study, pipelines[prefix], on_disk)
             log = stack.enter_context(_log(study.out / LOG))
             log(f"Study '{study.study.name}': {len(stages)} stages")
             lines[prefix] = line_of(prefix, log, stages)
@@ -185,8 +186,11 @@ def run_studies(
     return done
 
 
-def _refuse_small_disk(study: Study, pipeline: Pipeline) -> None:
-    """Refuse a run whose results would not fit, before any of it is made."""
+def _refuse_small_disk(study: Study, pipeline: Pipeline, on_disk: dict[int, tuple[int, float]]) -> None:
+    """Refuse a run whose results would not fit, before any of it is made.
+
+    ``on_disk`` is added to: how many stages, and bytes, the studies so far will write to each disk.
+    """
     forecast = pipeline.forecast()
     left = [stage for stage in pipeline.stages if forecast[stage.name] == "run"]
     if not left:
@@ -196,8 +200,11 @@ def _refuse_small_disk(study: Study, pipeline: Pipeline) -> None:
     except InputError:
         return  # the stages that read it say what is wrong with it
     voxels = float(np.prod(reference.grid.shape))
-    needed = sum(disk_bytes(stage, study, voxels) for stage in left)
-    refuse_small_disk(study.out, needed, f"the results of {len(left)} stages need", "", "[study] out")
+    disk = study.out.stat().st_dev
+    stages, needed = on_disk.get(disk, (0, 0.0))
+    stages, needed = stages + len(left), needed + sum(disk_bytes(stage, study, voxels) for stage in left)
+    on_disk[disk] = stages, needed
+    refuse_small_disk(study.out, needed, f"the results of {stages} stages need", "", "[study] out")
 
 
 def report(study: Path | str | Study) -> Ran:

@@ -23,7 +23,7 @@ from dvc.imagefile import read_image
 from dvc.imagewrite import write_image, write_labels
 from mrstrain.beginning import init
 from mrstrain.checking import check
-from mrstrain.running import forecast, report, run
+from mrstrain.running import forecast, report, run, run_studies
 from mrstrain.studyfile import read_study
 from mrstrain.subjects import cohort
 from tests.quick import QUICK
@@ -141,9 +141,15 @@ def test_run_again_does_nothing_in_under_ten_seconds(done):
 def test_a_disk_with_too_little_room_is_refused_before_anything_is_made(done, images, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5 * 10**7))
     shutil.copytree(images, tmp_path / "study")
-    with pytest.raises(OutputError, match=r"the results of 6 stages need about \d+ MB and the disk has 50 MB left"):
+    said = r"the results of 6 stages need about (\d+) MB and the disk has 50 MB left"
+    with pytest.raises(OutputError, match=said) as refused:
         run(tmp_path / "study")
     assert not (tmp_path / "study" / "results" / "registration").exists()
+    one = 10**6 * int(re.search(said, str(refused.value))[1])
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 3 * one // 2))
+    shutil.copytree(images, tmp_path / "other")
+    with pytest.raises(OutputError, match="the results of 12 stages need"):  # room for one of two
+        run_studies([read_study(tmp_path / name) for name in ("study", "other")])
     assert run(done[0]).complete  # where all is there already, none is needed
 
 
