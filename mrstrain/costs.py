@@ -19,9 +19,9 @@ _REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 50.0 / 2.3, 7.0
 _BORDERS = 2.5  # times as long with borders of tissues (docs/decisions/0009)
 _TWIN = 1.3  # times as long again: the twin is made and registered
 _CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
-# Of P1's time and memory, at 50,000 to 60,000 cells (docs/decisions/0007).
-_ELEMENT_TIMES = {"P1": 1.0, "MINI": 8.0, "P2": 20.0}
-_ELEMENT_GIB = {"P1": 1.0, "MINI": 2.0, "P2": 5.0}
+# Of P1's time and memory at 56,000 to 60,000 cells: P2 2.2 GiB, MINI .84 (docs/decisions/0007).
+_ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
+_ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
 _MESH_S = 100.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
 # GiB of all processes of a stage: registrations of 2.3 and 16.8 million voxels took 1.2 and 3.6, one of 2.3 with
