@@ -96,7 +96,7 @@ class Leg:
         """Where it is now."""
         path = self._path
         return Kept(
-            1.0 if self._whole else float(self._shares().min(initial=1.0)),
+            1.0 if self._whole else max(0.0, float(self._shares().min(initial=1.0))),
             self._stages,
             tuple(path.curve),
             path.iterations - self._counted,

@@ -18,7 +18,7 @@ from dvc.worker import Worker
 from fe.facets import BONE, CUT, SKIN
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.surfaces import Borders, borders_of, labels_at
-from fe.volumes import with_volumes
+from fe.volumes import volumes_of, with_volumes
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
 _FARTHEST = 0.1  # of the smallest voxel edge: how far a node may move at once to keep the tissues' volumes
@@ -119,17 +119,30 @@ def mesh_labels(
     body = np.isin(found, list(soft.values()))
     voxel_mm3 = labels.grid.voxel_volume_mm3
     volumes_mm3 = {number: voxel_mm3 * float((labels.labels == number).sum()) for number in numbers.values()}
+    _refuse_lost(numbers, soft, volumes_mm3, np.abs(volumes_of(points, cells)), found)
     points = with_volumes(points, cells, found, volumes_mm3, _FARTHEST * spacing)
     points = without_slivers(points, cells[body], found[body])
     mesh = _named(points, cells, found, soft, [numbers[b] for b in bones], labels)
-    quality = _quality(mesh, labels, soft)
-    for name, made, given in quality.volumes_ml:
+    return mesh, _quality(mesh, labels, soft)
+
+
+def _refuse_lost(
+    numbers: dict[str, int], soft: dict[str, int], volumes_mm3: dict[int, float], of_cells: FloatArray, found: IntArray
+) -> None:
+    """Refuse a mesh in which a region, bones included, is gone or lost a fifth of what its voxels hold."""
+    lost = [name for name, number in soft.items() if not (found == number).any()]
+    if lost:
+        raise MrstrainError(
+            f"No cell is left of {', '.join(lost)}: smaller than the mesh can show. Ask for shorter edges, or give its "
+            "label to a neighbour."
+        )
+    for name, number in numbers.items():
+        made, given = float(of_cells[found == number].sum()) / 1000.0, volumes_mm3[number] / 1000.0
         if abs(made - given) > _MOST_LOST * given:
             raise MrstrainError(
                 f"{name} has {made:.2f} mL in the mesh and {given:.2f} mL in the label map: it is finer than the mesh "
                 "or the voxels show. Ask for shorter edges, or give its label to a neighbour."
             )
-    return mesh, quality
 
 
 def _guessed(share: float) -> float:
@@ -220,12 +233,6 @@ def _named(
     points: FloatArray, cells: IntArray, found: IntArray, soft: dict[str, int], bones: list[int], labels: LabelMap
 ) -> TetMesh:
     kept = np.isin(found, list(soft.values()))
-    lost = [name for name, number in soft.items() if not (found == number).any()]
-    if lost:
-        raise MrstrainError(
-            f"No cell is left of {', '.join(lost)}: smaller than the mesh can show. Ask for shorter edges, or give its "
-            "label to a neighbour."
-        )
     body, tissue = cells[kept], found[kept]
     faces = np.sort(np.concatenate([body[:, face] for face in FACES]), axis=1)
     _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)

@@ -162,6 +162,8 @@ class Path:
                     return False
             else:
                 self._push(share * goal.values[0], goal.values[0])
+            if self.over():
+                return False
             if not self.contact.plate.turns or self._let_go():
                 return True
         return False
@@ -176,7 +178,7 @@ class Path:
         gap_mm, level_mm = self.contact.plate.gap_mm, level.plate.travel_mm[0]
         least_mm = gap_mm + _TIPPING * (level_mm - gap_mm)
         left, step = 1.0, 0.5
-        while left > 0.0 and step > _LEAST_STEP:
+        while left > 0.0 and step > _LEAST_STEP and not self.over():
             kept = self.standing
             least = max(0.0, left - step)
             if self._go(np.zeros(3, dtype=bool), force, least * moment):

@@ -94,7 +94,8 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     told, found = read_study(study), _Findings()
     reference, labels = _images(told, found)
     _registration(told, found)
-    found.tried(plate_axes, -np.asarray(told.plate.normal), told.plate.shear_direction)
+    for normal, shear in ((told.plate.normal, told.plate.shear_direction), *towards(told).values()):
+        found.tried(plate_axes, -np.asarray(normal), shear)
     if labels is not None and (told.models.sets or told.models.results):
         found.tried(check_bones, labels, told.mesh.bones)
     if labels is not None and told.models.results:

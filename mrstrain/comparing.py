@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from fe.meshstore import read_tet_mesh
 from mrstrain.comparefiles import clear_earlier, write_fields, write_on_image, write_tables
 from mrstrain.comparepage import closing_sections, page_sections, pictures_of, shown, viewer_of
 from mrstrain.inputs import make_output, refuse_touching_inputs
+from mrstrain.loads import Vector
 from mrstrain.measurements import Measurement, measurements_in, verdict_on
 from mrstrain.methods import methods
 from mrstrain.modelfiles import Reading, model_files
@@ -102,6 +103,7 @@ def compare(
     to_image: FloatArray | None = None,
     plate_normal: Sequence[float] = (0.0, 0.0, -1.0),
     shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
+    towards: Mapping[str, tuple[Vector, Vector]] | None = None,
     strains: tuple[float, float] = RANGE,
     thresholds: Path | str | None = None,
     least_ml: float = LEAST_ML,
@@ -131,6 +133,8 @@ def compare(
         As in `validate.sources.read_result`.
     plate_normal, shear_direction : (3,)
         The plate's outward normal and the direction of shear, LPS.
+    towards : mapping, optional
+        The same two for loads, by name, that went in directions of their own.
     strains : (low, high)
         Range of maximal shear over which curves are compared.
     thresholds : path, optional
@@ -153,7 +157,8 @@ def compare(
             f"The range of strain must rise from 0 or more to {_MOST_STRAIN:g} or less (no percent), and a volume be "
             f"0 or more; got {strains[0]:g} to {strains[1]:g}, {least_ml:g} mL."
         )
-    axes = plate_axes(-np.asarray(plate_normal, dtype=np.float64), shear_direction)
+    usual_axes = plate_axes(-np.asarray(plate_normal, dtype=np.float64), shear_direction)
+    own_axes = {load: plate_axes(-np.asarray(away), along) for load, (away, along) in (towards or {}).items()}
     thresholds_used = read_thresholds(None if thresholds is None else Path(thresholds))
     tissues = read_labels(labels, names)
     measurements = measurements_in(Path(dvc), loads)
@@ -195,7 +200,8 @@ def compare(
             "error_models": [f for m in measurements if (f := m.folder / "error_model.json").is_file()],
         },
         {
-            "bones": list(bones), "plate_axes_lps": axes.tolist(), "strains": list(strains),
+            "bones": list(bones), "plate_axes_lps": usual_axes.tolist(), "strains": list(strains),
+            "plate_axes_lps_of": {load: own.tolist() for load, own in own_axes.items()},
             "least_cluster_ml": least_ml,
             "thresholds": [[t.max_shear, t.source] for t in thresholds_used],
             "model_unit": model_unit, "model_frame": model_frame,
@@ -208,6 +214,7 @@ def compare(
     told: list[tuple[Comparison, Measurement, dict[str, Picture], Viewer]] = []
     for number, measurement in enumerate(compared):
         load = measurement.load
+        axes = own_axes.get(load, usual_axes)
         tell("compare", "comparing", number / len(files))
         measured, results = measurement.deformation(), [file.read(tissues.grid) for file in files[load]]
         one = compare_load(

@@ -19,7 +19,8 @@ _REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 50.0 / 2.3, 7.0
 _BORDERS = 2.5  # times as long with borders of tissues (docs/decisions/0009)
 _TWIN = 1.3  # times as long again: the twin is made and registered
 _CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
-# Of P1's time and memory at 56,000 to 60,000 cells: P2 2.2 GiB, MINI .84 (docs/decisions/0007).
+# Of P1's time and memory: P2 20 times as long on 60,000 cells of the heel, MINI a third of P2's time on 56,000, where
+# P2 took 2.2 GiB, MINI .84.
 _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
 _MESH_S = 100.0

@@ -11,6 +11,8 @@ import numpy as np
 from dvc.errors import InputError
 from fe.simulate import LoadStep
 
+Vector = tuple[float, float, float]
+
 LOADS = (
     LoadStep("Load1", 140.0),
     LoadStep("Load2", 15.0),

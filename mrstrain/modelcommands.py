@@ -92,7 +92,7 @@ def simulate(
     decks: Annotated[bool, typer.Option("--decks", help="Also write each load for CalculiX and FEBio.")] = False,
     limit_minutes: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Time after which a path of loads ends where it stands. Default: none."),
+        typer.Option(help="Time after which a path of loads ends where it stands. Default: none."),
     ] = None,
     mesh_unit: MeshUnit = Unit.MM,
     mesh_frame: MeshFrame = Frame.LPS,

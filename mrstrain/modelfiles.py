@@ -82,7 +82,7 @@ def model_files(
             notes.append(f"{name} has {lacking}: it is left out.")
             continue
         taken.add(name)
-        reached = _reached(place)
+        reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
         reading = _reading(place, usual)
         for load in loads:
             if load not in chosen:
@@ -91,6 +91,11 @@ def model_files(
                 notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}, which is not compared.")
             else:
                 files[load].append(ModelFile(name, chosen[load], reading))
+                if stable.get(load, 1.0) < 1.0:
+                    notes.append(
+                        f"{name}, {load}: a law of this model is not stable (Drucker) at the strain reached, in up to "
+                        f"{1.0 - stable[load]:.1%} of a tissue. It is compared all the same; do not trust its rank."
+                    )
     files = {load: of for load, of in files.items() if of}
     if not files:
         raise InputError("No model has a whole result for a measured load. " + " ".join(notes))
@@ -112,7 +117,7 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
             f"{place}: which load is it of? Measured are {', '.join(loads)}: call the file so, or give one load's "
             "folder as the measurement."
         )
-    if place.stem in _reached(place):
+    if place.stem in _outcome(place, "reached"):
         raise InputError(f"{place} is a simulation of {place.stem}, and {loads[0]} was measured.")
     return place.stem, {loads[0]: place}
 
@@ -132,7 +137,7 @@ def files_named(place: Path) -> list[Path]:
 
 def loads_of(place: Path, has_mesh: bool) -> list[str]:
     """Loads for which a model's folder has a file: those that a simulation of ours tells, else by the files' names."""
-    told = _reached(place)
+    told = _outcome(place, "reached")
     if told:
         return [load for load in told if any((place / (load + ending)).is_file() for ending in ENDINGS)]
     kept = [ending for ending in ENDINGS if ending != ".csv" or has_mesh or (place / SETTINGS).is_file()]
@@ -140,12 +145,12 @@ def loads_of(place: Path, has_mesh: bool) -> list[str]:
     return sorted({p.stem for p in place.iterdir() if p.suffix.lower() in kept and p != own})
 
 
-def _reached(place: Path) -> dict[str, float]:
-    """Share of each load that a simulation of ours reached."""
+def _outcome(place: Path, key: str) -> dict[str, float]:
+    """What a simulation of ours tells of each load: "reached", its share, or "stable_share"."""
     folder = place if place.is_dir() else place.parent
     try:
         outcome = json.loads((folder / "simulation.json").read_text(encoding="utf-8"))["outcome"]
-        return {load: float(told["reached"]) for load, told in outcome.items()}
+        return {load: float(told[key]) for load, told in outcome.items()}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 

@@ -68,7 +68,7 @@ def simulated_path(
             last = time.monotonic()
 
     def keep(state: State) -> None:
-        if state.reached > 0.0 and state.kept is not None:
+        if state.kept is not None and len(state.kept.curve) > 1:
             write_kept(folder / f"{state.load.name}{ENDING}", state.kept, made_from[state.load.name])
             write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
 

@@ -282,7 +282,8 @@ def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, 
         "dvc": str(study.out / REGISTRATION), "out": str(study.out / COMPARISON), "labels": str(labels),
         "names": None if names is None else str(names), "bones": study.mesh.bones,
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
-        "strains": how.strains, "thresholds": None if thresholds is None else str(thresholds),
+        "towards": towards(study), "strains": how.strains,
+        "thresholds": None if thresholds is None else str(thresholds),
         "least_ml": how.least_ml, "elsewhere": [str(place) for place in elsewhere],
     }  # fmt: skip
     named = [file for place in elsewhere if place.exists() for file in files_named(place)]

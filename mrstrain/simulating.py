@@ -35,12 +35,11 @@ from fe.result import (
 )
 from fe.simulate import LoadStep, State, check
 from mrstrain.inputs import make_output, refuse_touching_inputs
-from mrstrain.loads import LOADS, paths_of
+from mrstrain.loads import LOADS, Vector, paths_of
 from mrstrain.onepath import simulated_path
 from mrstrain.provenance import provenance, write_json
 
 Told = Callable[[str, str, float], None]
-Vector = tuple[float, float, float]
 
 _TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
 _FAR = 0.05  # det F of a patch further from 1 than this is counted
@@ -170,6 +169,8 @@ def simulate(
         If the mesh, a set or a load cannot be used; before anything is computed.
     """
     place, target = Path(mesh), Path(out)
+    if limit_s is not None and not limit_s > 0.0:
+        raise InputError(f"The limit of time must be above 0; got {limit_s:g} s.")
     towards = dict(towards or {})
     formulation(element)
     read = read_tet_mesh(place, unit=mesh_unit, frame=mesh_frame)
@@ -177,14 +178,15 @@ def simulate(
     names = [one.name for one in chosen]
     if not names or len(set(names)) < len(names):
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
-    paths = paths_of(loads, towards)
     strangers = towards.keys() - {load.name for load in loads}
     if strangers:
         raise InputError(f"Directions are given for {', '.join(sorted(strangers))}, which is none of the loads.")
-    plates = [
-        Plate(*towards.get(path[0].name, (plate_normal, shear_direction)), gap_mm, taped, turns, pivot_mm)
-        for path in paths
-    ]
+    plate_of = {
+        load.name: Plate(*towards.get(load.name, (plate_normal, shear_direction)), gap_mm, taped, turns, pivot_mm)
+        for load in loads
+    }
+    paths = paths_of(loads, {name: tuple(plate.axes.round(9).ravel()) for name, plate in plate_of.items()})
+    plates = [plate_of[path[0].name] for path in paths]
     held = fixed_facets(read, fixed)
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
@@ -330,6 +332,8 @@ def _written(
     )
     notes += tuple(
         f"{state.load.name}: its time was over at {state.reached:.0%} of the load; given more, it goes on from there."
+        if len(state.curve) > 1
+        else f"{state.load.name}: its time was over before the first equilibrium."
         for state in states
         if state.out_of_time
     )
@@ -358,6 +362,7 @@ def _written(
         outcome[state.load.name] = {
             "reached": state.reached,
             "out_of_time": state.out_of_time,
+            "stable_share": min(row.stable_share for row in rows if row.load == state.load.name),
             "plate_axes_lps": state.plate_axes.tolist(),
             "plate_travel_mm": state.travel_mm.tolist(),
             "plate_force_n": state.force_n.tolist(),

@@ -181,6 +181,30 @@ def test_a_load_that_a_model_did_not_carry_is_not_compared(study: Path) -> None:
     assert [sorted(one.found.models) for one in done.comparisons] == [["right"], ["half", "right"]]
 
 
+def test_a_law_that_is_unstable_is_told_beside_the_rank(study: Path) -> None:
+    outcome = {
+        "outcome": {load: {"reached": 1.0, "stable_share": share} for load, share in (("Load1", 0.9), ("Load2", 1.0))}
+    }
+    (study / "half" / "simulation.json").write_text(json.dumps(outcome | {"parameters": {}}))
+    done = compare(study / "measured", [study / "right", study / "half"], **given(study))
+    told = [note for note in done.notes if "not stable (Drucker)" in note]
+    assert [note.partition(":")[0] for note in told] == ["half, Load1"]
+    assert "10.0%" in told[0]
+
+
+def test_a_load_is_looked_at_along_its_own_directions(study: Path) -> None:
+    """Of a shear along y the plate across x moves 'along', that across y goes in."""
+    own = {"Load2": ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0))}
+    compare(study / "measured", [study / "right"], **given(study), towards=own)
+    travel = {r["load"]: r for r in rows(study / "out" / "travel.csv")}
+    usual, aside = (float(travel[load]["model_along_mm"]) for load in LOADS)
+    assert usual > 0.5
+    assert aside < 0.05
+    told = json.loads((study / "out" / "comparison.json").read_text())["parameters"]
+    assert list(told["plate_axes_lps_of"]) == ["Load2"]
+    assert np.array(told["plate_axes_lps_of"]["Load2"])[:, 0] == pytest.approx([0.0, -1.0, 0.0])
+
+
 def test_a_model_that_lies_elsewhere_or_is_strange_is_refused_or_told(study: Path) -> None:
     mesh = cube(6)
 

@@ -19,6 +19,7 @@ from tests.blocks import block
 from tests.test_simulate import dome
 
 SIDE = 12
+SHIFT_MM = 0.1  # by which a border may move to keep volumes
 
 
 @pytest.fixture
@@ -52,9 +53,9 @@ def with_nerve(voxels: tuple[int | slice, ...]) -> LabelMap:
 def test_the_cut_is_found_in_whatever_case_skin_is_written(name: str, latticed, tmp_path: Path) -> None:
     mesh, quality = latticed(post(name))
     assert set(mesh.facets) == {"bone", "skin", "cut"}
-    assert mesh.points_mm[mesh.facets["cut"]][:, :, 2] == pytest.approx(SIDE)
-    assert (mesh.points_mm[mesh.facets["skin"]][:, :, 2].max(axis=1) < SIDE + 1e-9).all()
-    assert not (mesh.points_mm[mesh.facets["skin"]][:, :, 2].min(axis=1) == SIDE).any()
+    assert mesh.points_mm[mesh.facets["cut"]][:, :, 2] == pytest.approx(SIDE, abs=SHIFT_MM)
+    assert (mesh.points_mm[mesh.facets["skin"]][:, :, 2].max(axis=1) < SIDE + SHIFT_MM).all()
+    assert not (mesh.points_mm[mesh.facets["skin"]][:, :, 2].min(axis=1) > SIDE - SHIFT_MM).any()
     assert dict(quality.thin)[name] > 0.5  # one cell thick
     assert not any("is called skin" in line for line in Meshed(tmp_path, mesh, quality).summary())
 
@@ -62,7 +63,7 @@ def test_the_cut_is_found_in_whatever_case_skin_is_written(name: str, latticed, 
 def test_without_a_skin_the_cut_is_told_to_count_as_outer_surface(latticed, tmp_path: Path) -> None:
     mesh, quality = latticed(post("dermis"))
     assert set(mesh.facets) == {"bone", "skin"}
-    assert (mesh.points_mm[mesh.facets["skin"]][:, :, 2].min(axis=1) == SIDE).any()
+    assert (mesh.points_mm[mesh.facets["skin"]][:, :, 2].min(axis=1) > SIDE - SHIFT_MM).any()
     told = Meshed(tmp_path, mesh, quality).summary()
     assert [line for line in told if "no tissue is called skin" in line and "no facets 'cut'" in line]
 
@@ -78,6 +79,16 @@ def test_a_tissue_that_loses_a_fifth_is_refused(latticed) -> None:
     latticed(sheet)
     with pytest.raises(MrstrainError, match=r"nerve has 0\.06 mL in the mesh and 0\.08 mL in the label map"):
         latticed(sheet, cubes=10)
+
+
+def test_what_is_lost_is_refused_before_the_rest_is_made_larger(latticed) -> None:
+    """Bone too; by moving their borders, what is left of a tissue could be given the volume of all of it."""
+    whole = post()
+    values = whole.labels.copy()
+    values[5:7, 5:7, 4:] = 2
+    values[5, 5, 4::2] = 1  # single voxels: cubes of 1.2 mm miss most
+    with pytest.raises(MrstrainError, match="bone has"):
+        latticed(LabelMap(whole.grid, values, whole.names), cubes=10)
 
 
 def test_the_summary_warns_of_volumes_and_angles(tmp_path: Path) -> None:

@@ -90,12 +90,33 @@ def test_a_path_whose_time_is_over_ends_where_it_stands_and_goes_on(
         assert other.force_n == pytest.approx(state.force_n, abs=2e-3)
 
 
+@pytest.mark.parametrize("turns", [False, True])
+@pytest.mark.parametrize("steps", [0, 1, 2])
+def test_a_path_cut_while_the_plate_approaches_ends_where_an_uncut_one_does(
+    monkeypatch: pytest.MonkeyPatch, turns: bool, steps: int
+) -> None:
+    plate = Plate(DOWN, ALONG, turns=turns)
+
+    def going(**others) -> State:
+        return simulate(dome((3, 4, 4)), LAWS, plate, LOADS[:1], **others)[0]
+
+    whole = going()
+    with monkeypatch.context() as clock:
+        clock.setattr("fe.simulate.time", SimpleNamespace(monotonic=count().__next__))
+        cut = going(limit_s=steps)
+    assert cut.out_of_time
+    assert 0.0 <= cut.reached < 1.0
+    on = going(earlier=[cut.kept])
+    assert on.travel_mm[0] == pytest.approx(whole.travel_mm[0], abs=2e-3)
+    assert np.abs(on.u_mm - whole.u_mm).max() < 0.01 * np.abs(whole.u_mm).max()
+
+
 def test_the_command_tells_that_time_was_over(tmp_path: Path) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
     given = [*GIVEN, "--out", str(tmp_path / "out"), "--limit-minutes", "0.00001"]
     ended = CliRunner().invoke(app, ["simulate", str(tmp_path / "dome.vtu"), *given])
     assert ended.exit_code == 1
-    assert "a: its time was over at 0% of the load" in ended.output
+    assert "a: its time was over before the first equilibrium" in ended.output
     assert "b was not tried" in ended.output
 
 

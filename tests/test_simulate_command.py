@@ -249,7 +249,10 @@ def test_a_load_may_go_in_directions_of_its_own(mesh_file: Path, tmp_path: Path)
     plate = {"plate_normal": DOWN, "shear_direction": (0.0, 1.0, 0.0)}
     aside = (tuple(DOWN), (0.0, 0.0, -1.0))
     assert [[x.name for x in p] for p in paths_of(loads, {"aside": aside})] == [["pressed", "forth"], ["aside"]]
-    done = run(mesh_file, out=tmp_path / "out", loads=loads, **plate, towards={"aside": aside}, threads=1).sets[0]
+    again = ((-2.0, 0.0, 0.0), (0.0, 3.0, 0.0))  # the plate's own, written out
+    done = run(
+        mesh_file, out=tmp_path / "out", loads=loads, **plate, towards={"aside": aside, "forth": again}, threads=1
+    ).sets[0]
     there = {state.load.name: state for state in done.states}
     alone = {"plate_normal": DOWN, "shear_direction": aside[1]}
     only = run(mesh_file, out=tmp_path / "only", loads=loads[2:], **alone, threads=1).sets[0].states[0]
@@ -257,7 +260,12 @@ def test_a_load_may_go_in_directions_of_its_own(mesh_file: Path, tmp_path: Path)
     assert np.abs(there["aside"].u_mm - there["forth"].u_mm).max() > 0.5 * np.abs(only.u_mm).max()
     force = there["aside"].plate_axes @ there["aside"].force_n
     assert force == pytest.approx(-2.0 * np.array(DOWN) + [0.0, 0.0, -1.0], abs=5e-3)
-    told = json.loads((tmp_path / "out" / done.name / "simulation.json").read_text())["outcome"]
+    told = json.loads((tmp_path / "out" / done.name / "simulation.json").read_text())
+    assert [[load["name"] for load in path] for path in told["parameters"]["paths"]] == [
+        ["pressed", "forth"],
+        ["aside"],
+    ]
+    told = told["outcome"]
     assert np.array(told["aside"]["plate_axes_lps"])[:, 1].tolist() == [0.0, 0.0, -1.0]
     assert np.array(told["forth"]["plate_axes_lps"])[:, 1].tolist() == [0.0, 1.0, 0.0]
     with pytest.raises(InputError, match="Load9, which is none of the loads"):
