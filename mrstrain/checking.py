@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +29,7 @@ from mrstrain.engines import settings_of
 from mrstrain.ledger import Ledger
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.pipeline import Pipeline
-from mrstrain.plan import load_step, plan, towards
+from mrstrain.plan import load_steps, plan, towards
 from mrstrain.registering import REPEAT
 from mrstrain.studyfile import Study, Vector, read_study
 from validate.location import read_thresholds
@@ -36,6 +37,7 @@ from validate.mapping import check_bones
 from validate.sources import check_overlap
 
 _T = TypeVar("_T")
+_THERE = 0.5  # of what a label map labels: less in the image, and it lies elsewhere
 _P = ParamSpec("_P")
 
 
@@ -99,7 +101,7 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     if labels is not None and (told.models.sets or told.models.results):
         found.tried(check_bones, labels, told.mesh.bones)
     if labels is not None and told.models.results:
-        found.tried(_foreign, told, labels)
+        found.tried(_foreign, told, found, labels)
     cells = _simulations(told, found, reference, labels) if told.models.sets else 0.0
     if told.compare.thresholds is not None:
         found.tried(read_thresholds, told.path(told.compare.thresholds))
@@ -139,12 +141,16 @@ def _images(study: Study, found: _Findings) -> tuple[Image | None, LabelMap | No
     others = {load: one.image for load, one in study.loads.items()}
     if images.repeat is not None:
         others[REPEAT] = images.repeat
+    hashes: dict[str, str] = {}
     for name, other in others.items():
         image = found.tried(_image, study, other)
         if image is not None:
             found.notes.append(f"{name}: {image.grid}")
             if reference is not None and _same(reference, image):
                 found.wrong.append(f"{name} is the unloaded image: every voxel is equal.")
+            twin = hashes.setdefault(hashlib.sha256(image.values.tobytes()).hexdigest(), name)
+            if twin != name:
+                found.wrong.append(f"{name} is the image of {twin}: every voxel is equal.")
     return reference, labels
 
 
@@ -174,10 +180,12 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
     laws = [one for one in sets if one is not None]
     given, own = study.plate, towards(study)
     by_direction: dict[tuple[Vector, Vector], list[LoadStep]] = {}
-    for name, load in study.loads.items():
-        step = found.tried(load_step, name, load)
-        if step is not None:
-            by_direction.setdefault(own.get(name, (given.normal, given.shear_direction)), []).append(step)
+    forced = found.tried(load_steps, study) or {}
+    for name, step in forced.items():
+        by_direction.setdefault(own.get(name, (given.normal, given.shear_direction)), []).append(step)
+    forceless = [name for name in study.loads if forced and name not in forced]
+    if forceless:
+        found.notes.append(f"{', '.join(forceless)}: no force, so measured and not simulated.")
     loads: list[tuple[Plate, list[LoadStep]]] = []
     for directions, steps in by_direction.items():
         plate = found.tried(Plate, *directions, given.gap_mm, given.taped, given.turns)
@@ -203,6 +211,13 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
         )
     if labels is None:
         return 0.0
+    if reference is not None and study.mesh.labels is not None:
+        there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())
+        if there < _THERE:
+            found.wrong.append(
+                f"{study.path(study.mesh.labels)}: only {there:.0%} of what it labels lies in the unloaded image. A "
+                "mesh has to lie where the images are."
+            )
     _on_labels(study, found, labels, laws)
     return cells_expected(labels, study.mesh.bones, study.mesh.edge_mm)
 
@@ -253,9 +268,9 @@ def _same(one: Image, other: Image) -> bool:
     return one.grid.same_as(other.grid) and np.array_equal(one.values, other.values, equal_nan=True)
 
 
-def _foreign(study: Study, labels: LabelMap) -> None:
+def _foreign(study: Study, found: _Findings, labels: LabelMap) -> None:
     """Read every result of another code."""
     files, _ = model_files(list(study.loads), [study.path(p) for p in study.models.results], Reading())
     for of in files.values():
         for file in of:
-            file.read(labels.grid)
+            found.tried(file.read, labels.grid)

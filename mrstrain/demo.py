@@ -15,6 +15,7 @@ from mrstrain.againsttruth import TABLE, write_errors
 from mrstrain.loads import LOADS
 from mrstrain.making import phantom
 from mrstrain.measurements import spline_in
+from mrstrain.pipeline import Outcome
 from mrstrain.plan import REGISTRATION
 from mrstrain.running import REPORT, Ran, run
 from mrstrain.runpage import write_run_report
@@ -49,7 +50,7 @@ names = "{to_mesh}.csv"
 [models]
 sets = {sets}
 {limit}"""
-_LIMIT = "limit_minutes = 20  # Friedman's fat, the softest, would take hours\n"
+_LIMIT = "limit_minutes = 20  # for each path of loads: Friedman's fat, the softest, would take hours\n"
 _LOAD = """[loads.{name}]
 image = "{name}.nii.gz"
 normal_n = {normal_n}
@@ -153,6 +154,12 @@ def _errors(target: Path, seed: int, ran: Ran) -> dict[str, tuple[TissueError, .
     return errors
 
 
+def _why(outcome: Outcome) -> str:
+    """A stage that is not whole, and what is said of it."""
+    partly = [] if outcome.record is None else [line for line in outcome.record.given.lines if "ONLY" in line]
+    return f"{outcome.stage}: {outcome.words}. {outcome.reason or ' '.join(partly)}"
+
+
 def _told(errors: dict[str, tuple[TissueError, ...]], ran: Ran) -> list[str]:
     fat = {load: e for load, of in errors.items() for e in of if e.tissue == "fat"}
     told = ", ".join(f"{load} {e.shear_rmse:.3f} of {e.true_p95:.2f}" for load, e in fat.items())
@@ -170,5 +177,5 @@ def _told(errors: dict[str, tuple[TissueError, ...]], ran: Ran) -> list[str]:
     compared = ran.outcomes["compare"].record
     if compared is not None:
         lines += [line for line in compared.given.lines if line.startswith(("All loads", "Nearest over"))]
-    lines += [f"{o.stage}: {o.words}. {o.reason}" for o in ran.outcomes.values() if o.record is None]
+    lines += [_why(outcome) for outcome in ran.outcomes.values() if not outcome.whole]
     return [*lines, f"Report: {ran.study.out / REPORT}"]

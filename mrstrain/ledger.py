@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import re
 import shutil
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -71,6 +73,14 @@ class Ledger:
         self.out, self.home = out, home
         self.folder = out / ".study"
         self._hashes: dict[tuple[str, int, int], str] = {}
+
+    def impersonal(self, text: str) -> str:
+        """A text without the folders above the study and above the home folder: they may name a patient or a person."""
+        for place, short in ((self.home, ""), (Path.home(), "~")):
+            if place != place.parent:
+                text = text.replace(f"{place}{os.sep}", f"{short}{os.sep}" if short else "")
+                text = re.sub(rf"{re.escape(str(place))}(?![\w.-])", short or ".", text)
+        return text
 
     def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:
         """Hashes of a stage's input files, and its arguments without the study's own place.

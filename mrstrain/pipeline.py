@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from dvc.errors import MrstrainError
@@ -209,6 +209,10 @@ class Pipeline:
     def end(self, name: str, outcome: Given | str, seconds: float, tell: Tell) -> None:
         """Record how a stage ended that was handed to the cluster."""
         stage = next(stage for stage in self.stages if stage.name == name)
+        if isinstance(outcome, str):
+            outcome = self.ledger.impersonal(outcome)
+        else:
+            outcome = replace(outcome, lines=tuple(self.ledger.impersonal(line) for line in outcome.lines))
         try:
             if isinstance(outcome, str):
                 # what an earlier run or half of this one left is no result of these inputs

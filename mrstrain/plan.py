@@ -14,7 +14,7 @@ from fe.simulate import LoadStep
 from mrstrain.driving import ENDING
 from mrstrain.modelfiles import files_named
 from mrstrain.registering import REPEAT
-from mrstrain.studyfile import Load, Study, Vector, as_folder
+from mrstrain.studyfile import Study, Vector, as_folder
 from validate.levelled import LEVELLED
 
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
@@ -105,7 +105,7 @@ def plan(study: Study) -> tuple[Stage, ...]:
                 stages.append(_driven(study, one, folder.name, tuple(stage.name for stage in meshed), measured))
                 models[stages[-1].name] = str(stages[-1].gives[0])
             if study.models.level:
-                for load in loads:
+                for load in load_steps(study):
                     stages.append(_levelled(study, folder, load))
                     models[stages[-1].name] = str(folder) + LEVELLED
     if models or study.models.results:
@@ -213,11 +213,13 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         as_folder(name)
     except ValueError as wrong:
         raise InputError(f"The material set '{name}' of {one} needs {wrong}.") from wrong
+    steps = load_steps(study)
     arguments = {
         "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
-        "loads": [asdict(load_step(load, of)) for load, of in study.loads.items()],
+        "loads": [asdict(step) for step in steps.values()],
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
-        "towards": towards(study), "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
+        "towards": {name: of for name, of in towards(study).items() if name in steps},
+        "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
         "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))), "element": study.models.element,
         "decks": study.models.decks,
         "limit_s": None if study.models.limit_minutes is None else 60.0 * study.models.limit_minutes,
@@ -235,17 +237,26 @@ def towards(study: Study) -> dict[str, tuple[Vector, Vector]]:
     }
 
 
-def load_step(name: str, load: Load) -> LoadStep:
-    """A load of the study as it is simulated.
+def load_steps(study: Study) -> dict[str, LoadStep]:
+    """The loads that are simulated: those with a force or a travel along the normal.
 
     Raises
     ------
     InputError
-        If it has neither force nor travel along the normal, or both.
+        If a load has only a shear, or both force and travel along an axis, or none has anything.
     """
-    if load.normal_n is None and load.normal_mm is None:
-        raise InputError(f"[loads.{name}] normal_n is missing: sets are simulated ([models] sets) under every load.")
-    return LoadStep(name, load.normal_n, load.shear_n, load.normal_mm, load.shear_mm)
+    steps = {}
+    for name, load in study.loads.items():
+        along = (load.normal_n, load.normal_mm)
+        if along == (None, None):
+            if (load.shear_n, load.shear_mm) != (None, None):
+                raise InputError(f"[loads.{name}] normal_n is missing: a plate that shears has to press.")
+            continue
+        steps[name] = LoadStep(name, load.normal_n, load.shear_n, load.normal_mm, load.shear_mm)
+    if not steps:
+        first = next(iter(study.loads))
+        raise InputError(f"[loads.{first}] normal_n is missing: no load has a force to simulate [models] sets under.")
+    return steps
 
 
 def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured: Mapping[str, str]) -> Stage:

@@ -181,7 +181,7 @@ def run_studies(
         for prefix, study in zip(prefixes, studies, strict=True):
             outcomes = pipelines[prefix].in_order()
             write_run_report(study.out / REPORT, study, outcomes)
-            lines[prefix](f"Report: {study.out / REPORT}")
+            lines[prefix](f"Report: {study.study.out}/{REPORT}")
             done.append(Ran(study, outcomes))
     return done
 

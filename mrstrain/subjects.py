@@ -187,6 +187,12 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
             scale = float(row["estimate_ml"]) / found if known and found > 0.0 else 1.0
             shares.setdefault(row["model"], {})[subject] = scale * float(row["share"])
     notes = [] if known else ["The measurement's error is not known in every subject: areas are those found."]
+    rare = {model: of for model, of in shares.items() if 2 * len(of) < len(areas)}
+    notes += [
+        f"{model} is not ranked: it has an area over all loads in only {len(of)} of {len(areas)} subjects."
+        for model, of in rare.items()
+    ]
+    shares = {model: of for model, of in shares.items() if model not in rare}
     for subject in areas:
         lacking = [model for model, of in shares.items() if subject not in of]
         if lacking:
@@ -245,7 +251,7 @@ def _write_page(
     for one in ran:
         failed = [f"{o.stage}: {o.words}. {o.reason}" for o in one.outcomes.values() if o.record is None]
         verdicts = list(_registered(one).values())
-        verdicts += [Verdict("distrust", tuple(failed))] if failed else []
-        report = Table("Its own report", ("folder",), ((os.path.relpath(one.study.out, path.parent),),))
+        folder = os.path.relpath(one.study.out, path.parent)
+        report = Table("Its own report", ("folder", "not whole"), ((folder, "; ".join(failed)),))
         sections.append(Section(one.study.study.name, worst(verdicts) if verdicts else None, (report,)))
     write_report(path, "Models over subjects", None, sections, [], flat(record))

@@ -90,6 +90,20 @@ def test_directions_of_one_load_are_looked_at_like_those_of_the_plate(study):
     assert wrong(study, (of_load[0], of_load[1].replace("2.0, 0.0, 0.0", "0.0, 2.0, 0.0"))) == ""
 
 
+def test_a_label_map_to_mesh_that_lies_elsewhere_and_one_image_for_two_loads_are_told(study):
+    far = Grid(GRID.shape, GRID.spacing_mm, GRID.origin_mm + np.array([500.0, 0.0, 0.0]))
+    values = np.ones(GRID.shape, dtype=np.int64)
+    values[:4] = 2
+    write_labels(study / "far.nii.gz", LabelMap(far, values, {1: "fat", 2: "bone"}))
+    there = ("[mesh]", '[mesh]\nlabels = "far.nii.gz"\nnames = "tissues.csv"')
+    assert "only 0% of what it labels lies in the unloaded image" in wrong(study, there)
+    twice = ("[plate]", '[loads.Load2]\nimage = "Load1.nii.gz"\nnormal_n = 2.0\n[plate]')
+    assert wrong(study, twice) == "Load2 is the image of Load1: every voxel is equal."
+    forceless = (twice[0], twice[1].replace("normal_n = 2.0\n", ""))
+    wrong(study, forceless)
+    assert "Load2: no force, so measured and not simulated." in check(study).notes
+
+
 def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
     made = dome((3, 4, 4))
     file, friedman = ("[mesh]", '[mesh]\nfile = "dome.vtu"'), ('"mine.toml", ', "")

@@ -132,3 +132,17 @@ def test_a_table_that_an_earlier_run_left_is_not_ranked_over(tmp_path, monkeypat
     ends[0] = outcome
     with pytest.raises(InputError, match="No subject was compared"):
         cohort(places, out=tmp_path / "none")
+
+
+def test_a_model_that_few_subjects_have_does_not_take_the_others_from_the_ranking(tmp_path, monkeypatch):
+    places = [compared(tmp_path, name, 0.1, 0.3) for name in ("Ada", "Ben", "Cy")]
+    for place in places[1:]:  # a law that only Ada's heel bore
+        table = place / "results" / "comparison" / "areas.csv"
+        table.write_text("".join(line for line in table.read_text().splitlines(True) if ",far," not in line))
+    record = Record(stage="compare", key="k", made_utc="", seconds=1.0, files={}, given=Given(()), made_from={})
+    ended = lambda studies, **_: [Ran(study, {"compare": Outcome("compare", record)}) for study in studies]  # noqa: E731
+    monkeypatch.setattr("mrstrain.subjects.run_studies", ended)
+    done = cohort(places, out=tmp_path / "out")
+    assert [(one.model, one.subjects) for one in done.ranking] == [("near", 3)]
+    assert "far is not ranked: it has an area over all loads in only 1 of 3 subjects." in done.notes
+    assert not any("not ranked over" in note for note in done.notes)

@@ -181,7 +181,7 @@ def test_only_what_changed_is_done_anew(done, tmp_path):
 
 def test_a_broken_image_leaves_the_others_to_finish_and_is_named(done, tmp_path):
     folder, _ = done
-    study = tmp_path / "study"
+    study = tmp_path / "Doe_Jane" / "heel"
     shutil.copytree(folder, study)
     whole = (study / "Load2.nii.gz").read_bytes()
     (study / "Load2.nii.gz").write_bytes(whole[: len(whole) // 2])
@@ -196,6 +196,8 @@ def test_a_broken_image_leaves_the_others_to_finish_and_is_named(done, tmp_path)
         assert "Load2" not in {row["load"] for row in csv.DictReader(file)}
     page = (out / "report.html").read_text()
     assert "register Load2 failed" in page
+    for file in (out / "report.html", out / "study.log", out / "provenance.json", *(out / ".study").glob("*.*")):
+        assert "Doe_Jane" not in file.read_text(), file
 
 
 def test_two_runs_in_one_folder(done):
@@ -327,7 +329,8 @@ def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
     assert told.loads["Load1"].normal_n is None  # forces are never guessed
     assert any("normal_n is missing" in one for one in check(study).wrong)
     assert told.models.results == ("ansys",)
-    assert len(told.models.sets) == 7
+    assert len(told.models.sets) == 6
+    assert "friedman" not in told.models.sets
 
 
 def test_init_of_an_empty_folder_says_what_is_missing(tmp_path):

@@ -115,6 +115,13 @@ def test_a_simulated_load_needs_its_force(tmp_path):
     text = WHOLE.replace("normal_n = 15.0\n", "")
     with pytest.raises(InputError, match=r"loads.Load2\] normal_n is missing"):
         plan(read_study(written(tmp_path, text)))
+    alone = text.replace("shear_n = 45.0\n", "") + "level = true\n"
+    stages = {stage.name: stage for stage in plan(read_study(written(tmp_path, alone)))}
+    assert [load["name"] for load in stages["simulate trebbi"].arguments["loads"]] == ["Load1"]
+    assert {name for name in stages if name.startswith("level trebbi")} == {"level trebbi Load1"}
+    assert "register Load2" in stages  # measured all the same
+    with pytest.raises(InputError, match=r"loads.Load1\] normal_n is missing: no load has a force"):
+        plan(read_study(written(tmp_path, alone.replace("normal_n = 140\n", ""))))
     measured = text.replace('sets = ["trebbi", "luboz"]', "sets = []")
     assert [s.kind for s in plan(read_study(written(tmp_path, measured)))] == ["register", "register", "compare"]
 
