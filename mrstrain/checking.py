@@ -158,8 +158,8 @@ def _registration(study: Study, found: _Findings) -> None:
     """Look at engine, parameters and error model."""
     how = study.registration
     settings = found.tried(
-        settings_of, how.engine, how.preset, [study.path(p) for p in how.parameters], borders=how.borders,
-        labelled=study.images.labels is not None,
+        settings_of, how.engine, how.preset, [study.path(p) for p in how.parameters], bending=how.bending,
+        volume=how.volume, borders=how.borders, labelled=study.images.labels is not None,
     )  # fmt: skip
     if settings is None:
         return
@@ -188,7 +188,7 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
         found.notes.append(f"{', '.join(forceless)}: no force, so measured and not simulated.")
     loads: list[tuple[Plate, list[LoadStep]]] = []
     for directions, steps in by_direction.items():
-        plate = found.tried(Plate, *directions, given.gap_mm, given.taped, given.turns)
+        plate = found.tried(Plate, *directions, given.gap_mm, given.taped, given.turns, given.pivot_mm)
         if plate is not None:
             found.tried(check_loads, plate, steps)
             loads.append((plate, steps))

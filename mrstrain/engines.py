@@ -44,9 +44,9 @@ def settings_of(
         raise ParameterError(f"No engine '{engine}'; there are elastix and {GAUSS_NEWTON}.")
     if engine == "elastix":
         if bending is not None or volume is not None:
-            raise ParameterError(f"--bending and --volume are weights of --engine {GAUSS_NEWTON}; elastix has none.")
+            raise ParameterError(f"bending and volume are weights of the engine {GAUSS_NEWTON}; elastix has none.")
         if borders:
-            raise ParameterError(f"--borders is for --engine {GAUSS_NEWTON}: elastix finds one smooth spline.")
+            raise ParameterError(f"borders are for the engine {GAUSS_NEWTON}: elastix finds one smooth spline.")
         if parameters and preset:
             raise ParameterError(
                 f"Give the preset {preset} or parameter files, not both: only one of them would be used."
@@ -56,9 +56,9 @@ def settings_of(
         return Settings.of(preset or "heel-mr")
     if parameters or preset:
         raise ParameterError(
-            f"Presets and parameter files are elastix'; --engine {GAUSS_NEWTON} takes --bending and --volume."
+            f"Presets and parameter files are elastix'; the engine {GAUSS_NEWTON} takes weights: bending and volume."
         )
     if borders and not labelled:
-        raise InputError("--borders needs the tissues: give a label map of the unloaded image with --labels.")
+        raise InputError("Borders need the tissues: give a label map of the unloaded image (labels).")
     own = GaussNewton(bending=bending, volume=volume)
     return Settings(gauss_newton=own, borders=AtBorders() if labelled and borders is not False else None)

@@ -153,6 +153,8 @@ def _registrations(study: Study) -> list[Stage]:
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "seed": study.study.seed, "threads": 1,
     }  # fmt: skip
+    weights = {"bending": how.bending, "volume": how.volume}
+    shared |= {name: weight for name, weight in weights.items() if weight is not None}
     files = (load0, *(Path(p) for p in aside.values()), *own, *error_model)
     folder, own_directions = study.out / REGISTRATION, towards(study)
 
@@ -219,7 +221,8 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         "loads": [asdict(step) for step in steps.values()],
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "towards": {name: of for name, of in towards(study).items() if name in steps},
-        "taped": study.plate.taped, "turns": study.plate.turns, "gap_mm": study.plate.gap_mm,
+        "taped": study.plate.taped, "turns": study.plate.turns, "pivot_mm": study.plate.pivot_mm,
+        "gap_mm": study.plate.gap_mm,
         "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))), "element": study.models.element,
         "decks": study.models.decks,
         "limit_s": None if study.models.limit_minutes is None else 60.0 * study.models.limit_minutes,

@@ -32,6 +32,8 @@ def register_one(
     tissue: Path | None = None,
     align: AlignOn = "bone",
     engine: str | None = None,
+    bending: float | None = None,
+    volume: float | None = None,
     borders: bool | None = None,
     preset: str | None = None,
     parameters: Sequence[Path] = (),
@@ -74,7 +76,9 @@ def register_one(
     )
     loaded = read_image(load)
     settings = replace(
-        settings_of(engine, preset, parameters, borders=borders, labelled=labels is not None),
+        settings_of(
+            engine, preset, parameters, bending=bending, volume=volume, borders=borders, labelled=labels is not None
+        ),
         align_on=align,
         seed=seed,
         threads=threads,

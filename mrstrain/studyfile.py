@@ -114,6 +114,7 @@ class PlateOf(_Part):
     shear_direction: Vector = (0.0, -1.0, 0.0)
     taped: Flag = True
     turns: Flag = False
+    pivot_mm: Vector | None = None
     gap_mm: Annotated[Real, Field(ge=0.0)] = 0.0
 
 
@@ -122,6 +123,8 @@ class Registering(_Part):
 
     engine: Literal["gauss-newton", "elastix"] | None = None
     borders: Flag | None = None
+    bending: Annotated[Real, Field(gt=0.0)] | None = None
+    volume: Annotated[Real, Field(ge=0.0)] | None = None
     preset: str | None = None
     parameters: tuple[str, ...] = ()
     chain: Flag = False

@@ -333,9 +333,9 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
         Settings(Settings.of("heel-mr").presets, borders=AtBorders())
     with pytest.raises(ParameterError, match="must be above 0"):
         AtBorders(0.0)
-    with pytest.raises(ParameterError, match="--borders is for --engine gauss-newton"):
+    with pytest.raises(ParameterError, match="borders are for the engine gauss-newton"):
         settings_of(None, "heel-mr", borders=True)
-    with pytest.raises(InputError, match="--borders needs the tissues"):
+    with pytest.raises(InputError, match="Borders need the tissues"):
         settings_of(None, None, borders=True)
     for wrong, kind, said in (
         ({"bone": pad.folder / "bone.nrrd"}, InputError, "--labels"),

@@ -136,6 +136,14 @@ def test_a_load_has_the_plates_directions_or_its_own(tmp_path):
     assert found.arguments["towards"] == {}
 
 
+def test_weights_of_the_engine_and_the_plates_pivot_reach_their_stages(tmp_path):
+    text = WHOLE + "[registration]\nvolume = 3.0\n[plate]\npivot_mm = [1.0, 2.0, 3.0]\n"
+    stages = {stage.name: stage.arguments for stage in plan(read_study(written(tmp_path, text)))}
+    assert stages["register Load1"]["volume"] == 3.0
+    assert "bending" not in stages["register Load1"]
+    assert stages["simulate trebbi"]["pivot_mm"] == (1.0, 2.0, 3.0)
+
+
 def test_a_simulation_may_have_a_limit_of_time(tmp_path):
     for text, limit in ((WHOLE + "limit_minutes = 2.5\n", 150.0), (WHOLE, None)):
         (simulated,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "simulate trebbi")
