@@ -338,8 +338,8 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
     with pytest.raises(InputError, match="Borders need the tissues"):
         settings_of(None, None, borders=True)
     for wrong, kind, said in (
-        ({"bone": pad.folder / "bone.nrrd"}, InputError, "--labels"),
-        (asked(pad, preset="heel-mr"), ParameterError, "--borders"),
+        ({"bone": pad.folder / "bone.nrrd"}, InputError, "label map"),
+        (asked(pad, preset="heel-mr"), ParameterError, "borders are for"),
     ):
         with pytest.raises(kind, match=said):
             run(pad.folder / "Load0.nii.gz", [pad.folder / "Load1.nii.gz"], out=tmp_path / "o", borders=True, **wrong)
