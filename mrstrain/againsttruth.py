@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 
 from dvc.report import Section, Table
 from dvc.whole import write_whole
@@ -17,6 +18,7 @@ from phantoms.score import TissueError
 TABLE = "error.csv"
 _MADE = "registered_utc"
 _FIGURES = ("true_p50", "true_p95", "shear_rmse", "shear_bias", "u_p50_mm", "u_p95_mm")
+_KINDS: Mapping[str, Callable[[str], Any]] = {"str": str, "int": int, "float": float}
 _COLUMNS = (
     "load",
     "tissue",
@@ -39,18 +41,33 @@ def write_errors(path: Path, errors: Mapping[str, Sequence[TissueError]], outcom
     write_whole(path, table.getvalue())
 
 
+def read_errors(path: Path, outcomes: Mapping[str, Outcome]) -> dict[str, tuple[TissueError, ...]]:
+    """What `write_errors` wrote of the loads whose registration is still the one that it was told of."""
+    errors: dict[str, tuple[TissueError, ...]] = {}
+    for row in _rows(path):
+        if row[_MADE] and row[_MADE] == _made(outcomes, row["load"]):
+            told = {field.name: _KINDS[str(field.type)](row[field.name]) for field in fields(TissueError)}
+            errors[row["load"]] = (*errors.get(row["load"], ()), TissueError(**told))
+    return errors
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    """The rows of such a table; none of a file of somebody's own."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return rows if rows and {"load", _MADE, *(f.name for f in fields(TissueError))} <= set(rows[0]) else []
+
+
 def error_against_truth(study: Study, outcomes: Mapping[str, Outcome]) -> list[Section]:
     """The section of a study whose folder has such a table; none of any other.
 
     The rows are those of registrations that are still there; of one that was made anew the error is not known.
     """
-    path = study.place / TABLE
-    if not path.is_file():
+    rows = _rows(study.place / TABLE)
+    if not rows:
         return []
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    if not rows or not {"load", "tissue", _MADE, *_FIGURES} <= set(rows[0]):
-        return []  # a file of somebody's own
     known = [row for row in rows if row[_MADE] and row[_MADE] == _made(outcomes, row["load"])]
     old = dict.fromkeys(row["load"] for row in rows if row not in known)
     note = "Displacement in mm. The calcaneus and the ankle's bones are rigid: their true shear is zero."

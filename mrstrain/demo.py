@@ -11,7 +11,7 @@ from dvc.errors import OutputError
 from dvc.imagewrite import write_labels
 from dvc.labels import read_labels, read_mask
 from dvc.whole import write_whole
-from mrstrain.againsttruth import TABLE, write_errors
+from mrstrain.againsttruth import TABLE, read_errors, write_errors
 from mrstrain.loads import LOADS
 from mrstrain.making import phantom
 from mrstrain.measurements import spline_in
@@ -101,7 +101,7 @@ def demo(
     target = Path(out)
     _make(target, seed, full, progress)
     ran = run(target, workers=workers, progress=progress)
-    errors = _errors(target, seed, ran)
+    errors = _errors(target, seed, ran, read_errors(target / TABLE, ran.outcomes))
     write_errors(target / TABLE, errors, ran.outcomes)
     write_run_report(target / "results" / REPORT, ran.study, ran.outcomes)
     return Shown(tuple(_told(errors, ran)), ran.complete)
@@ -139,13 +139,18 @@ def _text(seed: int, full: bool) -> str:
     )  # fmt: skip
 
 
-def _errors(target: Path, seed: int, ran: Ran) -> dict[str, tuple[TissueError, ...]]:
-    """Error of each load by tissue, where its result is valid."""
+def _errors(
+    target: Path, seed: int, ran: Ran, known: dict[str, tuple[TissueError, ...]]
+) -> dict[str, tuple[TissueError, ...]]:
+    """Error of each load by tissue, where its result is valid; those that are known are not computed again."""
     labels = read_labels(target / "tissues.nii.gz", target / "tissues.csv")
     heel = Heel(seed)
     errors = {}
     for load in ran.study.loads:
         folder = ran.study.out / REGISTRATION / load
+        if load in known:
+            errors[load] = known[load]
+            continue
         if ran.outcomes[f"register {load}"].record is None:
             continue
         found = spline_in(folder)

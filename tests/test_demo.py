@@ -8,10 +8,15 @@ import pytest
 
 from dvc.errors import OutputError
 from dvc.labels import read_labels
+from mrstrain.againsttruth import read_errors, write_errors
 from mrstrain.demo import _make
+from mrstrain.ledger import Record
 from mrstrain.loads import LOADS
+from mrstrain.pipeline import Outcome
 from mrstrain.plan import plan
+from mrstrain.stages import Given
 from mrstrain.studyfile import read_study
+from phantoms.score import TissueError
 
 
 @pytest.fixture
@@ -58,3 +63,19 @@ def test_changes_to_its_study_file_are_kept(folder):
     (folder / "study.toml").write_text(changed)
     _make(folder, 1, False, None)
     assert (folder / "study.toml").read_text() == changed
+
+
+def test_errors_are_read_again_while_their_registrations_are_the_same(tmp_path):
+    def outcomes(made_utc: str) -> dict[str, Outcome]:
+        record = Record(stage="register Load1", key="", made_utc=made_utc, seconds=1.0, files={}, given=Given(()))
+        return {"register Load1": Outcome("register Load1", record)}
+
+    errors = {
+        "Load1": tuple(TissueError(name, 12345, 0.1, 0.4, 1 / 3, -0.01, 0.05, 0.1, 0.2, 1) for name in ("fat", "a, b"))
+    }
+    write_errors(tmp_path / "error.csv", errors, outcomes("then"))
+    assert read_errors(tmp_path / "error.csv", outcomes("then")) == errors
+    assert read_errors(tmp_path / "error.csv", outcomes("since")) == {}
+    assert read_errors(tmp_path / "none.csv", outcomes("then")) == {}
+    (tmp_path / "own.csv").write_text("a,b\n1,2\n")
+    assert read_errors(tmp_path / "own.csv", outcomes("then")) == {}
