@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from dvc.errors import InputError
 from mrstrain.ledger import Ledger
 from mrstrain.plan import plan
-from mrstrain.studyfile import read_study
+from mrstrain.studyfile import _fields_at, read_study
 
 WHOLE = """
 [study]
@@ -148,6 +149,15 @@ def test_a_simulation_may_have_a_limit_of_time(tmp_path):
     for text, limit in ((WHOLE + "limit_minutes = 2.5\n", 150.0), (WHOLE, None)):
         (simulated,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "simulate trebbi")
         assert simulated.arguments["limit_s"] == limit
+
+
+def test_the_page_on_studies_names_every_key_and_no_other():
+    page = (Path(__file__).parents[1] / "docs" / "study.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `\[(\w+)(?:\.NAME)?\]` \|(.*)\|$", page, re.MULTILINE)
+    assert {table for table, _ in rows} == set(_fields_at([]))
+    for table, keys in rows:
+        known = set(_fields_at([table, "NAME"] if table == "loads" else [table]))
+        assert set(re.findall(r"`(\w+)`", keys)) == known, table
 
 
 def test_two_models_of_one_name_are_refused(tmp_path):
