@@ -13,7 +13,7 @@ from dvc.mesh import TetMesh
 from fe.materials import NeoHooke, Ogden
 from fe.newton import Tolerance
 from fe.plate import Plate
-from fe.result import region_figures
+from fe.result import cauchy_stress, region_figures
 from fe.simulate import LoadStep, State, simulate
 from tests.blocks import block
 from tests.test_assembly import needs_ngsolve
@@ -120,6 +120,46 @@ def test_another_library_finds_the_same_state(
     again = press(dome(), [LoadStep("pressed", 2.0), LoadStep("sheared", 2.0, 1.0)])
     for state, other in zip(sheared, again, strict=False):
         assert np.abs(other.u_mm - state.u_mm).max() < 1e-6
+
+
+def nodal_forces(mesh: TetMesh, state: State, laws: dict) -> np.ndarray:
+    """What the stress that is written out exerts at the nodes, N: the sum of V P grad N over their cells."""
+    F = np.eye(3) + state.gradients
+    P = np.linalg.det(F)[:, None, None] * cauchy_stress(state, mesh, laws) @ np.linalg.inv(F).transpose(0, 2, 1)
+    corners = mesh.points_mm[mesh.cells]
+    slopes = np.linalg.inv(corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+    slopes = np.concatenate([-slopes.sum(axis=1, keepdims=True), slopes], axis=1)
+    forces = np.zeros_like(mesh.points_mm)
+    np.add.at(forces, mesh.cells, mesh.volumes_mm3[:, None, None] * np.einsum("mij,maj->mai", P, slopes))
+    return forces
+
+
+def test_stress_is_in_balance_at_every_node() -> None:
+    mesh = dome((5, 8, 8))
+    state = press(mesh, [LoadStep("sheared", 2.0, 1.0)])[0]
+    stress = cauchy_stress(state, mesh, LAWS)
+    assert np.abs(stress - stress.transpose(0, 2, 1)).max() < 1e-9 * np.abs(stress).max()
+    forces, bone = nodal_forces(mesh, state, LAWS), np.unique(mesh.facets["bone"])
+    free = np.setdiff1d(np.arange(len(forces)), np.concatenate([bone, state.on_plate]))
+    assert len(free) > 200
+    assert np.abs(forces[free]).max() < 1e-4
+    assert forces[state.on_plate].sum(axis=0) == pytest.approx([2.0, 1.0, 0.0], abs=2e-3)
+    assert forces[bone].sum(axis=0) == pytest.approx([-2.0, -1.0, 0.0], abs=2e-3)
+
+
+def test_a_plate_without_friction_only_pushes_and_along_its_normal() -> None:
+    mesh, soft = dome(), {"skin": FAT, "fat": FAT}
+    for taped in (False, True):
+        state = press(mesh, PRESS, soft, taped=taped)[0]
+        forces = nodal_forces(mesh, state, soft)[state.on_plate]
+        assert len(forces) > 4
+        assert forces[:, 0].sum() == pytest.approx(2.0, abs=2e-3)
+        across = np.abs(forces[:, 1:]).max()
+        if taped:
+            assert across > 0.01  # held where it touched
+        else:
+            assert across < 1e-4
+            assert forces[:, 0].min() > -1e-4
 
 
 def test_without_tape_the_surface_slides() -> None:
