@@ -69,11 +69,13 @@ def coarse(labels: LabelMap) -> LabelMap:
 
 @pytest.fixture(scope="module")
 def images(tmp_path_factory, small_pair) -> Path:
-    """A heel at 1.6 mm; the loaded image serves for two loads, of which one has a row of voxels changed."""
+    """A heel at 1.6 mm; the repeat scan serves for Load2 too, with one voxel changed: no image is given twice."""
     folder = tmp_path_factory.mktemp("images")
     write_image(folder / "Load0.nii.gz", small_pair.reference)
     write_image(folder / "Load1.nii.gz", small_pair.loaded)
-    write_image(folder / "Load2.nii.gz", small_pair.repeat)
+    values = small_pair.repeat.values.copy()
+    values[0, 0, 0] += 1.0
+    write_image(folder / "Load2.nii.gz", type(small_pair.repeat)(small_pair.repeat.grid, values))
     write_image(folder / "Load0-again.nii.gz", small_pair.repeat)
     write_labels(folder / "tissues.nii.gz", small_pair.labels)
     write_labels(folder / "to_mesh.nii.gz", coarse(small_pair.labels))
