@@ -127,7 +127,7 @@ class TetMesh:
     @property
     def volumes_mm3(self) -> FloatArray:
         """Volume of each cell, (m,) mm3, positive."""
-        return _signed_volumes(self.points_mm, self.cells)
+        return signed_volumes(self.points_mm[self.cells])
 
     @property
     def centroids_mm(self) -> FloatArray:
@@ -231,15 +231,18 @@ def check_extent(points_mm: FloatArray) -> None:
         )
 
 
-def _signed_volumes(points: FloatArray, cells: IntArray) -> FloatArray:
-    corner = points[cells]
-    a, b, c = (corner[:, i] - corner[:, 0] for i in (1, 2, 3))
-    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+def signed_volumes(corners: FloatArray) -> FloatArray:
+    """Volumes of tetrahedra (...), in the cube of the corners' unit, from their corners (..., 4, 3) in any frame.
+
+    Positive where the first three corners turn to the left, seen from the fourth.
+    """
+    a, b, c = (corners[..., i, :] - corners[..., 0, :] for i in (1, 2, 3))
+    return np.asarray(np.einsum("...j,...j->...", a, np.cross(b, c)) / 6.0)
 
 
 def _positively_ordered(points: FloatArray, cells: IntArray) -> IntArray:
     """Give every cell a positive volume, or refuse; see the notes of TetMesh."""
-    volumes = _signed_volumes(points, cells)
+    volumes = signed_volumes(points[cells])
     longest = np.max([np.linalg.norm(points[cells[:, i]] - points[cells[:, j]], axis=1) for i, j in _EDGES], axis=0)
     flat = np.abs(volumes) <= _DEGENERATE * longest**3
     if flat.any():
@@ -279,7 +282,7 @@ def _overlapping(points: FloatArray, cells: IntArray) -> BoolArray:
     owner = np.tile(np.arange(len(cells)), 4)
     _, which = np.unique(faces, axis=0, return_inverse=True)
     which = which.ravel()
-    side = np.sign(_signed_volumes(points, np.column_stack([faces, opposite])))
+    side = np.sign(signed_volumes(points[np.column_stack([faces, opposite])]))
     shared_by = np.bincount(which)
     balance = np.bincount(which, weights=side)  # 0 where two cells lie on opposite sides
     wrong = (shared_by > 2) | ((shared_by == 2) & (balance != 0))

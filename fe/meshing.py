@@ -13,12 +13,12 @@ from scipy.spatial import cKDTree
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.image import LabelMap
-from dvc.mesh import FACES, TetMesh
+from dvc.mesh import FACES, TetMesh, signed_volumes
 from dvc.worker import Worker
 from fe.facets import BONE, CUT, SKIN
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.surfaces import Borders, borders_of, labels_at
-from fe.volumes import volumes_of, with_volumes
+from fe.volumes import with_volumes
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
 _FARTHEST = 0.1  # of the smallest voxel edge: how far a node may move at once to keep the tissues' volumes
@@ -96,9 +96,10 @@ def mesh_labels(
 
     Notes
     -----
-    The tetrahedra are fTetWild's (Hu and others 2020, doi:10.1145/3386569.3392385); where it leaves one with an angle
-    under 12 degrees, nodes are moved until there is none or no move helps. They differ a little from one run to the
-    next: keep a mesh, and its hash, with what was computed on it.
+    The tetrahedra are fTetWild's (Hu and others 2020, doi:10.1145/3386569.3392385). Borders are then moved, by three
+    tenths of a voxel at the most, until each region has the volume of its voxels (`fe.volumes`); where a cell has an
+    angle under 12 degrees, nodes are moved until there is none or no move helps. They differ a little from one run to
+    the next: keep a mesh, and its hash, with what was computed on it.
     """
     spacing = float(labels.grid.spacing_mm.min())
     if not 0.5 * spacing <= edge_mm <= 20.0:
@@ -119,7 +120,7 @@ def mesh_labels(
     body = np.isin(found, list(soft.values()))
     voxel_mm3 = labels.grid.voxel_volume_mm3
     volumes_mm3 = {number: voxel_mm3 * float((labels.labels == number).sum()) for number in numbers.values()}
-    _refuse_lost(numbers, soft, volumes_mm3, np.abs(volumes_of(points, cells)), found)
+    _refuse_lost(numbers, soft, volumes_mm3, np.abs(signed_volumes(points[cells])), found)
     points = with_volumes(points, cells, found, volumes_mm3, _FARTHEST * spacing)
     points = without_slivers(points, cells[body], found[body])
     mesh = _named(points, cells, found, soft, [numbers[b] for b in bones], labels)

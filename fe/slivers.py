@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dvc.arrays import FloatArray, IntArray
-from dvc.mesh import FACES
+from dvc.mesh import FACES, signed_volumes
 
 _FLAT = 0.02  # of the greatest variance of a border's normals around a node: less, and the border goes on straight
 _STEPS = (0.2, 0.1, 0.05, 0.02)  # of the mean edge around a node
@@ -55,7 +55,7 @@ def without_slivers(points_mm: FloatArray, cells: IntArray, tissue: IntArray, go
     """
     points = points_mm.copy()
     free = _freedom(points, cells, tissue)
-    sign = float(np.sign(np.median(_volumes(points[cells]))))
+    sign = float(np.sign(np.median(signed_volumes(points[cells]))))
     owners = np.argsort(cells, axis=None, kind="stable") // cells.shape[1]
     first = np.concatenate([[0], np.cumsum(np.bincount(cells.ravel(), minlength=len(points)))])
     for _ in range(_PASSES):
@@ -69,16 +69,11 @@ def without_slivers(points_mm: FloatArray, cells: IntArray, tissue: IntArray, go
     return points
 
 
-def _volumes(corners: FloatArray) -> FloatArray:
-    edges = corners[..., 1:, :] - corners[..., :1, :]
-    return np.asarray(np.linalg.det(edges))
-
-
 def _goodness(corners: FloatArray, sign: float) -> FloatArray:
     """Distance of the dihedral angles from flat (...), degrees; negative where a cell is turned inside out."""
     angles = dihedral_angles_deg(corners)
     worst = np.minimum(angles, 180.0 - angles).min(axis=-1)
-    return np.asarray(np.where(_volumes(corners) * sign > 0, worst, -1.0))
+    return np.asarray(np.where(signed_volumes(corners) * sign > 0, worst, -1.0))
 
 
 def _freedom(points: FloatArray, cells: IntArray, tissue: IntArray) -> FloatArray:

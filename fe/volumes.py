@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dvc.arrays import FloatArray, IntArray
-from dvc.mesh import FACES
+from dvc.mesh import FACES, signed_volumes
 
 _SHIFTS = 3
 _LEAST_LEFT = 0.2  # of a cell's volume, in one shift
@@ -33,6 +33,7 @@ def with_volumes(
     Returns
     -------
     points_mm : (n, 3)
+        The same but on the borders.
 
     Notes
     -----
@@ -49,7 +50,7 @@ def with_volumes(
     border = np.flatnonzero(low < high)
     for _ in range(_SHIFTS):
         corners = points[cells]
-        volume = volumes_of(points, cells)
+        volume = signed_volumes(corners)
         slope = np.zeros((len(labels), len(points), 3))  # of each label's volume by its nodes, mm^2
         for corner, (a, b, c) in enumerate(FACES):
             vector = np.cross(corners[:, b] - corners[:, a], corners[:, c] - corners[:, a]) / 6.0
@@ -73,17 +74,11 @@ def with_volumes(
 def _without_turning(points: FloatArray, cells: IntArray, moves: FloatArray) -> FloatArray:
     """The moves, halved around cells that they would turn over or all but flatten."""
     moves = moves.copy()
-    before = volumes_of(points, cells)
+    before = signed_volumes(points[cells])
     for _ in range(_HALVINGS):
-        flat = volumes_of(points + moves, cells) * np.sign(before) < _LEAST_LEFT * np.abs(before)
+        flat = signed_volumes((points + moves)[cells]) * np.sign(before) < _LEAST_LEFT * np.abs(before)
         if not flat.any():
             return moves
         moves[np.unique(cells[flat])] *= 0.5
     moves[np.unique(cells[flat])] = 0.0
     return moves
-
-
-def volumes_of(points: FloatArray, cells: IntArray) -> FloatArray:
-    """Signed volumes of tetrahedra (m,)."""
-    corners = points[cells]
-    return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0)
