@@ -9,8 +9,10 @@ import numpy as np
 
 from dvc.image import LabelMap
 from dvc.registration import GAUSS_NEWTON
+from fe.simulate import LoadStep
 from mrstrain.doctor import usable_memory_bytes
 from mrstrain.engines import engine_of
+from mrstrain.loads import paths_of
 from mrstrain.plan import Stage
 from mrstrain.studyfile import Study
 
@@ -67,10 +69,13 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
     if stage.kind == "compare":
         models = len({value for of in (stage.some.get("models", {}),) for value in of.values()})
         return loads * (_COMPARE_S + _MODEL_S * (models + len(study.models.results)))
-    times = _ELEMENT_TIMES[study.models.element] if stage.kind == "simulate" else 1.0
-    seconds = times * float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
-    limit = study.models.limit_minutes
-    return seconds if limit is None or stage.kind != "simulate" else min(seconds, 60.0 * loads * limit)
+    seconds = float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
+    if stage.kind != "simulate":
+        return seconds
+    seconds *= _ELEMENT_TIMES[study.models.element]
+    paths = paths_of([LoadStep(**load) for load in stage.arguments["loads"]], stage.arguments["towards"])
+    limit = stage.arguments["limit_s"]
+    return seconds if limit is None else min(seconds, len(paths) * limit)
 
 
 def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:

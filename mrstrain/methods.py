@@ -246,6 +246,10 @@ def _levelled(path: Path, measured: Mapping[str, Path]) -> str:
     )
 
 
+def _along(axes: Sequence[Sequence[float]], column: int, sign: float = 1.0) -> str:
+    return "(" + ", ".join(f"{sign * row[column] + 0.0:.3g}" for row in axes) + ")"
+
+
 def _solver(record: Record) -> str:
     given, versions = record["parameters"], record.get("versions", {})
     made = given.get("mesh_made")
@@ -255,6 +259,14 @@ def _solver(record: Record) -> str:
         else ""
     )
     loads = _listed([f"{step['name']} {LoadStep(**step).told}" for path in given["paths"] for step in path])
+    axes = {load: told.get("plate_axes_lps") for load, told in record.get("outcome", {}).items()}
+    if any(own != first for own in axes.values() for first in axes.values()):
+        loads += "".join(
+            f"; {load} with the plate's outward normal along {_along(own, 0, -1.0)} "
+            f"and shear along {_along(own, 1)} (LPS)"
+            for load, own in axes.items()
+            if own is not None
+        )
     contact = "bonded to the plate from the first touch" if given.get("taped", True) else "without friction"
     return (
         f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh}: {given['element']}; "

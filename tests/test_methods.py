@@ -66,6 +66,19 @@ def told(loads: dict[str, Path], models: dict[str, Path], error_known: bool = Tr
     return "\n".join(methods(loads, models, 1234, (0.2, 0.5), (0.2, 0.3), 0.1, error_known=error_known, version="1.0"))
 
 
+def test_directions_are_told_where_loads_do_not_share_them(tmp_path: Path) -> None:
+    place = simulated(tmp_path, "mine")
+    loads = {"Load1": measured(tmp_path / "res", "Load1")}
+    down, aside = [[0, 0, 1], [0, -1, 0], [1, 0, 0]], [[0, 1, 0], [0, 0, -1], [1, 0, 0]]
+    for other in (down, aside):
+        record = json.loads((place.parent / "simulation.json").read_text())
+        record["outcome"] = {"Load1": {"plate_axes_lps": down}, "Load2": {"plate_axes_lps": other}}
+        (place.parent / "simulation.json").write_text(json.dumps(record))
+        text = told(loads, {"mine": place})
+        said = "Load2 with the plate's outward normal along (0, 0, -1) and shear along (1, 0, 0) (LPS)"
+        assert (said in text) == (other is aside)
+
+
 def test_figures_and_papers_are_those_of_the_records(tmp_path: Path) -> None:
     loads = {load: measured(tmp_path / "res", load) for load in ("Load1", "Load2")}
     models = {"trebbi": simulated(tmp_path, "trebbi", {"edge_mm": 2.5, "pytetwild": "6.7"})}
