@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import binary_closing, binary_fill_holes, binary_opening, distance_transform_edt, label
+from numba import njit
+from scipy.ndimage import binary_fill_holes, binary_opening, distance_transform_edt, label
 from skimage.filters import threshold_otsu
 
 from dvc.arrays import BoolArray, IntArray
@@ -28,11 +29,7 @@ def tissue_mask(image: Image) -> Mask:
     """
     bright = bright_voxels(image)
     radius = np.maximum(np.rint(_CLOSE_MM / image.grid.spacing_mm / 2.0).astype(int), 0)
-    ball = _ellipsoid(radius)
-    opened = binary_opening(bright, structure=_ellipsoid(np.minimum(radius, 1)))
-    padded = np.pad(opened, [(int(r), int(r)) for r in radius], mode="edge")
-    inner = tuple(slice(int(r), int(r) + n) for r, n in zip(radius, opened.shape, strict=True))
-    closed = binary_closing(padded, structure=ball)[inner]
+    closed = _closed(binary_opening(bright, structure=_ellipsoid(np.minimum(radius, 1))), radius)
     parts, count = label(closed)
     if count:
         sizes = np.bincount(parts.ravel())
@@ -59,6 +56,38 @@ def widened(mask: Mask, margin_mm: float) -> Mask:
     """The mask and all voxels within ``margin_mm`` of it."""
     distance = distance_transform_edt(~mask.inside, sampling=mask.grid.spacing_mm)
     return Mask(mask.grid, distance <= margin_mm)
+
+
+def _closed(mask: BoolArray, radius: IntArray) -> BoolArray:
+    """Closing by an ellipsoid of radii in voxels; the mask goes on beyond its ends as it is there."""
+    padded = np.pad(mask, [(int(r), int(r)) for r in radius], mode="edge")
+    inner = tuple(slice(int(r), int(r) + n) for r, n in zip(radius, mask.shape, strict=True))
+    offsets = np.argwhere(_ellipsoid(radius)) - radius
+    return np.asarray(~_grown(~_grown(padded, offsets), offsets)[inner])
+
+
+@njit(cache=True)
+def _grown(inside: BoolArray, offsets: IntArray) -> BoolArray:
+    """Dilation by a convex structure, given as offsets: laid at the voxels of the surface alone, which are few."""
+    ni, nj, nk = inside.shape
+    out = inside.copy()
+    for i in range(ni):
+        for j in range(nj):
+            for k in range(nk):
+                if not inside[i, j, k] or (
+                    inside[max(i - 1, 0), j, k]
+                    and inside[min(i + 1, ni - 1), j, k]
+                    and inside[i, max(j - 1, 0), k]
+                    and inside[i, min(j + 1, nj - 1), k]
+                    and inside[i, j, max(k - 1, 0)]
+                    and inside[i, j, min(k + 1, nk - 1)]
+                ):
+                    continue
+                for n in range(len(offsets)):
+                    a, b, c = i + offsets[n, 0], j + offsets[n, 1], k + offsets[n, 2]
+                    if 0 <= a < ni and 0 <= b < nj and 0 <= c < nk:
+                        out[a, b, c] = True
+    return out
 
 
 def _ellipsoid(radius: IntArray) -> BoolArray:
