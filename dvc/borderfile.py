@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import FloatArray, frozen
+from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.borders import NUMBERS, BorderedSpline, Borders
 from dvc.bspline import BSpline
 from dvc.errors import InputError, MrstrainError
@@ -58,13 +58,31 @@ def read_bordered_spline(path: Path | str) -> BorderedSpline:
                 raise ValueError(f"borders found with {file['numbers']}, not {NUMBERS}; register again")
             control = _grid(file["control"])
             own = frozen(file["own"], np.int64)
-            borders = Borders.between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
+            borders = _between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
             return BorderedSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
     except (*_UNREADABLE, MrstrainError) as failure:
         raise InputError(
             f"{path}: no displacement with borders as `mrstrain register` writes it ({type(failure).__name__}: "
             f"{failure})."
         ) from failure
+
+
+_latest: list[Borders] = []
+"""Loads of one study have their borders in common, which take seconds to find and room in the memory."""
+
+
+def _between(grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Borders:
+    """Borders as they were last found, if these are the same; found anew otherwise."""
+    known = _latest[-1] if _latest else None
+    if (
+        known is None
+        or (known.rest, known.reach_mm) != (rest, reach_mm)
+        or not np.array_equal(_told(known.grid), _told(grid))
+        or not np.array_equal(known.own, own)
+    ):
+        known = Borders.between(grid, own, rest, reach_mm)
+        _latest[:] = [known]
+    return known
 
 
 def _told(grid: Grid) -> FloatArray:

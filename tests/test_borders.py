@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dvc.borderfile import read_bordered_spline, write_bordered_spline
 from dvc.borders import BorderedSpline, Borders
 from dvc.bspline import BSpline
 from dvc.deformation import Deformation, evaluate_on_grid
@@ -155,6 +156,27 @@ def test_on_a_grid_it_is_what_it_is_at_points(spline):
     np.testing.assert_allclose(u, true_u, atol=1e-10)
     np.testing.assert_allclose(H, true_H, atol=1e-10)
     assert isinstance(spline, Deformation)
+
+
+def test_files_with_the_same_borders_share_them_and_no_others_do(spline, borders, tmp_path):
+    """Finding them takes seconds, and one study's loads have them in common."""
+    others = {
+        "again": borders,
+        "reach": replace(borders, reach_mm=2.0 * borders.reach_mm),
+        "rest": replace(borders, rest=-1),
+        "grid": replace(borders, grid=borders.grid.moved_by(np.eye(3), np.array([1.0, 0.0, 0.0]))),
+        "own": borders_of(LabelMap(GRID, np.roll(layers().labels, 1, axis=0), NAMES)),
+    }
+    write_bordered_spline(tmp_path / "first", spline)
+    for name, other in others.items():
+        write_bordered_spline(tmp_path / name, replace(spline, borders=other))
+        first = read_bordered_spline(tmp_path / "first").borders
+        found = read_bordered_spline(tmp_path / name).borders
+        assert (found is first) == (name == "again")
+        assert np.array_equal(found.depth, other.depth)
+        assert np.array_equal(found.own, other.own)
+        assert (found.rest, found.reach_mm) == (other.rest, other.reach_mm)
+        assert np.array_equal(found.grid.origin_mm, other.grid.origin_mm)
 
 
 def test_what_does_not_fit_together_is_refused(spline, borders):
