@@ -24,12 +24,29 @@ def test_a_known_order_and_limit(order: float) -> None:
     assert found.error == pytest.approx(-0.2 * 1.5**order / 7.0, rel=0.05)
 
 
+def test_what_seems_to_converge_faster_than_it_can_is_not_called_converged() -> None:
+    """The plate's travel on a heel, as `converge` found it: the last two meshes agree by chance."""
+    h, travel = np.array([1.36, 1.12, 0.87, 0.70]), np.array([10.2547, 10.3734, 10.4355, 10.4373])
+    found = extrapolated(h, travel)
+    assert found.order == 2.0
+    assert found.limit == pytest.approx(10.526, abs=0.002)
+    assert found.error == pytest.approx(-0.0084, abs=0.0003)  # a hundred times what the last two differ by
+    cubic = extrapolated(h, 7.0 - 0.2 * h**3)
+    assert cubic.order == 2.0
+    assert abs(cubic.error) > 0.2 * 0.7**3 / 7.0
+
+
+def test_a_limit_that_is_passed_already_is_none() -> None:
+    h, f = np.array([2.02, 1.73, 0.82, 0.71]), np.array([0.15, 1.68, 2.21, 3.63])  # steady, but scattered
+    assert np.isnan(extrapolated(h, f).limit)
+
+
 def test_no_limit_is_told_where_there_is_none() -> None:
     h = np.array([5.0, 4.0, 3.0, 2.0])
     found = extrapolated(h, np.array([1.0, 1.2, 0.9, 1.1]))
     assert found.scatter > 0.05
     assert np.isnan(found.limit)
-    assert np.isnan(extrapolated(h[1:], np.array([1.0, 1.1, 1.3])).limit)  # runs away: no order between 0.5 and 3
+    assert np.isnan(extrapolated(h[1:], np.array([1.0, 1.1, 1.3])).limit)  # runs away: an order below 0.5
     for sizes in (h[:2], np.array([2.0, 1.9, 1.8])):
         with pytest.raises(InputError, match=r"3 or more meshes, the coarsest 1\.5 times the size"):
             extrapolated(sizes, sizes)
@@ -39,7 +56,7 @@ def test_the_command(tmp_path: Path) -> None:
     onion = half_onion()
     plain = LabelMap(onion.grid, np.where(onion.labels == 3, 2, onion.labels), {1: "bone", 2: "fat"})  # nothing thin
     write_labels(tmp_path / "map.nii.gz", plain)
-    sizes = [text for edge in ("4.5", "2.8", "2") for text in ("--edge-mm", edge)]
+    sizes = [text for edge in ("4.5", "2.8", "1.7") for text in ("--edge-mm", edge)]
     given = [*sizes, "--names", str(tmp_path / "map.csv"), "--load", "pressed=3", "--set", "luboz"]
     out = tmp_path / "study"
     done = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
@@ -48,7 +65,8 @@ def test_the_command(tmp_path: Path) -> None:
     with (out / "convergence.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximal shear of fat, p50"]
-    assert 0.1 < float(rows[0]["edge_2_mm"]) < 10.0
+    assert 0.1 < float(rows[0]["edge_1.7_mm"]) < 10.0
+    assert any(row["limit"] for row in rows) == (out / "convergence.png").is_file()
     before = (out / "mesh-2.8.vtu").read_bytes()
     again = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
     assert again.exit_code == 0
