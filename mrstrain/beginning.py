@@ -68,13 +68,15 @@ class Begun:
         ]
 
 
-def init(folder: Path | str) -> Begun:
+def init(folder: Path | str, *, name: str = "Subject 01") -> Begun:
     """Write a study file with comments from the files in a folder.
 
     Parameters
     ----------
     folder : path
         With the images, the label map and its names, and perhaps results of other codes in folders of their own.
+    name : str
+        Of the study, in its report; nothing that names a patient. Each of a cohort has its own.
 
     Raises
     ------
@@ -91,10 +93,11 @@ def init(folder: Path | str) -> Begun:
         raise OutputError(f"{target} is there already; remove it to have it written anew.")
     found = _look(place)
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # TOML knows no pairs of surrogates
     template = environment.from_string((files("mrstrain") / "templates" / "study.toml.j2").read_text(encoding="utf-8"))
     forces = {load.name: (load.normal_n, load.shear_n) for load in LOADS}
     sets = [name for name in published_names() if not name.endswith(_VARIANT) and name != _SOFTEST]
-    write_whole(target, template.render(found=found, forces=forces, sets=sets))
+    write_whole(target, template.render(found=found, name=name, forces=forces, sets=sets))
     return Begun(target, found)
 
 

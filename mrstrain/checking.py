@@ -24,8 +24,9 @@ from fe.plate import Plate
 from fe.published import MaterialSet, material_set
 from fe.simulate import LoadStep, check_loads
 from fe.simulate import check as check_simulation
-from mrstrain.costs import cells_expected, costs
+from mrstrain.costs import costs, sizes_of
 from mrstrain.engines import settings_of
+from mrstrain.inputs import is_bones_name
 from mrstrain.ledger import Ledger
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.pipeline import Pipeline
@@ -102,19 +103,18 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         found.tried(check_bones, labels, told.mesh.bones)
     if labels is not None and told.models.results:
         found.tried(_foreign, told, found, labels)
-    cells = _simulations(told, found, reference, labels) if told.models.sets else 0.0
+    if told.models.sets:
+        _simulations(told, found, reference, labels)
     if told.compare.thresholds is not None:
         found.tried(read_thresholds, told.path(told.compare.thresholds))
     low, high = told.compare.strains
     if not 0.0 <= low < high:
         found.wrong.append(f"[compare] strains: the range rises from 0 or more; got {low:g} to {high:g}.")
     planned = found.tried(plan, told)
-    if planned is not None and reference is not None and not found.wrong:
-        forecast = Pipeline(planned, Ledger(told.out, told.place)).forecast()
-        left = [stage for stage in planned if forecast[stage.name] == "run"]
-        voxels = float(np.prod(reference.grid.shape))
+    if planned is not None and not found.wrong:
+        left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
         found.notes += (
-            costs(told, planned, left, voxels, cells, workers or usable_cores())
+            costs(told, planned, left, *sizes_of(told), workers or usable_cores())
             if left
             else ["Everything is done already; a run only writes the report anew."]
         )
@@ -174,8 +174,8 @@ def _registration(study: Study, found: _Findings) -> None:
         )
 
 
-def _simulations(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> float:
-    """Look for what `simulate` would refuse; give about how many cells it will have."""
+def _simulations(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> None:
+    """Look for what `simulate` would refuse."""
     sets = [found.tried(material_set, study.set_given(name)) for name in study.models.sets]
     laws = [one for one in sets if one is not None]
     given, own = study.plate, towards(study)
@@ -196,11 +196,11 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
         file = study.path(study.mesh.file)
         mesh = found.tried(read_tet_mesh, file)
         if mesh is None:
-            return 0.0
+            return
         if reference is not None:
             found.tried(check_overlap, file, mesh, reference.grid)
         _on_mesh(found, mesh, laws, loads, study.models.fixed)
-        return float(len(mesh.cells))
+        return
     if study.mesh.labels is not None:
         to_mesh = study.path(study.mesh.labels)
         labels = found.tried(read_labels, to_mesh, _optional(study, study.mesh.names))
@@ -210,7 +210,7 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
             f"[models] fixed: beside the bone's surface the cut may be fixed; got {', '.join(sorted(unknown))}."
         )
     if labels is None:
-        return 0.0
+        return
     if reference is not None and study.mesh.labels is not None:
         there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())
         if there < _THERE:
@@ -219,7 +219,6 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
                 "mesh has to lie where the images are."
             )
     _on_labels(study, found, labels, laws)
-    return cells_expected(labels, study.mesh.bones, study.mesh.edge_mm)
 
 
 def _on_mesh(
@@ -245,6 +244,11 @@ def _on_labels(study: Study, found: _Findings, labels: LabelMap, sets: Sequence[
         found.tried(labels.region, region)
     numbers = np.unique(labels.labels)
     soft = [name for n, name in labels.names.items() if n != 0 and n in numbers and name not in study.mesh.bones]
+    found.notes += [
+        f"CARE: {name} will be meshed as soft tissue, and is called as a bone is: [mesh] bones leaves it out."
+        for name in soft
+        if is_bones_name(name)
+    ]
     for one in sets:
         found.tried(one.for_regions, soft)
     if "cut" in {name.casefold() for name in study.models.fixed} and "skin" not in {name.casefold() for name in soft}:

@@ -20,6 +20,7 @@ from filelock import FileLock
 from dvc.errors import InputError, MrstrainError
 from dvc.worker import usable_cores
 from mrstrain import stages
+from mrstrain.provenance import own_code
 from mrstrain.stages import Given
 
 _TELL_EVERY_S = 1.0
@@ -151,8 +152,6 @@ def cluster(
 
 
 def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
-    from mrstrain import __version__
-
     tokens = [out / f".seen-{uuid.uuid4().hex}" for out in places]
     for token in tokens:
         token.touch()
@@ -167,8 +166,8 @@ def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
             token.unlink(missing_ok=True)
     for worker, (version, daemon, seen) in answers.items():
         threads = client.nthreads().get(worker, 1)
-        if version != __version__:
-            raise InputError(f"The worker {worker} has mrstrain {version}, and here is {__version__}: use one version.")
+        if version != own_code():
+            raise InputError(f"The worker {worker} has mrstrain {version}, and here is {own_code()}: use one version.")
         if not seen:
             raise InputError(
                 f"The worker {worker} does not see {places[0]}: a study has to lie on a disk that all share."
@@ -185,9 +184,7 @@ def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
 
 
 def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:
-    from mrstrain import __version__
-
-    return __version__, multiprocessing.current_process().daemon, all(Path(token).exists() for token in tokens)
+    return own_code(), multiprocessing.current_process().daemon, all(Path(token).exists() for token in tokens)
 
 
 def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: str) -> tuple[Given | str, float]:

@@ -8,16 +8,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from dvc.image import LabelMap
+from dvc.imagefile import read_image
+from dvc.labels import read_labels
 from dvc.registration import GAUSS_NEWTON
+from fe.meshstore import read_tet_mesh
 from fe.simulate import LoadStep
 from mrstrain.doctor import usable_memory_bytes
 from mrstrain.engines import engine_of
 from mrstrain.loads import paths_of
-from mrstrain.plan import Stage
+from mrstrain.plan import Stage, labels_to_mesh
 from mrstrain.studyfile import Study
 
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
-_REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 50.0 / 2.3, 7.0
+_REGISTER_S, _REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 35.0, 7.0, 3.5
 _BORDERS = 2.5  # times as long with borders of tissues (docs/decisions/0009)
 _TWIN = 1.3  # times as long again: the twin is made and registered
 _CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
@@ -27,9 +30,9 @@ _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
 _MESH_S = 100.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
-# GiB of all processes of a stage: registrations of 2.3 and 16.8 million voxels took 1.2 and 3.6, one of 2.3 with
-# borders 1.6, a factorisation at 79,000 cells .84.
-_REGISTER_GIB, _REGISTER_GIB_PER_MVOXEL, _BORDERS_GIB_PER_MVOXEL = 0.82, 0.166, 0.14
+# GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took 1.4, 2.5, 4.0 and 10.6,
+# one of 2.3 with borders 1.6, a factorisation at 79,000 cells .84.
+_REGISTER_GIB, _REGISTER_GIB_PER_MVOXEL, _BORDERS_GIB_PER_MVOXEL = 1.05, 0.175, 0.14
 _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
 _OTHER_GIB = 1.5
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
@@ -43,6 +46,23 @@ def cells_expected(labels: LabelMap, bones: Sequence[str], edge_mm: float) -> fl
     soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in bones and n != 0])
     volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3
     return max(volume / (_SHAPE * edge_mm**3), _LEAST_CELLS)
+
+
+def sizes_of(study: Study) -> tuple[float, float]:
+    """Voxels of the unloaded image, and about how many cells sets are simulated on; 0 without sets.
+
+    Raises
+    ------
+    InputError
+        If the image, the mesh or the label map to be meshed cannot be read.
+    """
+    voxels = float(np.prod(read_image(study.path(study.images.load0), allow_missing=True).grid.shape))
+    if not study.models.sets:
+        return voxels, 0.0
+    if study.mesh.file is not None:
+        return voxels, float(len(read_tet_mesh(study.path(study.mesh.file)).cells))
+    labels = read_labels(*labels_to_mesh(study))
+    return voxels, cells_expected(labels, study.mesh.bones, study.mesh.edge_mm)
 
 
 def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
@@ -59,9 +79,9 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
     """
     loads = len(study.loads)
     slower = _BORDERS if _with_borders(study) else 1.0
-    registering = (slower * _REGISTER_S_PER_MVOXEL + _MAPS_S_PER_MVOXEL) * voxels / 1e6
+    registering = _REGISTER_S + (slower * _REGISTER_S_PER_MVOXEL + _MAPS_S_PER_MVOXEL) * voxels / 1e6
     if stage.kind == "register":
-        return (1.0 + _TWIN * study.registration.twin) * registering
+        return (1.0 + _TWIN * bool(stage.arguments.get("twin"))) * registering
     if stage.kind == "level":
         return 1.5 * registering
     if stage.kind == "mesh":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
@@ -35,12 +34,10 @@ from dvc.uncertainty import (
 )
 from dvc.verdict import Verdict
 from dvc.whole import write_whole
-from mrstrain.inputs import Subject
+from mrstrain.inputs import Subject, is_bones_name
 from mrstrain.page import said
 from mrstrain.twincheck import TwinCheck
 
-_BONES = {"bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform"}
-_SOFT = {"fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage"}
 _MOSTLY = 0.5
 _UNLABELLED = 0.1
 _SIGMA_SCALE = 0.1
@@ -277,9 +274,7 @@ def _bone_and_tissues(
         for number, name in subject.labels.names.items():
             inside = subject.labels.labels == number
             count = np.count_nonzero(inside)
-            words = set(re.split(r"[^a-z]+", name.lower()))
-            named = bool(words & _BONES) and not words & _SOFT
-            if named or (count and np.count_nonzero(inside & bone) > _MOSTLY * count):
+            if is_bones_name(name) or (count and np.count_nonzero(inside & bone) > _MOSTLY * count):
                 bone |= inside
             elif count:
                 soft[name.lower() if name.lower() in known else name] = inside

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,6 +20,11 @@ from dvc.labels import fit_mask, read_labels, read_mask
 from dvc.meshfile import MeshFile, read_mesh
 
 IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd")
+_BONES = {
+    "bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform", "metatarsal",
+    "femur", "trochanter", "patella", "pelvis", "sacrum", "coccyx", "ilium", "ischium", "pubis", "vertebra",
+}  # fmt: skip
+_SOFT = {"fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage"}
 _INFERIOR = (0.0, 0.0, -1.0)
 
 
@@ -194,6 +200,18 @@ def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "", op
             f"{out}: {what} about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. Free some, choose "
             f"another {option}{instead}."
         )
+
+
+def is_bones_name(name: str) -> bool:
+    """Whether a label is called as a bone is.
+
+    Examples
+    --------
+    >>> [is_bones_name(name) for name in ("Talus", "tibia_left", "Sacrum", "fat pad", "calcaneus tendon")]
+    [True, True, True, False, False]
+    """
+    words = set(re.split(r"[^a-z]+", name.lower()))
+    return bool(words & _BONES) and not words & _SOFT
 
 
 def make_output(out: Path) -> None:

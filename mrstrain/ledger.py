@@ -16,11 +16,11 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dvc.whole import write_whole
 from mrstrain.plan import Stage
-from mrstrain.provenance import file_hash, versions
+from mrstrain.provenance import file_hash, own_code, versions
 from mrstrain.stages import Given
 
-_MATTERS = ("mrstrain", "itk-elastix", "pytetwild")
-"""Packages with which results change that are long in the making."""
+_MATTERS = ("itk-elastix", "pytetwild")
+"""Packages beside our own with which results change that are long in the making."""
 
 
 class Record(BaseModel):
@@ -98,6 +98,7 @@ class Ledger:
             **made_from,
             "built_on": {name: record.identity for name, record in sorted(built_on.items())},
             "versions": {name: told[name] for name in _MATTERS},
+            "code": own_code(),
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

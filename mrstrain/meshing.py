@@ -15,7 +15,7 @@ from fe.facets import BONE, SKIN
 from fe.meshing import MeshQuality, mesh_labels
 from fe.meshstore import write_tet_mesh
 from fe.plate import Plate
-from mrstrain.inputs import make_output
+from mrstrain.inputs import is_bones_name, make_output
 from mrstrain.provenance import provenance
 
 _CARE_VOLUME, _CARE_ANGLE_DEG = 0.02, 10.0
@@ -51,6 +51,11 @@ class Meshed:
         lines += [
             f"{share:.0%} of the cells of {name} reach through it, one cell thick; --finer makes it thicker."
             for name, share in q.thin
+        ]
+        lines += [
+            f"CARE: {name} is meshed as soft tissue, and called as a bone is: cut it out with --bone {name}."
+            for name in self.mesh.regions
+            if is_bones_name(name)
         ]
         if not any(name.casefold() == SKIN for name in self.mesh.regions):
             lines.append(

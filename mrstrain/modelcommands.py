@@ -31,10 +31,10 @@ from mrstrain.options import (
 def mesh(
     labels: Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")],
     out: Annotated[Path, typer.Option(help="The mesh, ending in .vtu; a .json and a .png are written beside it.")],
-    edge_mm: Annotated[float, typer.Option(help="Length of edges wanted, mm.")] = 2.0,
+    edge_mm: Annotated[float, typer.Option(help="Length of edges wanted, mm; beyond four voxels these set it.")] = 2.0,
     names: Names = None,
     bone: Annotated[
-        list[str] | None, typer.Option(help="Region to cut out, whose surface is fixed; repeat for several.")
+        list[str] | None, typer.Option(help="Bone to cut out, whose surface is fixed; repeat for all. Default: bone.")
     ] = None,
     finer: Annotated[
         tuple[str, float] | None, typer.Option(help="Another edge length in one region, such as --finer skin 1.")
@@ -65,7 +65,11 @@ def simulate(
     out: Out,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Published material set, or a file of your own (.toml); repeat for several."),
+        typer.Option(
+            "--set",
+            help="akrami, erdemir, friedman, luboz, spears, trebbi, zwam, or a .toml of your own; repeat. "
+            "Default: trebbi.",
+        ),
     ] = None,
     load: Annotated[
         list[str] | None,

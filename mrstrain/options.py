@@ -39,7 +39,7 @@ class Unit(StrEnum):
 
 
 Out = Annotated[Path, typer.Option(help="Folder for the results; made where it is missing.")]
-Bone = Annotated[Path | None, typer.Option(help="Mask of the bone to align on, on the unloaded image.")]
+Bone = Annotated[Path | None, typer.Option(help="Mask of the bone whose motion is taken out, on the unloaded image.")]
 BoneLabel = Annotated[str | None, typer.Option(help="Or: the name of the bone in --labels.")]
 Tissue = Annotated[Path | None, typer.Option(help="Mask of the body; found by a threshold where it is not given.")]
 Labels = Annotated[Path | None, typer.Option(help="Label map of the tissues on the unloaded image.")]

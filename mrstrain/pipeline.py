@@ -170,6 +170,11 @@ class Pipeline:
                 told[stage.name] = "done already" if same else "run"
         return told
 
+    def to_do(self) -> list[Stage]:
+        """The stages that a run would work on."""
+        forecast = self.forecast()
+        return [stage for stage in self.stages if forecast[stage.name] == "run"]
+
     def _lacking(self, stage: Stage) -> str:
         for name in stage.after:
             if self.outcomes[name].record is None:

@@ -21,7 +21,6 @@ KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
 """Kinds of stages, in the order in which they come."""
 
 _AS_MEASURED = ("load0", "images", "bone", "engine", "borders", "preset", "parameters", "seed")
-_MINUTES = {"register": 1.0, "mesh": 1.3, "simulate": 2.5, "drive": 2.0, "level": 1.5, "compare": 1.5}
 
 REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
 
@@ -60,11 +59,6 @@ class Stage:
     def kind(self) -> str:
         """One of KINDS."""
         return self.name.split(" ", 1)[0]
-
-    @property
-    def minutes(self) -> float:
-        """About how long it takes on one core at the usual size: what progress is counted in."""
-        return _MINUTES[self.kind]
 
     @property
     def goes_on(self) -> bool:
@@ -185,13 +179,19 @@ def mesh_place(study: Study) -> Path:
     return study.out / MESH if study.mesh.file is None else study.path(study.mesh.file)
 
 
+def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:
+    """The label map that is meshed, and the table of its names."""
+    own = study.mesh.labels is not None
+    labels, names = (study.mesh.labels, study.mesh.names) if own else (study.images.labels, study.images.names)
+    assert labels is not None  # the study file was refused without
+    return study.path(labels), None if names is None else study.path(names)
+
+
 def _mesh(study: Study) -> list[Stage]:
     how = study.mesh
     if how.file is not None:
         return []
-    labels = study.path(how.labels or study.images.labels)
-    given = how.names if how.labels is not None else study.images.names
-    names = None if given is None else study.path(given)
+    labels, names = labels_to_mesh(study)
     arguments = {
         "out": str(study.out / MESH), "labels": str(labels), "names": None if names is None else str(names),
         "edge_mm": how.edge_mm, "bones": how.bones, "limit_s": 60.0 * how.limit_minutes,

@@ -8,6 +8,8 @@ import platform
 import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
+from functools import cache
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -32,6 +34,7 @@ _PACKAGES = (
     "mkl",
     "ngsolve",
 )
+_OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
 _BLOCK = 1 << 20
 
 
@@ -82,6 +85,21 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "not installed"
     return found
+
+
+@cache
+def own_code() -> str:
+    """Our version, and a hash of our packages' text and of the data that they bring: a version may be under way."""
+    digest = hashlib.sha256()
+    for package in _OURS:
+        (place,) = (Path(p) for p in import_module(package).__path__)
+        for file in sorted(place.rglob("*")):
+            name = file.relative_to(place)
+            if not file.is_file() or any(part.startswith((".", "__pycache__")) for part in name.parts):
+                continue
+            digest.update(f"{package}/{name.as_posix()}".encode())
+            digest.update(file.read_bytes())
+    return f"{version('mrstrain')}, code {digest.hexdigest()[:12]}"
 
 
 def machine() -> dict[str, object]:

@@ -9,12 +9,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from filelock import FileLock, Timeout
 
 from dvc.errors import InputError, OutputError, ParameterError
-from dvc.imagefile import read_image
-from mrstrain.costs import disk_bytes
+from mrstrain.costs import disk_bytes, seconds_of, sizes_of
 from mrstrain.inputs import make_output, refuse_small_disk
 from mrstrain.ledger import Ledger
 from mrstrain.pipeline import Outcome, Pipeline, run_all
@@ -26,6 +24,7 @@ from mrstrain.studyfile import Study, read_study
 Told = Callable[[str, str, float], None]
 
 LOG, REPORT = "study.log", "report.html"
+_USUAL_VOXELS, _USUAL_CELLS = 2e6, 70e3
 _NOTHING = ("nothing",)  # to be run: everything is taken as it is
 
 
@@ -142,23 +141,21 @@ def run_studies(
         refuse_unknown(stages, only, force)
         refuse_missing(stages)
     tell, ended = progress or (lambda *_: None), 0.0
-    total = sum(stage.minutes for stages in planned for stage in stages)
+    seconds: dict[str, float] = {}
     stages_told = f"{sum(map(len, planned))} stages"
     prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
     pipelines: dict[str, Pipeline] = {}
     lines: dict[str, Callable[[str], None]] = {}
 
-    def line_of(prefix: str, log: Callable[[str], None], stages: Sequence[Stage]) -> Callable[[str], None]:
-        minutes = {stage.name: stage.minutes for stage in stages}
-
+    def line_of(prefix: str, log: Callable[[str], None]) -> Callable[[str], None]:
         def line(text: str) -> None:
             nonlocal ended
             log(text)
-            name = text.split(": ", maxsplit=1)[0]
-            if name in minutes:
-                ended += minutes[name]
-                tell(prefix + name, "ended", 1.0)  # one that failed has not told so
-                tell(ALL, stages_told, round(ended / total, 9))
+            name = prefix + text.split(": ", maxsplit=1)[0]
+            if name in seconds:
+                ended += seconds[name]
+                tell(name, "ended", 1.0)  # one that failed has not told so
+                tell(ALL, stages_told, round(ended / sum(seconds.values()), 9))
 
         return line
 
@@ -172,11 +169,15 @@ def run_studies(
         for prefix, study, stages in zip(prefixes, studies, planned, strict=True):
             stack.enter_context(_alone(study.out))
             pipelines[prefix] = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
-            _refuse_small_disk(study, pipelines[prefix], on_disk)
+            left = pipelines[prefix].to_do()
+            voxels, cells = _sizes(study, left)
+            _refuse_small_disk(study, left, voxels, on_disk)
+            seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
             log = stack.enter_context(_log(study.out / LOG))
-            log(f"Study '{study.study.name}': {len(stages)} stages")
-            lines[prefix] = line_of(prefix, log, stages)
+            log(f"Study '{study.study.name}': {len(stages)} stages, {len(left)} of them to do")
+            lines[prefix] = line_of(prefix, log)
         run_all(pipelines, pool, lines)
+        tell(ALL, stages_told, 1.0)
         done = []
         for prefix, study in zip(prefixes, studies, strict=True):
             outcomes = pipelines[prefix].in_order()
@@ -186,20 +187,23 @@ def run_studies(
     return done
 
 
-def _refuse_small_disk(study: Study, pipeline: Pipeline, on_disk: dict[int, tuple[int, float]]) -> None:
+def _sizes(study: Study, left: Sequence[Stage]) -> tuple[float, float]:
+    """Sizes that stages which are left depend on, as `sizes_of` tells them."""
+    try:
+        return sizes_of(study) if left else (0.0, 0.0)
+    except (InputError, OSError):
+        return _USUAL_VOXELS, _USUAL_CELLS  # the stages that read it say what is wrong with it
+
+
+def _refuse_small_disk(
+    study: Study, left: Sequence[Stage], voxels: float, on_disk: dict[int, tuple[int, float]]
+) -> None:
     """Refuse a run whose results would not fit, before any of it is made.
 
     ``on_disk`` is added to: how many stages, and bytes, the studies so far will write to each disk.
     """
-    forecast = pipeline.forecast()
-    left = [stage for stage in pipeline.stages if forecast[stage.name] == "run"]
     if not left:
         return
-    try:
-        reference = read_image(study.path(study.images.load0), allow_missing=True)
-    except InputError:
-        return  # the stages that read it say what is wrong with it
-    voxels = float(np.prod(reference.grid.shape))
     disk = study.out.stat().st_dev
     stages, needed = on_disk.get(disk, (0, 0.0))
     stages, needed = stages + len(left), needed + sum(disk_bytes(stage, study, voxels) for stage in left)

@@ -19,11 +19,12 @@ Workers = Annotated[int | None, typer.Option(min=1, help="Stages at once. Defaul
 
 def init(
     folder: Annotated[Path, typer.Argument(help="With images, label map, and perhaps results of other codes.")],
+    name: Annotated[str, typer.Option(help="In the report; nothing that names a patient.")] = "Subject 01",
 ) -> None:
     """Write a study file, with comments, from what a folder holds."""
     from mrstrain.beginning import init as run
 
-    for line in run(folder).summary():
+    for line in run(folder, name=name).summary():
         typer.echo(line)
 
 
@@ -107,7 +108,10 @@ def demo(
     out: Out = Path("demo"),
     seed: Annotated[int, typer.Option(min=1, help="Seed of the phantom.")] = 1,
     full: Annotated[
-        bool, typer.Option("--full", help="The published size: seven material sets on some 80,000 tetrahedra.")
+        bool,
+        typer.Option(
+            "--full", help="The published size, an hour: seven sets, 75,000 cells; friedman is cut, status 1."
+        ),
     ] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="Stages at once. Default: one for each core.")] = None,
 ) -> None:

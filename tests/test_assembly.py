@@ -12,7 +12,7 @@ from fe.elements import Space, element
 from fe.linear import SingularError, Solver, factors
 from fe.materials import Hencky, NeoHooke, Ogden, Yeoh
 from fe.model import Model
-from fe.newton import Tolerance, equilibrium
+from fe.newton import LEAST_VOLUME, Tolerance, equilibrium
 from tests.blocks import block
 
 needs_mkl = pytest.mark.skipif(
@@ -162,6 +162,35 @@ def test_a_bar_pulled_and_pressed_has_the_laws_closed_form(name: str, law) -> No
             assert force == pytest.approx(16.0 * float(law.nominal_stress([stretch])[0]), rel=5e-3)
 
 
+def test_no_step_folds_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A block squeezed to a third in one step: whole steps would fold its cells, and shares of them do not."""
+    model = model_of("P1", layers=1)
+    x = model.space.nodes_mm[:, 0]
+    fixed = np.unique(np.concatenate([unknowns(np.flatnonzero(np.isclose(x, end)), 1, 2) for end in (0.0, 8.0)]))
+    fixed = np.union1d(fixed, unknowns(np.flatnonzero(np.isclose(x, 0.0)), 0))
+    moved = unknowns(np.flatnonzero(np.isclose(x, 8.0)), 0)
+    assembler = Assembler(model, fixed, {0: moved})
+    assembler.share({0: moved})
+    tried, told = [], []
+    residual = assembler.residual
+
+    def watched(state: np.ndarray):
+        found = residual(state)
+        tried.append(found[2])
+        return found
+
+    monkeypatch.setattr(assembler, "residual", watched)
+    found = equilibrium(
+        assembler, Solver(assembler.indptr, assembler.indices), np.zeros(model.unknowns), np.zeros(assembler.size),
+        np.array([assembler.own_equations]), np.array([-5.3]), Tolerance(), told=told.append,
+    )  # fmt: skip
+    made = [float(line.rsplit(" ", 1)[1]) for line in told if "least det F" in line]
+    assert min(tried) < 0.0
+    assert min(made) > LEAST_VOLUME
+    assert found is not None
+    assert found.state[moved] == pytest.approx(np.full(len(moved), -5.3))
+
+
 @pytest.mark.parametrize(
     "library", [pytest.param("pardiso", marks=needs_mkl), pytest.param("ngsolve", marks=needs_ngsolve)]
 )
@@ -182,6 +211,28 @@ def test_every_library_solves_the_same(library: str) -> None:
         assert solver.solve(right) == pytest.approx(0.5 * found[-1], rel=1e-8, abs=1e-10)
         solver.close()
     assert found[0] == pytest.approx(found[1], rel=1e-7, abs=1e-9 * np.abs(found[1]).max())
+
+
+@pytest.mark.parametrize(
+    ("machine", "installed", "expected"),
+    [
+        ("x86_64", True, "_Pardiso"),
+        ("AMD64", True, "_Pardiso"),
+        ("arm64", True, "_NGSolve"),
+        ("arm64", False, "_SuperLU"),
+        ("aarch64", True, "_NGSolve"),
+    ],
+)
+def test_each_machine_has_the_fastest_library_that_runs_there(
+    monkeypatch: pytest.MonkeyPatch, machine: str, installed: bool, expected: str
+) -> None:
+    made: list[str] = []
+    for name in ("_Pardiso", "_NGSolve", "_SuperLU"):
+        monkeypatch.setattr(f"fe.linear.{name}", lambda *_, name=name: made.append(name))
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    monkeypatch.setattr("fe.linear.find_spec", lambda name: object() if installed and name == "ngsolve" else None)
+    factors(np.array([0, 1]), np.array([0]))
+    assert made == [expected]
 
 
 @pytest.mark.parametrize("library", ["superlu", pytest.param("ngsolve", marks=needs_ngsolve)])

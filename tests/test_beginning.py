@@ -25,9 +25,10 @@ def test_what_has_no_role_is_told_and_stands_in_the_study_file(tmp_path):
         tmp_path, "Load0.nii.gz", "Load1.nii.gz", "Load1.nrrd", "Load1-again.nii.gz", "T1 <scout>.nii.gz",
         "labels.nii.gz", "tissues.nii.gz", "calcaneus.nii.gz", "other-bone.nii.gz",
     )  # fmt: skip
-    begun = init(tmp_path)
+    begun = init(tmp_path, name='S07 "left" \U0001f9b6')
     told, text = "\n".join(begun.summary()), begun.path.read_text()
     study = read_study(tmp_path)
+    assert study.study.name == 'S07 "left" \U0001f9b6'
     assert (study.images.labels, study.images.bone_mask) == ("labels.nii.gz", "calcaneus.nii.gz")
     assert study.loads["Load1"].image == "Load1.nii.gz"
     for name, why in (
@@ -74,3 +75,10 @@ def test_every_key_of_a_study_file_stands_in_it_with_its_default(tmp_path, names
             default = model.model_fields[key].get_default()
             if not model.model_fields[key].is_required() and default not in (None, ()):
                 assert (tuple(value) if isinstance(value, list) else value) == default, key
+
+
+def test_init_of_an_empty_folder_says_what_is_missing(tmp_path):
+    told = "\n".join(init(tmp_path).summary())
+    assert "Load0: NOT FOUND" in told
+    with pytest.raises(InputError, match=r"\[images\] 'load0' is missing"):
+        read_study(tmp_path)

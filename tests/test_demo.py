@@ -8,12 +8,15 @@ import pytest
 
 from dvc.errors import OutputError
 from dvc.labels import read_labels
+from dvc.report import Section
+from dvc.verdict import Verdict
 from mrstrain.againsttruth import read_errors, write_errors
-from mrstrain.demo import _make
+from mrstrain.demo import _make, _told
 from mrstrain.ledger import Record
 from mrstrain.loads import LOADS
 from mrstrain.pipeline import Outcome
 from mrstrain.plan import plan
+from mrstrain.running import Ran
 from mrstrain.stages import Given
 from mrstrain.studyfile import read_study
 from phantoms.score import TissueError
@@ -63,6 +66,36 @@ def test_changes_to_its_study_file_are_kept(folder):
     (folder / "study.toml").write_text(changed)
     _make(folder, 1, False, None)
     assert (folder / "study.toml").read_text() == changed
+
+
+def test_it_ends_with_five_lines_and_the_reports_path(folder):
+    _make(folder, 1, False, None)
+    study = read_study(folder)
+
+    def ended(stage: str, *lines: str, verdict: str | None = None, complete: bool = True) -> Outcome:
+        sections = () if verdict is None else (Section(stage, verdict=Verdict(verdict, ("why",))),)
+        given = Given(lines, sections, complete=complete)
+        return Outcome(stage, Record(stage=stage, key="", made_utc="", seconds=1.0, files={}, given=given))
+
+    outcomes = {
+        f"register {load.name}": ended(f"register {load.name}", verdict="caution" if load.name == "Load3" else "trust")
+        for load in LOADS
+    }
+    outcomes["compare"] = ended(
+        "compare", "Load1: trebbi 1.0", "All loads: trebbi 2.5", "Nearest over all loads: trebbi."
+    )
+    errors = {x.name: (TissueError("fat", 9, 0.1, 0.44, 0.0221, 0.0, 0.1, 0.1, 0.2, 0),) for x in LOADS}
+    lines = _told(errors, Ran(study, outcomes))
+    assert len(lines) == 5
+    assert "Load1 trust" in lines[0]
+    assert "Load3 use with care" in lines[0]
+    assert "Load4 0.022 of 0.44" in lines[1]
+    assert lines[2:4] == ["All loads: trebbi 2.5", "Nearest over all loads: trebbi."]
+    assert lines[4] == f"Report: {folder / 'results' / 'report.html'}"
+    outcomes["simulate luboz"] = ended("simulate luboz", "luboz, Load1: ONLY 75% of the load", complete=False)
+    lines = _told(errors, Ran(study, outcomes))
+    assert lines[4] == "simulate luboz: in part. luboz, Load1: ONLY 75% of the load"
+    assert lines[5].startswith("Report: ")
 
 
 def test_errors_are_read_again_while_their_registrations_are_the_same(tmp_path):

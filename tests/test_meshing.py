@@ -14,6 +14,7 @@ from fe.meshing import _guessed, mesh_labels
 from fe.meshstore import read_tet_mesh, write_tet_mesh
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.surfaces import borders_of, labels_at
+from mrstrain.meshing import Meshed
 from tests.blocks import block
 
 NAMES = {1: "bone", 2: "fat", 3: "skin"}
@@ -79,6 +80,13 @@ def test_surfaces_lie_where_they_should(meshed) -> None:
     assert radius["bone"] == pytest.approx(6.0, abs=0.8)
     assert np.mean(radius["skin"] < 16.0) < 0.03  # its own section at the cut counts as cut, but for its very rim
     assert np.abs(mesh.points_mm[np.unique(mesh.facets["cut"]), 2] + 0.5).max() < 0.8
+    shared = np.intersect1d(*(np.unique(mesh.cells[cells]) for cells in mesh.regions.values()))
+    assert len(shared) > 100
+    border = np.linalg.norm(mesh.points_mm[shared], axis=1)  # fat's with skin
+    rim = mesh.points_mm[shared, 2] > -1.5  # where three surfaces meet, the mesher takes a corner off now and then
+    assert border[~rim] == pytest.approx(14.0, abs=0.8)
+    assert border[rim] == pytest.approx(14.0, abs=1.5)
+    assert np.mean(np.abs(border[rim] - 14.0) < 0.8) > 0.9
     whole = np.concatenate(list(mesh.facets.values()))
     assert len(np.unique(np.sort(whole, axis=1), axis=0)) == len(whole)
     edges = np.sort(np.concatenate([whole[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)
@@ -86,10 +94,20 @@ def test_surfaces_lie_where_they_should(meshed) -> None:
     assert (times % 2 == 0).all()  # closed
 
 
-def test_a_finer_skin_is_more_than_one_cell_thick(meshed) -> None:
+def test_a_finer_skin_is_two_cells_thick(meshed) -> None:
+    """No cell of a skin of 3 mm reaches through it, but for one in a hundred at the rim of the cut."""
     _, coarse = meshed
     _, fine = mesh_labels(half_onion(), 4.0, finer=("skin", 1.4))
-    assert dict(fine.thin)["skin"] < 0.3 < dict(coarse.thin)["skin"]
+    assert dict(fine.thin)["skin"] < 0.01
+    assert dict(coarse.thin)["skin"] > 0.3
+
+
+def test_a_bone_that_is_meshed_as_tissue_is_told(meshed) -> None:
+    mesh, quality = meshed
+    for name, told in (("Talus", True), ("fat", False)):
+        regions = {name: mesh.regions["fat"], "skin": mesh.regions["skin"]}
+        lines = Meshed(Path("a.vtu"), TetMesh(mesh.points_mm, mesh.cells, regions, mesh.facets), quality).summary()
+        assert any(f"cut it out with --bone {name}" in line for line in lines) == told
 
 
 def test_dihedral_angles_of_known_shapes() -> None:

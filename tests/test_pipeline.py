@@ -6,16 +6,17 @@ import hashlib
 import json
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from dvc.errors import InputError
-from mrstrain import __version__
 from mrstrain.cluster import _refuse_unfit
 from mrstrain.ledger import Ledger
 from mrstrain.pipeline import Pipeline, run_all
 from mrstrain.plan import Stage
+from mrstrain.provenance import own_code
 from mrstrain.running import refuse_unknown
 from mrstrain.stages import Given
 
@@ -215,16 +216,16 @@ class Workers:
     [
         (Workers(None), "have no mrstrain"),
         (Workers(("0.0.1", False, True)), "has mrstrain 0.0.1, and here is"),
-        (Workers((__version__, False, False)), "does not see"),
-        (Workers((__version__, False, True), threads=4), "runs 4 stages at once"),
-        (Workers((__version__, True, True)), "may not start processes"),
+        (Workers((own_code(), False, False)), "does not see"),
+        (Workers((own_code(), False, True), threads=4), "runs 4 stages at once"),
+        (Workers((own_code(), True, True)), "may not start processes"),
     ],
 )
 def test_workers_that_would_not_do_are_refused_by_what_they_lack(tmp_path, workers, says):
     with pytest.raises(InputError, match=says):
         _refuse_unfit(workers, "tcp://far:0", [tmp_path])
     assert not list(tmp_path.iterdir())
-    _refuse_unfit(Workers((__version__, False, True)), "tcp://far:0", [tmp_path])
+    _refuse_unfit(Workers((own_code(), False, True)), "tcp://far:0", [tmp_path])
 
 
 def test_a_moved_study_stays_finished(folder, tmp_path_factory):
@@ -307,6 +308,26 @@ def test_taken_as_they_are_stale_results_are_called_so_and_reasons_are_kept(fold
     assert not pipeline.outcomes["register a"].whole
     assert pipeline.outcomes["register b"].reason == "It broke."
     assert pipeline.outcomes["mesh"].whole
+
+
+def test_what_other_code_made_is_made_anew(folder, monkeypatch):
+    ran(folder)
+    assert ran(folder)[0] == []
+    monkeypatch.setattr("mrstrain.ledger.own_code", lambda: "other")
+    assert ran(folder)[0] == ALL
+    assert ran(folder)[0] == []
+
+
+@pytest.mark.parametrize("file", ["fe/published.toml", "phantoms/twin.py", "mrstrain/levelling.py"])
+def test_code_and_the_data_that_it_brings_count(file, monkeypatch):
+    known, (package, name) = own_code(), file.split("/")
+    changed = Path(import_module(package).__path__[0]) / name
+    monkeypatch.setattr(Path, "read_bytes", lambda self, read=Path.read_bytes: read(self) + b" " * (self == changed))
+    own_code.cache_clear()
+    assert own_code() != known
+    monkeypatch.undo()
+    own_code.cache_clear()
+    assert own_code() == known
 
 
 def test_a_record_tells_what_it_was_made_from(folder):

@@ -1,5 +1,6 @@
 """`mrstrain simulate`: a mesh in; for each set and load a VTU file, tables and pictures out; refusals first."""
 
+import hashlib
 import json
 import re
 from pathlib import Path
@@ -16,6 +17,7 @@ from dvc.kinematics import StrainField
 from dvc.mesh import TetMesh
 from fe.figures import _along_plate
 from fe.meshstore import read_tet_mesh, write_tet_mesh
+from fe.published import published_names
 from fe.result import deformation, patch_volumes, volume_percentiles
 from fe.simulate import LoadStep, simulate
 from mrstrain.cli import app
@@ -23,7 +25,7 @@ from mrstrain.loads import load_named, paths_of
 from mrstrain.simulating import simulate as run
 from tests.blocks import block
 from tests.test_mesh_names import abaqus, ansys
-from tests.test_simulate import DOWN, FAT, PRESS, block_under_plate, dome, press
+from tests.test_simulate import DOWN, FAT, PRESS, block_under_plate, dome, nodal_forces, press
 
 PLATE = ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0"]
 MINE = """
@@ -72,6 +74,8 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         assert set(told["parameters"]["laws"]) == {"fat", "skin"}
         assert told["outcome"]["Load3"]["plate_force_n"] == pytest.approx([2, 1, 0], abs=2e-3)
         assert [file["name"] for file in told["inputs"]["mesh"]] == ["dome.vtu", "dome.json"]
+        hashed = [hashlib.sha256(mesh_file.with_suffix(end).read_bytes()).hexdigest() for end in (".vtu", ".json")]
+        assert [file["sha256"] for file in told["inputs"]["mesh"]] == hashed
         assert [file["name"] for file in told["inputs"]["sets"]] == ["mine.toml"]
         assert "C3D10" in (folder / "Load3.inp").read_text()
         assert (folder / "slices.png").stat().st_size > 10_000
@@ -97,6 +101,20 @@ def test_every_set_and_load_has_its_files(mesh_file: Path, tmp_path: Path) -> No
         F = load3.cell_data["F"][0].reshape(-1, 3, 3)
         strain = StrainField.from_gradient(F - np.eye(3))
         assert load3.cell_data["max_shear"][0] == pytest.approx(strain.max_shear, abs=1e-12)
+        green = load3.cell_data["green_lagrange"][0].reshape(-1, 3, 3)
+        assert green == pytest.approx(0.5 * (F.transpose(0, 2, 1) @ F - np.eye(3)), abs=1e-12)
+        stress = load3.cell_data["cauchy_stress_mpa"][0].reshape(-1, 3, 3)
+        bone = np.unique(read_tet_mesh(mesh_file).facets["bone"])
+        forces = nodal_forces(read_tet_mesh(mesh_file), F, stress)
+        assert forces[bone].sum(axis=0) == pytest.approx([-2.0, -1.0, 0.0], abs=2e-3)
+        pressure = np.trace(stress, axis1=1, axis2=2) / 3.0
+        assert load3.cell_data["pressure_mpa"][0] == pytest.approx(pressure, abs=1e-12)
+
+
+def test_the_help_names_every_published_set() -> None:
+    told = re.sub(r"[^\w,-]+", " ", CliRunner().invoke(app, ["simulate", "--help"], env={"COLUMNS": "200"}).output)
+    for name in published_names():
+        assert name.removesuffix("-as-published") in told, name
 
 
 def test_a_plate_that_turns_says_so(mesh_file: Path, tmp_path: Path) -> None:
