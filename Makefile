@@ -1,6 +1,6 @@
 # The commands a person types, which are also the ones that CI runs.
 #
-#   make demo    set-up, then the demonstration: a phantom pair registered, a report in ./demo
+#   make demo    set-up, then the demonstration: a phantom heel through a whole study, a report in ./demo
 #   make test    set-up, then lint, types, import contract and all tests
 #   make setup   only the environment in .venv, redone when requirements.lock or pyproject.toml changes
 #   make lint    ruff, mypy and the import contract

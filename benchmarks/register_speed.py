@@ -1,12 +1,10 @@
-"""Time beside plain elastix, and peak memory of a 256^3 pair.
+"""Time of a registration beside plain elastix.
 
-    python benchmarks/speed_and_memory.py --out benchmarks/results/speed_and_memory.json
+    python -m benchmarks.register_speed --out benchmarks/results/register_speed.json
 
-Speed: the same pair, masks and threads in one warm process, in turn: `dvc.register` (shading, search, rigid, non-rigid)
+The same pair, masks and threads in one warm process, in turn: `dvc.register` (shading, search, rigid, non-rigid)
 with our own engine and with elastix, and plain elastix (rigid on the bone, then the same B-spline parameters on the
-tissue, result image). A phantom set of Load0 to Load4 is timed once. Memory: `mrstrain register` on a pair of 256^3
-voxels, sum over all of its processes, sampled five times a second from /proc (Linux only); shared pages are counted by
-their share.
+tissue, result image). A phantom set of Load0 to Load4 is timed once.
 """
 
 from __future__ import annotations
@@ -14,22 +12,17 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.memory import peak_kib
 from dvc import elastix
 from dvc.elastixtext import format_parameters
-from dvc.image import Grid, Image, Mask
-from dvc.imagewrite import write_image, write_mask
+from dvc.image import Mask
 from dvc.presets import load_preset
 from dvc.registration import Settings, register
-from dvc.resample import carry
 from dvc.tissue import tissue_mask, widened
 from dvc.worker import Worker, usable_cores
 from mrstrain.making import phantom
@@ -82,47 +75,13 @@ def phantom_seconds() -> float:
         return time.perf_counter() - began
 
 
-def memory(name: str) -> dict[str, float]:
-    pair = heel_pair(seed=1, load=0.6)
-    low, high = pair.reference.grid.bounds_mm()
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        for stem, image in (("Load0", pair.reference), ("Load1", pair.loaded)):
-            low, high = image.grid.bounds_mm()
-            step = (high - low) / 256
-            grid = Grid((256, 256, 256), step, low + step / 2)
-            values = np.nan_to_num(carry(image, grid, order=1))
-            noise = np.random.default_rng(len(stem)).normal(scale=1.0, size=grid.shape)
-            write_image(folder / f"{stem}.nii.gz", Image(grid, values + noise.astype(np.float32)))
-        write_mask(folder / "bone.nii.gz", pair.bone)
-        began = time.perf_counter()
-        command = [
-            sys.executable,
-            "-m",
-            "mrstrain",
-            "register",
-            str(folder / "Load0.nii.gz"),
-            str(folder / "Load1.nii.gz"),
-        ]
-        command += ["--bone", str(folder / "bone.nii.gz"), "--out", str(folder / "out")]
-        command += [] if name == "gauss-newton" else ["--preset", name]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        peak = peak_kib(process)
-        return {
-            "exit_status": process.returncode,
-            "peak_gib": peak / 2**20,
-            "seconds": time.perf_counter() - began,
-            "voxels": 256**3,
-        }
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     results = {"versions": versions(), "cores": os.cpu_count(), "speed": speed(given.rounds)}
-    results |= {"phantom_set_s": phantom_seconds(), "memory": {n: memory(n) for n in ("gauss-newton", "heel-mr")}}
+    results["phantom_set_s"] = phantom_seconds()
     print(json.dumps(results, indent=1))
     if given.out is not None:
         given.out.parent.mkdir(parents=True, exist_ok=True)
