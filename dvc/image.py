@@ -303,7 +303,15 @@ class LabelMap:
         for label, known in self.names.items():
             if known == name:
                 return Mask(self.grid, self.labels == label)
-        raise InputError(f"The label map has no region '{name}'; it has {sorted(self.names.values())}.")
+        raise self.no_region(name)
+
+    def no_region(self, name: str) -> InputError:
+        """What to say where a name is asked for that no label has."""
+        unnamed = all(known.startswith("label-") for known in self.names.values())
+        hint = " It came without a table of names (--names), so labels go by their numbers." if unnamed else ""
+        return InputError(
+            f"The label map has no region '{name}'; it has {', '.join(sorted(self.names.values())) or 'none'}.{hint}"
+        )
 
     def toward_lps(self) -> LabelMap:
         """The same label map with its axes closest to L, P, S."""

@@ -109,7 +109,7 @@ def mesh_labels(
     numbers = {name: number for number, name in labels.names.items() if (labels.labels == number).any()}
     for name in (*bones, *((finer[0],) if finer else ())):
         if name not in numbers:
-            raise InputError(f"The label map has no region '{name}'; it has {', '.join(sorted(numbers))}.")
+            raise labels.no_region(name)
     soft = {name: number for name, number in numbers.items() if name not in bones}
     if not soft:
         raise InputError(f"No soft tissue is left in the label map beside {', '.join(bones)}.")

@@ -97,6 +97,8 @@ class TestReadLabels:
         labels = read_labels(_save(tmp_path / "a.nii", _block(5)))
         assert labels.names == {5: "label-5"}
         np.testing.assert_array_equal(labels.labels, _block(5))
+        with pytest.raises(InputError, match=r"no region 'bone'; it has label-5. It came without a table of names"):
+            labels.region("bone")
 
     def test_names_that_are_not_in_the_map_are_let_go(self, tmp_path: Path) -> None:
         path = _save(tmp_path / "a.nii", _block(5))

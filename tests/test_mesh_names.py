@@ -106,22 +106,33 @@ def test_the_summary_warns_of_volumes_and_angles(tmp_path: Path) -> None:
     assert told(9.9, 12.0) == []
 
 
-def ansys(path: Path, mesh: TetMesh) -> None:
+def with_middles(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Its nodes and those in the middle of its edges, and the ten of each cell, as Abaqus, ANSYS and VTK order them."""
+    ends = np.sort(mesh.cells[:, [(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]].reshape(-1, 2), axis=1)
+    edges, of_cells = np.unique(ends, axis=0, return_inverse=True)
+    points = np.concatenate([mesh.points_mm, mesh.points_mm[edges].mean(axis=1)])
+    return points, np.hstack([mesh.cells, len(mesh.points_mm) + of_cells.reshape(-1, 6)])
+
+
+def ansys(path: Path, mesh: TetMesh, *, quadratic: bool = False) -> None:
     """As CDWRITE writes it: a material for each tissue; components in capitals, of which no two share a name.
 
-    SKIN therefore holds the tissue and the surface elements (SURF154) on it; BONE is a component of nodes.
+    SKIN therefore holds the tissue and the surface elements (SURF154) on it; BONE is a component of nodes. Cells are
+    SOLID285, or SOLID187, whose ten nodes take two lines.
     """
-    lines = ["/PREP7", "ET,1,285", "ET,2,154", f"NBLOCK,6,SOLID,{len(mesh.points_mm):9d},{len(mesh.points_mm):9d}"]
-    lines += ["(3i9,6e21.13e3)"]
-    for number, at in enumerate(mesh.points_mm, start=1):
+    points, cells = with_middles(mesh) if quadratic else (mesh.points_mm, mesh.cells)
+    lines = ["/PREP7", f"ET,1,{187 if quadratic else 285}", "ET,2,154"]
+    lines += [f"NBLOCK,6,SOLID,{len(points):9d},{len(points):9d}", "(3i9,6e21.13e3)"]
+    for number, at in enumerate(points, start=1):
         lines += [f"{number:9d}{0:9d}{0:9d}" + "".join(f"{x:21.13E}" for x in at)]
     lines += ["N,R5.3,LOC,       -1,", "EBLOCK,19,SOLID", "(19i9)"]
     material = np.full(len(mesh.cells), 1)
     material[mesh.regions["skin"]] = 2
-    solids = [(1, of, [*cell]) for of, cell in zip(material, mesh.cells + 1, strict=True)]
+    solids = [(1, of, [*cell]) for of, cell in zip(material, cells + 1, strict=True)]
     flat = [(2, 3, [*face, face[-1]]) for face in mesh.facets["skin"] + 1]
     for number, (kind, of, nodes) in enumerate(solids + flat, start=1):
-        lines += ["".join(f"{v:9d}" for v in [of, kind, 1, 1, 0, 0, 0, 0, len(nodes), 0, number, *nodes])]
+        row = [f"{v:9d}" for v in [of, kind, 1, 1, 0, 0, 0, 0, len(nodes), 0, number, *nodes]]
+        lines += ["".join(row[at : at + 19]) for at in range(0, len(row), 19)]
     lines += [f"{-1:9d}"]
     surface = len(mesh.cells) + 1 + np.arange(len(flat))
     for name, kind, members in (
@@ -134,11 +145,12 @@ def ansys(path: Path, mesh: TetMesh) -> None:
     path.write_text("\n".join([*lines, "FINISH"]) + "\n")
 
 
-def abaqus(path: Path, mesh: TetMesh) -> None:
+def abaqus(path: Path, mesh: TetMesh, *, quadratic: bool = False) -> None:
     """Sets of nodes for surfaces."""
-    lines = ["*NODE"] + [f"{n}, {x!r}, {y!r}, {z!r}" for n, (x, y, z) in enumerate(mesh.points_mm.tolist(), start=1)]
-    lines += ["*ELEMENT, TYPE=C3D4H"]
-    lines += [f"{n}, " + ", ".join(map(str, cell)) for n, cell in enumerate((mesh.cells + 1).tolist(), start=1)]
+    points, cells = with_middles(mesh) if quadratic else (mesh.points_mm, mesh.cells)
+    lines = ["*NODE"] + [f"{n}, {x!r}, {y!r}, {z!r}" for n, (x, y, z) in enumerate(points.tolist(), start=1)]
+    lines += [f"*ELEMENT, TYPE={'C3D10' if quadratic else 'C3D4H'}"]
+    lines += [f"{n}, " + ", ".join(map(str, cell)) for n, cell in enumerate((cells + 1).tolist(), start=1)]
     for name, cells in mesh.regions.items():
         lines += [f"*ELSET, ELSET={name.capitalize()}", *(str(c + 1) for c in cells)]
     for name, facets in (("Bone", "bone"), ("SKIN", "skin")):

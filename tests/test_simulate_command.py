@@ -209,9 +209,13 @@ def test_more_is_fixed_beside_the_bone_and_what_law_stands_in_is_told(tmp_path: 
     assert "no facets 'side'; it has bone, skin, cut" in str(refused.exception)
 
 
-def test_meshes_of_ansys_and_abaqus_give_what_the_same_mesh_gives_as_vtu(mesh_file: Path, tmp_path: Path) -> None:
-    ansys(tmp_path / "dome.cdb", dome((3, 4, 4)))
-    abaqus(tmp_path / "dome.inp", dome((3, 4, 4)))
+@pytest.mark.parametrize("quadratic", [False, True], ids=["SOLID285 and C3D4H", "SOLID187 and C3D10"])
+def test_meshes_of_ansys_and_abaqus_give_what_the_same_mesh_gives_as_vtu(
+    mesh_file: Path, tmp_path: Path, quadratic: bool
+) -> None:
+    """Of cells with ten nodes the corners are taken."""
+    ansys(tmp_path / "dome.cdb", dome((3, 4, 4)), quadratic=quadratic)
+    abaqus(tmp_path / "dome.inp", dome((3, 4, 4)), quadratic=quadratic)
     told = {}
     for place in (mesh_file, tmp_path / "dome.cdb", tmp_path / "dome.inp"):
         out = tmp_path / place.suffix[1:]
