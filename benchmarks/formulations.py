@@ -1,10 +1,11 @@
 """Mixed tetrahedra side by side: error and time of stabilised P1, MINI and P2 on three problems at nu = 0.4999.
 
-    .venv/bin/python -m benchmarks.formulations --out benchmarks/results/formulations.json [--heel heel.vtu]
+    .venv/bin/python -m benchmarks.formulations --out benchmarks/results/formulations.json [--heel fine.vtu coarse.vtu]
 
 Cook's membrane in three dimensions (bending and shear), a block pressed between a fixed face and a taped plate, and
-the heel under a plate (a mesh that `mrstrain mesh` made). One after the other in one process, on one thread; what is
-compiled is compiled beforehand. The reference is P2 on the finest mesh of each problem.
+the heel under a plate (meshes that `mrstrain mesh` made of one label map, in the order in which they are to run). One
+after the other in one process, on one thread; what is compiled is compiled beforehand. The reference is P2 on the
+finest mesh of each problem.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ def _figures(mesh: TetMesh, state: State, region: str) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--heel", type=Path)
+    parser.add_argument("--heel", type=Path, nargs="+", default=[])
     parser.add_argument("--load", nargs=3, default=("Load1", "140", "0"), metavar=("NAME", "NORMAL", "SHEAR"))
     parser.add_argument("--elements", nargs="+", default=ELEMENTS)
     parser.add_argument("--sizes", type=int, nargs="+", default=[2, 4, 8])
@@ -132,18 +133,20 @@ def main() -> None:
     for name in given.elements:
         cook(name, 1)  # compiles
     found: dict[str, Any] = {"versions": versions(), "cook": [], "block": [], "heel": []}
+
+    def tell(problem: str, row: dict[str, Any]) -> None:
+        found[problem].append(row)
+        given.out.write_text(json.dumps(found, indent=1) + "\n")
+        print(problem, row, flush=True)
+
     for n in given.sizes:
         for name in given.elements:
-            for problem, run in (("cook", cook), ("block", pressed_block)):
-                found[problem].append(run(name, n))
-                print(problem, found[problem][-1], flush=True)
-    if given.heel is not None:
-        mesh = read_tet_mesh(given.heel)
-        load = LoadStep(given.load[0], float(given.load[1]), float(given.load[2]))
+            tell("cook", cook(name, n))
+            tell("block", pressed_block(name, n))
+    load = LoadStep(given.load[0], float(given.load[1]), float(given.load[2]))
+    for place in given.heel:
         for name in given.elements:
-            found["heel"].append(heel(name, mesh, load))
-            print("heel", found["heel"][-1], flush=True)
-    given.out.write_text(json.dumps(found, indent=1) + "\n")
+            tell("heel", heel(name, read_tet_mesh(place), load))
 
 
 if __name__ == "__main__":

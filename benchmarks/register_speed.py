@@ -21,7 +21,7 @@ import numpy as np
 from dvc import elastix
 from dvc.elastixtext import format_parameters
 from dvc.image import Mask
-from dvc.presets import load_preset
+from dvc.presets import load_preset, read_parameter_file
 from dvc.registration import Settings, register
 from dvc.tissue import tissue_mask, widened
 from dvc.worker import Worker, usable_cores
@@ -29,6 +29,7 @@ from mrstrain.making import phantom
 from mrstrain.provenance import versions
 from phantoms.heel import HeelPair, heel_pair
 
+RIGID = Path(__file__).with_name("bone_rigid.txt")
 RESULT = {"WriteResultImage": ("true",)}
 
 
@@ -36,7 +37,7 @@ def plain(pair: HeelPair, body: Mask, worker: Worker) -> None:
     with tempfile.TemporaryDirectory() as folder:
         rigid = worker.run(
             "plain elastix", elastix.register, pair.reference, pair.loaded,
-            load_preset("bone-rigid").complete(seed=1), pair.bone, None, None, folder,
+            read_parameter_file(RIGID).complete(seed=1), pair.bone, None, None, folder,
         )  # fmt: skip
         start = Path(folder) / "rigid.txt"
         start.write_text(format_parameters(rigid.transform))

@@ -3,13 +3,13 @@
 First a search that cannot be trapped: the bone is laid at every place of the loaded image in many
 orientations, at low resolution, and normalised correlation is taken by FFT (masked template matching; see
 D. Padfield, Masked object registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Then
-elastix refines the best places; the best of these is kept and refined once more with other random samples. The motion
-midway between the two is the result, and their spread the alignment's own measure of how well it repeats.
+Gauss-Newton refines the best places (`dvc.rigidfit`); from the best of these each half of the bone is fitted once more
+by itself. The motion midway between the two is the result, and their spread the alignment's own measure of how well it
+repeats.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -23,11 +23,10 @@ from dvc.deformation import Deformation, RigidMotion
 from dvc.errors import InputError, RegistrationError
 from dvc.image import Grid, Image, Mask
 from dvc.resample import carry, fill_missing, smoothed
+from dvc.rigidfit import RigidFit
 from dvc.similarity import local_correlation
-from dvc.transformfile import rigid_from_elastix
 
 AlignOn = Literal["bone", "image", "none"]
-RigidFit = Callable[[Image, Image, Mask, int], dict[str, tuple[str, ...]]]
 
 _SEARCH_MM = 4.0
 _SEARCH_MARGIN_MM = 4.0
@@ -62,7 +61,7 @@ class Alignment:
     similarity_before, similarity : float
         Normalised correlation in and 2 mm around the bone (over the whole mask with "image"), before and after.
     repeatability_mm : float
-        Root mean square, over the bone's voxels, of the distance between two fits with other random samples.
+        Root mean square, over the bone's voxels, of the distance between the motions that two halves of them give.
         NaN with "none".
     bone_shift_mm : (3,)
         Displacement of the bone's centroid, LPS.
@@ -107,7 +106,7 @@ def refuse_turned_contrast(reference: Image, loaded: Image, tissue: Mask, motion
         )
 
 
-def align(reference: Image, loaded: Image, mask: Mask, fit: RigidFit, *, on: AlignOn, seed: int) -> Alignment:
+def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -> Alignment:
     """Find the rigid motion of a bone, or of all that the mask holds, from the reference to the loaded image.
 
     Parameters
@@ -116,25 +115,27 @@ def align(reference: Image, loaded: Image, mask: Mask, fit: RigidFit, *, on: Ali
         Without shading (`dvc.shading`), which would pull the optimum off by some hundredths of a millimetre.
     mask : Mask
         The bone (or tissue) on the reference grid.
-    fit : callable
-        ``fit(fixed, moving, mask, seed)`` runs elastix' rigid registration and returns its transform.
+    on : {"bone", "image"}
+        What the mask holds.
     seed : int
+        Of the halves into which the mask's voxels are divided.
 
     Raises
     ------
     RegistrationError
-        If no place of the loaded image looks like the bone, if the contrast is inverted, or if two fits disagree
-        by more than 0.5 mm: a failed alignment is not handed on.
+        If no place of the loaded image looks like the bone, if the contrast is inverted, or if the fits of two halves
+        disagree by more than 0.5 mm: a failed alignment is not handed on.
     """
     if not mask.inside.any():
         raise InputError("The mask to align on is empty.")
     starts, highest = _search(reference, loaded, mask)
+    fit = RigidFit(reference, loaded, mask, seed)
     candidates: list[tuple[float, RigidMotion]] = []
     for start in starts:
         try:
-            motion = _refine(reference, loaded, mask, start, fit, seed)
+            motion = fit.whole(start)
         except RegistrationError:
-            continue  # a start from which elastix finds no overlap is not the place
+            continue  # not the place
         score = _similarity(reference, loaded, mask, motion)
         if np.isfinite(score):
             candidates.append((score, motion))
@@ -144,16 +145,16 @@ def align(reference: Image, loaded: Image, mask: Mask, fit: RigidFit, *, on: Ali
     score, motion = max(candidates, key=lambda c: c[0], default=(float("nan"), RigidMotion.identity()))
     if not score >= _LOWEST_SIMILARITY:
         raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
-    again = _refine(reference, loaded, mask, motion, fit, seed + 1)
+    one, other = fit.halves(motion)
     points = mask.points()
-    spread = float(np.sqrt(np.mean(np.sum((again.apply(points) - motion.apply(points)) ** 2, axis=1))))
+    spread = float(np.sqrt(np.mean(np.sum((one.apply(points) - other.apply(points)) ** 2, axis=1))))
     if not spread <= _LARGEST_SPREAD_MM:
         raise RegistrationError(
             f"Two rigid fits on the {on} differ by {spread:.2f} mm (at most {_LARGEST_SPREAD_MM} is accepted): the "
             f"{on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly "
             "inside the loaded one."
         )
-    motion = _midway(again, motion, points.mean(axis=0))
+    motion = _midway(one, other, points.mean(axis=0))
     centroid = points.mean(axis=0)[None]
     return Alignment(
         motion,
@@ -184,13 +185,6 @@ def motion_of(deformation: Deformation, mask: Mask) -> RigidMotion:
     return RigidMotion(R, x.mean(axis=0) - R @ X.mean(axis=0))
 
 
-def _refine(reference: Image, loaded: Image, mask: Mask, start: RigidMotion, fit: RigidFit, seed: int) -> RigidMotion:
-    """Elastix' rigid fit from a start; the start is put into the loaded image's header, so nothing is resampled."""
-    back = start.inverse()
-    moved = Image(loaded.grid.moved_by(back.rotation, back.translation_mm), loaded.values)
-    return start.after(rigid_from_elastix(fit(reference, moved, mask, seed)))
-
-
 def _midway(a: RigidMotion, b: RigidMotion, centre: FloatArray) -> RigidMotion:
     rotation = Rotation.from_matrix(np.stack([a.rotation, b.rotation])).mean().as_matrix()
     target = (a.apply(centre[None])[0] + b.apply(centre[None])[0]) / 2.0
@@ -213,8 +207,8 @@ def _similarity(reference: Image, loaded: Image, mask: Mask, motion: RigidMotion
         return float("nan")
     a, b = fixed[known].astype(np.float64), moved[known].astype(np.float64)
     a, b = a - a.mean(), b - b.mean()
-    norm = np.sqrt((a @ a) * (b @ b))
-    return float(a @ b / norm) if norm > 0 else float("nan")
+    norm = np.sqrt((a * a).sum() * (b * b).sum())
+    return float((a * b).sum() / norm) if norm > 0 else float("nan")
 
 
 def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highest: float, on: AlignOn) -> str:

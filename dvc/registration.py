@@ -7,7 +7,6 @@ displacement is that of the tissue relative to its bone; T(X) = R (X + u(X)) + t
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,6 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dvc import elastix
 from dvc.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.arrays import FloatArray
 from dvc.borders import Spline
@@ -26,9 +24,8 @@ from dvc.deformation import Composed, Deformation, RigidMotion, Within
 from dvc.errors import InputError, ParameterError
 from dvc.gaussnewton import Choice, GaussNewton
 from dvc.image import Image, LabelMap, Mask
-from dvc.nonrigid import by_elastix, by_gauss_newton, without_gaps
-from dvc.presets import Preset, load_preset, preset_or_file
-from dvc.resample import fill_missing
+from dvc.nonrigid import by_elastix, by_gauss_newton
+from dvc.presets import Preset, preset_or_file
 from dvc.shading import without_shading
 from dvc.sharpen import USUAL_SKIN, AtBorders
 from dvc.tissue import tissue_mask
@@ -54,8 +51,8 @@ class Settings:
     seed : int
         Seed of every random number.
     threads : int
-        Threads of each worker. elastix' results, the bone's alignment among them, are equal bit for bit on equal
-        numbers of threads; the correction of shading, and what Gauss-Newton adds, on any.
+        Threads of each worker. What our own engine finds, the bone's alignment and the correction of shading are
+        equal bit for bit on any number of threads; what elastix finds, on equal numbers.
     gauss_newton : GaussNewton, optional
         Parameters of our own engine, which then takes the place of elastix and the presets.
     borders : AtBorders, optional
@@ -343,30 +340,11 @@ def _align(
     if settings.align_on == "none":
         return not_aligned(reference, loaded, body)
     mask = bone if settings.align_on == "bone" and bone is not None else body
-    preset = load_preset("bone-rigid")
-
-    def fit(fixed: Image, moving: Image, where: Mask, seed: int) -> dict[str, tuple[str, ...]]:
-        known = Mask(where.grid, where.inside & ~fixed.missing)
-        whole, seen = without_gaps(moving)
-        with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
-            return worker.run(
-                "aligning the bone",
-                elastix.register,
-                fill_missing(fixed),
-                whole,
-                preset.complete(seed=seed),
-                known,
-                seen,
-                None,
-                folder,
-            ).transform
-
-    seed = _seeds(settings)[0]
-    return align(reference, loaded, mask, fit, on=settings.align_on, seed=seed)
+    return worker.run("aligning the bone", align, reference, loaded, mask, settings.align_on, _seeds(settings)[0])
 
 
 def _seeds(settings: Settings) -> list[int]:
-    """Independent seeds: of the rigid fits (two in a row are used), then of each non-rigid stage."""
+    """Independent seeds: of the rigid alignment, then of each non-rigid stage."""
     drawn = np.random.SeedSequence(settings.seed).generate_state(1 + len(settings.presets))
     return [int(s) % 2**30 + 1 for s in drawn]
 

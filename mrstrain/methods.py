@@ -21,6 +21,8 @@ _PAPERS = {
     "Shamonin 2014": "Shamonin DP, Bron EE, Lelieveldt BPF, Smits M, Klein S, Staring M. Fast parallel image "
     "registration on CPU and GPU for diagnostic classification of Alzheimer's disease. Front Neuroinform 7:50, 2014. "
     "doi:10.3389/fninf.2013.00050",
+    "Baker 2004": "Baker S, Matthews I. Lucas-Kanade 20 years on: a unifying framework. Int J Comput Vis "
+    "56(3):221-255, 2004. doi:10.1023/B:VISI.0000011205.11775.fd",
     "Lowekamp 2013": "Lowekamp BC, Chen DT, Ibáñez L, Blezek D. The design of SimpleITK. Front Neuroinform 7:45, 2013. "
     "doi:10.3389/fninf.2013.00045",
     "Tustison 2010": "Tustison NJ, Avants BB, Cook PA, Zheng Y, Egan A, Yushkevich PA, Gee JC. N4ITK: improved N3 bias "
@@ -134,8 +136,8 @@ def _registration(record: Record) -> str:
         if not own
         else f"with the Gauss-Newton engine of {ours}: {_weights(own, given.get('borders'), on_bone)}"
     )
-    if own and given.get("align") != "none":
-        how += f"; rigid alignment with {elastix}"
+    if given.get("align") != "none":
+        how += "; rigid alignment by Gauss-Newton least squares (Baker 2004)"
     return (
         f"{align} registered non-rigidly {how}; seed {given.get('seed')}. Beforehand the smooth receive field was "
         "taken out of both images (N4, Tustison 2010). Images were read and "

@@ -17,7 +17,6 @@ from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationEr
 from dvc.image import Image, Mask
 from dvc.imagefile import read_image
 from dvc.landmarks import read_landmarks
-from dvc.presets import load_preset
 from dvc.registration import GAUSS_NEWTON, Registration, Settings, refuse_one_image_twice
 from dvc.registration import register as register_pair
 from dvc.tissue import tissue_mask
@@ -279,7 +278,6 @@ def record_of(
             "seed": settings.seed,
             "threads": settings.threads,
             "plate_normal_lps": subject.plate_normal.tolist(),
-            "rigid": load_preset("bone-rigid").text,
             "engine": settings.engine,
             "gauss_newton": None if own is None else asdict(own),
             "borders": None if settings.borders is None else asdict(settings.borders),

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from dvc.errors import InputError, MrstrainError
-from dvc.presets import load_preset
 from dvc.registration import AT_BORDERS, GAUSS_NEWTON, Settings
 from dvc.whole import write_whole
 from dvc.worker import Worker, each_in_workers, usable_cores
@@ -55,6 +54,7 @@ LABELS_OFF = (0, 1, -1)
 
 # What makes the images: a study goes on only with runs made by the same.
 _MAKING = {"anatomy.py", "bodies.py", "flow.py", "heel.py", "motions.py", "mri.py", "study.py"}
+_ALIGNING = {"align.py", "rigidfit.py"}
 # Our own engine, which has no release number as elastix has.
 _ENGINE = {
     "gaussnewton.py",
@@ -249,9 +249,11 @@ def _check(case: Case) -> None:
 def _key(case: Case) -> str:
     """What a run's result depends on beside its case."""
     told = versions()
-    text = Settings.of(case.preset).text + load_preset("bone-rigid").text
-    sources = _sources("phantoms", _MAKING) + (
-        _sources("dvc", _ENGINE) if case.preset in {GAUSS_NEWTON, AT_BORDERS} else ""
+    text = Settings.of(case.preset).text
+    sources = (
+        _sources("phantoms", _MAKING)
+        + _sources("dvc", _ALIGNING)
+        + (_sources("dvc", _ENGINE) if case.preset in {GAUSS_NEWTON, AT_BORDERS} else "")
     )
     return hashlib.sha256((text + told["mrstrain"] + told["itk-elastix"] + sources).encode()).hexdigest()
 

@@ -124,9 +124,9 @@ def test_several_stages_have_no_known_error() -> None:
 
 def test_a_preset_without_a_model_is_told() -> None:
     found, subject, maps = given()
-    found.settings = Settings.of("bone-rigid")
-    bars = error_bars(found, subject, maps, error_model_of("bone-rigid"))
-    assert "bone-rigid has not been measured" in bars.told
+    found.settings = Settings((replace(load_preset("heel-mr"), name="mine"),))
+    bars = error_bars(found, subject, maps, error_model_of("mine"))
+    assert "mine has not been measured" in bars.told
 
 
 def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:

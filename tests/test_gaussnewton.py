@@ -227,6 +227,7 @@ def test_any_number_of_threads_gives_the_same_bits(tmp_path):
     np.savez(tmp_path / "pair.npz", fixed=fixed.values, moving=moving.values)
     script = f"""
 import hashlib, numpy as np
+from dvc.align import align
 from dvc.gaussnewton import GaussNewton, fit
 from dvc.image import Grid, Image, Mask
 pair = np.load({str(tmp_path / "pair.npz")!r})
@@ -235,7 +236,9 @@ inside = np.zeros(grid.shape, dtype=bool)
 inside[4:-4, 4:-4, 4:-4] = True
 mask = Mask(grid, inside)
 found, choice = fit(Image(grid, pair["fixed"]), Image(grid, pair["moving"]), mask, mask, None, GaussNewton(5.0))
-print(hashlib.sha256(found.coefficients_mm.tobytes()).hexdigest(), choice.weights.bending)
+on = align(Image(grid, pair["fixed"]), Image(grid, pair["moving"]), mask, "image", 1)
+of_both = found.coefficients_mm.tobytes() + on.motion.rotation.tobytes() + on.motion.translation_mm.tobytes()
+print(hashlib.sha256(of_both).hexdigest(), choice.weights.bending, on.similarity, on.repeatability_mm)
 """
     told = []
     for threads in ("1", "3"):

@@ -120,7 +120,8 @@ def test_our_own_engine_is_told_with_its_weights(tmp_path: Path) -> None:
             "every 3.2 mm",
             weight,
             "300/mm3",
-            "alignment with elastix",
+            "rigid alignment by Gauss-Newton",
+            "doi:10.1023/B:VISI",
         ):
             assert said in text, said
         assert "taken as it was given" not in text.split("Results of other")[0]

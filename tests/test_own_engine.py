@@ -116,7 +116,7 @@ def test_error_bars_are_the_engines_own(written):
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"engine": "gauss-newton", "preset": "bone-rigid"}, "elastix"),
+        ({"engine": "gauss-newton", "preset": "heel-mr"}, "elastix"),
         ({"engine": "elastix", "bending": 3.0}, "gauss-newton"),
         ({"preset": "heel-mr", "parameters": ["mine.txt"]}, "not both"),
         ({"engine": "ants"}, "there are elastix and gauss-newton"),

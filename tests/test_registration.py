@@ -9,10 +9,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from dvc.align import align, motion_of
+from dvc.align import Alignment, align, motion_of
 from dvc.bspline import BSpline
 from dvc.deformation import Composed, RigidMotion, evaluate_on_grid
-from dvc.elastix import register as run_elastix
 from dvc.errors import InputError, ParameterError, RegistrationError
 from dvc.gaussnewton import GaussNewton
 from dvc.image import Grid, Image, Mask
@@ -50,7 +49,7 @@ def found(small_pair, worker):
 def test_the_bones_motion_is_found(found, small_pair):
     assert rms_over(small_pair.bone, found.alignment.motion, small_pair.foot_motion) < COARSE_MM
     assert found.alignment.similarity > 0.9
-    assert found.alignment.repeatability_mm < 0.05
+    assert found.alignment.repeatability_mm < COARSE_MM  # of two halves, which know half as much each
 
 
 def test_strain_is_that_of_the_tissue_relative_to_its_bone(found, small_pair):
@@ -143,58 +142,46 @@ def test_without_a_bone_the_whole_image_can_be_aligned(tiny_pair, worker):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 12])
-def test_row_9_a_foot_moved_by_20_mm_and_15_degrees_is_found(seed, worker):
+def test_row_9_a_foot_moved_by_20_mm_and_15_degrees_is_found(seed):
     random = np.random.default_rng(seed)
     axis, way = random.normal(size=(2, 3))
     rotation = Rotation.from_rotvec(np.radians(15.0) * axis / np.linalg.norm(axis)).as_matrix()
     motion = RigidMotion.about(np.array([0.0, 5.0, 0.0]), rotation, 20.0 * way / np.linalg.norm(way))
     pair = heel_pair(seed=seed, foot_motion=motion)
-    found = _aligned(pair.reference, pair.loaded, pair.bone, worker)
-    assert rms_over(pair.bone, found.motion, motion) < 0.05
-    assert found.motion.after(motion.inverse()).angle_deg < 0.05
+    found = aligned(pair.reference, pair.loaded, pair.bone)
+    assert rms_over(pair.bone, found.motion, motion) < 0.03  # elastix, in its place: 0.05
+    assert found.motion.after(motion.inverse()).angle_deg < 0.03
 
 
-def test_row_9_another_centre_is_no_obstacle(small_pair, worker):
+def test_row_9_another_centre_is_no_obstacle(small_pair):
     far = RigidMotion(np.eye(3), np.array([300.0, -150.0, 800.0]))
     moved = Image(small_pair.loaded.grid.moved_by(far.rotation, far.translation_mm), small_pair.loaded.values)
-    found = _aligned(small_pair.reference, moved, small_pair.bone, worker)
+    found = aligned(small_pair.reference, moved, small_pair.bone)
     assert rms_over(small_pair.bone, found.motion, far.after(small_pair.foot_motion)) < COARSE_MM
 
 
-def _aligned(reference, loaded, bone, worker):
-    def fit(fixed, moving, mask, seed):
-        import tempfile
-
-        with tempfile.TemporaryDirectory() as folder:
-            parameters = load_preset("bone-rigid").complete(seed=seed)
-            return worker.run("aligning", run_elastix, fixed, moving, parameters, mask, None, None, folder).transform
-
-    return align(without_shading(reference), without_shading(loaded), bone, fit, on="bone", seed=1)
+def aligned(reference: Image, loaded: Image, bone: Mask) -> Alignment:
+    return align(without_shading(reference), without_shading(loaded), bone, "bone", 1)
 
 
-def test_row_9_a_bone_along_which_fits_slide_is_not_located():
-    """A rod of uniform signal looks the same all along: two fits differ by what they happen to end at."""
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+def test_row_9_a_bone_along_which_fits_slide_is_not_located(noise):
+    """A rod of uniform signal looks the same all along: fits begun apart stay apart, but for one with a knob."""
+    random = np.random.default_rng(3)
     grid = Grid((30, 30, 40), np.full(3, 2.0), np.array([-29.0, -29.0, -39.0]))
     X = grid.points()
     rod = np.linalg.norm(X[..., :2], axis=-1) < 9.0
-    image = Image(grid, np.where(rod, 100.0, 40.0).astype(np.float32))
-    bone = Mask(grid, rod & (np.abs(X[..., 2]) < 16.0))
+    knob = np.linalg.norm(X - [9.0, 0.0, 3.0], axis=-1) < 8.0
+    bone = Mask(grid, (rod | knob) & (np.abs(X[..., 2]) < 16.0))
 
-    def sliding_by(slide_mm: float):
-        def fit(_fixed, _moving, _mask, seed: int) -> dict[str, tuple[str, ...]]:
-            slid = slide_mm if seed == 2 else 0.0  # the second fit's seed
-            numbers = (*["0"] * 5, str(slid))
-            return {
-                "Transform": ("EulerTransform",),
-                "TransformParameters": numbers,
-                "CenterOfRotationPoint": ("0",) * 3,
-            }
+    def seen(shape: np.ndarray) -> Image:
+        clean = gaussian_filter(np.where(shape, 100.0, 40.0), 0.7)
+        return Image(grid, (clean + noise * random.normal(size=shape.shape)).astype(np.float32))
 
-        return align(image, image, bone, fit, on="bone", seed=1)
-
-    assert sliding_by(0.4).repeatability_mm == pytest.approx(0.4)
-    with pytest.raises(RegistrationError, match=r"differ by 0\.60 mm .* the bone is not located"):
-        sliding_by(0.6)
+    with pytest.raises(RegistrationError, match=r"differ by \d\.\d\d mm .* the bone is not located"):
+        align(seen(rod), seen(rod), bone, "bone", 1)
+    found = align(seen(rod | knob), seen(rod | knob), bone, "bone", 1)
+    assert found.repeatability_mm < (0.3 if noise else 0.02)
 
 
 def test_row_9_an_image_without_the_bone_is_refused(small_pair, worker):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
@@ -14,6 +15,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from filelock import FileLock
 
@@ -26,8 +28,8 @@ from mrstrain.checking import check
 from mrstrain.running import forecast, report, run, run_studies
 from mrstrain.studyfile import read_study
 from mrstrain.subjects import cohort
+from tests.processes import cluster_of_two, under_way, wait_for
 from tests.quick import QUICK
-from tests.waiting import under_way, wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -99,6 +101,11 @@ def done(images, tmp_path_factory):
 
 def shear_of(folder: Path, load: str) -> np.ndarray:
     return read_image(folder / "results" / "registration" / load / "max_shear.nii.gz", allow_missing=True).values
+
+
+def areas(study: Path) -> list[float]:
+    with (study / "results" / "comparison" / "areas.csv").open() as file:
+        return [float(row["ml"]) for row in csv.DictReader(file)]
 
 
 def test_every_result_is_there_and_the_report_tells_it(done):
@@ -255,37 +262,42 @@ def test_killed_in_any_stage_and_run_again(done, tmp_path, stage):
     assert sorted(of_all) == of_all
     assert of_all[0] > 0.0
     assert of_all[-1] == 1.0
-
-    def areas(of: Path) -> list[float]:
-        with (of / "results" / "comparison" / "areas.csv").open() as file:
-            return [float(row["ml"]) for row in csv.DictReader(file)]
-
     # A mesh made anew is another; states found on the same are the same to the solver's tolerance.
     assert areas(study) == pytest.approx(areas(folder), rel=0.2 if stage == "mesh" else 1e-4)
+
+
+def test_a_registration_whose_process_is_killed_fails_alone_and_is_named(done, images, tmp_path):
+    """As the system does where memory runs out."""
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    command = [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--workers", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    records = study / "results" / ".study"
+
+    def registering() -> list[psutil.Process]:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            below = psutil.Process(process.pid).children(recursive=True)
+            return [one for one in below if any("popen_loky" in word for word in one.cmdline())]
+        return []
+
+    wait_for(lambda: under_way(records, "register Load1") and registering() != [], process)
+    registering()[-1].kill()
+    told, _ = process.communicate(timeout=400)
+    assert process.returncode == 1
+    assert "register Load1: FAILED" in told
+    assert "died (exit code SIGKILL(-9))" in told
+    assert not (study / "results" / "registration" / "Load1").exists()
+    assert np.array_equal(shear_of(study, "Load2"), shear_of(folder, "Load2"), equal_nan=True)  # the others finish
+    assert "register Load1 failed" in (study / "results" / "report.html").read_text()
+    assert forecast(study, only=["register"])["register Load1"] == "run"
 
 
 def test_a_cluster_whose_worker_is_killed_loses_nothing(done, images, tmp_path):
     folder, _ = done
     study = tmp_path / "study"
     shutil.copytree(images, study)
-    environment = os.environ | {"DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
-    file = tmp_path / "scheduler.json"
-    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
-    scheduler = subprocess.Popen(
-        [*dask, "--host", "127.0.0.1", "--port", "0", "--dashboard-address", ":0", "--scheduler-file", str(file)],
-        env=environment, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
-    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--no-nanny"]
-    workers = [
-        subprocess.Popen(
-            [*worker, "--nthreads", "1", "--dashboard-address", ":0", "--local-directory", str(tmp_path / str(n))],
-            env=environment, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-        )
-        for n in range(2)
-    ]  # fmt: skip
-    try:
-        wait_for(file.is_file, scheduler)
-        address = json.loads(file.read_text())["address"]
+    with cluster_of_two(tmp_path) as (address, workers):
         process = subprocess.Popen(
             [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--scheduler", address],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -298,12 +310,12 @@ def test_a_cluster_whose_worker_is_killed_loses_nothing(done, images, tmp_path):
         assert process.wait(timeout=400) == 0  # what was not asked for is no failure
         for load in ("Load1", "Load2"):
             assert np.array_equal(shear_of(study, load), shear_of(folder, load), equal_nan=True)
+        rest = run(study, scheduler=address)  # what builds on them, by the worker that is left
+        assert rest.complete
+        assert [name for name in STAGES if not rest.outcomes[name].again] == ["mesh", "simulate akrami", "compare"]
+        assert areas(study) == pytest.approx(areas(folder), rel=0.2)  # on a mesh of its own
         outcomes = (study / "results" / "study.log").read_text()
         assert "FAILED" not in outcomes
-    finally:
-        for one in (*workers, scheduler):
-            one.kill()
-            one.wait()
 
 
 def test_a_scheduler_that_is_not_there(images, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 import shutil
 from pathlib import Path
@@ -164,3 +165,37 @@ def test_study_files_of_the_pages_can_be_read(tmp_path: Path) -> None:
     for number, block in enumerate(blocks):
         (tmp_path / f"{number}.toml").write_text(block)
         assert read_study(tmp_path / f"{number}.toml").loads
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the headings of a page, as the site and the repository's host make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M)
+    headings = re.findall(r"^#+ (.*)$", text, re.M)
+    return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", heading.lower()).strip()) for heading in headings}
+
+
+def test_every_link_leads_somewhere() -> None:
+    links = [
+        (page, link)
+        for page in [*PAGES, ROOT / "benchmarks" / "README.md"]
+        for link in re.findall(r"\]\(([^)]+)\)", page.read_text())
+        if not link.startswith("https://")
+    ]
+    assert len(links) > 50
+    for page, link in links:
+        place, _, anchor = link.partition("#")
+        target = (page.parent / place).resolve() if place else page
+        assert target.exists(), (page, link)
+        assert not anchor or anchor in anchors(target), (page, link)
+
+
+def test_the_site_has_every_page_and_the_reference_every_name() -> None:
+    listed = set(re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
+    assert listed == {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
+    names = [name for page in (DOCS / "api").glob("*.md") for name in re.findall(r"^::: (\S+)", page.read_text(), re.M)]
+    assert len(names) > 20
+    for name in names:
+        pkgutil.resolve_name(name)
+    for page in DOCS.rglob("*.md"):
+        for included in re.findall(r'--8<-- "([^":]+)', page.read_text()):
+            assert (ROOT / included).is_file(), page

@@ -1,0 +1,192 @@
+"""A rigid motion between two images, by Gauss-Newton over the voxels of a mask, from a start right to a few mm.
+
+Sought is the motion T for which I1(T(X)) comes closest to a I0(X) + b over the voxels X, with whatever gain a and
+offset b fit best: where normalised correlation is highest. A small motion d(X) = p + w x (X - c) of the voxels before
+T changes I1(T(X)) by a grad I0 . d, so the values carried are regressed on I0, 1 and the six columns of
+-grad I0 . d, and T becomes T after d (inverse compositional; Baker and Matthews 2004,
+doi:10.1023/B:VISI.0000011205.11775.fd). The gradient is the unloaded image's, at its voxels, where the noise of a
+difference of two neighbours is not correlated with that of the voxel between them: noise does not pull the motion.
+Images are blurred at first, by less and less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import map_coordinates, spline_filter
+from scipy.spatial.transform import Rotation
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.deformation import RigidMotion
+from dvc.errors import RegistrationError
+from dvc.image import Grid, Image, Mask
+from dvc.resample import fill_missing, smoothed
+
+_BLURS_MM = (4.0, 2.0, 1.0, 0.0)
+_FINE_FROM = 1  # of these, for fits that begin near the end
+_VOXELS_PER_BLUR = 1.5  # blurred images are compared at every voxel that lies so much closer than the blur
+_STEPS = 40
+_SMALL_MM = 1e-4  # a step that moves the voxels by less, root mean square, is the last
+_SMALL_SHARE = 0.01  # or by less than this share of the blur, where it is more
+_LONGEST_MM = 2.0
+_LEAST_SHOWN = 0.5
+_BLOCK_MM = 8.0  # halves of the mask are made of blocks of this size: neighbours share noise and errors
+_ASIDE_MM = 0.7  # by which the two fits of a pair begin to either side, in each of the six ways to move
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Level:
+    """Both images with one blur: the unloaded one at points of the mask, the loaded one whole.
+
+    Attributes
+    ----------
+    points : (n, 3)
+        LPS mm.
+    columns : (n, 8)
+        What the carried values are regressed on: I0, 1, and -grad I0 . d for unit steps of the six unknowns.
+    half : (n,) bool
+        One of two halves of the points.
+    scene, order
+        The loaded image, as coefficients of splines of that order.
+    """
+
+    blur_mm: float
+    points: FloatArray
+    columns: FloatArray
+    half: BoolArray
+    scene: Image
+    order: int
+
+
+class RigidFit:
+    """Fits of one mask's voxels in one pair of images, from any start.
+
+    Parameters
+    ----------
+    reference, loaded : Image
+        Of one contrast, but for gain and offset.
+    mask : Mask
+        On the reference grid.
+    seed : int
+        Of the halves into which the mask is divided.
+    """
+
+    def __init__(self, reference: Image, loaded: Image, mask: Mask, seed: int) -> None:
+        points = mask.points()
+        self._centre = points.mean(axis=0)
+        self._radius_mm = float(np.sqrt(np.mean(np.sum((points - self._centre) ** 2, axis=1))))
+        self._random = np.random.default_rng(seed)
+        missing = loaded.missing
+        self._gaps = missing.astype(np.float32) if missing.any() else None
+        scenes = _scenes(fill_missing(loaded))
+        self._levels = [self._level(reference, mask, blur, scenes[blur]) for blur in _BLURS_MM]
+        self._aside = self._random.permuted(np.repeat([-1.0, 1.0], 3)) * _ASIDE_MM
+
+    def whole(self, start: RigidMotion) -> RigidMotion:
+        """The motion found from a start by all of the voxels.
+
+        Raises
+        ------
+        RegistrationError
+            If half of the voxels leave the loaded image, or nothing there changes with them.
+        """
+        motion = start
+        for level in self._levels:
+            motion = self._settled(level, motion, np.ones(len(level.points), dtype=bool))
+        return motion
+
+    def halves(self, near: RigidMotion) -> tuple[RigidMotion, RigidMotion]:
+        """Two motions found by one half of the voxels each, begun to either side of one that is near.
+
+        Along a way in which the image tells nothing they stay apart.
+
+        Raises
+        ------
+        RegistrationError
+            As from `whole`.
+        """
+        found = []
+        for side in (1.0, -1.0):
+            motion = near.after(self._step(side * self._aside))
+            for level in self._levels[_FINE_FROM:]:
+                motion = self._settled(level, motion, level.half if side > 0.0 else ~level.half)
+            found.append(motion)
+        return found[0], found[1]
+
+    def _level(self, reference: Image, mask: Mask, blur_mm: float, scene: Image) -> _Level:
+        box = mask.box(int(np.ceil(3.0 * blur_mm / mask.grid.spacing_mm.min())) + 2)
+        inside, part = mask.inside[box], Image(mask.grid.part(box), reference.values[box])
+        fixed = fill_missing(smoothed(part, blur_mm) if blur_mm else part).values.astype(np.float64)
+        slopes = np.stack(list(np.gradient(fixed, *part.grid.spacing_mm)), axis=-1)
+        thin = np.zeros(inside.shape, dtype=bool)
+        thin[_every(part.grid, blur_mm)] = True
+        at = np.argwhere(inside & thin & ~part.missing)
+        if len(at) < 16:
+            at = np.argwhere(inside & ~part.missing)
+        points = part.grid.points_at(at.astype(np.float64))
+        gradient = slopes[tuple(at.T)] @ part.grid.direction.T
+        turning = np.cross(points - self._centre, gradient) / self._radius_mm
+        values = fixed[tuple(at.T)]
+        columns = np.column_stack([values, np.ones(len(at)), -gradient, -turning])
+        blocks = np.floor(at * part.grid.spacing_mm / _BLOCK_MM).astype(int)
+        _, block = np.unique(blocks, axis=0, return_inverse=True)
+        count = int(block.max()) + 1
+        half = self._random.permuted(np.arange(count) % 2 == 0)[block.reshape(-1)]
+        return _Level(blur_mm, points, columns, half, scene, 1 if blur_mm else 3)
+
+    def _settled(self, level: _Level, motion: RigidMotion, part: BoolArray) -> RigidMotion:
+        """Where steps over some of a level's points come to rest."""
+        small = max(_SMALL_MM, _SMALL_SHARE * level.blur_mm)
+        for _ in range(_STEPS):
+            step = self._regressed(level, motion, part)
+            length = float(np.linalg.norm(step))
+            motion = motion.after(self._step(step * min(1.0, _LONGEST_MM / max(length, 1e-12))))
+            if length < small:
+                break
+        return motion
+
+    def _regressed(self, level: _Level, motion: RigidMotion, part: BoolArray) -> FloatArray:
+        """The next step (6,), mm: along the axes, and turns about them times the mask's radius."""
+        at = level.scene.grid.indices_of(motion.apply(level.points[part])).T
+        last = np.array(level.scene.grid.shape)[:, None] - 1
+        shown = np.all((at >= 0) & (at <= last), axis=0)
+        if self._gaps is not None:
+            shown[shown] = map_coordinates(self._gaps, at[:, shown], order=1, mode="nearest") < 1e-6
+        if np.count_nonzero(shown) < _LEAST_SHOWN * len(shown):
+            raise RegistrationError("The bone leaves the loaded image.")
+        carried = map_coordinates(level.scene.values, at[:, shown], order=level.order, prefilter=False, mode="mirror")
+        columns = level.columns[part][shown]
+        scale = np.sqrt(np.einsum("ni,ni->i", columns, columns))  # sums whose bits do not depend on threads
+        columns = columns / np.where(scale > 0.0, scale, 1.0)
+        normal, right = np.einsum("ni,nj->ij", columns, columns), np.einsum("ni,n->i", columns, carried)
+        found = np.linalg.lstsq(normal, right, rcond=1e-9)[0] / np.where(scale > 0.0, scale, 1.0)
+        if not found[0] > 0.0:
+            raise RegistrationError("What is brighter in the unloaded image is not brighter in the loaded one.")
+        return np.asarray(found[2:] / found[0])
+
+    def _step(self, step: FloatArray) -> RigidMotion:
+        turn = Rotation.from_rotvec(step[3:] / self._radius_mm).as_matrix()
+        return RigidMotion.about(self._centre, turn, step[:3])
+
+
+def _scenes(loaded: Image) -> dict[float, Image]:
+    """The loaded image by its blur: cubic coefficients without, and values at fewer voxels the more it is blurred."""
+    scenes, now, blurred = {}, loaded, 0.0
+    for blur in sorted(_BLURS_MM):
+        if not blur:
+            scenes[blur] = Image(loaded.grid, spline_filter(loaded.values, 3, np.float32, "mirror"))
+            continue
+        now, blurred = smoothed(now, float(np.sqrt(blur**2 - blurred**2))), blur
+        every = _every(now.grid, blur)
+        values = now.values[every]
+        spacing = now.grid.spacing_mm * [one.step for one in every]
+        now = Image(Grid(values.shape, spacing, now.grid.origin_mm, now.grid.direction), values)
+        scenes[blur] = now
+    return scenes
+
+
+def _every(grid: Grid, blur_mm: float) -> tuple[slice, slice, slice]:
+    """As many of a grid's voxels as an image needs that is blurred so much."""
+    i, j, k = (slice(None, None, max(1, int(blur_mm / _VOXELS_PER_BLUR / s))) for s in grid.spacing_mm)
+    return i, j, k

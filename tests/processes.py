@@ -1,0 +1,57 @@
+"""Processes beside the test's own: waiting for what they do, and a cluster of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from subprocess import DEVNULL, Popen
+
+from filelock import FileLock, Timeout
+
+
+def under_way(records: Path, stage: str) -> bool:
+    """Whether a worker holds the stage's lock, and the stage has no record yet."""
+    lock = records / f"{stage}.lock"
+    if not lock.is_file():
+        return False
+    try:
+        with FileLock(lock, timeout=0):
+            return False
+    except Timeout:
+        return not (records / f"{stage}.json").exists()
+
+
+def wait_for(condition: Callable[[], bool], process: Popen, limit_s: float = 300.0) -> None:
+    """Wait until a condition holds, while a process runs."""
+    began = time.monotonic()
+    while not condition():
+        assert process.poll() is None, "it ended before"
+        assert time.monotonic() - began < limit_s, "it took too long"
+        time.sleep(0.2)
+
+
+@contextmanager
+def cluster_of_two(folder: Path) -> Iterator[tuple[str, list[Popen]]]:
+    """A Dask scheduler on loopback, by its address, and two workers of one thread each, ended with the block."""
+    environment = os.environ | {"DASK_DISTRIBUTED__WORKER__DAEMON": "False"}
+    file = folder / "scheduler.json"
+
+    def started(command: str, *given: str) -> Popen:
+        asked = [sys.executable, "-m", f"distributed.cli.{command}", "--dashboard-address", ":0", *given]
+        return Popen([*asked, "--scheduler-file", str(file)], env=environment, stdout=DEVNULL, stderr=DEVNULL)
+
+    scheduler = started("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+    places = [("--local-directory", str(folder / str(n))) for n in range(2)]
+    workers = [started("dask_worker", "--no-nanny", "--nthreads", "1", *place) for place in places]
+    try:
+        wait_for(file.is_file, scheduler)
+        yield json.loads(file.read_text())["address"], workers
+    finally:
+        for one in (*workers, scheduler):
+            one.kill()
+            one.wait()
