@@ -1,12 +1,13 @@
 """A rigid motion between two images, by Gauss-Newton over the voxels of a mask, from a start right to a few mm.
 
-Sought is the motion T for which I1(T(X)) comes closest to a I0(X) + b over the voxels X, with whatever gain a and
-offset b fit best: where normalised correlation is highest. A small motion d(X) = p + w x (X - c) of the voxels before
-T changes I1(T(X)) by a grad I0 . d, so the values carried are regressed on I0, 1 and the six columns of
--grad I0 . d, and T becomes T after d (inverse compositional; Baker and Matthews 2004,
-doi:10.1023/B:VISI.0000011205.11775.fd). The gradient is the unloaded image's, at its voxels, where the noise of a
-difference of two neighbours is not correlated with that of the voxel between them: noise does not pull the motion.
-Images are blurred at first, by less and less.
+Sought is the motion T for which I1(T(X)) comes closest to a gain g(X), quadratic in place, times I0(X), at voxels X. A
+small motion d(X) = p + w x (X - c) of the voxels before T changes I1(T(X)) by g grad I0 . d; so what is left of the
+difference is regressed on the six columns of grad I0 . d, and T becomes T after d (inverse compositional; Baker and
+Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). Images are blurred at first, by less and less.
+
+The gain takes up the shading that its correction leaves, which would pull a mask along its edges. A free offset beside
+it would let noise do the same: noise makes a slope that is regressed too small. The gradient is the unloaded image's,
+at its voxels, where the noise of a difference of two neighbours is not correlated with that of the voxel between them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation import RigidMotion
-from dvc.errors import RegistrationError
+from dvc.errors import InputError, RegistrationError
 from dvc.image import Grid, Image, Mask
 from dvc.resample import fill_missing, smoothed
 
@@ -31,7 +32,11 @@ _SMALL_MM = 1e-4  # a step that moves the voxels by less, root mean square, is t
 _SMALL_SHARE = 0.01  # or by less than this share of the blur, where it is more
 _LONGEST_MM = 2.0
 _LEAST_SHOWN = 0.5
+_LEAST_GAIN = 0.1  # of what the images' standard deviations make it: a gain near zero would blow up what is left
+_SHADED_MM = 10.0  # a mask whose voxels lie nearer to its centre, root mean square, has one gain: too small for more
 _BLOCK_MM = 8.0  # halves of the mask are made of blocks of this size: neighbours share noise and errors
+_LEAST_BLOCKS = 8  # where there are fewer, of voxels
+_LEAST_VOXELS = 16
 _ASIDE_MM = 0.7  # by which the two fits of a pair begin to either side, in each of the six ways to move
 
 
@@ -43,8 +48,12 @@ class _Level:
     ----------
     points : (n, 3)
         LPS mm.
-    columns : (n, 8)
-        What the carried values are regressed on: I0, 1, and -grad I0 . d for unit steps of the six unknowns.
+    values : (n,)
+        I0.
+    places : (n, 10 or 1)
+        Polynomials of place of which the gain is a sum.
+    changes : (n, 6)
+        grad I0 . d for unit steps of the six unknowns.
     half : (n,) bool
         One of two halves of the points.
     scene, order
@@ -53,7 +62,9 @@ class _Level:
 
     blur_mm: float
     points: FloatArray
-    columns: FloatArray
+    values: FloatArray
+    places: FloatArray
+    changes: FloatArray
     half: BoolArray
     scene: Image
     order: int
@@ -65,22 +76,30 @@ class RigidFit:
     Parameters
     ----------
     reference, loaded : Image
-        Of one contrast, but for gain and offset.
+        Of one contrast, but for a gain that changes smoothly in place; an offset pulls a little.
     mask : Mask
         On the reference grid.
     seed : int
         Of the halves into which the mask is divided.
+
+    Raises
+    ------
+    InputError
+        If the unloaded image has values at fewer than 16 of the mask's voxels.
     """
 
     def __init__(self, reference: Image, loaded: Image, mask: Mask, seed: int) -> None:
-        points = mask.points()
+        known = Mask(mask.grid, mask.inside & ~reference.missing)
+        points = known.points()
+        if len(points) < _LEAST_VOXELS:
+            raise InputError(f"The unloaded image shows {len(points)} voxels of the mask: too few to align on.")
         self._centre = points.mean(axis=0)
         self._radius_mm = float(np.sqrt(np.mean(np.sum((points - self._centre) ** 2, axis=1))))
         self._random = np.random.default_rng(seed)
         missing = loaded.missing
-        self._gaps = missing.astype(np.float32) if missing.any() else None
+        self._gaps = Image(loaded.grid, missing.astype(np.float32)) if missing.any() else None
         scenes = _scenes(fill_missing(loaded))
-        self._levels = [self._level(reference, mask, blur, scenes[blur]) for blur in _BLURS_MM]
+        self._levels = [self._level(reference, known, blur, scenes[blur]) for blur in _BLURS_MM]
         self._aside = self._random.permuted(np.repeat([-1.0, 1.0], 3)) * _ASIDE_MM
 
     def whole(self, start: RigidMotion) -> RigidMotion:
@@ -89,7 +108,7 @@ class RigidFit:
         Raises
         ------
         RegistrationError
-            If half of the voxels leave the loaded image, or nothing there changes with them.
+            If half of the voxels leave what the loaded image shows, or its contrast there is turned round.
         """
         motion = start
         for level in self._levels:
@@ -121,53 +140,63 @@ class RigidFit:
         slopes = np.stack(list(np.gradient(fixed, *part.grid.spacing_mm)), axis=-1)
         thin = np.zeros(inside.shape, dtype=bool)
         thin[_every(part.grid, blur_mm)] = True
-        at = np.argwhere(inside & thin & ~part.missing)
-        if len(at) < 16:
-            at = np.argwhere(inside & ~part.missing)
+        at = np.argwhere(inside & thin)
+        if len(at) < _LEAST_VOXELS:
+            at = np.argwhere(inside)
         points = part.grid.points_at(at.astype(np.float64))
         gradient = slopes[tuple(at.T)] @ part.grid.direction.T
         turning = np.cross(points - self._centre, gradient) / self._radius_mm
         values = fixed[tuple(at.T)]
-        columns = np.column_stack([values, np.ones(len(at)), -gradient, -turning])
+        x, y, z = ((points - self._centre) / self._radius_mm).T
+        places = np.column_stack([np.ones(len(at)), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x])
+        if self._radius_mm < _SHADED_MM:
+            places = places[:, :1]
         blocks = np.floor(at * part.grid.spacing_mm / _BLOCK_MM).astype(int)
-        _, block = np.unique(blocks, axis=0, return_inverse=True)
-        count = int(block.max()) + 1
-        half = self._random.permuted(np.arange(count) % 2 == 0)[block.reshape(-1)]
-        return _Level(blur_mm, points, columns, half, scene, 1 if blur_mm else 3)
+        kinds, block = np.unique(blocks, axis=0, return_inverse=True)
+        if len(kinds) < _LEAST_BLOCKS:
+            kinds = block = np.arange(len(at))
+        half = self._random.permuted(np.arange(len(kinds)) % 2 == 0)[block.reshape(-1)]
+        return _Level(blur_mm, points, values, places, np.hstack([gradient, turning]), half, scene, 1 if blur_mm else 3)
 
     def _settled(self, level: _Level, motion: RigidMotion, part: BoolArray) -> RigidMotion:
         """Where steps over some of a level's points come to rest."""
         small = max(_SMALL_MM, _SMALL_SHARE * level.blur_mm)
         for _ in range(_STEPS):
-            step = self._regressed(level, motion, part)
+            step = self._next(level, motion, part)
             length = float(np.linalg.norm(step))
             motion = motion.after(self._step(step * min(1.0, _LONGEST_MM / max(length, 1e-12))))
             if length < small:
                 break
         return motion
 
-    def _regressed(self, level: _Level, motion: RigidMotion, part: BoolArray) -> FloatArray:
+    def _next(self, level: _Level, motion: RigidMotion, part: BoolArray) -> FloatArray:
         """The next step (6,), mm: along the axes, and turns about them times the mask's radius."""
-        at = level.scene.grid.indices_of(motion.apply(level.points[part])).T
+        moved = motion.apply(level.points[part])
+        at = level.scene.grid.indices_of(moved).T
         last = np.array(level.scene.grid.shape)[:, None] - 1
         shown = np.all((at >= 0) & (at <= last), axis=0)
         if self._gaps is not None:
-            shown[shown] = map_coordinates(self._gaps, at[:, shown], order=1, mode="nearest") < 1e-6
+            here = self._gaps.grid.indices_of(moved[shown]).T
+            shown[shown] = map_coordinates(self._gaps.values, here, order=1, mode="nearest") < 1e-6
         if np.count_nonzero(shown) < _LEAST_SHOWN * len(shown):
             raise RegistrationError("The bone leaves the loaded image.")
         carried = map_coordinates(level.scene.values, at[:, shown], order=level.order, prefilter=False, mode="mirror")
-        columns = level.columns[part][shown]
-        scale = np.sqrt(np.einsum("ni,ni->i", columns, columns))  # sums whose bits do not depend on threads
-        columns = columns / np.where(scale > 0.0, scale, 1.0)
-        normal, right = np.einsum("ni,nj->ij", columns, columns), np.einsum("ni,n->i", columns, carried)
-        found = np.linalg.lstsq(normal, right, rcond=1e-9)[0] / np.where(scale > 0.0, scale, 1.0)
-        if not found[0] > 0.0:
+        values, places, changes = level.values[part][shown], level.places[part][shown], level.changes[part][shown]
+        if not ((values - values.mean()) * (carried - carried.mean())).sum() > 0.0:
             raise RegistrationError("What is brighter in the unloaded image is not brighter in the loaded one.")
-        return np.asarray(found[2:] / found[0])
+        gain = np.einsum("ni,i->n", places, _regressed(places * values[:, None], carried))
+        gain = np.maximum(gain, _LEAST_GAIN * carried.std() / values.std())
+        return _regressed(changes, values - carried / gain)
 
     def _step(self, step: FloatArray) -> RigidMotion:
         turn = Rotation.from_rotvec(step[3:] / self._radius_mm).as_matrix()
         return RigidMotion.about(self._centre, turn, step[:3])
+
+
+def _regressed(columns: FloatArray, on: FloatArray) -> FloatArray:
+    """Least squares, by sums whose bits do not depend on threads."""
+    normal, right = np.einsum("ni,nj->ij", columns, columns), np.einsum("ni,n->i", columns, on)
+    return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-9)[0])
 
 
 def _scenes(loaded: Image) -> dict[float, Image]:

@@ -1,0 +1,109 @@
+"""The rigid fit on a known texture: exact without noise, on any grid, with gaps; and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dvc.deformation import RigidMotion
+from dvc.errors import InputError, RegistrationError
+from dvc.image import Grid, Image, Mask
+from dvc.rigidfit import RigidFit
+from tests.textures import texture
+
+CENTRE = np.array([2.0, 26.0, 24.0])
+_AXES = np.array([[0.0, 0, 1], [-1, 0, 0], [0, 1, 0]])
+FINE = Grid((44, 46, 40), np.array([1.0, 1.0, 1.0]), CENTRE - 21.0)
+SLICES = Grid((44, 46, 14), np.array([1.0, 1.0, 3.0]), CENTRE - 21.0)
+SWAPPED = Grid((46, 40, 44), np.ones(3), CENTRE + np.array([-21.0, 21.0, -21.0]), _AXES)
+
+
+def turned_by(degrees: list[float], shift_mm: list[float]) -> RigidMotion:
+    return RigidMotion.about(CENTRE, Rotation.from_rotvec(degrees, degrees=True).as_matrix(), np.array(shift_mm))
+
+
+MOTION = turned_by([2.0, -3.0, 4.0], [1.5, -1.0, 0.7])
+
+
+def seen(grid: Grid, motion: RigidMotion, noise: float = 0.0, seed: int = 1) -> Image:
+    values = texture(motion.inverse().apply(grid.points().reshape(-1, 3))).reshape(grid.shape)
+    return Image(grid, (values + noise * np.random.default_rng(seed).normal(size=grid.shape)).astype(np.float32))
+
+
+def ball(grid: Grid, radius_mm: float = 14.0) -> Mask:
+    return Mask(grid, np.linalg.norm(grid.points() - CENTRE, axis=-1) < radius_mm)
+
+
+def off_mm(found: RigidMotion, mask: Mask) -> float:
+    X = mask.points()
+    return float(np.sqrt(np.mean(np.sum((found.apply(X) - MOTION.apply(X)) ** 2, axis=1))))
+
+
+@pytest.mark.parametrize(("grid", "within"), [(FINE, 0.005), (SWAPPED, 0.005), (SLICES, 0.05)])
+def test_the_motion_is_found_on_any_grid(grid: Grid, within: float) -> None:
+    mask = ball(grid)
+    fit = RigidFit(seen(grid, RigidMotion.identity()), seen(FINE, MOTION), mask, 1)
+    assert off_mm(MOTION, mask) == 0.0
+    assert off_mm(RigidMotion.identity(), mask) > 2.0
+    found = fit.whole(RigidMotion.identity())
+    assert off_mm(found, mask) < within
+    one, other = fit.halves(found)
+    assert max(off_mm(one, mask), off_mm(other, mask)) < 2.0 * within
+
+
+def test_a_gain_that_changes_in_place_does_not_matter_and_an_offset_little() -> None:
+    loaded = seen(FINE, MOTION)
+    x, y, _ = np.moveaxis((FINE.points() - CENTRE) / 20.0, -1, 0)
+    gain = 7.0 * (1.0 + 0.3 * x - 0.2 * y * y + 0.1 * x * y)
+    for values, within in ((gain * loaded.values, 0.005), (loaded.values + 0.3, 0.05)):  # a tenth of the mean
+        fit = RigidFit(seen(FINE, RigidMotion.identity()), Image(FINE, values.astype(np.float32)), ball(FINE), 1)
+        assert off_mm(fit.whole(RigidMotion.identity()), ball(FINE)) < within
+
+
+def test_noise_does_not_pull() -> None:
+    """The mean error of 12 draws is a few times less than that of one; a gain by regression would pull it (0.6)."""
+    mask, errors = ball(FINE), []
+    for draw in range(12):
+        pair = (seen(FINE, motion, 0.2, 2 * draw + n) for n, motion in enumerate((RigidMotion.identity(), MOTION)))
+        found = RigidFit(*pair, mask, 1).whole(MOTION)
+        errors.append(found.apply(mask.points()) - MOTION.apply(mask.points()))
+    single = float(np.sqrt(np.mean(np.sum(np.array(errors) ** 2, axis=2))))
+    mean = float(np.sqrt(np.mean(np.sum(np.mean(errors, axis=0) ** 2, axis=1))))
+    assert single < 0.07
+    assert mean < 0.5 * single
+
+
+def test_what_the_loaded_image_does_not_show_is_left_out() -> None:
+    mask, loaded = ball(FINE), seen(FINE, MOTION)
+    values = loaded.values.copy()
+    hidden = FINE.points()[..., 0] > CENTRE[0] + 4.0
+    values[hidden] = np.nan
+    fit = RigidFit(seen(FINE, RigidMotion.identity()), Image(FINE, values), mask, 1)
+    assert off_mm(fit.whole(RigidMotion.identity()), mask) < 0.02
+    values[FINE.points()[..., 0] > CENTRE[0] - 4.0] = np.nan
+    fit = RigidFit(seen(FINE, RigidMotion.identity()), Image(FINE, values), mask, 1)
+    with pytest.raises(RegistrationError, match="leaves"):
+        fit.whole(RigidMotion.identity())
+
+
+def test_what_the_unloaded_image_does_not_show_is_left_out_too() -> None:
+    mask, reference = ball(FINE), seen(FINE, RigidMotion.identity())
+    values = reference.values.copy()
+    values[FINE.points()[..., 1] > CENTRE[1] + 4.0] = np.nan
+    fit = RigidFit(Image(FINE, values), seen(FINE, MOTION), mask, 1)
+    assert off_mm(fit.whole(RigidMotion.identity()), mask) < 0.02
+    with pytest.raises(InputError, match="shows 0 voxels of the mask"):
+        RigidFit(Image(FINE, np.full_like(values, np.nan)), seen(FINE, MOTION), mask, 1)
+
+
+def test_a_mask_smaller_than_a_block_has_halves_too() -> None:
+    mask = ball(FINE, 4.0)
+    fit = RigidFit(seen(FINE, RigidMotion.identity()), seen(FINE, MOTION), mask, 1)
+    assert max(off_mm(half, mask) for half in fit.halves(MOTION)) < 0.05
+
+
+def test_turned_contrast_is_refused() -> None:
+    fit = RigidFit(seen(FINE, RigidMotion.identity()), Image(FINE, -seen(FINE, MOTION).values), ball(FINE), 1)
+    with pytest.raises(RegistrationError, match="not brighter"):
+        fit.whole(MOTION)
