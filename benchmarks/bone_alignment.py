@@ -37,9 +37,9 @@ def off_mm(mask: Mask, a: RigidMotion, b: RigidMotion) -> float:
     return float(np.sqrt(np.mean(np.sum((a.apply(X) - b.apply(X)) ** 2, axis=1))))
 
 
-def midway(a: RigidMotion, b: RigidMotion, centre: np.ndarray) -> RigidMotion:
-    turn = Rotation.from_matrix(np.stack([a.rotation, b.rotation])).mean().as_matrix()
-    return RigidMotion(turn, (a.apply(centre[None]) + b.apply(centre[None]))[0] / 2.0 - turn @ centre)
+def midway(motions: list[RigidMotion], centre: np.ndarray) -> RigidMotion:
+    turn = Rotation.from_matrix(np.stack([motion.rotation for motion in motions])).mean().as_matrix()
+    return RigidMotion(turn, np.mean([motion.apply(centre[None])[0] for motion in motions], axis=0) - turn @ centre)
 
 
 def by_elastix(fixed: Image, moving: Image, bone: Mask, start: RigidMotion, seed: int) -> RigidMotion:
@@ -61,13 +61,13 @@ def one(pair: HeelPair, seed: int, noise: float) -> dict[str, object]:
     fit = RigidFit(fixed, moving, pair.bone, 1)
     halves = fit.halves(fit.whole(start))
     middle = time.perf_counter()
-    two = [by_elastix(fixed, moving, pair.bone, start, seed) for seed in (1, 2)]
+    two = [tuple(by_elastix(fixed, moving, pair.bone, start, seed) for seed in (1, 2))]
     ended = time.perf_counter()
     row: dict[str, object] = {"seed": seed, "noise": noise, "start_mm": off_mm(pair.bone, start, pair.foot_motion)}
     for name, found, seconds in (("ours", halves, middle - began), ("elastix", two, ended - middle)):
         row[name] = {
-            "error_mm": off_mm(pair.bone, midway(*found, centre), pair.foot_motion),
-            "spread_mm": off_mm(pair.bone, *found),
+            "error_mm": off_mm(pair.bone, midway([one for both in found for one in both], centre), pair.foot_motion),
+            "spread_mm": max(off_mm(pair.bone, *both) for both in found),
             "seconds": seconds,
         }
     return row

@@ -3,9 +3,9 @@
 First a search that cannot be trapped: the bone is laid at every place of the loaded image in many
 orientations, at low resolution, and normalised correlation is taken by FFT (masked template matching; see
 D. Padfield, Masked object registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Then
-Gauss-Newton refines the best places (`dvc.rigidfit`); from the best of these each half of the bone is fitted once more
-by itself. The motion midway between the two is the result, and their spread the alignment's own measure of how well it
-repeats.
+Gauss-Newton refines the best places (`dvc.rigidfit`); around the best of these, halves of the bone are fitted each by
+itself, begun to either side along each of the six ways to move. The mean of all is the result, and the largest distance
+between two halves the alignment's own measure of how well it repeats.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class Alignment:
     similarity_before, similarity : float
         Normalised correlation in and 2 mm around the bone (over the whole mask with "image"), before and after.
     repeatability_mm : float
-        Root mean square, over the bone's voxels, of the distance between the motions that two halves of them give.
-        NaN with "none".
+        Root mean square, over the bone's voxels, of the distance between the motions that two halves of them give,
+        begun apart; the largest of six pairs. NaN with "none".
     bone_shift_mm : (3,)
         Displacement of the bone's centroid, LPS.
     """
@@ -122,14 +122,16 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
 
     Raises
     ------
+    InputError
+        If the mask is empty, or too little of it is seen in the unloaded image.
     RegistrationError
         If no place of the loaded image looks like the bone, if the contrast is inverted, or if the fits of two halves
         disagree by more than 0.5 mm: a failed alignment is not handed on.
     """
     if not mask.inside.any():
         raise InputError("The mask to align on is empty.")
-    starts, highest = _search(reference, loaded, mask)
     fit = RigidFit(reference, loaded, mask, seed)
+    starts, highest = _search(reference, loaded, mask)
     candidates: list[tuple[float, RigidMotion]] = []
     for start in starts:
         try:
@@ -145,16 +147,21 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
     score, motion = max(candidates, key=lambda c: c[0], default=(float("nan"), RigidMotion.identity()))
     if not score >= _LOWEST_SIMILARITY:
         raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
-    one, other = fit.halves(motion)
     points = mask.points()
-    spread = float(np.sqrt(np.mean(np.sum((one.apply(points) - other.apply(points)) ** 2, axis=1))))
+    advice = (
+        f"the {on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly inside "
+        "the loaded one."
+    )
+    try:
+        pairs = fit.halves(motion)
+    except RegistrationError as why:
+        raise RegistrationError(f"A half of the {on} cannot be fitted by itself ({why}): {advice}") from why
+    spread = max(_apart_mm(one, other, points) for one, other in pairs)
     if not spread <= _LARGEST_SPREAD_MM:
         raise RegistrationError(
-            f"Two rigid fits on the {on} differ by {spread:.2f} mm (at most {_LARGEST_SPREAD_MM} is accepted): the "
-            f"{on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly "
-            "inside the loaded one."
+            f"Two rigid fits on the {on} differ by {spread:.2f} mm (at most {_LARGEST_SPREAD_MM} is accepted): {advice}"
         )
-    motion = _midway(one, other, points.mean(axis=0))
+    motion = _midway([half for pair in pairs for half in pair], points.mean(axis=0))
     centroid = points.mean(axis=0)[None]
     return Alignment(
         motion,
@@ -185,10 +192,14 @@ def motion_of(deformation: Deformation, mask: Mask) -> RigidMotion:
     return RigidMotion(R, x.mean(axis=0) - R @ X.mean(axis=0))
 
 
-def _midway(a: RigidMotion, b: RigidMotion, centre: FloatArray) -> RigidMotion:
-    rotation = Rotation.from_matrix(np.stack([a.rotation, b.rotation])).mean().as_matrix()
-    target = (a.apply(centre[None])[0] + b.apply(centre[None])[0]) / 2.0
+def _midway(motions: list[RigidMotion], centre: FloatArray) -> RigidMotion:
+    rotation = Rotation.from_matrix(np.stack([motion.rotation for motion in motions])).mean().as_matrix()
+    target = np.mean([motion.apply(centre[None])[0] for motion in motions], axis=0)
     return RigidMotion(rotation, target - rotation @ centre)
+
+
+def _apart_mm(one: RigidMotion, other: RigidMotion, points: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.sum((one.apply(points) - other.apply(points)) ** 2, axis=1))))
 
 
 def _near(mask: Mask, margin_mm: float) -> BoolArray:
@@ -215,9 +226,9 @@ def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highe
     inverted = max(
         (s for s, _ in _scored(reference, loaded, mask, _rotations()[:_INVERTED_TRIES], sign=-1.0)), default=0.0
     )
-    found = (
-        f"the best normalised correlation found around it is {score:.2f}" if np.isfinite(score) else "it was not found"
-    )
+    found = f"the best normalised correlation found around it is {score:.2f}"
+    if not np.isfinite(score):
+        found = "nowhere does the loaded image look like it"
     told = f"The rigid alignment on the {on} failed: {found} ({_LOWEST_SIMILARITY} is needed)."
     if inverted > max(_LOWEST_SIMILARITY, highest + _CLEARLY):
         return (
@@ -270,7 +281,7 @@ def _scored(
     scene, known = _scene(loaded)
     values = np.where(known, scene.values, np.median(scene.values[known]))
     size = [fft.next_fast_len(s + t, real=True) for s, t in zip(scene.grid.shape, template_grid.shape, strict=True)]
-    scene_f, square_f, known_f = (fft.rfftn(v, size, workers=-1) for v in (values, values**2, known.astype(np.float64)))
+    scene_f, square_f, known_f = (fft.rfftn(v, size) for v in (values, values**2, known.astype(np.float64)))
     places = tuple(slice(0, s) for s in scene.grid.shape)
     half = (np.array(template_grid.shape) - 1) // 2
     found = []
@@ -280,11 +291,11 @@ def _scored(
         deviation = t - (t * w).sum() / count
         energy = (w * deviation * deviation).sum()
         t = w * deviation
-        w_f = np.conj(fft.rfftn(w, size, workers=-1))
-        cross = fft.irfftn(scene_f * np.conj(fft.rfftn(t, size, workers=-1)), size, workers=-1)
-        mean = fft.irfftn(scene_f * w_f, size, workers=-1) / count
-        variance = fft.irfftn(square_f * w_f, size, workers=-1) / count - mean**2
-        covered = fft.irfftn(known_f * w_f, size, workers=-1) / count
+        w_f = np.conj(fft.rfftn(w, size))
+        cross = fft.irfftn(scene_f * np.conj(fft.rfftn(t, size)), size)
+        mean = fft.irfftn(scene_f * w_f, size) / count
+        variance = fft.irfftn(square_f * w_f, size) / count - mean**2
+        covered = fft.irfftn(known_f * w_f, size) / count
         floor = 1e-3 * values.var()
         score = sign * cross / np.sqrt(energy * count * np.maximum(variance, floor))
         score[covered < _LEAST_COVERED] = -np.inf

@@ -194,7 +194,7 @@ def register(
         Result of another load (its ``bspline``) to start from: the first guess, which the registration then corrects
         against these two images, so no error is carried on. elastix starts from a `BSpline` alone.
     worker : Worker, optional
-        Process to run elastix in; a new one by default.
+        Process to compute in; a new one by default.
     progress : callable, optional
         ``progress(stage, fraction)``, about twice a second.
 
@@ -211,7 +211,7 @@ def register(
         If the bone cannot be found in the loaded image, if the contrast of the two images is turned round and is not
         to be followed by mutual information, or if elastix fails; with elastix' reason.
     WorkerError
-        If the process that runs elastix dies.
+        If the process dies.
     """
     began = time.monotonic()
     chosen = settings or Settings.of()

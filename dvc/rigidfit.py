@@ -1,13 +1,15 @@
 """A rigid motion between two images, by Gauss-Newton over the voxels of a mask, from a start right to a few mm.
 
-Sought is the motion T for which I1(T(X)) comes closest to a gain g(X), quadratic in place, times I0(X), at voxels X. A
-small motion d(X) = p + w x (X - c) of the voxels before T changes I1(T(X)) by g grad I0 . d; so what is left of the
+Sought is the motion T for which I1(T(X)) comes closest to g(X) I0(X) + o at voxels X, with a gain g quadratic in place.
+A small motion d(X) = p + w x (X - c) of the voxels before T changes I1(T(X)) by g grad I0 . d; so what is left of the
 difference is regressed on the six columns of grad I0 . d, and T becomes T after d (inverse compositional; Baker and
 Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). Images are blurred at first, by less and less.
 
-The gain takes up the shading that its correction leaves, which would pull a mask along its edges. A free offset beside
-it would let noise do the same: noise makes a slope that is regressed too small. The gradient is the unloaded image's,
-at its voxels, where the noise of a difference of two neighbours is not correlated with that of the voxel between them.
+Three things would pull a mask along its edges. Shading, which its correction leaves in part: the gain takes it up.
+Noise in I0, which makes a slope too small that is regressed on it: so the gain is found with the mean of each voxel's
+six neighbours as instrument, whose noise is another. And the noise of a gradient between voxels, which goes with the
+noise beside it: that of the unloaded image at its voxels, a difference of two neighbours, is correlated neither with
+the voxel between them nor with the neighbours' mean.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import convolve, map_coordinates, spline_filter
 from scipy.spatial.transform import Rotation
 
 from dvc.arrays import BoolArray, FloatArray
@@ -37,7 +39,9 @@ _SHADED_MM = 10.0  # a mask whose voxels lie nearer to its centre, root mean squ
 _BLOCK_MM = 8.0  # halves of the mask are made of blocks of this size: neighbours share noise and errors
 _LEAST_BLOCKS = 8  # where there are fewer, of voxels
 _LEAST_VOXELS = 16
-_ASIDE_MM = 0.7  # by which the two fits of a pair begin to either side, in each of the six ways to move
+_ASIDE_MM = 1.5  # by which the two fits of a pair begin to either side
+_FARTHEST_MM = 15.0
+_NEIGHBOURS = np.where(np.abs(np.indices((3, 3, 3)) - 1).sum(axis=0) == 1, 1.0 / 6.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,8 +52,8 @@ class _Level:
     ----------
     points : (n, 3)
         LPS mm.
-    values : (n,)
-        I0.
+    values, around : (n,)
+        I0, and the mean of the six neighbours'.
     places : (n, 10 or 1)
         Polynomials of place of which the gain is a sum.
     changes : (n, 6)
@@ -63,6 +67,7 @@ class _Level:
     blur_mm: float
     points: FloatArray
     values: FloatArray
+    around: FloatArray
     places: FloatArray
     changes: FloatArray
     half: BoolArray
@@ -76,7 +81,7 @@ class RigidFit:
     Parameters
     ----------
     reference, loaded : Image
-        Of one contrast, but for a gain that changes smoothly in place; an offset pulls a little.
+        Of one contrast, but for an offset, and a gain that changes smoothly in place.
     mask : Mask
         On the reference grid.
     seed : int
@@ -85,12 +90,14 @@ class RigidFit:
     Raises
     ------
     InputError
-        If the unloaded image has values at fewer than 16 of the mask's voxels.
+        If the unloaded image has values at fewer than 16 of the mask's voxels, or is a single slice.
     """
 
     def __init__(self, reference: Image, loaded: Image, mask: Mask, seed: int) -> None:
         known = Mask(mask.grid, mask.inside & ~reference.missing)
         points = known.points()
+        if min(mask.grid.shape) < 2:
+            raise InputError("The unloaded image is a single slice: a motion in space takes a volume to align.")
         if len(points) < _LEAST_VOXELS:
             raise InputError(f"The unloaded image shows {len(points)} voxels of the mask: too few to align on.")
         self._centre = points.mean(axis=0)
@@ -100,7 +107,6 @@ class RigidFit:
         self._gaps = Image(loaded.grid, missing.astype(np.float32)) if missing.any() else None
         scenes = _scenes(fill_missing(loaded))
         self._levels = [self._level(reference, known, blur, scenes[blur]) for blur in _BLURS_MM]
-        self._aside = self._random.permuted(np.repeat([-1.0, 1.0], 3)) * _ASIDE_MM
 
     def whole(self, start: RigidMotion) -> RigidMotion:
         """The motion found from a start by all of the voxels.
@@ -108,30 +114,38 @@ class RigidFit:
         Raises
         ------
         RegistrationError
-            If half of the voxels leave what the loaded image shows, or its contrast there is turned round.
+            If half of the voxels leave what the loaded image shows, its contrast there is turned round, or the motion
+            goes off by 15 mm.
         """
         motion = start
         for level in self._levels:
             motion = self._settled(level, motion, np.ones(len(level.points), dtype=bool))
+        points = self._levels[0].points
+        moved_mm = float(np.sqrt(np.mean(np.sum((motion.apply(points) - start.apply(points)) ** 2, axis=1))))
+        if moved_mm > _FARTHEST_MM:
+            raise RegistrationError(f"The fit went off by {moved_mm:.0f} mm.")
         return motion
 
-    def halves(self, near: RigidMotion) -> tuple[RigidMotion, RigidMotion]:
-        """Two motions found by one half of the voxels each, begun to either side of one that is near.
+    def halves(self, near: RigidMotion) -> list[tuple[RigidMotion, RigidMotion]]:
+        """Pairs of motions found by one half of the voxels each, begun to either side of one that is near.
 
-        Along a way in which the image tells nothing they stay apart.
+        One pair for each way to move on which the images tell something by itself: the axes of the normal equations.
+        Along one of which they tell nothing its pair stays apart.
 
         Raises
         ------
         RegistrationError
             As from `whole`.
         """
-        found = []
-        for side in (1.0, -1.0):
-            motion = near.after(self._step(side * self._aside))
-            for level in self._levels[_FINE_FROM:]:
-                motion = self._settled(level, motion, level.half if side > 0.0 else ~level.half)
-            found.append(motion)
-        return found[0], found[1]
+        changes = self._levels[-1].changes
+        _, ways = np.linalg.eigh(np.einsum("ni,nj->ij", changes, changes))
+        return [(self._half(near, _ASIDE_MM * way, True), self._half(near, -_ASIDE_MM * way, False)) for way in ways.T]
+
+    def _half(self, near: RigidMotion, aside_mm: FloatArray, first: bool) -> RigidMotion:
+        motion = near.after(self._step(aside_mm))
+        for level in self._levels[_FINE_FROM:]:
+            motion = self._settled(level, motion, level.half == first)
+        return motion
 
     def _level(self, reference: Image, mask: Mask, blur_mm: float, scene: Image) -> _Level:
         box = mask.box(int(np.ceil(3.0 * blur_mm / mask.grid.spacing_mm.min())) + 2)
@@ -156,7 +170,10 @@ class RigidFit:
         if len(kinds) < _LEAST_BLOCKS:
             kinds = block = np.arange(len(at))
         half = self._random.permuted(np.arange(len(kinds)) % 2 == 0)[block.reshape(-1)]
-        return _Level(blur_mm, points, values, places, np.hstack([gradient, turning]), half, scene, 1 if blur_mm else 3)
+        around = convolve(fixed, _NEIGHBOURS, mode="nearest")[tuple(at.T)]
+        return _Level(
+            blur_mm, points, values, around, places, np.hstack([gradient, turning]), half, scene, 1 if blur_mm else 3
+        )
 
     def _settled(self, level: _Level, motion: RigidMotion, part: BoolArray) -> RigidMotion:
         """Where steps over some of a level's points come to rest."""
@@ -184,18 +201,24 @@ class RigidFit:
         values, places, changes = level.values[part][shown], level.places[part][shown], level.changes[part][shown]
         if not ((values - values.mean()) * (carried - carried.mean())).sum() > 0.0:
             raise RegistrationError("What is brighter in the unloaded image is not brighter in the loaded one.")
-        gain = np.einsum("ni,i->n", places, _regressed(places * values[:, None], carried))
+        columns, by = (
+            np.column_stack([places * seen[:, None], np.ones(len(seen))])
+            for seen in (values, level.around[part][shown])
+        )
+        found = _regressed(columns, carried, by)
+        gain = np.einsum("ni,i->n", places, found[:-1])
         gain = np.maximum(gain, _LEAST_GAIN * carried.std() / values.std())
-        return _regressed(changes, values - carried / gain)
+        return _regressed(changes, values - (carried - found[-1]) / gain)
 
     def _step(self, step: FloatArray) -> RigidMotion:
         turn = Rotation.from_rotvec(step[3:] / self._radius_mm).as_matrix()
         return RigidMotion.about(self._centre, turn, step[:3])
 
 
-def _regressed(columns: FloatArray, on: FloatArray) -> FloatArray:
-    """Least squares, by sums whose bits do not depend on threads."""
-    normal, right = np.einsum("ni,nj->ij", columns, columns), np.einsum("ni,n->i", columns, on)
+def _regressed(columns: FloatArray, on: FloatArray, instruments: FloatArray | None = None) -> FloatArray:
+    """Least squares, or with instruments in the columns' place; by sums whose bits do not depend on threads."""
+    by = columns if instruments is None else instruments
+    normal, right = np.einsum("ni,nj->ij", by, columns), np.einsum("ni,n->i", by, on)
     return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-9)[0])
 
 

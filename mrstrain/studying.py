@@ -54,7 +54,7 @@ LABELS_OFF = (0, 1, -1)
 
 # What makes the images: a study goes on only with runs made by the same.
 _MAKING = {"anatomy.py", "bodies.py", "flow.py", "heel.py", "motions.py", "mri.py", "study.py"}
-_ALIGNING = {"align.py", "rigidfit.py"}
+_ALIGNING = {"align.py", "rigidfit.py", "resample.py", "similarity.py", "deformation.py"}
 # Our own engine, which has no release number as elastix has.
 _ENGINE = {
     "gaussnewton.py",

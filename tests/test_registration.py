@@ -165,29 +165,32 @@ def aligned(reference: Image, loaded: Image, bone: Mask) -> Alignment:
 
 
 @pytest.mark.parametrize("noise", [0.0, 3.0])
-def test_row_9_a_bone_along_which_fits_slide_is_not_located(noise):
+@pytest.mark.parametrize("along", [[0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, -2.0, 1.0]], ids=str)
+def test_row_9_a_bone_along_which_fits_slide_is_not_located(along, noise):
     """A rod of uniform signal looks the same all along: fits begun apart stay apart, but for one with a knob."""
-    random = np.random.default_rng(3)
-    grid = Grid((30, 30, 40), np.full(3, 2.0), np.array([-29.0, -29.0, -39.0]))
+    random, axis = np.random.default_rng(3), np.array(along) / np.linalg.norm(along)
+    grid = Grid((36, 36, 36), np.full(3, 2.0), np.full(3, -35.0))
     X = grid.points()
-    rod = np.linalg.norm(X[..., :2], axis=-1) < 9.0
-    knob = np.linalg.norm(X - [9.0, 0.0, 3.0], axis=-1) < 8.0
-    bone = Mask(grid, (rod | knob) & (np.abs(X[..., 2]) < 16.0))
+    ahead = X @ axis
+    rod = np.linalg.norm(X - ahead[..., None] * axis, axis=-1) < 9.0
+    aside = np.cross(axis, [0.3, 0.5, -0.4])
+    knob = np.linalg.norm(X - 9.0 * aside / np.linalg.norm(aside) - 3.0 * axis, axis=-1) < 8.0
+    bone = Mask(grid, (rod | knob) & (np.abs(ahead) < 16.0))
 
     def seen(shape: np.ndarray) -> Image:
         clean = gaussian_filter(np.where(shape, 100.0, 40.0), 0.7)
         return Image(grid, (clean + noise * random.normal(size=shape.shape)).astype(np.float32))
 
-    with pytest.raises(RegistrationError, match=r"differ by \d\.\d\d mm .* the bone is not located"):
+    with pytest.raises(RegistrationError, match="the bone is not located"):
         align(seen(rod), seen(rod), bone, "bone", 1)
     found = align(seen(rod | knob), seen(rod | knob), bone, "bone", 1)
-    assert found.repeatability_mm < (0.3 if noise else 0.02)
+    assert found.repeatability_mm < (0.4 if noise else 0.02)
 
 
 def test_row_9_an_image_without_the_bone_is_refused(small_pair, worker):
     random = np.random.default_rng(5)
     noise = gaussian_filter(random.normal(size=small_pair.loaded.grid.shape), 2.0).astype(np.float32)
-    with pytest.raises(RegistrationError, match="normalised correlation"):
+    with pytest.raises(RegistrationError, match="nowhere does the loaded image look like it"):
         register(
             small_pair.reference,
             Image(small_pair.loaded.grid, noise),

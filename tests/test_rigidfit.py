@@ -48,21 +48,20 @@ def test_the_motion_is_found_on_any_grid(grid: Grid, within: float) -> None:
     assert off_mm(RigidMotion.identity(), mask) > 2.0
     found = fit.whole(RigidMotion.identity())
     assert off_mm(found, mask) < within
-    one, other = fit.halves(found)
-    assert max(off_mm(one, mask), off_mm(other, mask)) < 2.0 * within
+    assert max(off_mm(half, mask) for pair in fit.halves(found) for half in pair) < 2.0 * within
 
 
-def test_a_gain_that_changes_in_place_does_not_matter_and_an_offset_little() -> None:
+def test_an_offset_and_a_gain_that_changes_in_place_do_not_matter() -> None:
     loaded = seen(FINE, MOTION)
     x, y, _ = np.moveaxis((FINE.points() - CENTRE) / 20.0, -1, 0)
     gain = 7.0 * (1.0 + 0.3 * x - 0.2 * y * y + 0.1 * x * y)
-    for values, within in ((gain * loaded.values, 0.005), (loaded.values + 0.3, 0.05)):  # a tenth of the mean
+    for values in (gain * loaded.values, loaded.values + 0.3, loaded.values - 50.0):
         fit = RigidFit(seen(FINE, RigidMotion.identity()), Image(FINE, values.astype(np.float32)), ball(FINE), 1)
-        assert off_mm(fit.whole(RigidMotion.identity()), ball(FINE)) < within
+        assert off_mm(fit.whole(RigidMotion.identity()), ball(FINE)) < 0.005
 
 
 def test_noise_does_not_pull() -> None:
-    """The mean error of 12 draws is a few times less than that of one; a gain by regression would pull it (0.6)."""
+    """The mean error of 12 draws is as much less than that of one as chance has it (0.29); plain regression: 0.6."""
     mask, errors = ball(FINE), []
     for draw in range(12):
         pair = (seen(FINE, motion, 0.2, 2 * draw + n) for n, motion in enumerate((RigidMotion.identity(), MOTION)))
@@ -71,7 +70,7 @@ def test_noise_does_not_pull() -> None:
     single = float(np.sqrt(np.mean(np.sum(np.array(errors) ** 2, axis=2))))
     mean = float(np.sqrt(np.mean(np.sum(np.mean(errors, axis=0) ** 2, axis=1))))
     assert single < 0.07
-    assert mean < 0.5 * single
+    assert mean < 0.45 * single
 
 
 def test_what_the_loaded_image_does_not_show_is_left_out() -> None:
@@ -97,10 +96,16 @@ def test_what_the_unloaded_image_does_not_show_is_left_out_too() -> None:
         RigidFit(Image(FINE, np.full_like(values, np.nan)), seen(FINE, MOTION), mask, 1)
 
 
+def test_a_single_slice_is_refused() -> None:
+    slice_ = Grid((44, 46, 1), np.ones(3), CENTRE - [21.0, 21.0, 0.0])
+    with pytest.raises(InputError, match="single slice"):
+        RigidFit(seen(slice_, RigidMotion.identity()), seen(FINE, MOTION), ball(slice_), 1)
+
+
 def test_a_mask_smaller_than_a_block_has_halves_too() -> None:
     mask = ball(FINE, 4.0)
     fit = RigidFit(seen(FINE, RigidMotion.identity()), seen(FINE, MOTION), mask, 1)
-    assert max(off_mm(half, mask) for half in fit.halves(MOTION)) < 0.05
+    assert max(off_mm(half, mask) for pair in fit.halves(MOTION) for half in pair) < 0.05
 
 
 def test_turned_contrast_is_refused() -> None:
