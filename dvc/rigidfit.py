@@ -36,8 +36,9 @@ _LONGEST_MM = 2.0
 _LEAST_SHOWN = 0.5
 _LEAST_GAIN = 0.1  # of what the images' standard deviations make it: a gain near zero would blow up what is left
 _SHADED_MM = 10.0  # a mask whose voxels lie nearer to its centre, root mean square, has one gain: too small for more
-_BLOCK_MM = 8.0  # halves of the mask are made of blocks of this size: neighbours share noise and errors
-_LEAST_BLOCKS = 8  # where there are fewer, of voxels
+_BLOCK_MM = 8.0  # halves of the mask are made of cubes of this size, like a chessboard: neighbours share noise
+_BLOCK_SHARE = 0.7  # or of this share of the root mean square distance to the centre, where that is less
+_LEAST_SHARE = 0.25  # a half that gets less is drawn voxel by voxel
 _LEAST_VOXELS = 16
 _ASIDE_MM = 1.5  # by which the two fits of a pair begin to either side
 _FARTHEST_MM = 15.0
@@ -58,8 +59,6 @@ class _Level:
         Polynomials of place of which the gain is a sum.
     changes : (n, 6)
         grad I0 . d for unit steps of the six unknowns.
-    half : (n,) bool
-        One of two halves of the points.
     scene, order
         The loaded image, as coefficients of splines of that order.
     """
@@ -70,7 +69,6 @@ class _Level:
     around: FloatArray
     places: FloatArray
     changes: FloatArray
-    half: BoolArray
     scene: Image
     order: int
 
@@ -85,7 +83,7 @@ class RigidFit:
     mask : Mask
         On the reference grid.
     seed : int
-        Of the halves into which the mask is divided.
+        Of the ways in which the mask is divided into halves.
 
     Raises
     ------
@@ -102,6 +100,7 @@ class RigidFit:
             raise InputError(f"The unloaded image shows {len(points)} voxels of the mask: too few to align on.")
         self._centre = points.mean(axis=0)
         self._radius_mm = float(np.sqrt(np.mean(np.sum((points - self._centre) ** 2, axis=1))))
+        self._block_mm = max(min(_BLOCK_MM, _BLOCK_SHARE * self._radius_mm), float(mask.grid.spacing_mm.max()))
         self._random = np.random.default_rng(seed)
         missing = loaded.missing
         self._gaps = Image(loaded.grid, missing.astype(np.float32)) if missing.any() else None
@@ -129,8 +128,9 @@ class RigidFit:
     def halves(self, near: RigidMotion) -> list[tuple[RigidMotion, RigidMotion]]:
         """Pairs of motions found by one half of the voxels each, begun to either side of one that is near.
 
-        One pair for each way to move on which the images tell something by itself: the axes of the normal equations.
-        Along one of which they tell nothing its pair stays apart.
+        One pair for each way to move on which the images tell something by itself, the axes of the normal equations,
+        and with a division of its own. Along a way of which they tell nothing its pair stays apart, or noise leads the
+        halves to places that agree by chance alone.
 
         Raises
         ------
@@ -139,12 +139,25 @@ class RigidFit:
         """
         changes = self._levels[-1].changes
         _, ways = np.linalg.eigh(np.einsum("ni,nj->ij", changes, changes))
-        return [(self._half(near, _ASIDE_MM * way, True), self._half(near, -_ASIDE_MM * way, False)) for way in ways.T]
+        pairs = []
+        for way in _ASIDE_MM * ways.T:
+            corner = self._random.uniform(0.0, 2.0 * self._block_mm, 3)
+            halves = [self._divided(level.points, corner) for level in self._levels[_FINE_FROM:]]
+            one = self._part(near.after(self._step(way)), halves)
+            other = self._part(near.after(self._step(-way)), [~half for half in halves])
+            pairs.append((one, other))
+        return pairs
 
-    def _half(self, near: RigidMotion, aside_mm: FloatArray, first: bool) -> RigidMotion:
-        motion = near.after(self._step(aside_mm))
-        for level in self._levels[_FINE_FROM:]:
-            motion = self._settled(level, motion, level.half == first)
+    def _divided(self, points: FloatArray, corner: FloatArray) -> BoolArray:
+        blocks = np.floor((points - self._centre + corner) / self._block_mm).astype(int)
+        half = blocks.sum(axis=1) % 2 == 0
+        if not _LEAST_SHARE <= half.mean() <= 1.0 - _LEAST_SHARE:
+            half = self._random.permuted(np.arange(len(half)) % 2 == 0)
+        return np.asarray(half)
+
+    def _part(self, motion: RigidMotion, parts: list[BoolArray]) -> RigidMotion:
+        for level, part in zip(self._levels[_FINE_FROM:], parts, strict=True):
+            motion = self._settled(level, motion, part)
         return motion
 
     def _level(self, reference: Image, mask: Mask, blur_mm: float, scene: Image) -> _Level:
@@ -165,14 +178,9 @@ class RigidFit:
         places = np.column_stack([np.ones(len(at)), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x])
         if self._radius_mm < _SHADED_MM:
             places = places[:, :1]
-        blocks = np.floor(at * part.grid.spacing_mm / _BLOCK_MM).astype(int)
-        kinds, block = np.unique(blocks, axis=0, return_inverse=True)
-        if len(kinds) < _LEAST_BLOCKS:
-            kinds = block = np.arange(len(at))
-        half = self._random.permuted(np.arange(len(kinds)) % 2 == 0)[block.reshape(-1)]
         around = convolve(fixed, _NEIGHBOURS, mode="nearest")[tuple(at.T)]
         return _Level(
-            blur_mm, points, values, around, places, np.hstack([gradient, turning]), half, scene, 1 if blur_mm else 3
+            blur_mm, points, values, around, places, np.hstack([gradient, turning]), scene, 1 if blur_mm else 3
         )
 
     def _settled(self, level: _Level, motion: RigidMotion, part: BoolArray) -> RigidMotion:

@@ -187,6 +187,24 @@ def test_row_9_a_bone_along_which_fits_slide_is_not_located(along, noise):
     assert found.repeatability_mm < (0.4 if noise else 0.02)
 
 
+@pytest.mark.parametrize("noise", [0.5, 3.0])
+def test_row_9_a_bone_whose_turning_nothing_shows_is_not_located(noise):
+    """A ball looks the same however it is turned, a flat one when it is about its axis; with three axes it does not."""
+    random, grid = np.random.default_rng(3), Grid((36, 36, 36), np.full(3, 2.0), np.full(3, -35.0))
+
+    def pair(axes: list[float]) -> tuple[Image, Image, Mask]:
+        radius = np.linalg.norm(grid.points() / axes, axis=-1)
+        clean = 40.0 + 60.0 / (1.0 + np.exp(radius - 14.0))
+        images = (clean + noise * random.normal(size=grid.shape) for _ in range(2))
+        one, other = (Image(grid, values.astype(np.float32)) for values in images)
+        return one, other, Mask(grid, radius < 14.0)
+
+    for axes in ([1.0, 1.0, 1.0], [1.0, 1.0, 0.6]):
+        with pytest.raises(RegistrationError, match="the bone is not located"):
+            align(*pair(axes), "bone", 1)
+    assert align(*pair([1.0, 1.6, 0.6]), "bone", 1).repeatability_mm < 0.2 * noise
+
+
 def test_row_9_an_image_without_the_bone_is_refused(small_pair, worker):
     random = np.random.default_rng(5)
     noise = gaussian_filter(random.normal(size=small_pair.loaded.grid.shape), 2.0).astype(np.float32)
