@@ -81,6 +81,20 @@ def _fastest() -> str:
     return "ngsolve" if find_spec("ngsolve") is not None else "superlu"
 
 
+def self_test() -> str:
+    """Solve a small system; return a sentence on what came out, for `mrstrain doctor`."""
+    A = sparse.diags([4.0, -1.0], [0, 1], shape=(100, 100), format="csr")
+    A.sort_indices()
+    solver = factors(A.indptr.astype(np.int64), A.indices.astype(np.int64))
+    solver.factorise(A.data)
+    x = solver.solve(np.ones(100))
+    solver.close()
+    whole = A + sparse.triu(A, 1).T
+    if np.abs(whole @ x - 1.0).max() > _FINE:
+        raise MrstrainError(f"{_fastest()} solved a hundred equations wrongly.")
+    return f"{_fastest()} solved a hundred equations"
+
+
 class _Pardiso:
     def __init__(self, indptr: IntArray, indices: IntArray, threads: int, rough: bool) -> None:
         from pypardiso import PyPardisoSolver

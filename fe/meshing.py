@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError, WorkerError
-from dvc.image import LabelMap
+from dvc.image import Grid, LabelMap
 from dvc.mesh import FACES, TetMesh, signed_volumes
 from dvc.worker import Worker
 from fe.facets import BONE, CUT, SKIN
@@ -54,6 +54,33 @@ class MeshQuality:
     thin: tuple[tuple[str, float], ...]
 
 
+def check_meshing(
+    labels: LabelMap, edge_mm: float, bones: Sequence[str], finer: tuple[str, float] | None
+) -> dict[str, int]:
+    """Refuse what `mesh_labels` would, before it begins; return the numbers of the regions that the label map has.
+
+    Raises
+    ------
+    InputError
+        If an edge length is out of range, a region is not in the label map, or no soft tissue is left.
+    """
+    spacing = float(labels.grid.spacing_mm.min())
+    if not 0.5 * spacing <= edge_mm <= 20.0:
+        raise InputError(
+            f"The edge length must lie between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm}."
+        )
+    if finer is not None and not 0.0 < finer[1] < edge_mm:
+        raise InputError(f"The finer edge length must lie between 0 and {edge_mm} mm; got {finer[1]}.")
+    there = set(np.unique(labels.labels).tolist())
+    numbers = {name: number for number, name in labels.names.items() if number in there}
+    for name in (*bones, *((finer[0],) if finer else ())):
+        if name not in numbers:
+            raise labels.no_region(name)
+    if not numbers.keys() - set(bones):
+        raise InputError(f"No soft tissue is left in the label map beside {', '.join(bones)}.")
+    return numbers
+
+
 def mesh_labels(
     labels: LabelMap,
     edge_mm: float,
@@ -90,7 +117,7 @@ def mesh_labels(
     Raises
     ------
     InputError
-        If the edge length is out of range, or a region is not in the label map.
+        As from `check_meshing`.
     MrstrainError
         If a tissue vanished or lost a fifth of its volume, or meshing took too long.
 
@@ -101,18 +128,9 @@ def mesh_labels(
     angle under 12 degrees, nodes are moved until there is none or no move helps. They differ a little from one run to
     the next: keep a mesh, and its hash, with what was computed on it.
     """
-    spacing = float(labels.grid.spacing_mm.min())
-    if not 0.5 * spacing <= edge_mm <= 20.0:
-        raise InputError(
-            f"The edge length must lie between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm}."
-        )
-    numbers = {name: number for number, name in labels.names.items() if (labels.labels == number).any()}
-    for name in (*bones, *((finer[0],) if finer else ())):
-        if name not in numbers:
-            raise labels.no_region(name)
+    numbers = check_meshing(labels, edge_mm, bones, finer)
     soft = {name: number for name, number in numbers.items() if name not in bones}
-    if not soft:
-        raise InputError(f"No soft tissue is left in the label map beside {', '.join(bones)}.")
+    spacing = float(labels.grid.spacing_mm.min())
     borders = borders_of(labels)
     lattice = None if finer is None else _lattice(labels, numbers[finer[0]], edge_mm, finer[1])
     points, cells = _limited(borders, edge_mm, _ENVELOPE * spacing, lattice, limit_s, watch)
@@ -125,6 +143,15 @@ def mesh_labels(
     points = without_slivers(points, cells[body], found[body])
     mesh = _named(points, cells, found, soft, [numbers[b] for b in bones], labels)
     return mesh, _quality(mesh, labels, soft)
+
+
+def self_test() -> str:
+    """Mesh a small ball around a bone; return a sentence on what came out, for `mrstrain doctor`."""
+    grid = Grid((12, 12, 12), np.ones(3), np.full(3, -5.5))
+    radius = np.linalg.norm(grid.points(), axis=-1)
+    labels = LabelMap(grid, (radius < 5.0) + (radius < 2.5).astype(np.int64), {1: "fat", 2: "bone"})
+    _, quality = mesh_labels(labels, 2.0, limit_s=60.0)
+    return f"a ball became {quality.cells} cells"
 
 
 def _refuse_lost(
@@ -206,8 +233,6 @@ def _lattice(labels: LabelMap, label: int, edge_mm: float, finer_mm: float) -> t
     """Edge lengths on a lattice of tetrahedra: ``finer_mm`` in a region, rising to ``edge_mm`` away from it."""
     from scipy.ndimage import distance_transform_edt
 
-    if not 0.0 < finer_mm < edge_mm:
-        raise InputError(f"The finer edge length must lie between 0 and {edge_mm} mm; got {finer_mm}.")
     grid = labels.grid
     inside = np.nonzero(labels.labels)
     away = distance_transform_edt(labels.labels != label, sampling=grid.spacing_mm)

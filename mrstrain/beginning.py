@@ -9,6 +9,7 @@ from pathlib import Path
 
 import jinja2
 
+from dvc.dicom import is_dicom
 from dvc.errors import InputError, OutputError
 from dvc.whole import write_whole
 from fe.published import published_names
@@ -29,6 +30,7 @@ _ROLES = {
     "labels": "the label map", "mesh_labels": "the label map to be meshed", "bone_mask": "the bone",
     "repeat": "the repeat scan", "load": "the load of that name",
 }  # fmt: skip
+_LOOKED_AT = 20
 _TABLES = (".csv", ".txt", ".label", ".ctbl")
 
 
@@ -62,10 +64,8 @@ class Begun:
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.passed_over.items()]
-        return [
-            *lines,
-            f"Study file: {self.path}. Put the forces in; then: mrstrain check {self.path.parent}",
-        ]
+        todo = "Put the forces in" if found.load0 and found.loads else "Put in what was not found, and the forces"
+        return [*lines, f"Study file: {self.path}. {todo}; then: mrstrain check {self.path.parent}"]
 
 
 def init(folder: Path | str, *, name: str = "Subject 01") -> Begun:
@@ -104,7 +104,8 @@ def init(folder: Path | str, *, name: str = "Subject 01") -> Begun:
 def _look(place: Path) -> Found:
     found = Found()
     images = sorted(p.name for p in place.iterdir() if p.name.lower().endswith(IMAGES) and p.is_file())
-    images += sorted(p.name for p in place.iterdir() if p.is_dir() and any(p.glob("*.dcm")))
+    folders = sorted(p for p in place.iterdir() if p.is_dir())
+    images += [p.name for p in folders if _holds_dicom(p)]
     for name in images:
         role = _role(_stem(name))
         if role == "load":
@@ -121,10 +122,20 @@ def _look(place: Path) -> Found:
             found.passed_over[name] = f"since {taken} is taken for {_ROLES[role]}"
     found.names = _table(place, found.labels)
     found.mesh_names = _table(place, found.mesh_labels)
-    for inside in sorted(p for p in place.iterdir() if p.is_dir() and p.name not in images):
+    for inside in folders:
+        if inside.name in images:
+            continue
         if any((inside / (load + ending)).is_file() for load in found.loads for ending in ENDINGS):
             found.results.append(inside.name)
+        elif _role(inside.name) is not None:
+            found.passed_over[inside.name] = "a folder without a DICOM image in it"
     return found
+
+
+def _holds_dicom(folder: Path) -> bool:
+    """Whether one of a folder's first files is a DICOM image, whatever it is called."""
+    some = sorted(p for p in folder.iterdir() if p.is_file())[:_LOOKED_AT]
+    return any(is_dicom(p) for p in some)
 
 
 def _role(stem: str) -> str | None:

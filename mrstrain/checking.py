@@ -19,12 +19,12 @@ from dvc.mesh import TetMesh
 from dvc.uncertainty import error_model_of, read_error_model
 from dvc.worker import usable_cores
 from fe.facets import fixed_facets
-from fe.meshstore import read_tet_mesh
+from fe.meshing import check_meshing
 from fe.plate import Plate
 from fe.published import MaterialSet, material_set
 from fe.simulate import LoadStep, check_loads
 from fe.simulate import check as check_simulation
-from mrstrain.costs import costs, sizes_of
+from mrstrain.costs import costs, mesh_given, sizes_of
 from mrstrain.engines import settings_of
 from mrstrain.inputs import is_bones_name
 from mrstrain.ledger import Ledger
@@ -64,10 +64,20 @@ class Checked:
 
 @dataclass(slots=True)
 class _Findings:
-    """What was found so far; as in `Checked`."""
+    """What was found so far; as in `Checked`, of files that cannot be read only where ``of_files`` is set."""
 
+    of_files: bool = True
     wrong: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def read(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
+        """What a file holds; None where it cannot be read."""
+        if self.of_files:
+            return self.tried(read, *given, **options)
+        try:
+            return read(*given, **options)
+        except (MrstrainError, OSError):
+            return None
 
     def tried(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
         """What a function gives; None where it refuses, which is noted once."""
@@ -95,21 +105,11 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         If the study file itself cannot be read.
     """
     told, found = read_study(study), _Findings()
-    reference, labels = _images(told, found)
-    _registration(told, found)
-    for normal, shear in ((told.plate.normal, told.plate.shear_direction), *towards(told).values()):
-        found.tried(plate_axes, -np.asarray(normal), shear)
-    if labels is not None and (told.models.sets or told.models.results):
-        found.tried(check_bones, labels, told.mesh.bones)
+    reference, labels = _reference(told, found)
+    _loaded(told, found, reference)
+    _alike(told, found, reference, labels)
     if labels is not None and told.models.results:
         found.tried(_foreign, told, found, labels)
-    if told.models.sets:
-        _simulations(told, found, reference, labels)
-    if told.compare.thresholds is not None:
-        found.tried(read_thresholds, told.path(told.compare.thresholds))
-    low, high = told.compare.strains
-    if not 0.0 <= low < high:
-        found.wrong.append(f"[compare] strains: the range rises from 0 or more; got {low:g} to {high:g}.")
     planned = found.tried(plan, told)
     if planned is not None and not found.wrong:
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
@@ -121,13 +121,36 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     return Checked(tuple(found.wrong), tuple(found.notes))
 
 
-def _images(study: Study, found: _Findings) -> tuple[Image | None, LabelMap | None]:
-    """Look at images, labels and masks; give the unloaded image, and the labels on it."""
+def wrong_for_all(study: Study) -> tuple[str, ...]:
+    """What keeps every load or model of a study from being what it says, in sentences, found in a second or two.
+
+    Files that are damaged, and loaded images, are left to the stages: they keep only what is made from them.
+    """
+    found = _Findings(of_files=False)
+    _alike(study, found, *_reference(study, found))
+    return tuple(found.wrong)
+
+
+def _alike(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> None:
+    """Look at what holds for all loads: settings, the plate, and the models' laws and mesh."""
+    _registration(study, found)
+    for normal, shear in ((study.plate.normal, study.plate.shear_direction), *towards(study).values()):
+        found.tried(plate_axes, -np.asarray(normal), shear)
+    if labels is not None and (study.models.sets or study.models.results):
+        found.tried(check_bones, labels, study.mesh.bones)
+    if study.models.sets:
+        _simulations(study, found, reference, labels)
+    if study.compare.thresholds is not None:
+        found.tried(read_thresholds, study.path(study.compare.thresholds))
+
+
+def _reference(study: Study, found: _Findings) -> tuple[Image | None, LabelMap | None]:
+    """Look at the unloaded image, labels and masks; give the image, and the labels on it."""
     images = study.images
-    reference = found.tried(_image, study, images.load0)
+    reference = found.read(_image, study, images.load0)
     if reference is not None:
         found.notes.append(f"Load0: {reference.grid}")
-    labels = found.tried(read_labels, study.path(images.labels), _optional(study, images.names))
+    labels = found.read(read_labels, study.path(images.labels), _optional(study, images.names))
     if labels is not None:
         found.notes.append(f"Labels: {', '.join(labels.names.values())}")
         if reference is not None:
@@ -138,6 +161,12 @@ def _images(study: Study, found: _Findings) -> tuple[Image | None, LabelMap | No
         for mask in (images.bone_mask, images.tissue):
             if mask is not None:
                 found.tried(read_mask, study.path(mask), reference.grid)
+    return reference, labels
+
+
+def _loaded(study: Study, found: _Findings, reference: Image | None) -> None:
+    """Look at the loaded images and the repeat scan."""
+    images = study.images
     others = {load: one.image for load, one in study.loads.items()}
     if images.repeat is not None:
         others[REPEAT] = images.repeat
@@ -151,7 +180,6 @@ def _images(study: Study, found: _Findings) -> tuple[Image | None, LabelMap | No
             twin = hashes.setdefault(hashlib.sha256(image.values.tobytes()).hexdigest(), name)
             if twin != name:
                 found.wrong.append(f"{name} is the image of {twin}: every voxel is equal.")
-    return reference, labels
 
 
 def _registration(study: Study, found: _Findings) -> None:
@@ -159,7 +187,7 @@ def _registration(study: Study, found: _Findings) -> None:
     how = study.registration
     settings = found.tried(
         settings_of, how.engine, how.preset, [study.path(p) for p in how.parameters], bending=how.bending,
-        volume=how.volume, borders=how.borders, labelled=study.images.labels is not None,
+        volume=how.volume, borders=how.borders, labelled=True,
     )  # fmt: skip
     if settings is None:
         return
@@ -194,7 +222,7 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
             loads.append((plate, steps))
     if study.mesh.file is not None:
         file = study.path(study.mesh.file)
-        mesh = found.tried(read_tet_mesh, file)
+        mesh = found.read(mesh_given, study, study.mesh.file)
         if mesh is None:
             return
         if reference is not None:
@@ -203,7 +231,7 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
         return
     if study.mesh.labels is not None:
         to_mesh = study.path(study.mesh.labels)
-        labels = found.tried(read_labels, to_mesh, _optional(study, study.mesh.names))
+        labels = found.read(read_labels, to_mesh, _optional(study, study.mesh.names))
     unknown = {name.casefold() for name in study.models.fixed} - {"bone", "cut"}
     if unknown:
         found.wrong.append(
@@ -239,9 +267,9 @@ def _on_mesh(
 
 def _on_labels(study: Study, found: _Findings, labels: LabelMap, sets: Sequence[MaterialSet]) -> None:
     """Look whether a label map has the regions that are named, and each set a law for every tissue that is meshed."""
-    finer = [] if study.mesh.finer is None else [study.mesh.finer.region]
-    for region in (*study.mesh.bones, *finer):
-        found.tried(labels.region, region)
+    how = study.mesh
+    finer = None if how.finer is None else (how.finer.region, how.finer.edge_mm)
+    found.tried(check_meshing, labels, how.edge_mm, how.bones, finer)
     numbers = np.unique(labels.labels)
     soft = [name for n, name in labels.names.items() if n != 0 and n in numbers and name not in study.mesh.bones]
     found.notes += [
@@ -261,7 +289,7 @@ def _image(study: Study, given: str) -> Image:
     place = study.path(given)
     if not place.exists():
         raise InputError(f"{place}: there is no such file.")
-    return read_image(place)
+    return read_image(place, allow_missing=study.images.allow_missing)
 
 
 def _optional(study: Study, given: str | None) -> Path | None:

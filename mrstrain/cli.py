@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+from collections.abc import Callable
+from importlib import import_module
 from typing import Annotated
 
 import typer
@@ -65,14 +67,17 @@ def doctor() -> None:
     """Is this machine fit to run mrstrain?"""
     from mrstrain.doctor import examine
 
-    def registration() -> str:
-        from dvc.elastix import self_test
-        from dvc.worker import Worker
+    def trial(what: str, module: str) -> Callable[[], str]:
+        def run() -> str:
+            from dvc.worker import Worker
 
-        with Worker(threads=1) as worker:
-            return worker.run("trying elastix", self_test)
+            with Worker(threads=1) as worker:
+                return str(worker.run(f"trying {what}", import_module(module).self_test))
 
-    findings = examine(elastix_check=registration)
+        return run
+
+    tried = {"itk-elastix": "dvc.elastix", "pytetwild": "fe.meshing", "sparse solver": "fe.linear"}
+    findings = examine(trials={what: trial(what, module) for what, module in tried.items()})
     for finding in findings:
         typer.echo(f"{'ok  ' if finding.ok else 'NOT '} {finding.what}: {finding.detail}")
         if not finding.ok and finding.advice:

@@ -28,7 +28,7 @@ from mrstrain.page import flat
 from mrstrain.provenance import provenance, versions, write_json
 from validate.comparison import ALL_LOADS, Comparison, total
 from validate.comparison import compare as compare_load
-from validate.curves import RANGE, Area
+from validate.curves import RANGE, Area, check_range
 from validate.levelled import LEVELLED
 from validate.location import LEAST_ML, read_thresholds
 from validate.mapping import ALL, check_bones
@@ -38,7 +38,6 @@ from validate.sources import check_overlap
 Told = Callable[[str, str, float], None]
 
 _WHOLE = 0.9  # share of the mesh under which a model's cover is told
-_MOST_STRAIN = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,11 +151,9 @@ def compare(
         If measurement and models have no load in common, or as in `validate.comparison.compare`.
     """
     target, tell = Path(out), progress or (lambda *_: None)
-    if not 0.0 <= strains[0] < strains[1] <= _MOST_STRAIN or least_ml < 0.0:
-        raise InputError(
-            f"The range of strain must rise from 0 or more to {_MOST_STRAIN:g} or less (no percent), and a volume be "
-            f"0 or more; got {strains[0]:g} to {strains[1]:g}, {least_ml:g} mL."
-        )
+    check_range(strains)
+    if least_ml < 0.0:
+        raise InputError(f"The smallest cluster's volume must be 0 or more; got {least_ml:g} mL.")
     usual_axes = plate_axes(-np.asarray(plate_normal, dtype=np.float64), shear_direction)
     own_axes = {load: plate_axes(-np.asarray(away), along) for load, (away, along) in (towards or {}).items()}
     thresholds_used = read_thresholds(None if thresholds is None else Path(thresholds))

@@ -10,6 +10,7 @@ import numpy as np
 from dvc.image import LabelMap
 from dvc.imagefile import read_image
 from dvc.labels import read_labels
+from dvc.mesh import TetMesh
 from dvc.registration import GAUSS_NEWTON
 from fe.meshstore import read_tet_mesh
 from fe.simulate import LoadStep
@@ -60,7 +61,7 @@ def sizes_of(study: Study) -> tuple[float, float]:
     if not study.models.sets:
         return voxels, 0.0
     if study.mesh.file is not None:
-        return voxels, float(len(read_tet_mesh(study.path(study.mesh.file)).cells))
+        return voxels, float(len(mesh_given(study, study.mesh.file).cells))
     labels = read_labels(*labels_to_mesh(study))
     return voxels, cells_expected(labels, study.mesh.bones, study.mesh.edge_mm)
 
@@ -111,18 +112,30 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
 
 def disk_bytes(stage: Stage, study: Study, voxels: float) -> float:
     """About how much room the results of a stage take; parameters as in `seconds_of`."""
-    loads = len(study.loads)
     if stage.kind == "register":
         return _BYTES_VOXEL * voxels
-    if stage.kind == "level":
-        return loads * (_BYTES_VOXEL * voxels + 1e6 * _MB_MODEL)
-    return 1e6 * _MB_MODEL * (1 if stage.kind == "mesh" else loads)
+    if stage.kind == "level":  # of one load
+        return _BYTES_VOXEL * voxels + 1e6 * _MB_MODEL
+    return 1e6 * _MB_MODEL * (1 if stage.kind == "mesh" else len(study.loads))
+
+
+def _longest(left: Sequence[Stage], seconds: Sequence[float]) -> float:
+    """Seconds of the longest row of stages that wait for one another: no number of cores makes less of it."""
+    until: dict[str, float] = {}
+    for stage, own in zip(left, seconds, strict=True):
+        until[stage.name] = own + max((until.get(name, 0.0) for name in stage.before), default=0.0)
+    return max(until.values())
+
+
+def mesh_given(study: Study, file: str) -> TetMesh:
+    """The mesh made elsewhere that a study names."""
+    return read_tet_mesh(study.path(file), unit=study.mesh.unit, frame=study.mesh.frame)
 
 
 def _with_borders(study: Study) -> bool:
     how = study.registration
     ours = engine_of(how.engine, how.preset, how.parameters) == GAUSS_NEWTON
-    return ours and how.borders is not False and study.images.labels is not None
+    return ours and how.borders is not False
 
 
 def costs(
@@ -133,7 +146,7 @@ def costs(
     Other parameters are those of `seconds_of`; ``workers`` are the stages at once.
     """
     seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
-    minutes = max(sum(seconds) / workers, *seconds) / 60.0
+    minutes = max(sum(seconds) / workers, _longest(left, seconds)) / 60.0
     gib = sorted((gib_of(stage, study, voxels, cells) for stage in left), reverse=True)
     needed = sum(gib[:workers])  # whichever of them meet
     disk = sum(disk_bytes(stage, study, voxels) for stage in left) / 1e9

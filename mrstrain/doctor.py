@@ -13,7 +13,7 @@ import platform
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +26,8 @@ _RIVALS = {
 }
 _NEEDED = (
     "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "meshio", "nibabel", "pydicom", "numba",
-    "matplotlib", "jinja2", "rich", "typer",
+    "matplotlib", "jinja2", "rich", "typer", "loky", "distributed", "filelock", "pydantic", "pytetwild", "pyvista",
+    "vtk",
 )  # fmt: skip
 _ELASTIX = "0.25."  # the series that the parameters and their checks were written for
 _OLDEST_PYTHON = (3, 11)
@@ -64,15 +65,18 @@ class Finding:
     advice: str = ""
 
 
-def examine(folder: str | os.PathLike[str] = ".", *, elastix_check: Callable[[], str] | None = None) -> list[Finding]:
+def examine(
+    folder: str | os.PathLike[str] = ".", *, trials: Mapping[str, Callable[[], str]] | None = None
+) -> list[Finding]:
     """Look at all that a run depends on, and stop at nothing.
 
     Parameters
     ----------
     folder : path
         Where results would be written; its disk is looked at. The nearest existing parent counts.
-    elastix_check : callable, optional
-        Registers a tiny pair in a worker process, and returns a line on how it went; raises where it failed.
+    trials : mapping of str to callable, optional
+        By the distribution that each tries: does something small, and returns a line on how it went; raises where it
+        failed.
 
     Returns
     -------
@@ -80,9 +84,7 @@ def examine(folder: str | os.PathLike[str] = ".", *, elastix_check: Callable[[],
         In the order in which they are best mended.
     """
     findings = [_python(), _foreign(), *_packages(), _cores(), _memory(), _disk(Path(folder)), _temporary()]
-    if elastix_check is not None:
-        findings.append(_registration(elastix_check))
-    return findings
+    return [*findings, *(_tried(what, trial) for what, trial in (trials or {}).items())]
 
 
 def refuse_foreign_packages() -> None:
@@ -244,10 +246,10 @@ def _temporary() -> Finding:
     return Finding("temporary folder", True, f"{tempfile.gettempdir()} is writable")
 
 
-def _registration(elastix_check: Callable[[], str]) -> Finding:
+def _tried(what: str, trial: Callable[[], str]) -> Finding:
     try:
-        return Finding("registration", True, elastix_check())
+        return Finding(f"trial of {what}", True, trial())
     except Exception as error:
         # whatever goes wrong in the worker is a finding here, and not the end of the examination
-        advice = "Reinstall itk-elastix in an environment of its own; the line above is what it said."
-        return Finding("registration", False, f"{type(error).__name__}: {error}", advice)
+        advice = f"Reinstall {what} in an environment of its own; the line above is what it said."
+        return Finding(f"trial of {what}", False, f"{type(error).__name__}: {error}", advice)

@@ -56,7 +56,8 @@ def settings_of(
         return Settings.of(preset or "heel-mr")
     if parameters or preset:
         raise ParameterError(
-            f"Presets and parameter files are elastix'; the engine {GAUSS_NEWTON} takes weights: bending and volume."
+            f"Presets and parameter files are elastix'; the engine {GAUSS_NEWTON} takes weights: bending and volume. "
+            "Leave the engine out, or name elastix."
         )
     if borders and not labelled:
         raise InputError("Borders need the tissues: give a label map of the unloaded image (labels).")

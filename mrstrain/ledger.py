@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dvc.whole import write_whole
 from mrstrain.plan import Stage
-from mrstrain.provenance import file_hash, own_code, versions
+from mrstrain.provenance import file_hash, own_code, versions, without_folders
 from mrstrain.stages import Given
 
 _MATTERS = ("itk-elastix", "pytetwild")
@@ -83,12 +83,9 @@ class Ledger:
         return text
 
     def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:
-        """Hashes of a stage's input files, and its arguments without the study's own place.
-
-        A study that is moved as a whole so stays finished.
-        """
-        plain = json.dumps(arguments, sort_keys=True, default=list).replace(str(self.home), "")
-        return {"files": [[path.name, self._hash(path)] for path in stage.files], "arguments": json.loads(plain)}
+        """Hashes of a stage's input files, and its arguments without folders: a study that is moved stays finished."""
+        files = [[path.name, self._hash(path)] for path in stage.files]
+        return {"files": files, "arguments": without_folders(arguments, self.home)}
 
     def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, Record]) -> str:
         """Hash of what a stage would be made from now; ``built_on`` are the stages whose results it reads."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -117,7 +117,8 @@ class Pipeline:
 
     def _settled(self, stage: Stage) -> Mapping[str, Any] | None:
         """Give the arguments of a stage that has to be run now; None for one whose outcome is known."""
-        lacking, asked = self._lacking(stage), self._asked(stage)
+        there = {name for name, outcome in self.outcomes.items() if outcome.record is not None}
+        lacking, asked = _lacking(stage, there), self._asked(stage)
         if lacking:
             self.outcomes[stage.name] = Outcome(stage.name, None, f"Not run: {lacking}", asked=asked)
             return None
@@ -149,14 +150,22 @@ class Pipeline:
         return self.ledger.reason(stage) or "Not run: it has no result, and is not among those asked for."
 
     def forecast(self) -> dict[str, str]:
-        """What a run would do with each stage, without doing it: "done already", "run", or "left out"."""
+        """What a run would do with each stage, without doing it.
+
+        "done already", "run", "left out", or "cannot be run" and what for.
+        """
         told: dict[str, str] = {}
         kept = {stage.name: self.ledger.finished(stage) for stage in self.stages}
+        there: set[str] = set()
         for stage in self.stages:
             anew = any(told[name] == "run" for name in stage.before)
             record = kept[stage.name]
+            lacking = _lacking(stage, there)
             if not self._asked(stage):
                 told[stage.name] = "left out"
+            elif lacking:
+                told[stage.name] = f"cannot be run: {lacking}"
+                continue
             elif anew or record is None or _among(stage, self._force, default=False):
                 told[stage.name] = "run"
             else:
@@ -168,21 +177,14 @@ class Pipeline:
                 made_from = self.ledger.made_from(stage, {**stage.arguments, **some})
                 same = record.key == self.ledger.key(stage, made_from, built_on) and not record.given.retry
                 told[stage.name] = "done already" if same else "run"
+            if record is not None or told[stage.name] == "run":
+                there.add(stage.name)
         return told
 
     def to_do(self) -> list[Stage]:
         """The stages that a run would work on."""
         forecast = self.forecast()
         return [stage for stage in self.stages if forecast[stage.name] == "run"]
-
-    def _lacking(self, stage: Stage) -> str:
-        for name in stage.after:
-            if self.outcomes[name].record is None:
-                return f"{name} has no result."
-        for of in stage.some.values():
-            if all(self.outcomes[name].record is None for name in of):
-                return f"none of {', '.join(of)} has a result."
-        return ""
 
     def _arguments(self, stage: Stage) -> Mapping[str, Any]:
         there = {
@@ -263,6 +265,17 @@ def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], tell: Ma
             prefix = next(p for p in pipelines if full.startswith(p) and full[len(p) :] in pipelines[p].names)
             pipelines[prefix].end(full[len(prefix) :], given, seconds, tell[prefix])
             pipelines[prefix].start(cluster, tell[prefix], prefix)
+
+
+def _lacking(stage: Stage, there: Set[str]) -> str:
+    """Which result a stage cannot do without, of those that are there; empty where it can be run."""
+    for name in stage.after:
+        if name not in there:
+            return f"{name} has no result."
+    for of in stage.some.values():
+        if there.isdisjoint(of):
+            return f"none of {', '.join(of)} has a result."
+    return ""
 
 
 def _among(stage: Stage, chosen: Sequence[str], *, default: bool) -> bool:

@@ -79,7 +79,7 @@ def plan(study: Study) -> tuple[Stage, ...]:
     ------
     InputError
         If two material sets or models would share a folder, a load that is simulated has no force, or models are
-        levelled without a bone.
+        levelled without a bone, or on an image with gaps.
     """
     stages = _registrations(study)
     loads = tuple(study.loads)
@@ -147,6 +147,7 @@ def _registrations(study: Study) -> list[Stage]:
         "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "seed": study.study.seed, "threads": 1,
     }  # fmt: skip
+    shared |= {"allow_missing": True} if images.allow_missing else {}
     weights = {"bending": how.bending, "volume": how.volume}
     shared |= {name: weight for name, weight in weights.items() if weight is not None}
     files = (load0, *(Path(p) for p in aside.values()), *own, *error_model)
@@ -181,9 +182,8 @@ def mesh_place(study: Study) -> Path:
 
 def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:
     """The label map that is meshed, and the table of its names."""
-    own = study.mesh.labels is not None
-    labels, names = (study.mesh.labels, study.mesh.names) if own else (study.images.labels, study.images.names)
-    assert labels is not None  # the study file was refused without
+    own = study.mesh.labels
+    labels, names = (own, study.mesh.names) if own else (study.images.labels, study.images.names)
     return study.path(labels), None if names is None else study.path(names)
 
 
@@ -226,6 +226,7 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))), "element": study.models.element,
         "decks": study.models.decks,
         "limit_s": None if study.models.limit_minutes is None else 60.0 * study.models.limit_minutes,
+        "mesh_unit": study.mesh.unit, "mesh_frame": study.mesh.frame,
     }  # fmt: skip
     return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
 
@@ -265,7 +266,7 @@ def load_steps(study: Study) -> dict[str, LoadStep]:
 def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured: Mapping[str, str]) -> Stage:
     arguments = {
         "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "dvc": str(study.out / REGISTRATION),
-        "material": study.set_given(one),
+        "material": study.set_given(one), "mesh_unit": study.mesh.unit, "mesh_frame": study.mesh.frame,
     }  # fmt: skip
     gives = (study.out / MODELS / (name + ENDING),)
     return Stage(f"drive {name}", arguments, _own(study, one), gives, meshed, {"loads": measured})
@@ -274,6 +275,8 @@ def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
     if study.bone is None and study.images.bone_mask is None:
         raise InputError("[models] level = true needs a bone, where models are at rest: [images] bone, or bone_mask.")
+    if study.images.allow_missing:
+        raise InputError("[models] level = true needs an unloaded image without gaps: [images] allow_missing = false.")
     sent = _registrations(study)[-1].arguments
     arguments = {key: sent[key] for key in _AS_MEASURED}
     arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}

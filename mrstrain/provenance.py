@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 import re
 from collections.abc import Mapping
@@ -12,6 +13,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from dvc.whole import write_whole
 from dvc.worker import usable_cores
@@ -151,3 +153,20 @@ def provenance(
 def write_json(path: Path, content: Mapping[str, object]) -> None:
     """Write JSON whole or not at all; NaN is refused, as JSON has none."""
     write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def without_folders(told: Any, home: Path) -> Any:
+    """Values without the place of a study: paths in its folder from there, those outside by the file's name alone.
+
+    A study that is moved as a whole so stays the same; and folders may name a patient.
+    """
+    if isinstance(told, Mapping):
+        return {key: without_folders(value, home) for key, value in told.items()}
+    if isinstance(told, list | tuple | set | frozenset):
+        return [without_folders(value, home) for value in told]
+    if not isinstance(told, str):
+        return told
+    if not os.path.isabs(told):
+        return Path(told).name if Path(os.path.normpath(told)).parts[:1] == ("..",) else told
+    place = Path(os.path.normpath(told))
+    return place.relative_to(home).as_posix() if place.is_relative_to(home) else place.name

@@ -43,6 +43,7 @@ def register_one(
     repeat: Path | None = None,
     after: Path | None = None,
     twin: bool = False,
+    allow_missing: bool = False,
     threads: int = 1,
     seed: int = 1,
     tell: Callable[[str, float], None] = lambda *_: None,
@@ -73,12 +74,11 @@ def register_one(
         names=names,
         plate_normal=plate_normal,
         shear_direction=shear_direction,
+        allow_missing=allow_missing,
     )
-    loaded = read_image(load)
+    loaded = read_image(load, allow_missing=allow_missing)
     settings = replace(
-        settings_of(
-            engine, preset, parameters, bending=bending, volume=volume, borders=borders, labelled=labels is not None
-        ),
+        settings_of(engine, preset, parameters, bending=bending, volume=volume, borders=borders, labelled=True),
         align_on=align,
         seed=seed,
         threads=threads,
@@ -93,6 +93,7 @@ def register_one(
         {
             "chain": after is not None,
             "twin": twin,
+            "allow_missing": allow_missing,
             "bone_label": bone if isinstance(bone, str) else None,
             "shear_direction_lps": None if shear_direction is None else list(shear_direction),
         },

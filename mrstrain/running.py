@@ -12,6 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from dvc.errors import InputError, OutputError, ParameterError
+from mrstrain.checking import wrong_for_all
 from mrstrain.costs import disk_bytes, seconds_of, sizes_of
 from mrstrain.inputs import make_output, refuse_small_disk
 from mrstrain.ledger import Ledger
@@ -110,7 +111,8 @@ def run(
     Raises
     ------
     InputError
-        If the study cannot be read, or a file is missing; before anything is run.
+        If the study cannot be read, a file is missing, or something is wrong that all loads or models have in common;
+        before anything is run.
     ParameterError
         If both a scheduler and a number of workers are given.
     OutputError
@@ -139,7 +141,7 @@ def run_studies(
     planned = [plan(study) for study in studies]
     for stages in planned:
         refuse_unknown(stages, only, force)
-        refuse_missing(stages)
+    refuse_missing(planned)
     tell, ended = progress or (lambda *_: None), 0.0
     seconds: dict[str, float] = {}
     stages_told = f"{sum(map(len, planned))} stages"
@@ -165,17 +167,20 @@ def run_studies(
         return cluster(tell, [study.out for study in studies], scheduler=scheduler, workers=workers)
 
     on_disk: dict[int, tuple[int, float]] = {}
+    begun: list[bool] = []
     with ExitStack() as stack:
         for prefix, study, stages in zip(prefixes, studies, planned, strict=True):
             stack.enter_context(_alone(study.out))
             pipelines[prefix] = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
             left = pipelines[prefix].to_do()
+            begun.append(bool(left))
             voxels, cells = _sizes(study, left)
             _refuse_small_disk(study, left, voxels, on_disk)
             seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
             log = stack.enter_context(_log(study.out / LOG))
             log(f"Study '{study.study.name}': {len(stages)} stages, {len(left)} of them to do")
             lines[prefix] = line_of(prefix, log)
+        refuse_wrong([study for study, todo in zip(studies, begun, strict=True) if todo])
         run_all(pipelines, pool, lines)
         tell(ALL, stages_told, 1.0)
         done = []
@@ -232,12 +237,15 @@ def report(study: Path | str | Study) -> Ran:
 
 
 def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = ()) -> dict[str, str]:
-    """What `run` would do with each stage: "done already", "run" or "left out"; parameters and errors are its own."""
+    """What `run` would do with each stage, as `Pipeline.forecast` tells it; parameters and errors are `run`'s own."""
     told = study if isinstance(study, Study) else read_study(study)
     stages = plan(told)
     refuse_unknown(stages, only, force)
-    refuse_missing(stages)
-    return Pipeline(stages, Ledger(told.out, told.place), only=only, force=force).forecast()
+    refuse_missing([stages])
+    what = Pipeline(stages, Ledger(told.out, told.place), only=only, force=force).forecast()
+    if "run" in what.values():
+        refuse_wrong([told])
+    return what
 
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:
@@ -252,11 +260,20 @@ def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence
             raise InputError(f"--force {name} makes nothing anew: --only {', '.join(only)} leaves it out.")
 
 
-def refuse_missing(stages: Sequence[Stage]) -> None:
-    """Refuse a study whose files are not there, naming every one."""
-    missing = dict.fromkeys(path for stage in stages for path in stage.files if not path.exists())
+def refuse_missing(planned: Sequence[Sequence[Stage]]) -> None:
+    """Refuse studies whose files are not there, naming every one of all of them."""
+    files = dict.fromkeys(path for stages in planned for stage in stages for path in stage.files)
+    missing = [path for path in files if not path.exists()]
     if missing:
         raise InputError("These files of the study are not there:\n" + "\n".join(f"  {path}" for path in missing))
+
+
+def refuse_wrong(studies: Sequence[Study]) -> None:
+    """Refuse studies that would fail in whole, hours later in part, naming all that is wrong with them."""
+    told = {study.study.name: wrong for study in studies if (wrong := wrong_for_all(study))}
+    if told:
+        lines = [f"{name}: {sentence}" for name, wrong in told.items() for sentence in wrong]
+        raise InputError("This cannot be run as it is (`mrstrain check` tells more):\n  " + "\n  ".join(lines))
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from dvc.report import Section, Table, write_report
 from dvc.verdict import Verdict, worst
@@ -15,7 +14,7 @@ from mrstrain.methods import METHODS, methods_of_registrations
 from mrstrain.page import flat
 from mrstrain.pipeline import Outcome
 from mrstrain.plan import REGISTRATION
-from mrstrain.provenance import provenance, write_json
+from mrstrain.provenance import provenance, without_folders, write_json
 from mrstrain.studyfile import Study
 
 
@@ -35,7 +34,7 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, Outcome]) 
         closing += given.closing
     if not closing and registered:
         closing.append(_methods(study, outcomes))
-    record = provenance("run", {}, _without_folders(study.model_dump(mode="json", exclude={"place"})))
+    record = provenance("run", {}, without_folders(study.model_dump(mode="json", exclude={"place"}), study.place))
     made = {name: o.record for name, o in outcomes.items() if o.record is not None}
     record["inputs"] = {"inputs": _inputs(made)}
     parts = {name: {"made_utc": one.made_utc, **one.made_from} for name, one in made.items()}
@@ -49,15 +48,6 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, Outcome]) 
         flat(record),
         notes=_lacking(outcomes),
     )
-
-
-def _without_folders(told: Any) -> Any:
-    """What a study file tells, of absolute paths the file's name alone: folders may name a patient."""
-    if isinstance(told, dict):
-        return {key: _without_folders(value) for key, value in told.items()}
-    if isinstance(told, list):
-        return [_without_folders(value) for value in told]
-    return Path(told).name if isinstance(told, str) and Path(told).is_absolute() else told
 
 
 def _inputs(made: Mapping[str, Record]) -> list[dict[str, str]]:

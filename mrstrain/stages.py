@@ -100,17 +100,17 @@ def simulate(
     return Given(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures))
 
 
-def drive(tell: Tell, *, out: str, mesh: str, dvc: str, material: str, loads: Sequence[str]) -> Given:
+def drive(tell: Tell, *, out: str, mesh: str, dvc: str, material: str, loads: Sequence[str], **options: Any) -> Given:
     """One material set whose outside goes where it was measured; as `mrstrain.drive`."""
     with Worker(threads=1) as worker:
-        done = worker.run(f"driving {material}", _driven, mesh, dvc, out, material, tuple(loads))
+        done = worker.run(f"driving {material}", _driven, mesh, dvc, out, material, tuple(loads), options)
     return Given(tuple(done.summary()[:-1]), complete=done.complete)
 
 
-def _driven(mesh: str, dvc: str, out: str, material: str, loads: Sequence[str]) -> Any:
+def _driven(mesh: str, dvc: str, out: str, material: str, loads: Sequence[str], options: Mapping[str, Any]) -> Any:
     from mrstrain.driving import drive as run
 
-    return run(mesh, dvc, out=out, sets=[material], loads=loads, threads=1)
+    return run(mesh, dvc, out=out, sets=[material], loads=loads, threads=1, **options)
 
 
 def level(

@@ -110,7 +110,7 @@ def demo(
     full: Annotated[
         bool,
         typer.Option(
-            "--full", help="The published size, an hour: seven sets, 75,000 cells; friedman is cut, status 1."
+            "--full", help="The published size, an hour: seven sets, 75,000 cells; friedman is cut, which it tells."
         ),
     ] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="Stages at once. Default: one for each core.")] = None,

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, Valid
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
+from validate.curves import RANGE, check_range
 
 FILE = "study.toml"
 
@@ -37,6 +38,14 @@ def _new(names: tuple[str, ...]) -> tuple[str, ...]:
     if len(set(names)) < len(names):
         raise ValueError("each only once")
     return names
+
+
+def _rising(strains: tuple[float, float]) -> tuple[float, float]:
+    try:
+        check_range(strains)
+    except InputError as wrong:
+        raise ValueError(str(wrong)) from wrong
+    return strains
 
 
 Name = Annotated[str, AfterValidator(as_folder)]
@@ -80,6 +89,8 @@ class Images(_Part):
         A second unloaded image: the noise floor.
     tissue : str, optional
         Mask of the body, bone included.
+    allow_missing : bool
+        Whether voxels that are NaN or infinite are left out, not refused.
     """
 
     load0: str
@@ -89,6 +100,7 @@ class Images(_Part):
     bone_mask: str | None = None
     repeat: str | None = None
     tissue: str | None = None
+    allow_missing: Flag = False
 
 
 class Load(_Part):
@@ -154,7 +166,7 @@ class Meshing(_Part):
     limit_minutes : float
         Time after which meshing is given up.
     file : str, optional
-        A mesh made elsewhere, instead.
+        A mesh made elsewhere, instead; its lengths in ``unit``, its axes those of ``frame``.
     """
 
     edge_mm: Annotated[Real, Field(gt=0.0)] = 2.0
@@ -164,6 +176,8 @@ class Meshing(_Part):
     finer: Finer | None = None
     limit_minutes: Annotated[Real, Field(gt=0.0)] = 60.0
     file: str | None = None
+    unit: Literal["mm", "m"] = "mm"
+    frame: Literal["LPS", "RAS"] = "LPS"
 
 
 class Models(_Part):
@@ -201,7 +215,7 @@ class Models(_Part):
 class Comparing(_Part):
     """How models are compared with the measurement; as the options of `compare`."""
 
-    strains: tuple[Real, Real] = (0.2, 0.5)
+    strains: Annotated[tuple[Real, Real], AfterValidator(_rising)] = RANGE
     thresholds: str | None = None
     least_ml: Annotated[Real, Field(ge=0.0)] = 0.1
 

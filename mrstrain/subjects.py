@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -15,6 +14,7 @@ from dvc.errors import InputError
 from dvc.report import Picture, Section, Table, write_report
 from dvc.verdict import Verdict, worst
 from dvc.whole import write_whole
+from mrstrain.alike import refuse_other_laws, unlike
 from mrstrain.inputs import make_output
 from mrstrain.page import flat, said
 from mrstrain.plan import COMPARISON
@@ -91,7 +91,8 @@ def cohort(
     Raises
     ------
     InputError
-        If a study cannot be read, two have one name, or no subject has been compared with a model.
+        If a study cannot be read, two have one name, a material set has other laws in one than in another, or no
+        subject has been compared with a model.
     """
     told = [read_study(place) for place in studies]
     names = [study.study.name for study in told]
@@ -102,6 +103,7 @@ def cohort(
     ranges = {study.compare.strains for study in told}
     if len(ranges) > 1:
         raise InputError(f"The studies compare over different ranges of strain ([compare] strains): {sorted(ranges)}.")
+    refuse_other_laws(told)
     ran = run_studies(told, scheduler=scheduler, workers=workers, progress=progress)
     without = {one.study.study.name: why for one in ran if (why := _uncounted(one))}
     areas = {name: _areas(one.study.out) for one in ran if (name := one.study.study.name) not in without}
@@ -111,6 +113,7 @@ def cohort(
         )
     shares, notes = _shares(areas)
     notes = [f"{name} is not counted: {why}" for name, why in without.items()] + notes
+    notes += unlike([one.study for one in ran if one.study.study.name not in without])
     notes += _doubts([one for one in ran if any(one.study.study.name in of for of in shares.values())])
     try:
         ranking = standings(shares)
@@ -251,7 +254,6 @@ def _write_page(
     for one in ran:
         failed = [f"{o.stage}: {o.words}. {o.reason}" for o in one.outcomes.values() if o.record is None]
         verdicts = list(_registered(one).values())
-        folder = os.path.relpath(one.study.out, path.parent)
-        report = Table("Its own report", ("folder", "not whole"), ((folder, "; ".join(failed)),))
-        sections.append(Section(one.study.study.name, worst(verdicts) if verdicts else None, (report,)))
+        verdict = worst(verdicts) if verdicts else None
+        sections.append(Section(one.study.study.name, verdict, paragraphs=tuple(f"Not whole: {why}" for why in failed)))
     write_report(path, "Models over subjects", None, sections, [], flat(record))

@@ -82,3 +82,15 @@ def test_init_of_an_empty_folder_says_what_is_missing(tmp_path):
     assert "Load0: NOT FOUND" in told
     with pytest.raises(InputError, match=r"\[images\] 'load0' is missing"):
         read_study(tmp_path)
+    assert "Put in what was not found, and the forces" in told
+
+
+def test_dicom_folders_are_found_whatever_their_files_are_called(tmp_path):
+    for folder, name in (("Load0", "IM0001"), ("Load1", "I1.IMA"), ("Load2", "A.DCM"), ("Load3", "notes.txt")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / name).write_bytes(bytes(128) + b"DICM" if folder in ("Load0", "Load1") else b"x")
+    begun = init(tmp_path)
+    assert begun.found.load0 == "Load0"
+    assert begun.found.loads == {"Load1": "Load1", "Load2": "Load2"}
+    assert "NOT USED: Load3, a folder without a DICOM image in it" in begun.summary()
+    assert "Put the forces in" in begun.summary()[-1]

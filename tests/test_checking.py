@@ -10,12 +10,14 @@ import pytest
 
 from dvc.errors import InputError, RegistrationError
 from dvc.image import Grid, Image, LabelMap
+from dvc.imagefile import read_image
 from dvc.imagewrite import write_image, write_labels
 from dvc.mesh import TetMesh
 from fe.meshstore import write_tet_mesh
 from mrstrain import costs, stages
-from mrstrain.checking import check
-from mrstrain.plan import plan
+from mrstrain.checking import check, wrong_for_all
+from mrstrain.plan import Stage, plan
+from mrstrain.running import forecast, run
 from mrstrain.studyfile import read_study
 from tests.test_simulate import dome
 
@@ -226,3 +228,68 @@ def test_what_is_fixed_beside_the_bone_has_to_be_there_and_decides_what_is_done_
 
     assert held("") == held('fixed = ["bone"]\n') == ("bone",)
     assert held('fixed = ["cut"]\n') == ("bone", "cut")
+
+
+def test_a_run_refuses_before_it_begins_what_all_of_it_needs(study, monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("a cluster was started")
+
+    monkeypatch.setattr("mrstrain.cluster.cluster", never)
+    for change, told in (
+        (("labels =", 'bone = "calcaneuz"\nlabels ='), "no region 'calcaneuz'"),
+        (("[mesh]", "[mesh]\nedge_mm = 0.02"), "half a voxel"),
+        (("[mesh]", '[mesh]\nfiner = { region = "skni", edge_mm = 1.0 }'), "no region 'skni'"),
+        (("sets =", 'fixed = ["skin"]\nsets ='), "the cut may be fixed"),
+    ):
+        assert told in wrong(study, change)
+        for begin in (run, forecast):
+            with pytest.raises(InputError, match=f"(?s)cannot be run as it is.*Heel: .*{told}"):
+                begin(study)
+
+
+def test_a_damaged_loaded_image_is_left_to_its_stage(study):
+    (study / "Load1.nii.gz").write_bytes((study / "Load1.nii.gz").read_bytes()[:-99])
+    assert "Load1.nii.gz" in "".join(check(study).wrong)
+    assert wrong_for_all(read_study(study)) == ()
+
+
+@pytest.mark.parametrize(("given", "told"), [("[0.5, 0.2]", "must rise"), ("[20.0, 50.0]", "no percent")])
+def test_a_range_of_strain_that_no_comparison_takes_is_refused_with_the_study_file(study, given, told):
+    (study / "study.toml").write_text(STUDY + f"[compare]\nstrains = {given}\n")
+    with pytest.raises(InputError, match=rf"\[compare\] 'strains': .*{told}"):
+        read_study(study)
+
+
+def test_gaps_are_left_out_where_the_study_says_so(study):
+    image = read_image(study / "Load1.nii.gz")
+    values = image.values.copy()
+    values[3, 3, 3] = np.nan
+    write_image(study / "Load1.nii.gz", Image(GRID, values))
+    assert "1 of 4096 voxels are NaN" in wrong(study)
+    masked = ("labels =", "allow_missing = true\nlabels =")
+    assert wrong(study, masked) == ""
+    (registered, *_) = plan(read_study(study))
+    assert registered.arguments["allow_missing"]
+    (study / "study.toml").write_text(STUDY.replace(*masked) + "level = true\n")
+    with pytest.raises(InputError, match="without gaps"):
+        plan(read_study(study))
+
+
+def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
+    (study / "study.toml").write_text(STUDY)
+    told = read_study(study)
+    first = next(stage for stage in plan(told) if stage.kind == "register")
+    row = [first]
+    for k in range(3):
+        row.append(replace(first, name=f"register {k}", after=(row[-1].name,)))
+    apart = [replace(first, name=f"register {k}") for k in range(4)]
+    one = costs.seconds_of(first, told, 1e6, 0.0)
+
+    def minutes(stages: list[Stage]) -> float:
+        return float(costs.costs(told, stages, stages, 1e6, 0.0, 8)[0].split("about ")[1].split()[0])
+
+    assert minutes(apart) == pytest.approx(one / 60.0, abs=0.5)
+    assert minutes(row) == pytest.approx(4 * one / 60.0, abs=0.5)
+    levelled = replace(first, name="level trebbi Load1")
+    (study / "study.toml").write_text(STUDY + '[loads.Load2]\nimage = "Load1.nii.gz"\n')
+    assert costs.disk_bytes(levelled, read_study(study), 1e6) == costs.disk_bytes(levelled, told, 1e6)

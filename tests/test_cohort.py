@@ -146,3 +146,34 @@ def test_a_model_that_few_subjects_have_does_not_take_the_others_from_the_rankin
     assert [(one.model, one.subjects) for one in done.ranking] == [("near", 3)]
     assert "far is not ranked: it has an area over all loads in only 1 of 3 subjects." in done.notes
     assert not any("not ranked over" in note for note in done.notes)
+
+
+def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refused(tmp_path, monkeypatch):
+    places = [compared(tmp_path / "Mueller_Hans", name, 0.1, 0.3) for name in ("Ada", "Ben", "Cy")]
+    record = Record(stage="compare", key="k", made_utc="", seconds=1.0, files={}, given=Given(()), made_from={})
+    ended = lambda studies, **_: [Ran(study, {"compare": Outcome("compare", record)}) for study in studies]  # noqa: E731
+    monkeypatch.setattr("mrstrain.subjects.run_studies", ended)
+    alike = cohort(places, out=tmp_path / "alike")
+    assert not any("not measured and simulated alike" in note for note in alike.notes)
+    assert "Mueller_Hans" not in "".join(file.read_text() for file in (tmp_path / "alike").iterdir())
+
+    other = places[1] / "study.toml"
+    text = other.read_text()
+    other.write_text(text.replace('Load1.nii.gz"', 'Load1.nii.gz"\nnormal_n = 15') + 'element = "P2"\n')
+    notes = cohort(places, out=tmp_path / "unlike").notes
+    begin = "Subjects are not measured and simulated alike, "
+    assert f"{begin}[loads.Load1] normal_n differs: not given in Ada, Cy; 15 in Ben." in notes
+    assert f"{begin}[models] element differs: P1 in Ada, Cy; P2 in Ben." in notes
+
+    for place, mu in zip(places, (10, 10, 999), strict=True):
+        (place / "mine.toml").write_text(f'[mine]\n[mine.fat]\nlaw = "neo-Hooke"\nmu_kpa = {mu}\nnu = 0.49\n')
+        (place / "study.toml").write_text(STUDY.format(name=place.name) + 'sets = ["mine.toml"]\n')
+    with pytest.raises(InputError, match="'mine' has other laws in Cy than in Ada"):
+        cohort(places, out=tmp_path / "laws")
+    cohort(places[:2], out=tmp_path / "same")
+
+
+def test_files_that_are_lacking_are_told_of_all_subjects_at_once(tmp_path):
+    places = [compared(tmp_path, name, 0.1, 0.3) for name in ("Ada", "Ben")]
+    with pytest.raises(InputError, match=r"(?s)Ada.*Load0\.nii\.gz.*Ben.*Load0\.nii\.gz"):
+        cohort(places, out=tmp_path / "out")

@@ -1,8 +1,11 @@
-"""The demonstration's study file, in both sizes; the demonstration itself is run by `make demo`."""
+"""The demonstration's study file, in both sizes, and one load of it on coarse voxels; `make demo` runs it whole."""
 
 from __future__ import annotations
 
 import json
+import re
+from functools import partial
+from importlib import import_module
 
 import pytest
 
@@ -14,12 +17,15 @@ from mrstrain.againsttruth import read_errors, write_errors
 from mrstrain.demo import _make, _told
 from mrstrain.ledger import Record
 from mrstrain.loads import LOADS
+from mrstrain.making import phantom
 from mrstrain.pipeline import Outcome
 from mrstrain.plan import plan
-from mrstrain.running import Ran
+from mrstrain.running import Ran, run
 from mrstrain.stages import Given
 from mrstrain.studyfile import read_study
 from phantoms.score import TissueError
+
+demonstration = import_module("mrstrain.demo")  # the package has a function of that name
 
 
 @pytest.fixture
@@ -96,6 +102,25 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
     lines = _told(errors, Ran(study, outcomes))
     assert lines[4] == "simulate luboz: in part. luboz, Load1: ONLY 75% of the load"
     assert lines[5].startswith("Report: ")
+
+
+def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_truth(tmp_path, monkeypatch):
+    """Load2 alone, voxels of 2 mm, and nothing but its registration."""
+    (load2,) = (load for load in LOADS if load.name == "Load2")
+    monkeypatch.setattr(demonstration, "LOADS", [load2])
+    monkeypatch.setattr(demonstration, "phantom", partial(phantom, spacing_mm=2.0, loads=["Load2"]))
+    monkeypatch.setattr(demonstration, "run", partial(run, only=["register Load2"]))
+    shown = demonstration.demo(tmp_path / "demo", seed=3)
+    assert not shown.complete  # the rest has no result
+    assert shown.lines[0].startswith("Verdicts on the registrations: Load2 ")
+    error, true = (float(word) for word in re.search(r"Load2 ([\d.]+) of ([\d.]+)", shown.lines[1]).groups())
+    assert 0.0 < error < 0.5 * true
+    report = tmp_path / "demo" / "results" / "report.html"
+    assert shown.lines[-1] == f"Report: {report}"
+    assert "Error against the truth" in report.read_text()
+    before = (tmp_path / "demo" / "error.csv").read_bytes()
+    assert demonstration.demo(tmp_path / "demo", seed=3).lines == shown.lines  # nothing is done again
+    assert (tmp_path / "demo" / "error.csv").read_bytes() == before
 
 
 def test_errors_are_read_again_while_their_registrations_are_the_same(tmp_path):

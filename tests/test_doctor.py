@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections import namedtuple
+from importlib import import_module
+from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
@@ -93,21 +96,28 @@ def test_the_check_takes_a_moment_and_loads_none_of_our_packages() -> None:
 
 
 def test_the_doctor_looks_at_everything_and_finds_this_environment_fit(tmp_path: Path) -> None:
-    found = examine(tmp_path / "not" / "yet", elastix_check=lambda: "a pair of 16^3 voxels in 0.4 s")
+    found = examine(tmp_path / "not" / "yet", trials={"itk-elastix": lambda: "a pair of 16^3 voxels in 0.4 s"})
     findings = by_name(found)
     assert {"Python", "package names", "itk-elastix", "numpy", "memory", "disk"} <= set(findings)
-    assert findings["registration"].detail == "a pair of 16^3 voxels in 0.4 s"
-    for name in ("Python", "package names", "itk-elastix", "temporary folder", "registration"):
+    assert findings["trial of itk-elastix"].detail == "a pair of 16^3 voxels in 0.4 s"
+    for name in ("Python", "package names", "itk-elastix", "temporary folder", "trial of itk-elastix"):
         assert findings[name].ok, findings[name]
     assert all(finding.advice == "" for finding in findings.values() if finding.ok)
-    assert "registration" not in by_name(examine(tmp_path))
+    assert not any(name.startswith("trial") for name in by_name(examine(tmp_path)))
+    needed = {re.split("[<>=;]", one)[0] for one in requires("mrstrain") if ";" not in one}  # without markers
+    assert {name.casefold() for name in findings} >= {name.casefold() for name in needed}
+
+
+@pytest.mark.parametrize("module", ["dvc.elastix", "fe.meshing", "fe.linear"])
+def test_what_it_tries_works_here(module: str) -> None:
+    assert import_module(module).self_test()
 
 
 def test_a_failed_registration_is_a_finding_and_not_an_exception(tmp_path: Path) -> None:
     def crash() -> str:
         raise RuntimeError("the worker was killed by signal 11")
 
-    finding = by_name(examine(tmp_path, elastix_check=crash))["registration"]
+    finding = by_name(examine(tmp_path, trials={"itk-elastix": crash}))["trial of itk-elastix"]
     assert not finding.ok
     assert "RuntimeError: the worker was killed by signal 11" in finding.detail
     assert finding.advice

@@ -16,7 +16,7 @@ from mrstrain.cluster import _refuse_unfit
 from mrstrain.ledger import Ledger
 from mrstrain.pipeline import Pipeline, run_all
 from mrstrain.plan import Stage
-from mrstrain.provenance import own_code
+from mrstrain.provenance import own_code, without_folders
 from mrstrain.running import refuse_unknown
 from mrstrain.stages import Given
 
@@ -228,11 +228,40 @@ def test_workers_that_would_not_do_are_refused_by_what_they_lack(tmp_path, worke
     _refuse_unfit(Workers((own_code(), False, True)), "tcp://far:0", [tmp_path])
 
 
-def test_a_moved_study_stays_finished(folder, tmp_path_factory):
-    ran(folder)
-    moved = tmp_path_factory.mktemp("elsewhere") / "study"
-    folder.rename(moved)
+@pytest.mark.parametrize("name", ["study", "Müller Ö 'x'"])
+def test_a_moved_study_stays_finished(folder, tmp_path_factory, name):
+    named = folder.with_name(name)
+    folder.rename(named)
+    ran(named)
+    for record in (named / "results" / ".study").glob("*.json"):
+        assert str(named) not in repr(json.loads(record.read_text())["made_from"])
+    moved = tmp_path_factory.mktemp("elsewhere") / "moved"
+    named.rename(moved)
     assert ran(moved)[0] == []
+
+
+def test_records_name_no_folders_outside_the_study(tmp_path):
+    home = tmp_path / "Müller"
+    given = {
+        "in": str(home / "a" / "Load0.nii.gz"), "up": str(home / ".." / "Doe_Jane" / "x.nii"), "n": 1.5,
+        "far": [str(tmp_path / "Doe_Jane" / "y.csv"), "../Doe_Jane/z.toml", "b/w.toml", "trebbi", ""], "none": None,
+    }  # fmt: skip
+    assert without_folders(given, home) == {
+        "in": "a/Load0.nii.gz", "up": "x.nii", "n": 1.5,
+        "far": ["y.csv", "z.toml", "b/w.toml", "trebbi", ""], "none": None,
+    }  # fmt: skip
+
+
+def test_the_forecast_knows_what_cannot_be_run(folder):
+    def told(only: tuple[str, ...]) -> dict[str, str]:
+        return Pipeline(stages_in(folder), Ledger(folder / "results", folder), only=only).forecast()
+
+    assert told(("simulate",))["simulate a"] == "cannot be run: mesh has no result."
+    assert told(("compare",))["compare"].startswith("cannot be run: none of register a")
+    assert told(("mesh", "simulate"))["simulate a"] == "run"
+    assert told(("register", "compare"))["compare"] == "run"
+    ran(folder)
+    assert set(told(("compare",)).values()) == {"left out", "done already"}
 
 
 def test_the_forecast_is_what_is_run(folder):

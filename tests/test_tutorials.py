@@ -146,6 +146,9 @@ def test_every_command_and_option_of_the_pages_is_there() -> None:
     known = {name: one for name, one in typer.main.get_command(app).commands.items()}  # type: ignore[attr-defined]
     told = commands_told()
     assert len(told) > 10
+    for page in PAGES:  # none stands in running text
+        text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M)
+        assert not re.search(r"^mrstrain [a-z]+ .*--", text, re.M), page
     for page, line in told:
         _, name, *words = line.split()
         assert name in known, (page, line)

@@ -13,11 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from dvc.arrays import FloatArray
+from dvc.errors import InputError
 from dvc.regions import volume_above
 from dvc.uncertainty import widened
 
 RANGE = (0.2, 0.5)
 """Strains between which curves are compared, by default."""
+
+MOST_STRAIN = 3.0
+"""Maximal shear beyond which a range is taken to be in percent."""
 
 DRAWS = 200
 """Truths drawn for the curves and areas of a load."""
@@ -25,6 +29,21 @@ DRAWS = 200
 _GRID = 301
 _SURE = 0.975
 _EVERY = 4  # draws, of which one is made a perfect model
+
+
+def check_range(strains: tuple[float, float]) -> None:
+    """Refuse a range of strain between which no curves can be compared.
+
+    Raises
+    ------
+    InputError
+        If it does not rise from 0 or more to 3 or less.
+    """
+    if not 0.0 <= strains[0] < strains[1] <= MOST_STRAIN:
+        raise InputError(
+            f"The range of strain must rise from 0 or more to {MOST_STRAIN:g} or less (no percent); got "
+            f"{strains[0]:g} to {strains[1]:g}."
+        )
 
 
 def area_between(
