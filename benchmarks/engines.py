@@ -1,4 +1,4 @@
-"""Error, time and memory of both engines on the same heels: heel-mr (elastix) beside gauss-newton.
+"""Error, time and memory of both engines on the same heels: heel-mr and another set (elastix) beside gauss-newton.
 
     python -m benchmarks.engines --seeds 1 2 --motions smooth Load1 --out benchmarks/results/engines.json
 
@@ -36,6 +36,7 @@ from phantoms.study import distances_mm, motion_named
 
 ENGINES = {
     "elastix, heel-mr": Settings.of("heel-mr"),
+    "elastix, 4 mm": Settings.of(str(Path(__file__).with_name("four_mm.txt"))),
     "gauss-newton": Settings(gauss_newton=GaussNewton()),
     "gauss-newton, bending 4": Settings(gauss_newton=GaussNewton(bending=4.0)),
 }

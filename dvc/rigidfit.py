@@ -7,9 +7,9 @@ Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). Images are blurred at fi
 
 Three things would pull a mask along its edges. Shading, which its correction leaves in part: the gain takes it up.
 Noise in I0, which makes a slope too small that is regressed on it: so the gain is found with the mean of each voxel's
-six neighbours as instrument, whose noise is another. And the noise of a gradient between voxels, which goes with the
-noise beside it: that of the unloaded image at its voxels, a difference of two neighbours, is correlated neither with
-the voxel between them nor with the neighbours' mean.
+six neighbours as instrument, whose noise is another (but where a scanner has interpolated its voxels). And the noise
+of a gradient between voxels, which goes with the noise beside it: that of the unloaded image at its voxels, a
+difference of two neighbours, is correlated neither with the voxel between them nor with the neighbours' mean.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import convolve, map_coordinates, spline_filter
+from scipy.ndimage import binary_erosion, convolve, map_coordinates, spline_filter
 from scipy.spatial.transform import Rotation
 
 from dvc.arrays import BoolArray, FloatArray
@@ -92,7 +92,7 @@ class RigidFit:
     """
 
     def __init__(self, reference: Image, loaded: Image, mask: Mask, seed: int) -> None:
-        known = Mask(mask.grid, mask.inside & ~reference.missing)
+        known = _surrounded(reference, mask)
         points = known.points()
         if min(mask.grid.shape) < 2:
             raise InputError("The unloaded image is a single slice: a motion in space takes a volume to align.")
@@ -102,6 +102,9 @@ class RigidFit:
         self._radius_mm = float(np.sqrt(np.mean(np.sum((points - self._centre) ** 2, axis=1))))
         self._block_mm = max(min(_BLOCK_MM, _BLOCK_SHARE * self._radius_mm), float(mask.grid.spacing_mm.max()))
         self._random = np.random.default_rng(seed)
+        # In units of the bone's own brightness: an offset beside large numbers would be lost in rounding.
+        brightness = float(np.sqrt(np.mean(reference.values[known.inside].astype(np.float64) ** 2))) or 1.0
+        reference, loaded = (Image(i.grid, i.values / np.float32(brightness)) for i in (reference, loaded))
         missing = loaded.missing
         self._gaps = Image(loaded.grid, missing.astype(np.float32)) if missing.any() else None
         scenes = _scenes(fill_missing(loaded))
@@ -135,7 +138,7 @@ class RigidFit:
         Raises
         ------
         RegistrationError
-            As from `whole`.
+            If half of a half's voxels leave what the loaded image shows, or its contrast there is turned round.
         """
         changes = self._levels[-1].changes
         _, ways = np.linalg.eigh(np.einsum("ni,nj->ij", changes, changes))
@@ -221,6 +224,16 @@ class RigidFit:
     def _step(self, step: FloatArray) -> RigidMotion:
         turn = Rotation.from_rotvec(step[3:] / self._radius_mm).as_matrix()
         return RigidMotion.about(self._centre, turn, step[:3])
+
+
+def _surrounded(image: Image, mask: Mask) -> Mask:
+    """The voxels of a mask that the image shows with all of their six neighbours; all that it shows, if they are few.
+
+    Beside a gap or the image's end differences and means of neighbours have a voxel's own noise in them.
+    """
+    shown = ~image.missing
+    inside = mask.inside & binary_erosion(shown)
+    return Mask(mask.grid, inside if np.count_nonzero(inside) >= _LEAST_VOXELS else mask.inside & shown)
 
 
 def _regressed(columns: FloatArray, on: FloatArray, instruments: FloatArray | None = None) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ParamSpec, TypeVar
@@ -30,7 +30,7 @@ from mrstrain.inputs import is_bones_name
 from mrstrain.ledger import Ledger
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.pipeline import Pipeline
-from mrstrain.plan import load_steps, plan, towards
+from mrstrain.plan import KINDS, labels_to_mesh, load_steps, plan, towards
 from mrstrain.registering import REPEAT
 from mrstrain.studyfile import Study, Vector, read_study
 from validate.location import read_thresholds
@@ -107,7 +107,7 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     told, found = read_study(study), _Findings()
     reference, labels = _reference(told, found)
     _loaded(told, found, reference)
-    _alike(told, found, reference, labels)
+    _alike(told, found, reference, labels, KINDS)
     if labels is not None and told.models.results:
         found.tried(_foreign, told, found, labels)
     planned = found.tried(plan, told)
@@ -121,31 +121,37 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     return Checked(tuple(found.wrong), tuple(found.notes))
 
 
-def wrong_for_all(study: Study) -> tuple[str, ...]:
-    """What keeps every load or model of a study from being what it says, in sentences, found in a second or two.
+def wrong_for_all(study: Study, kinds: Collection[str] = KINDS) -> tuple[str, ...]:
+    """What keeps stages of some kinds from what the study says, of whichever load or model; in a second or two.
 
     Files that are damaged, and loaded images, are left to the stages: they keep only what is made from them.
     """
     found = _Findings(of_files=False)
-    _alike(study, found, *_reference(study, found))
+    _alike(study, found, *_reference(study, found), kinds)
     return tuple(found.wrong)
 
 
-def _alike(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> None:
-    """Look at what holds for all loads: settings, the plate, and the models' laws and mesh."""
-    _registration(study, found)
+def _alike(
+    study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None, kinds: Collection[str]
+) -> None:
+    """Look at what loads or models have in common: settings, the plate, laws and mesh; of stages of some kinds."""
     for normal, shear in ((study.plate.normal, study.plate.shear_direction), *towards(study).values()):
         found.tried(plate_axes, -np.asarray(normal), shear)
-    if labels is not None and (study.models.sets or study.models.results):
-        found.tried(check_bones, labels, study.mesh.bones)
-    if study.models.sets:
-        _simulations(study, found, reference, labels)
-    if study.compare.thresholds is not None:
-        found.tried(read_thresholds, study.path(study.compare.thresholds))
+    if not {"register", "level"}.isdisjoint(kinds):
+        _registration(study, found, reference, labels)
+    if study.models.sets and not {"mesh", "simulate", "drive"}.isdisjoint(kinds):
+        _simulations(study, found, reference)
+    if study.models.level and "level" in kinds and reference is not None and reference.missing.any():
+        found.wrong.append("[models] level = true needs an unloaded image without voxels that are NaN or infinite.")
+    if "compare" in kinds:
+        if labels is not None and (study.models.sets or study.models.results):
+            found.tried(check_bones, labels, study.mesh.bones)
+        if study.compare.thresholds is not None:
+            found.tried(read_thresholds, study.path(study.compare.thresholds))
 
 
 def _reference(study: Study, found: _Findings) -> tuple[Image | None, LabelMap | None]:
-    """Look at the unloaded image, labels and masks; give the image, and the labels on it."""
+    """Look at the unloaded image and the labels; give the image, and the labels on it."""
     images = study.images
     reference = found.read(_image, study, images.load0)
     if reference is not None:
@@ -155,12 +161,6 @@ def _reference(study: Study, found: _Findings) -> tuple[Image | None, LabelMap |
         found.notes.append(f"Labels: {', '.join(labels.names.values())}")
         if reference is not None:
             labels = found.tried(fit_mask, labels, reference.grid, images.labels) or labels
-        if images.bone_mask is None and study.bone is not None:
-            found.tried(labels.region, study.bone)
-    if reference is not None:
-        for mask in (images.bone_mask, images.tissue):
-            if mask is not None:
-                found.tried(read_mask, study.path(mask), reference.grid)
     return reference, labels
 
 
@@ -182,9 +182,14 @@ def _loaded(study: Study, found: _Findings, reference: Image | None) -> None:
                 found.wrong.append(f"{name} is the image of {twin}: every voxel is equal.")
 
 
-def _registration(study: Study, found: _Findings) -> None:
-    """Look at engine, parameters and error model."""
-    how = study.registration
+def _registration(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> None:
+    """Look at bone and masks, engine, parameters and error model."""
+    images, how = study.images, study.registration
+    if images.bone_mask is None and study.bone is not None and labels is not None:
+        found.tried(labels.region, study.bone)
+    for mask in (images.bone_mask, images.tissue):
+        if mask is not None and reference is not None:
+            found.tried(read_mask, study.path(mask), reference.grid)
     settings = found.tried(
         settings_of, how.engine, how.preset, [study.path(p) for p in how.parameters], bending=how.bending,
         volume=how.volume, borders=how.borders, labelled=True,
@@ -202,7 +207,7 @@ def _registration(study: Study, found: _Findings) -> None:
         )
 
 
-def _simulations(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> None:
+def _simulations(study: Study, found: _Findings, reference: Image | None) -> None:
     """Look for what `simulate` would refuse."""
     sets = [found.tried(material_set, study.set_given(name)) for name in study.models.sets]
     laws = [one for one in sets if one is not None]
@@ -229,9 +234,7 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, labels
             found.tried(check_overlap, file, mesh, reference.grid)
         _on_mesh(found, mesh, laws, loads, study.models.fixed)
         return
-    if study.mesh.labels is not None:
-        to_mesh = study.path(study.mesh.labels)
-        labels = found.read(read_labels, to_mesh, _optional(study, study.mesh.names))
+    labels = found.read(read_labels, *labels_to_mesh(study))
     unknown = {name.casefold() for name in study.models.fixed} - {"bone", "cut"}
     if unknown:
         found.wrong.append(

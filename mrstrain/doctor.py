@@ -75,7 +75,7 @@ def examine(
     folder : path
         Where results would be written; its disk is looked at. The nearest existing parent counts.
     trials : mapping of str to callable, optional
-        By the distribution that each tries: does something small, and returns a line on how it went; raises where it
+        By what each tries: does something small, and returns a line on how it went; raises where it
         failed.
 
     Returns
@@ -251,5 +251,5 @@ def _tried(what: str, trial: Callable[[], str]) -> Finding:
         return Finding(f"trial of {what}", True, trial())
     except Exception as error:
         # whatever goes wrong in the worker is a finding here, and not the end of the examination
-        advice = f"Reinstall {what} in an environment of its own; the line above is what it said."
+        advice = "Reinstall mrstrain in an environment of its own; the line above is what the trial said."
         return Finding(f"trial of {what}", False, f"{type(error).__name__}: {error}", advice)

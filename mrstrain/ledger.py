@@ -74,17 +74,24 @@ class Ledger:
         self.folder = out / ".study"
         self._hashes: dict[tuple[str, int, int], str] = {}
 
-    def impersonal(self, text: str) -> str:
-        """A text without the folders above the study and above the home folder: they may name a patient or a person."""
-        for place, short in ((self.home, ""), (Path.home(), "~")):
+    def impersonal(self, text: str, stage: Stage) -> str:
+        """A text without folders above the study, a stage's files and the home folder: they may name a person."""
+        around = [place for file in stage.files for place in (file.parent, Path(os.path.normpath(file.parent)))]
+        outside = [place for place in around if not Path(os.path.normpath(place)).is_relative_to(self.home)]
+        shortened = [
+            *((place, "", "a folder") for place in outside),
+            (self.home, "", "."),
+            (Path.home(), f"~{os.sep}", "~"),
+        ]
+        for place, before, alone in shortened:
             if place != place.parent:
-                text = text.replace(f"{place}{os.sep}", f"{short}{os.sep}" if short else "")
-                text = re.sub(rf"{re.escape(str(place))}(?![\w.-])", short or ".", text)
+                text = text.replace(f"{place}{os.sep}", before)
+                text = re.sub(rf"{re.escape(str(place))}(?![\w.-])", alone, text)
         return text
 
     def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:
         """Hashes of a stage's input files, and its arguments without folders: a study that is moved stays finished."""
-        files = [[path.name, self._hash(path)] for path in stage.files]
+        files = [[without_folders(str(path), self.home), self._hash(path)] for path in stage.files]
         return {"files": files, "arguments": without_folders(arguments, self.home)}
 
     def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, Record]) -> str:
@@ -92,6 +99,7 @@ class Ledger:
         told = versions()
         content = {
             "stage": stage.name,
+            "called": [path.name for path in stage.files],
             **made_from,
             "built_on": {name: record.identity for name, record in sorted(built_on.items())},
             "versions": {name: told[name] for name in _MATTERS},

@@ -156,7 +156,7 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
             ),
             ("Correlation in and around the bone, after alignment", _number(alignment["similarity"]), ""),
             (
-                "Spread of the rigid fits of two halves of the bone (rms over the bone; not its accuracy)",
+                "Spread of the rigid fits of halves of the bone (rms over the bone; largest of six pairs)",
                 _number(alignment["repeatability_rms_mm"]),
                 "mm",
             ),

@@ -109,7 +109,8 @@ class Pipeline:
                 try:
                     work = self._settled(stage)
                 except (OSError, MrstrainError) as failure:  # an input that is gone, or may not be read
-                    self.outcomes[stage.name] = Outcome(stage.name, None, str(failure), asked=self._asked(stage))
+                    reason = self.ledger.impersonal(str(failure), stage)
+                    self.outcomes[stage.name] = Outcome(stage.name, None, reason, asked=self._asked(stage))
                     continue
                 if work is not None:
                     ready.append((stage, work))
@@ -161,19 +162,19 @@ class Pipeline:
             anew = any(told[name] == "run" for name in stage.before)
             record = kept[stage.name]
             lacking = _lacking(stage, there)
+            if lacking:
+                told[stage.name] = f"cannot be run: {lacking}" if self._asked(stage) else "left out"
+                continue
             if not self._asked(stage):
                 told[stage.name] = "left out"
-            elif lacking:
-                told[stage.name] = f"cannot be run: {lacking}"
-                continue
             elif anew or record is None or _among(stage, self._force, default=False):
                 told[stage.name] = "run"
             else:
                 some = {
-                    argument: [value for name, value in of.items() if kept[name] is not None]
+                    argument: [value for name, value in of.items() if name in there]
                     for argument, of in {**stage.some, **stage.perhaps}.items()
                 }
-                built_on = {name: r for name in stage.before if (r := kept[name]) is not None}
+                built_on = {name: r for name in stage.before if name in there and (r := kept[name]) is not None}
                 made_from = self.ledger.made_from(stage, {**stage.arguments, **some})
                 same = record.key == self.ledger.key(stage, made_from, built_on) and not record.given.retry
                 told[stage.name] = "done already" if same else "run"
@@ -217,9 +218,9 @@ class Pipeline:
         """Record how a stage ended that was handed to the cluster."""
         stage = next(stage for stage in self.stages if stage.name == name)
         if isinstance(outcome, str):
-            outcome = self.ledger.impersonal(outcome)
+            outcome = self.ledger.impersonal(outcome, stage)
         else:
-            outcome = replace(outcome, lines=tuple(self.ledger.impersonal(line) for line in outcome.lines))
+            outcome = replace(outcome, lines=tuple(self.ledger.impersonal(line, stage) for line in outcome.lines))
         try:
             if isinstance(outcome, str):
                 # what an earlier run or half of this one left is no result of these inputs
@@ -230,7 +231,7 @@ class Pipeline:
                 record = self.ledger.keep(stage, key, made_from, outcome, seconds)
                 self.outcomes[stage.name] = Outcome(stage.name, record, self._built_on_old(stage))
         except (OSError, MrstrainError) as failure:
-            self.outcomes[stage.name] = Outcome(stage.name, None, str(failure))
+            self.outcomes[stage.name] = Outcome(stage.name, None, self.ledger.impersonal(str(failure), stage))
         one = self.outcomes[stage.name]
         tell(f"{stage.name}: {one.words} after {seconds:.0f} s" + (f". {one.reason}" if one.reason else ""))
         if one.record is not None:

@@ -79,7 +79,7 @@ def plan(study: Study) -> tuple[Stage, ...]:
     ------
     InputError
         If two material sets or models would share a folder, a load that is simulated has no force, or models are
-        levelled without a bone, or on an image with gaps.
+        levelled without a bone.
     """
     stages = _registrations(study)
     loads = tuple(study.loads)
@@ -275,8 +275,6 @@ def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
     if study.bone is None and study.images.bone_mask is None:
         raise InputError("[models] level = true needs a bone, where models are at rest: [images] bone, or bone_mask.")
-    if study.images.allow_missing:
-        raise InputError("[models] level = true needs an unloaded image without gaps: [images] allow_missing = false.")
     sent = _registrations(study)[-1].arguments
     arguments = {key: sent[key] for key in _AS_MEASURED}
     arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}

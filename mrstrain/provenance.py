@@ -156,17 +156,17 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
 
 
 def without_folders(told: Any, home: Path) -> Any:
-    """Values without the place of a study: paths in its folder from there, those outside by the file's name alone.
+    """Values without the place of a study: paths in its folder from there, files outside by their names alone.
 
-    A study that is moved as a whole so stays the same; and folders may name a patient.
+    A study that is moved as a whole so stays the same; and folders may name a patient, so one outside is "a folder".
     """
     if isinstance(told, Mapping):
         return {key: without_folders(value, home) for key, value in told.items()}
-    if isinstance(told, list | tuple | set | frozenset):
+    if isinstance(told, list | tuple):
         return [without_folders(value, home) for value in told]
     if not isinstance(told, str):
         return told
-    if not os.path.isabs(told):
-        return Path(told).name if Path(os.path.normpath(told)).parts[:1] == ("..",) else told
-    place = Path(os.path.normpath(told))
-    return place.relative_to(home).as_posix() if place.is_relative_to(home) else place.name
+    place = Path(os.path.normpath(home / told))
+    if not place.is_relative_to(home):
+        return "a folder" if place.is_dir() else place.name
+    return place.relative_to(home).as_posix() if os.path.isabs(told) else told

@@ -111,8 +111,8 @@ def run(
     Raises
     ------
     InputError
-        If the study cannot be read, a file is missing, or something is wrong that all loads or models have in common;
-        before anything is run.
+        If the study cannot be read, a file is missing, or something is wrong with what its loads or models have in
+        common and stages that are to be run need; before anything is run.
     ParameterError
         If both a scheduler and a number of workers are given.
     OutputError
@@ -146,7 +146,12 @@ def run_studies(
     seconds: dict[str, float] = {}
     stages_told = f"{sum(map(len, planned))} stages"
     prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
-    pipelines: dict[str, Pipeline] = {}
+    pipelines = {
+        prefix: Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
+        for prefix, study, stages in zip(prefixes, studies, planned, strict=True)
+    }
+    todo = [pipeline.to_do() for pipeline in pipelines.values()]
+    refuse_wrong(studies, todo)
     lines: dict[str, Callable[[str], None]] = {}
 
     def line_of(prefix: str, log: Callable[[str], None]) -> Callable[[str], None]:
@@ -167,20 +172,15 @@ def run_studies(
         return cluster(tell, [study.out for study in studies], scheduler=scheduler, workers=workers)
 
     on_disk: dict[int, tuple[int, float]] = {}
-    begun: list[bool] = []
     with ExitStack() as stack:
-        for prefix, study, stages in zip(prefixes, studies, planned, strict=True):
+        for prefix, study, stages, left in zip(prefixes, studies, planned, todo, strict=True):
             stack.enter_context(_alone(study.out))
-            pipelines[prefix] = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
-            left = pipelines[prefix].to_do()
-            begun.append(bool(left))
             voxels, cells = _sizes(study, left)
             _refuse_small_disk(study, left, voxels, on_disk)
             seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
             log = stack.enter_context(_log(study.out / LOG))
             log(f"Study '{study.study.name}': {len(stages)} stages, {len(left)} of them to do")
             lines[prefix] = line_of(prefix, log)
-        refuse_wrong([study for study, todo in zip(studies, begun, strict=True) if todo])
         run_all(pipelines, pool, lines)
         tell(ALL, stages_told, 1.0)
         done = []
@@ -242,10 +242,9 @@ def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequ
     stages = plan(told)
     refuse_unknown(stages, only, force)
     refuse_missing([stages])
-    what = Pipeline(stages, Ledger(told.out, told.place), only=only, force=force).forecast()
-    if "run" in what.values():
-        refuse_wrong([told])
-    return what
+    pipeline = Pipeline(stages, Ledger(told.out, told.place), only=only, force=force)
+    refuse_wrong([told], [pipeline.to_do()])
+    return pipeline.forecast()
 
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:
@@ -268,9 +267,13 @@ def refuse_missing(planned: Sequence[Sequence[Stage]]) -> None:
         raise InputError("These files of the study are not there:\n" + "\n".join(f"  {path}" for path in missing))
 
 
-def refuse_wrong(studies: Sequence[Study]) -> None:
-    """Refuse studies that would fail in whole, hours later in part, naming all that is wrong with them."""
-    told = {study.study.name: wrong for study in studies if (wrong := wrong_for_all(study))}
+def refuse_wrong(studies: Sequence[Study], todo: Sequence[Sequence[Stage]]) -> None:
+    """Refuse studies whose stages to do would all fail, some of them hours later, naming all that is wrong."""
+    told = {
+        study.study.name: wrong
+        for study, left in zip(studies, todo, strict=True)
+        if left and (wrong := wrong_for_all(study, {stage.kind for stage in left}))
+    }
     if told:
         lines = [f"{name}: {sentence}" for name, wrong in told.items() for sentence in wrong]
         raise InputError("This cannot be run as it is (`mrstrain check` tells more):\n  " + "\n  ".join(lines))

@@ -245,6 +245,21 @@ def test_a_run_refuses_before_it_begins_what_all_of_it_needs(study, monkeypatch)
         for begin in (run, forecast):
             with pytest.raises(InputError, match=f"(?s)cannot be run as it is.*Heel: .*{told}"):
                 begin(study)
+        if "bone =" not in change[1]:
+            assert forecast(study, only=("register",))["register Load1"] == "run"
+    assert not (study / "results").exists()
+    (study / "study.toml").write_text(STUDY.replace("labels =", 'bone = "calcaneuz"\nlabels ='))
+    assert forecast(study, only=("mesh", "simulate"))["simulate friedman"] == "run"
+
+
+def test_what_is_meshed_is_looked_at_as_it_is(study):
+    """Labels in voxels of 1 mm are meshed at .6 mm; brought to the image's 2 mm for all else."""
+    fine = Grid((32, 32, 32), (1.0, 1.0, 1.0), (-6.5, -6.5, -6.5))
+    values = np.ones(fine.shape, dtype=np.int64)
+    values[:8] = 2
+    write_labels(study / "tissues.nii.gz", LabelMap(fine, values, {1: "fat", 2: "bone"}))
+    assert wrong(study, ("[mesh]", "[mesh]\nedge_mm = 0.6")) == ""
+    assert "half a voxel" in wrong(study, ("[mesh]", "[mesh]\nedge_mm = 0.4"))
 
 
 def test_a_damaged_loaded_image_is_left_to_its_stage(study):
@@ -270,9 +285,13 @@ def test_gaps_are_left_out_where_the_study_says_so(study):
     assert wrong(study, masked) == ""
     (registered, *_) = plan(read_study(study))
     assert registered.arguments["allow_missing"]
-    (study / "study.toml").write_text(STUDY.replace(*masked) + "level = true\n")
-    with pytest.raises(InputError, match="without gaps"):
-        plan(read_study(study))
+    level = ("[models]", "[models]\nlevel = true")
+    assert wrong(study, masked, level) == ""  # which reads the unloaded image alone
+    write_image(study / "Load0.nii.gz", Image(GRID, values[::-1]))
+    assert "level = true needs an unloaded image without" in wrong(study, masked, level)
+    with pytest.raises(InputError, match="level = true"):
+        forecast(study)
+    assert forecast(study, only=("register",))["register Load1"] == "run"
 
 
 def test_time_counts_what_waits_for_what_and_room_each_load_once(study):

@@ -159,17 +159,23 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
 
     other = places[1] / "study.toml"
     text = other.read_text()
-    other.write_text(text.replace('Load1.nii.gz"', 'Load1.nii.gz"\nnormal_n = 15') + 'element = "P2"\n')
+    other.write_text(
+        text.replace('Load1.nii.gz"', 'Load1.nii.gz"\nnormal_n = 15\nshear_n = 0')
+        + '[registration]\nengine = "elastix"\n'
+    )
     notes = cohort(places, out=tmp_path / "unlike").notes
     begin = "Subjects are not measured and simulated alike, "
-    assert f"{begin}[loads.Load1] normal_n differs: not given in Ada, Cy; 15 in Ben." in notes
-    assert f"{begin}[models] element differs: P1 in Ada, Cy; P2 in Ben." in notes
+    assert f"{begin}[loads.Load1] along the normal differs: nothing in Ada, Cy; 15 N in Ben." in notes
+    assert f"{begin}[registration] differs: gauss-newton-borders in Ada, Cy; heel-mr in Ben." in notes
+    assert len([note for note in notes if note.startswith(begin)]) == 2  # a shear of nothing is none
 
     for place, mu in zip(places, (10, 10, 999), strict=True):
         (place / "mine.toml").write_text(f'[mine]\n[mine.fat]\nlaw = "neo-Hooke"\nmu_kpa = {mu}\nnu = 0.49\n')
         (place / "study.toml").write_text(STUDY.format(name=place.name) + 'sets = ["mine.toml"]\n')
     with pytest.raises(InputError, match="'mine' has other laws in Cy than in Ada"):
         cohort(places, out=tmp_path / "laws")
+    again = (places[0] / "mine.toml").read_text().replace("mu_kpa = 10\n", "mu_mpa = 0.01\n").replace("fat", "Fat")
+    (places[1] / "mine.toml").write_text(again)
     cohort(places[:2], out=tmp_path / "same")
 
 

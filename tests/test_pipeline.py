@@ -245,11 +245,22 @@ def test_records_name_no_folders_outside_the_study(tmp_path):
     given = {
         "in": str(home / "a" / "Load0.nii.gz"), "up": str(home / ".." / "Doe_Jane" / "x.nii"), "n": 1.5,
         "far": [str(tmp_path / "Doe_Jane" / "y.csv"), "../Doe_Jane/z.toml", "b/w.toml", "trebbi", ""], "none": None,
+        "dicom": [str(tmp_path / "Doe_John"), "../Doe_John"],
     }  # fmt: skip
+    (tmp_path / "Doe_John").mkdir()
     assert without_folders(given, home) == {
         "in": "a/Load0.nii.gz", "up": "x.nii", "n": 1.5,
-        "far": ["y.csv", "z.toml", "b/w.toml", "trebbi", ""], "none": None,
+        "far": ["y.csv", "z.toml", "b/w.toml", "trebbi", ""], "none": None, "dicom": ["a folder", "a folder"],
     }  # fmt: skip
+
+
+def test_what_is_told_of_a_failure_names_no_folders_outside_the_study(tmp_path):
+    home = tmp_path / "study"
+    far, up = tmp_path / "Doe_Jane" / "x.nii", home / ".." / "Doe_John" / "y.nii"
+    stage = Stage("register a", {}, (far, up, home / "z.nii"), (home / "results" / "a",))
+    text = f"{far}: no image. {up}, in {tmp_path / 'Doe_John'}: none. {home / 'z.nii'}: none."
+    told = Ledger(home / "results", home).impersonal(text, stage)
+    assert told == "x.nii: no image. y.nii, in a folder: none. z.nii: none."
 
 
 def test_the_forecast_knows_what_cannot_be_run(folder):
@@ -260,8 +271,14 @@ def test_the_forecast_knows_what_cannot_be_run(folder):
     assert told(("compare",))["compare"].startswith("cannot be run: none of register a")
     assert told(("mesh", "simulate"))["simulate a"] == "run"
     assert told(("register", "compare"))["compare"] == "run"
+    ran(folder, failing=("mesh",))
+    assert told(("compare",))["compare"] == "done already"  # of the measurements alone, as a run takes it
     ran(folder)
     assert set(told(("compare",)).values()) == {"left out", "done already"}
+    (folder / "results" / ".study" / "mesh.json").unlink()
+    assert told(("simulate",))["simulate a"] == "cannot be run: mesh has no result."
+    assert told(("compare",))["compare"] == "run"  # models that a mesh is lost of are no result any more
+    assert "compare" in ran(folder, only=("compare",))[0]
 
 
 def test_the_forecast_is_what_is_run(folder):
