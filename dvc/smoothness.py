@@ -28,6 +28,7 @@ class Bending:
 
     def __init__(self, control: Grid) -> None:
         self._gram = [_gram(n, float(h)) for n, h in zip(control.shape, control.spacing_mm, strict=True)]
+        self._along_last = [np.ascontiguousarray(gram.T) for gram in self._gram[2]]
         ni, nj, nk = control.shape
         self._between = np.empty((ni, 3, 3, nj, nk))
         (m0, s0, c0), (m1, s1, c1), (m2, s2, c2) = [[g[:, 3] for g in gram] for gram in self._gram]
@@ -43,7 +44,7 @@ class Bending:
     def product(self, coefficients: FloatArray) -> FloatArray:
         """B c for coefficients (3, ni, nj, nk): the gradient of the energy."""
         out = np.empty_like(coefficients)
-        _last_two_axes(coefficients, *self._gram[1], *self._gram[2], self._between)
+        _last_two_axes(coefficients, *self._gram[1], *self._along_last, self._between)
         _first_axis(self._between, *self._gram[0], out)
         return out
 
@@ -106,20 +107,25 @@ def _last_two_axes(
     curve_k: FloatArray,
     out: FloatArray,
 ) -> None:
-    """What the first axis' values, slopes and curvatures are to be multiplied with, (ni, 3, 3, nj, nk)."""
+    """What the first axis' values, slopes and curvatures are to be multiplied with, (ni, 3, 3, nj, nk).
+
+    Gram matrices are (nj, 7) of the second axis, and (7, nk) of the last.
+    """
     nj, nk = c.shape[2], c.shape[3]
     for i in prange(c.shape[1]):
         value, slope, curve = np.empty((nj, nk)), np.empty((nj, nk)), np.empty((nj, nk))
+        line = np.zeros(nk + 6)  # with what lies beyond its ends, so that the compiler takes several k at once
         for m in range(3):
             for j in range(nj):
-                for k in range(nk):
-                    a, b, d = 0.0, 0.0, 0.0
-                    for s in range(max(-3, -k), min(4, nk - k)):
-                        x = c[m, i, j, k + s]
-                        a += value_k[k, s + 3] * x
-                        b += slope_k[k, s + 3] * x
-                        d += curve_k[k, s + 3] * x
-                    value[j, k], slope[j, k], curve[j, k] = a, b, d
+                line[3 : nk + 3] = c[m, i, j]
+                a, b, d = value[j], slope[j], curve[j]
+                a[:], b[:], d[:] = 0.0, 0.0, 0.0
+                for s in range(7):
+                    x, p, q, r = line[s : s + nk], value_k[s], slope_k[s], curve_k[s]
+                    for k in range(nk):
+                        a[k] += p[k] * x[k]
+                        b[k] += q[k] * x[k]
+                        d[k] += r[k] * x[k]
             for j in range(nj):
                 out[i, m, :, j] = 0.0
                 for s in range(max(-3, -j), min(4, nj - j)):
