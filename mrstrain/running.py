@@ -146,12 +146,13 @@ def run_studies(
     seconds: dict[str, float] = {}
     stages_told = f"{sum(map(len, planned))} stages"
     prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
-    pipelines = {
-        prefix: Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
-        for prefix, study, stages in zip(prefixes, studies, planned, strict=True)
-    }
-    todo = [pipeline.to_do() for pipeline in pipelines.values()]
+    each = [
+        Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
+        for study, stages in zip(studies, planned, strict=True)
+    ]
+    todo = [pipeline.to_do() for pipeline in each]
     refuse_wrong(studies, todo)
+    pipelines = dict(zip(prefixes, each, strict=True))
     lines: dict[str, Callable[[str], None]] = {}
 
     def line_of(prefix: str, log: Callable[[str], None]) -> Callable[[str], None]:
