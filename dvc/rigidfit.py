@@ -40,6 +40,7 @@ _BLOCK_MM = 8.0  # halves of the mask are made of cubes of this size, like a che
 _BLOCK_SHARE = 0.7  # or of this share of the root mean square distance to the centre, where that is less
 _LEAST_SHARE = 0.25  # a half that gets less is drawn voxel by voxel
 _LEAST_VOXELS = 16
+_FEW = 0.5  # of the voxels that an image shows
 _ASIDE_MM = 1.5  # by which the two fits of a pair begin to either side
 _FARTHEST_MM = 15.0
 _NEIGHBOURS = np.where(np.abs(np.indices((3, 3, 3)) - 1).sum(axis=0) == 1, 1.0 / 6.0, 0.0)
@@ -227,13 +228,14 @@ class RigidFit:
 
 
 def _surrounded(image: Image, mask: Mask) -> Mask:
-    """The voxels of a mask that the image shows with all of their six neighbours; all that it shows, if they are few.
+    """The voxels of a mask that the image shows with all of their six neighbours; if those are few, all that it shows.
 
     Beside a gap or the image's end differences and means of neighbours have a voxel's own noise in them.
     """
     shown = ~image.missing
-    inside = mask.inside & binary_erosion(shown)
-    return Mask(mask.grid, inside if np.count_nonzero(inside) >= _LEAST_VOXELS else mask.inside & shown)
+    surrounded, inside = mask.inside & binary_erosion(shown), mask.inside & shown
+    few = np.count_nonzero(surrounded) < _FEW * np.count_nonzero(inside)  # of few slices most lie at an end
+    return Mask(mask.grid, inside if few else surrounded)
 
 
 def _regressed(columns: FloatArray, on: FloatArray, instruments: FloatArray | None = None) -> FloatArray:

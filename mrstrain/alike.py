@@ -48,7 +48,10 @@ def _same_laws(one: MaterialSet, other: MaterialSet) -> bool:
 
 
 def unlike(studies: Sequence[Study]) -> list[str]:
-    """A sentence for each part of a study file in which subjects differ, but for files, name and directions."""
+    """A sentence for each way to register, mesh and solve, and each load and its force, in which subjects differ.
+
+    Files, names and directions are each subject's own.
+    """
     told: dict[str, dict[str, str | float]] = {}
     for study in studies:
         name = study.study.name
@@ -56,6 +59,7 @@ def unlike(studies: Sequence[Study]) -> list[str]:
         if study.models.sets:
             for part, how in (("[plate]", _plate(study)), ("[mesh]", _mesh(study)), ("[models]", _solved(study))):
                 told.setdefault(part, {})[name] = how
+        told.setdefault("[loads]", {})[name] = ", ".join(sorted(study.loads))
         for load, of in study.loads.items():
             for along, value in _pushed(of).items():
                 told.setdefault(f"[loads.{load}] {along}", {})[name] = value
@@ -100,7 +104,12 @@ def _mesh(study: Study) -> str:
 
 def _solved(study: Study) -> str:
     fixed = sorted({name.casefold() for name in study.models.fixed} - {BONE})
-    return study.models.element + (f" with {', '.join(fixed)} fixed" if fixed else "")
+    limit = study.models.limit_minutes
+    return (
+        study.models.element
+        + (f" with {', '.join(fixed)} fixed" if fixed else "")
+        + (f", {limit:g} minutes at the most" if limit else "")
+    )
 
 
 def _pushed(load: Load) -> dict[str, str | float]:

@@ -64,7 +64,11 @@ class Begun:
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.passed_over.items()]
-        todo = "Put the forces in" if found.load0 and found.loads else "Put in what was not found, and the forces"
+        todo = (
+            "Put the forces in"
+            if found.load0 and found.loads and found.labels
+            else "Put in what was not found, and the forces"
+        )
         return [*lines, f"Study file: {self.path}. {todo}; then: mrstrain check {self.path.parent}"]
 
 
@@ -133,9 +137,12 @@ def _look(place: Path) -> Found:
 
 
 def _holds_dicom(folder: Path) -> bool:
-    """Whether one of a folder's first files is a DICOM image, whatever it is called."""
-    some = sorted(p for p in folder.iterdir() if p.is_file())[:_LOOKED_AT]
-    return any(is_dicom(p) for p in some)
+    """Whether a folder's files are DICOM images, by a name or by what the first of them hold."""
+    try:
+        files = sorted(p for p in folder.iterdir() if p.is_file())
+        return any(p.suffix.lower() == ".dcm" for p in files) or any(is_dicom(p) for p in files[:_LOOKED_AT])
+    except OSError:  # not to be read: none that could be used
+        return False
 
 
 def _role(stem: str) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ParamSpec, TypeVar
@@ -30,7 +30,7 @@ from mrstrain.inputs import is_bones_name
 from mrstrain.ledger import Ledger
 from mrstrain.modelfiles import Reading, model_files
 from mrstrain.pipeline import Pipeline
-from mrstrain.plan import KINDS, labels_to_mesh, load_steps, plan, towards
+from mrstrain.plan import Stage, labels_to_mesh, load_steps, plan, towards
 from mrstrain.registering import REPEAT
 from mrstrain.studyfile import Study, Vector, read_study
 from validate.location import read_thresholds
@@ -64,20 +64,10 @@ class Checked:
 
 @dataclass(slots=True)
 class _Findings:
-    """What was found so far; as in `Checked`, of files that cannot be read only where ``of_files`` is set."""
+    """What was found so far, as in `Checked`."""
 
-    of_files: bool = True
     wrong: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-
-    def read(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
-        """What a file holds; None where it cannot be read."""
-        if self.of_files:
-            return self.tried(read, *given, **options)
-        try:
-            return read(*given, **options)
-        except (MrstrainError, OSError):
-            return None
 
     def tried(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
         """What a function gives; None where it refuses, which is noted once."""
@@ -105,9 +95,8 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
         If the study file itself cannot be read.
     """
     told, found = read_study(study), _Findings()
-    reference, labels = _reference(told, found)
+    reference, labels = _shared(told, found, None)
     _loaded(told, found, reference)
-    _alike(told, found, reference, labels, KINDS)
     if labels is not None and told.models.results:
         found.tried(_foreign, told, found, labels)
     planned = found.tried(plan, told)
@@ -121,47 +110,60 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     return Checked(tuple(found.wrong), tuple(found.notes))
 
 
-def wrong_for_all(study: Study, kinds: Collection[str] = KINDS) -> tuple[str, ...]:
-    """What keeps stages of some kinds from what the study says, of whichever load or model; in a second or two.
-
-    Files that are damaged, and loaded images, are left to the stages: they keep only what is made from them.
-    """
-    found = _Findings(of_files=False)
-    _alike(study, found, *_reference(study, found), kinds)
+def wrong_with(study: Study, stages: Sequence[Stage]) -> tuple[str, ...]:
+    """What some of these stages would fail by, but for their loaded images: each keeps only its own load."""
+    found = _Findings()
+    _shared(study, found, stages)
     return tuple(found.wrong)
 
 
-def _alike(
-    study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None, kinds: Collection[str]
-) -> None:
-    """Look at what loads or models have in common: settings, the plate, laws and mesh; of stages of some kinds."""
-    for normal, shear in ((study.plate.normal, study.plate.shear_direction), *towards(study).values()):
+def _shared(study: Study, found: _Findings, stages: Sequence[Stage] | None) -> tuple[Image | None, LabelMap | None]:
+    """Look at what some stages need, or all (None), but loaded images; give the unloaded one, and the labels on it."""
+    known = None if stages is None else {word for stage in stages for word in (stage.name, stage.kind)}
+
+    def asked(*names_or_kinds: str) -> bool:
+        return known is None or not known.isdisjoint(names_or_kinds)
+
+    reference = _reference(study, found) if asked("register", "level") else None
+    labels = _labels(study, found, reference) if asked("register", "level", "compare") else None
+    every, own = asked("simulate", "drive", "compare"), towards(study)
+    shared = (study.plate.normal, study.plate.shear_direction)
+    loads = [load for load in study.loads if every or asked(f"register {load}")]
+    for normal, shear in dict.fromkeys(own.get(load, shared) for load in loads):
         found.tried(plate_axes, -np.asarray(normal), shear)
-    if not {"register", "level"}.isdisjoint(kinds):
+    if asked("register", "level"):
         _registration(study, found, reference, labels)
-    if study.models.sets and not {"mesh", "simulate", "drive"}.isdisjoint(kinds):
-        _simulations(study, found, reference)
-    if study.models.level and "level" in kinds and reference is not None and reference.missing.any():
+    if study.models.sets and asked("mesh") and study.mesh.file is None:
+        _meshing(study, found)
+    if study.models.sets and asked("simulate", "drive"):
+        laws = [one for one in _sets(study, found) if asked(f"simulate {one.name}", f"drive {one.name}")]
+        _simulations(study, found, reference, laws)
+    if study.models.level and asked("level") and reference is not None and reference.missing.any():
         found.wrong.append("[models] level = true needs an unloaded image without voxels that are NaN or infinite.")
-    if "compare" in kinds:
+    if asked("compare"):
         if labels is not None and (study.models.sets or study.models.results):
             found.tried(check_bones, labels, study.mesh.bones)
         if study.compare.thresholds is not None:
             found.tried(read_thresholds, study.path(study.compare.thresholds))
+    return reference, labels
 
 
-def _reference(study: Study, found: _Findings) -> tuple[Image | None, LabelMap | None]:
-    """Look at the unloaded image and the labels; give the image, and the labels on it."""
-    images = study.images
-    reference = found.read(_image, study, images.load0)
+def _reference(study: Study, found: _Findings) -> Image | None:
+    """Look at the unloaded image."""
+    reference = found.tried(_image, study, study.images.load0)
     if reference is not None:
         found.notes.append(f"Load0: {reference.grid}")
-    labels = found.read(read_labels, study.path(images.labels), _optional(study, images.names))
+    return reference
+
+
+def _labels(study: Study, found: _Findings, reference: Image | None) -> LabelMap | None:
+    """Look at the labels; give them on the unloaded image's grid."""
+    labels = found.tried(read_labels, study.path(study.images.labels), _optional(study, study.images.names))
     if labels is not None:
         found.notes.append(f"Labels: {', '.join(labels.names.values())}")
         if reference is not None:
-            labels = found.tried(fit_mask, labels, reference.grid, images.labels) or labels
-    return reference, labels
+            labels = found.tried(fit_mask, labels, reference.grid, study.images.labels) or labels
+    return labels
 
 
 def _loaded(study: Study, found: _Findings, reference: Image | None) -> None:
@@ -207,10 +209,14 @@ def _registration(study: Study, found: _Findings, reference: Image | None, label
         )
 
 
-def _simulations(study: Study, found: _Findings, reference: Image | None) -> None:
-    """Look for what `simulate` would refuse."""
+def _sets(study: Study, found: _Findings) -> list[MaterialSet]:
+    """Read the material sets."""
     sets = [found.tried(material_set, study.set_given(name)) for name in study.models.sets]
-    laws = [one for one in sets if one is not None]
+    return [one for one in sets if one is not None]
+
+
+def _simulations(study: Study, found: _Findings, reference: Image | None, laws: Sequence[MaterialSet]) -> None:
+    """Look for what `simulate` would refuse."""
     given, own = study.plate, towards(study)
     by_direction: dict[tuple[Vector, Vector], list[LoadStep]] = {}
     forced = found.tried(load_steps, study) or {}
@@ -225,31 +231,14 @@ def _simulations(study: Study, found: _Findings, reference: Image | None) -> Non
         if plate is not None:
             found.tried(check_loads, plate, steps)
             loads.append((plate, steps))
-    if study.mesh.file is not None:
-        file = study.path(study.mesh.file)
-        mesh = found.read(mesh_given, study, study.mesh.file)
-        if mesh is None:
-            return
+    if study.mesh.file is None:
+        _on_labels(study, found, reference, laws)
+        return
+    mesh = found.tried(mesh_given, study, study.mesh.file)
+    if mesh is not None:
         if reference is not None:
-            found.tried(check_overlap, file, mesh, reference.grid)
+            found.tried(check_overlap, study.path(study.mesh.file), mesh, reference.grid)
         _on_mesh(found, mesh, laws, loads, study.models.fixed)
-        return
-    labels = found.read(read_labels, *labels_to_mesh(study))
-    unknown = {name.casefold() for name in study.models.fixed} - {"bone", "cut"}
-    if unknown:
-        found.wrong.append(
-            f"[models] fixed: beside the bone's surface the cut may be fixed; got {', '.join(sorted(unknown))}."
-        )
-    if labels is None:
-        return
-    if reference is not None and study.mesh.labels is not None:
-        there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())
-        if there < _THERE:
-            found.wrong.append(
-                f"{study.path(study.mesh.labels)}: only {there:.0%} of what it labels lies in the unloaded image. A "
-                "mesh has to lie where the images are."
-            )
-    _on_labels(study, found, labels, laws)
 
 
 def _on_mesh(
@@ -268,24 +257,51 @@ def _on_mesh(
             found.tried(check_simulation, mesh, chosen[0], plate, steps, fixed_facets(mesh, fixed))
 
 
-def _on_labels(study: Study, found: _Findings, labels: LabelMap, sets: Sequence[MaterialSet]) -> None:
-    """Look whether a label map has the regions that are named, and each set a law for every tissue that is meshed."""
-    how = study.mesh
-    finer = None if how.finer is None else (how.finer.region, how.finer.edge_mm)
-    found.tried(check_meshing, labels, how.edge_mm, how.bones, finer)
-    numbers = np.unique(labels.labels)
-    soft = [name for n, name in labels.names.items() if n != 0 and n in numbers and name not in study.mesh.bones]
-    found.notes += [
-        f"CARE: {name} will be meshed as soft tissue, and is called as a bone is: [mesh] bones leaves it out."
-        for name in soft
-        if is_bones_name(name)
-    ]
+def _meshing(study: Study, found: _Findings) -> None:
+    """Look whether the label map that is meshed has the regions that are named."""
+    labels = found.tried(read_labels, *labels_to_mesh(study))
+    if labels is not None:
+        how = study.mesh
+        finer = None if how.finer is None else (how.finer.region, how.finer.edge_mm)
+        found.tried(check_meshing, labels, how.edge_mm, how.bones, finer)
+        found.notes += [
+            f"CARE: {name} will be meshed as soft tissue, and is called as a bone is: [mesh] bones leaves it out."
+            for name in _soft(study, labels)
+            if is_bones_name(name)
+        ]
+
+
+def _on_labels(study: Study, found: _Findings, reference: Image | None, sets: Sequence[MaterialSet]) -> None:
+    """Look whether each set has a law for every tissue that is meshed, and whether that lies where the images are."""
+    fixed = {name.casefold() for name in study.models.fixed}
+    unknown = fixed - {"bone", "cut"}
+    if unknown:
+        found.wrong.append(
+            f"[models] fixed: beside the bone's surface the cut may be fixed; got {', '.join(sorted(unknown))}."
+        )
+    labels = found.tried(read_labels, *labels_to_mesh(study))
+    if labels is None:
+        return
+    if reference is not None and study.mesh.labels is not None:
+        there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())
+        if there < _THERE:
+            found.wrong.append(
+                f"{study.path(study.mesh.labels)}: only {there:.0%} of what it labels lies in the unloaded image. A "
+                "mesh has to lie where the images are."
+            )
+    soft = _soft(study, labels)
     for one in sets:
         found.tried(one.for_regions, soft)
-    if "cut" in {name.casefold() for name in study.models.fixed} and "skin" not in {name.casefold() for name in soft}:
+    if "cut" in fixed and "skin" not in {name.casefold() for name in soft}:
         found.wrong.append(
             "[models] fixed: 'cut' needs a tissue called skin in the label map, which tells it from the outer surface."
         )
+
+
+def _soft(study: Study, labels: LabelMap) -> list[str]:
+    """Names of the tissues that are meshed."""
+    numbers = np.unique(labels.labels)
+    return [name for n, name in labels.names.items() if n != 0 and n in numbers and name not in study.mesh.bones]
 
 
 def _image(study: Study, given: str) -> Image:

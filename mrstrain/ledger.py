@@ -76,17 +76,17 @@ class Ledger:
 
     def impersonal(self, text: str, stage: Stage) -> str:
         """A text without folders above the study, a stage's files and the home folder: they may name a person."""
-        around = [place for file in stage.files for place in (file.parent, Path(os.path.normpath(file.parent)))]
-        outside = [place for place in around if not Path(os.path.normpath(place)).is_relative_to(self.home)]
-        shortened = [
-            *((place, "", "a folder") for place in outside),
-            (self.home, "", "."),
-            (Path.home(), f"~{os.sep}", "~"),
-        ]
-        for place, before, alone in shortened:
+        told = [place for file in stage.files for place in (file.parent, *([file] if file.is_dir() else []))]
+        told += [Path(os.path.normpath(place)) for place in told]
+        outside = [place for place in told if not Path(os.path.normpath(place)).is_relative_to(self.home)]
+        shortened = {place: ("", "a folder") for place in outside}
+        shortened |= {Path.home(): (f"~{os.sep}", "~"), self.home: ("", ".")}
+        for place in sorted(shortened, key=lambda one: -len(str(one))):  # what lies in another first
             if place != place.parent:
-                text = text.replace(f"{place}{os.sep}", before)
-                text = re.sub(rf"{re.escape(str(place))}(?![\w.-])", alone, text)
+                within, alone = shortened[place]
+                begin = rf"(?<![\w.-]){re.escape(str(place))}"
+                text = re.sub(begin + re.escape(os.sep), within.replace("\\", r"\\"), text)
+                text = re.sub(rf"{begin}(?![\w.-])", alone, text)
         return text
 
     def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from dvc.errors import InputError, OutputError, ParameterError
-from mrstrain.checking import wrong_for_all
+from mrstrain.checking import wrong_with
 from mrstrain.costs import disk_bytes, seconds_of, sizes_of
 from mrstrain.inputs import make_output, refuse_small_disk
 from mrstrain.ledger import Ledger
@@ -111,8 +111,8 @@ def run(
     Raises
     ------
     InputError
-        If the study cannot be read, a file is missing, or something is wrong with what its loads or models have in
-        common and stages that are to be run need; before anything is run.
+        If the study cannot be read, a file is missing, or stages that are to be run would fail by what it says or by
+        what is in its files, loaded images left aside; before anything is run.
     ParameterError
         If both a scheduler and a number of workers are given.
     OutputError
@@ -269,11 +269,11 @@ def refuse_missing(planned: Sequence[Sequence[Stage]]) -> None:
 
 
 def refuse_wrong(studies: Sequence[Study], todo: Sequence[Sequence[Stage]]) -> None:
-    """Refuse studies whose stages to do would all fail, some of them hours later, naming all that is wrong."""
+    """Refuse studies of whose stages to do some would fail, hours later, by what need not be computed to be known."""
     told = {
         study.study.name: wrong
         for study, left in zip(studies, todo, strict=True)
-        if left and (wrong := wrong_for_all(study, {stage.kind for stage in left}))
+        if left and (wrong := wrong_with(study, left))
     }
     if told:
         lines = [f"{name}: {sentence}" for name, wrong in told.items() for sentence in wrong]

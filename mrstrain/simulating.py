@@ -61,6 +61,8 @@ class Simulated:
         What was assumed, and what is not to be trusted.
     complete : bool
         Whether every load was carried, with laws that are stable at the strain reached.
+    timed_out : bool
+        Whether all that it lacks is what its limit of time did not let it reach.
     """
 
     name: str
@@ -68,6 +70,7 @@ class Simulated:
     figures: tuple[RegionFigures, ...]
     notes: tuple[str, ...]
     complete: bool
+    timed_out: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -384,4 +387,5 @@ def _written(
         with whole_file(folder / file) as part:
             part.write_bytes(drawn)
     complete = len(tried) == len(loads) and not unstable and all(state.reached == 1.0 for state in states)
-    return Simulated(name, tuple(states), tuple(rows), notes, complete)
+    timed_out = not complete and not unstable and all(state.reached == 1.0 or state.out_of_time for state in states)
+    return Simulated(name, tuple(states), tuple(rows), notes, complete, timed_out)

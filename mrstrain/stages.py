@@ -34,6 +34,8 @@ class Given:
         Whether all of it was reached; a model that carried a part of its load was not.
     retry : bool
         Whether a part of it failed in a way that may not come again: it is run anew next time.
+    timed_out : bool
+        Whether all that it lacks is what its limit of time did not let it reach.
     """
 
     lines: tuple[str, ...]
@@ -41,6 +43,7 @@ class Given:
     closing: tuple[Section, ...] = ()
     complete: bool = True
     retry: bool = False
+    timed_out: bool = False
 
 
 def register(tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone: str | None, **options: Any) -> Given:
@@ -97,7 +100,8 @@ def simulate(
         tell(stage, sum(begun.values()) / max(len(begun), 2 if len(loads) > 1 else 1))
 
     done = run(mesh, out=out, sets=[material], loads=steps, workers=1, threads=1, progress=told, **options)
-    return Given(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures))
+    timed_out = any(one.timed_out for one in done.sets)  # one set, if it did not fail
+    return Given(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), timed_out=timed_out)
 
 
 def drive(tell: Tell, *, out: str, mesh: str, dvc: str, material: str, loads: Sequence[str], **options: Any) -> Given:

@@ -93,4 +93,14 @@ def test_dicom_folders_are_found_whatever_their_files_are_called(tmp_path):
     assert begun.found.load0 == "Load0"
     assert begun.found.loads == {"Load1": "Load1", "Load2": "Load2"}
     assert "NOT USED: Load3, a folder without a DICOM image in it" in begun.summary()
-    assert "Put the forces in" in begun.summary()[-1]
+    assert "Put in what was not found" in begun.summary()[-1]  # the label map
+    (tmp_path / "study.toml").unlink()
+    (tmp_path / "tissues.nii.gz").touch()
+    assert "Put the forces in" in init(tmp_path).summary()[-1]
+
+
+def test_a_dicom_folder_may_hold_many_other_files(tmp_path):
+    (tmp_path / "Load0").mkdir()
+    for name in (*(f"A{n:02d}.bmp" for n in range(25)), "I1.dcm"):
+        (tmp_path / "Load0" / name).write_bytes(b"x")
+    assert init(tmp_path).found.load0 == "Load0"

@@ -15,7 +15,7 @@ from dvc.imagewrite import write_image, write_labels
 from dvc.mesh import TetMesh
 from fe.meshstore import write_tet_mesh
 from mrstrain import costs, stages
-from mrstrain.checking import check, wrong_for_all
+from mrstrain.checking import check, wrong_with
 from mrstrain.plan import Stage, plan
 from mrstrain.running import forecast, run
 from mrstrain.studyfile import read_study
@@ -252,6 +252,41 @@ def test_a_run_refuses_before_it_begins_what_all_of_it_needs(study, monkeypatch)
     assert forecast(study, only=("mesh", "simulate"))["simulate friedman"] == "run"
 
 
+def test_stages_are_refused_by_what_they_need_and_not_by_what_others_do(study):
+    def refused(*only: str) -> str:
+        try:
+            what = forecast(study, only=only)
+        except InputError as wrong:
+            return str(wrong)
+        assert "run" in what.values()
+        return ""
+
+    values = np.full(GRID.shape, 9)
+    values[:8], values[:4] = 1, 2
+    write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 9: "skin"}))
+    assert "mine has no law for the region 'skin'" in refused("mesh", "simulate mine")
+    assert refused("mesh") == refused("register") == refused("mesh", "simulate friedman") == ""
+    second = STUDY.replace(
+        "[plate]", '[loads.Load2]\nimage = "Load1.nii.gz"\nnormal_n = 2.0\nshear_direction = [2.0, 0.0, 0.0]\n[plate]'
+    )
+    (study / "study.toml").write_text(second)
+    assert refused("register Load1") == refused("mesh") == ""
+    assert "shear" in refused("register Load2")
+    (study / "study.toml").write_text(STUDY.replace("[registration]", "taped = false\n[registration]"))
+    assert "a plate without friction" in refused("mesh", "simulate friedman")
+    assert refused("mesh") == ""
+
+
+@pytest.mark.parametrize("name", ["Load0", "tissues"])
+def test_an_image_that_all_registrations_read_is_refused_where_it_is_damaged(study, name):
+    file = study / f"{name}.nii.gz"
+    file.write_bytes(file.read_bytes()[:-99])
+    with pytest.raises(InputError, match=f"(?s)cannot be run as it is.*{name}"):
+        forecast(study, only=("register",))
+    if name == "Load0":
+        assert forecast(study, only=("mesh",))["mesh"] == "run"
+
+
 def test_what_is_meshed_is_looked_at_as_it_is(study):
     """Labels in voxels of 1 mm are meshed at .6 mm; brought to the image's 2 mm for all else."""
     fine = Grid((32, 32, 32), (1.0, 1.0, 1.0), (-6.5, -6.5, -6.5))
@@ -265,7 +300,8 @@ def test_what_is_meshed_is_looked_at_as_it_is(study):
 def test_a_damaged_loaded_image_is_left_to_its_stage(study):
     (study / "Load1.nii.gz").write_bytes((study / "Load1.nii.gz").read_bytes()[:-99])
     assert "Load1.nii.gz" in "".join(check(study).wrong)
-    assert wrong_for_all(read_study(study)) == ()
+    told = read_study(study)
+    assert wrong_with(told, plan(told)) == ()
 
 
 @pytest.mark.parametrize(("given", "told"), [("[0.5, 0.2]", "must rise"), ("[20.0, 50.0]", "no percent")])

@@ -178,6 +178,13 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
     (places[1] / "mine.toml").write_text(again)
     cohort(places[:2], out=tmp_path / "same")
 
+    (places[1] / "study.toml").write_text(
+        (places[1] / "study.toml").read_text() + 'limit_minutes = 5\n[loads.Load2]\nimage = "Load2.nii.gz"\n'
+    )
+    notes = cohort(places[:2], out=tmp_path / "more").notes
+    assert f"{begin}[loads] differs: Load1 in Ada; Load1, Load2 in Ben." in notes
+    assert f"{begin}[models] differs: P1 in Ada; P1, 5 minutes at the most in Ben." in notes
+
 
 def test_files_that_are_lacking_are_told_of_all_subjects_at_once(tmp_path):
     places = [compared(tmp_path, name, 0.1, 0.3) for name in ("Ada", "Ben")]

@@ -104,24 +104,16 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
     assert lines[5].startswith("Report: ")
 
 
-def test_a_model_that_its_limit_of_time_ended_is_no_failure_of_the_demonstration(folder):
-    _make(folder, 1, True, None)
-    limited = Ran(read_study(folder), {})
-    _make(folder, 1, False, None)
-    unlimited = Ran(read_study(folder), {})
-
-    def reached(ran: Ran, line: str, *, retry: bool = False, reason: str = "", there: bool = True) -> bool:
-        given = Given((line,), complete=False, retry=retry)
+def test_a_model_that_its_limit_of_time_ended_is_no_failure_of_the_demonstration():
+    def reached(*, timed_out: bool, reason: str = "", there: bool = True) -> bool:
+        given = Given((), complete=False, timed_out=timed_out)
         record = Record(stage="simulate friedman", key="", made_utc="", seconds=1.0, files={}, given=given)
-        return _reached(Outcome("simulate friedman", record if there else None, reason), ran)
+        return _reached(Outcome("simulate friedman", record if there else None, reason))
 
-    cut = "friedman: Load1: its time was over at 33% of the load; given more, it goes on from there."
-    assert reached(limited, cut)
-    assert not reached(unlimited, cut)
-    assert not reached(limited, "friedman: Load1: no smaller step would help.")
-    assert not reached(limited, cut, retry=True)
-    assert not reached(limited, cut, reason="Made from other inputs than the study names now.")
-    assert not reached(limited, cut, there=False)
+    assert reached(timed_out=True)
+    assert not reached(timed_out=False)
+    assert not reached(timed_out=True, reason="Made from other inputs than the study names now.")
+    assert not reached(timed_out=True, there=False)
 
 
 def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_truth(tmp_path, monkeypatch):

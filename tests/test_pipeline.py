@@ -263,6 +263,17 @@ def test_what_is_told_of_a_failure_names_no_folders_outside_the_study(tmp_path):
     assert told == "x.nii: no image. y.nii, in a folder: none. z.nii: none."
 
 
+def test_what_is_told_of_a_failure_names_no_folders_one_within_another(tmp_path):
+    home, dicom = tmp_path / "Doe_Jane", tmp_path / "Doe_Jim" / "DICOM"
+    dicom.mkdir(parents=True)
+    files = (home / ".." / "p.txt", tmp_path / "q.txt", dicom, tmp_path / "Doe_Jim" / "r.nii", home / "z.nii")
+    text = f"{home / 'z.nii'}, {files[0]}, {files[1]}, {dicom / 'IM1'}, {dicom}, {files[3]}: none."
+    for given in (files, files[::-1]):
+        stage = Stage("register a", {}, given, (home / "results" / "a",))
+        told = Ledger(home / "results", home).impersonal(text, stage)
+        assert told == "z.nii, p.txt, q.txt, IM1, a folder, r.nii: none."
+
+
 def test_the_forecast_knows_what_cannot_be_run(folder):
     def told(only: tuple[str, ...]) -> dict[str, str]:
         return Pipeline(stages_in(folder), Ledger(folder / "results", folder), only=only).forecast()
