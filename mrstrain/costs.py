@@ -31,9 +31,9 @@ _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
 _MESH_S = 100.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
-# GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took 1.4, 2.5, 4.0 and 10.6,
-# one of 2.3 with borders 1.6, a factorisation at 79,000 cells .84.
-_REGISTER_GIB, _REGISTER_GIB_PER_MVOXEL, _BORDERS_GIB_PER_MVOXEL = 1.05, 0.175, 0.14
+# GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
+# with borders 1.2 and 2.3 of the first two, by elastix .4 more; a factorisation at 79,000 cells .84.
+_REGISTER_GIB, _REGISTER_GIB_PER_MVOXEL, _BORDERS_GIB_PER_MVOXEL, _ELASTIX_GIB = 0.65, 0.175, 0.1, 0.4
 _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
 _OTHER_GIB = 1.5
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
@@ -103,7 +103,8 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
     """About how much memory a stage takes, GiB, all its processes together; parameters as in `seconds_of`."""
     if stage.kind in ("register", "level"):
         more = _BORDERS_GIB_PER_MVOXEL if _with_borders(study) else 0.0
-        return _REGISTER_GIB + (_REGISTER_GIB_PER_MVOXEL + more) * voxels / 1e6
+        loading = 0.0 if _by_gauss_newton(study) else _ELASTIX_GIB
+        return _REGISTER_GIB + loading + (_REGISTER_GIB_PER_MVOXEL + more) * voxels / 1e6
     if stage.kind in ("simulate", "drive"):
         times = _ELEMENT_GIB[study.models.element] if stage.kind == "simulate" else 1.0
         return _SIMULATE_GIB + times * _SIMULATE_GIB_PER_CELL * cells
@@ -132,10 +133,13 @@ def mesh_given(study: Study, file: str) -> TetMesh:
     return read_tet_mesh(study.path(file), unit=study.mesh.unit, frame=study.mesh.frame)
 
 
-def _with_borders(study: Study) -> bool:
+def _by_gauss_newton(study: Study) -> bool:
     how = study.registration
-    ours = engine_of(how.engine, how.preset, how.parameters) == GAUSS_NEWTON
-    return ours and how.borders is not False
+    return engine_of(how.engine, how.preset, how.parameters) == GAUSS_NEWTON
+
+
+def _with_borders(study: Study) -> bool:
+    return _by_gauss_newton(study) and study.registration.borders is not False
 
 
 def costs(
