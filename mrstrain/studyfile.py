@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
@@ -178,6 +178,12 @@ class Meshing(_Part):
     file: str | None = None
     unit: Literal["mm", "m"] = "mm"
     frame: Literal["LPS", "RAS"] = "LPS"
+
+    @model_validator(mode="after")
+    def _of_a_file(self) -> Meshing:
+        if self.file is None and (self.unit, self.frame) != ("mm", "LPS"):
+            raise ValueError("unit and frame are those of a mesh made elsewhere, and no 'file' names one")
+        return self
 
 
 class Models(_Part):

@@ -219,3 +219,13 @@ def test_files_that_inputs_name_are_inputs_too(tmp_path):
     files = {stage.name: [path.resolve() for path in stage.files] for stage in stages}
     assert tmp_path / "heel.cdb" in files["compare"]
     assert tmp_path / "own.json" in files["simulate trebbi"]
+
+
+def test_unit_and_frame_are_those_of_a_mesh_made_elsewhere(tmp_path):
+    (tmp_path / "own.vtu").write_text("x")
+    of_file = WHOLE + '[mesh]\nfile = "own.vtu"\nunit = "m"\nframe = "RAS"\n'
+    simulated = [stage for stage in plan(read_study(written(tmp_path, of_file))) if stage.kind == "simulate"]
+    assert {(stage.arguments["mesh_unit"], stage.arguments["mesh_frame"]) for stage in simulated} == {("m", "RAS")}
+    for key in ('unit = "m"', 'frame = "RAS"'):
+        with pytest.raises(InputError, match="no 'file' names one"):
+            read_study(written(tmp_path, WHOLE + f"[mesh]\n{key}\n"))
