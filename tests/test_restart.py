@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from fe.meshstore import write_tet_mesh
 from fe.plate import Plate
 from fe.restart import fingerprint, read_kept, write_kept
 from fe.simulate import LoadStep, State, simulate
+from mrstrain import stages
 from mrstrain.cli import app
 from tests.test_simulate import ALONG, DOWN, LAWS, dome
 
@@ -118,6 +120,20 @@ def test_the_command_tells_that_time_was_over(tmp_path: Path) -> None:
     assert ended.exit_code == 1
     assert "a: its time was over before the first equilibrium" in ended.output
     assert "b was not tried" in ended.output
+
+
+@pytest.mark.parametrize(("limit_s", "timed_out"), [(1e-6, True), (None, False)])
+def test_a_stage_tells_that_nothing_but_time_was_lacking(
+    tmp_path: Path, limit_s: float | None, timed_out: bool
+) -> None:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
+    given = stages.simulate(
+        lambda *_: None, out=str(tmp_path / "out"), mesh=str(tmp_path / "dome.vtu"), material="luboz",
+        loads=[asdict(load) for load in LOADS[:1]], plate_normal=DOWN, shear_direction=ALONG, limit_s=limit_s,
+    )  # fmt: skip
+    assert given.timed_out is timed_out
+    assert given.complete is not timed_out
+    assert not given.retry
 
 
 def test_what_was_made_from_something_else_is_not_used(whole, tmp_path: Path) -> None:

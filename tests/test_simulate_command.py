@@ -181,6 +181,13 @@ def test_a_law_that_is_not_stable_at_the_strain_reached_is_told_and_ends_with_st
     assert re.search("soft: " + note, told["1.4mm"].output)
     assert any(re.fullmatch(note, line) for line in told["1.4mm noted"])
     assert "Drucker" not in told["0.2mm"].output
+    loads, plate = (
+        [LoadStep("a", normal_mm=1.4)],
+        {"plate_normal": (-1.0, 0.0, 0.0), "shear_direction": (0.0, 1.0, 0.0)},
+    )
+    done = run(tmp_path / "block.vtu", out=tmp_path / "1.4mm", sets=[str(tmp_path / "soft.toml")], loads=loads, **plate)
+    assert not done.complete
+    assert not done.sets[0].timed_out  # more time would not help
 
 
 def test_more_is_fixed_beside_the_bone_and_what_law_stands_in_is_told(tmp_path: Path) -> None:
