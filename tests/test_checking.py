@@ -183,7 +183,7 @@ def test_larger_images_and_meshes_take_longer_and_more_memory(study):
         usual = read_study(study)
         seconds, gib = (of(registering, usual, small, 0.0) for of in (costs.seconds_of, costs.gib_of))
         assert seconds == pytest.approx(slower * 16.3 + 43.1, rel=0.05)
-        assert gib == pytest.approx(1.29 if slower > 1.0 else 1.46, abs=0.05)
+        assert gib == pytest.approx(1.29 if slower > 1.0 else 1.81, abs=0.05)
     assert costs.gib_of(simulating, told, 0.0, 79e3) == pytest.approx(1.2)
     assert costs.gib_of(simulating, told, 0.0, 8 * 79e3) == pytest.approx(8.2)
     assert costs.seconds_of(simulating, told, 0.0, 8 * 79e3) > 8 * costs.seconds_of(simulating, told, 0.0, 79e3)
