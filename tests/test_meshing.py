@@ -77,9 +77,11 @@ def test_surfaces_lie_where_they_should(meshed) -> None:
     mesh, _ = meshed
     radius = {name: np.linalg.norm(mesh.points_mm[np.unique(rows)], axis=1) for name, rows in mesh.facets.items()}
     assert set(radius) == {"bone", "skin", "cut"}
-    assert radius["bone"] == pytest.approx(6.0, abs=0.8)
     assert np.mean(radius["skin"] < 16.0) < 0.03  # its own section at the cut counts as cut, but for its very rim
-    assert np.abs(mesh.points_mm[np.unique(mesh.facets["cut"]), 2] + 0.5).max() < 0.8
+    for off_mm in (np.abs(radius["bone"] - 6.0), np.abs(mesh.points_mm[np.unique(mesh.facets["cut"]), 2] + 0.5)):
+        assert off_mm.max() < 1.0  # the rim where they meet is rounded, by less than a voxel
+        assert np.quantile(off_mm, 0.95) < 0.5
+        assert off_mm.mean() < 0.2
     shared = np.intersect1d(*(np.unique(mesh.cells[cells]) for cells in mesh.regions.values()))
     assert len(shared) > 100
     border = np.linalg.norm(mesh.points_mm[shared], axis=1)  # fat's with skin
