@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import RegistrationError
 from dvc.image import Grid, Image
 from dvc.imageterm import ImagePair, Normal
-from dvc.smoothness import Roughness
+from dvc.smoothness import REST, Roughness
 from dvc.splinesums import Stiffness
 
 _BLOCKS = 2.5  # blocks between two control points, about
@@ -43,6 +44,11 @@ class Weights:
     volume: float
     rigidity: float
     volume_gradient: float = 0.0
+
+    @property
+    def patience(self) -> int:
+        """How many times as many steps to take: where volume may change, each goes less far."""
+        return 2 if self.volume_gradient else 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +99,8 @@ class Level:
         At the voxels, as in `SplineSums`: the displacement is then a sum of splines.
     rough : sequence of (float, float)
         Of each spline, how its bending and its square count beside the first one's bending.
+    laplacians : {1, 2}
+        What its bending is, as in `Roughness`.
     """
 
     def __init__(
@@ -105,12 +113,14 @@ class Level:
         control: Grid,
         rim_mm: float = 0.0,
         factors: FloatArray | None = None,
-        rough: Sequence[tuple[float, float]] = ((1.0, 0.0),),
+        rough: Sequence[tuple[float, float]] = ((1.0, REST),),
+        laplacians: int = 1,
     ) -> None:
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
         self.control = control
         self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm, factors)
-        self.roughness = Roughness(control, rough)
+        self.roughness = Roughness(control, rough, laplacians)
+        self._tissue = _share_at(control, soft | stiff, fixed.grid)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0
         # between neighbouring blocks of soft tissue: the volume that their difference stands for, over its length^2
@@ -118,6 +128,10 @@ class Level:
             np.minimum(*_neighbours(self._soft, axis)) / length**2
             for axis, length in enumerate(block * fixed.grid.spacing_mm)
         ]
+
+    def following(self, coefficients: FloatArray) -> Roughness:
+        """`roughness`, with less weight where this displacement of the tissue is curved."""
+        return self.roughness.following(coefficients, self._tissue)
 
     def at(self, coefficients: FloatArray, halves: int = -1) -> State:
         """The state at a displacement; of the voxels all (-1) or one half (0, 1), as in `ImagePair.normal`."""
@@ -281,6 +295,12 @@ class Level:
         moved = self.pair.blocks.evaluate(step)[0]
         square = np.einsum("...a,...a->...", moved, moved)
         return float(np.sqrt(_dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)))
+
+
+def _share_at(control: Grid, mask: BoolArray, grid: Grid) -> FloatArray:
+    """A mask at control points, 0 to 1, interpolated: the same in any frame, where nearest voxels may be two."""
+    at = np.moveaxis(grid.indices_of(control.points()), -1, 0)
+    return np.asarray(map_coordinates(mask.astype(np.float64), at, order=1, mode="grid-constant"))
 
 
 def _neighbours(field: FloatArray, axis: int) -> tuple[FloatArray, FloatArray]:

@@ -1,10 +1,12 @@
 """Gauss-Newton registration: a cubic B-spline displacement, all voxels, and a prior whose weight the images choose.
 
-Minimised is ``1/(2 s^2) sum r^2 + b/2 int |D^2 u|^2 + v/2 int (J - 1)^2 + w/2 int |E|^2``: residuals r over the voxels
-of a mask with their own variance s^2, the bending of the displacement, the change of volume in soft tissue and the
-strain of the bone. Four levels from coarse to fine, smoothed images first; each step by conjugate gradients that never
-form the Hessian. Nothing is drawn at random, and every sum has a fixed order: the result is the same bit for bit on
-any number of threads. docs/decisions/0009 has the reasons.
+Minimised is ``1/(2 s^2) sum r^2 + b/2 int c |Δ u|^2 + v/2 int (J - 1)^2 + w/2 int |E|^2``: residuals r over the voxels
+of a mask with their own variance s^2, the bending of the displacement (and, very little, itself: `dvc.smoothness`), the
+change of volume in soft tissue and the strain of the bone. Bending counts alike everywhere (c = 1) at first; in the
+last steps less where it was found. Four levels from coarse to fine, smoothed images first; each step by conjugate
+gradients that never form the Hessian. Nothing is drawn at random, and every sum has a fixed order: the result is the
+same bit for bit on any number of threads.
+docs/decisions/0009 has the reasons.
 """
 
 from __future__ import annotations
@@ -24,9 +26,10 @@ from dvc.descent import Level, Weights
 from dvc.errors import InputError, ParameterError
 from dvc.image import Grid, Image, Mask
 from dvc.resample import smoothed
+from dvc.smoothness import NUMBERS
 
 # Of each level: smoothing of both images (mm), control spacing over the finest, most steps, the step that ends it (mm).
-LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 1.0, 5, 0.005))
+LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 1.0, 3, 0.005))
 _LEAST_VOXELS = 2.0
 _BLURRED = 2.0  # standard deviations: nearer to its ends a blurred image shows what it was padded with
 _RIM_MM = 1.2  # bone nearer to its surface than that may be tissue in part of a voxel
@@ -39,8 +42,8 @@ USUAL_VOLUME = 300.0
 _LOOKING_MM4, _FREED = 1000.0, 100.0
 _ASKED = 0.04  # the change of volume that a hundredth of the soft tissue exceeds: between loads and swelling
 _RATIO = np.sqrt(10.0)
-_POWERS = -2, 3  # powers of the ratio that are tried at the most: weights of 0.3 to 95
-_CHECK_STEPS, _CHECK_TOLERANCE, _CHECK_MOST = 2, 0.05, 80
+_POWERS = -4, 3  # powers of the ratio that are tried at the most: weights of 0.03 to 95
+_CHECK_TOLERANCE, _CHECK_MOST = 0.05, 80
 _MIDDLE = 0.7  # of each edge of the mask's box
 _LAST_STEPS = 2
 
@@ -92,10 +95,11 @@ class GaussNewton:
             "usual": USUAL_BENDING,
             "ratio": _RATIO,
             "powers": _POWERS,
-            "steps": [_CHECK_STEPS, _LAST_STEPS],
+            "steps": [1, _LAST_STEPS],
         }
         rims = {"blurred": _BLURRED, "bone_rim_mm": _RIM_MM}
         told = {"engine": "gauss-newton", "levels": LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
+        told |= {"roughness": NUMBERS}
         return json.dumps(asdict(self) | {"volume": self.weights.volume} | told)
 
     @property
@@ -231,19 +235,22 @@ def fit(
             np.zeros((3, *control.shape)) if guess is None else turned(axes.T, spline_through(guess, control))
         )
         level = _level(pictures, inside.inside, soft, core, control, sigma_mm)
-        coefficients = level.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
+        coefficients = level.descend(coefficients, weights, steps=steps * weights.patience, stop_mm=stop_mm)
         if options.volume is None and number == len(LEVELS) - 2:
             asked = _volume_asked(level, coefficients, weights)
             if asked > _ASKED:
                 weights = replace(weights, volume=0.0, volume_gradient=_FREED)
         progress((number + 1) / (len(LEVELS) + 2))
     choice = Choice(weights, "fixed beforehand", asked=asked)
+    level.roughness = level.following(coefficients)
     if options.bending is None:
         part = _middle(inside.inside)
         middle = Level(*pictures, inside.inside & part, soft & part, core & part, control)
+        middle.roughness = level.roughness
         choice = replace(choose(middle, coefficients, weights), asked=asked)
         progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
-        coefficients = level.descend(coefficients, choice.weights, steps=_LAST_STEPS, stop_mm=LEVELS[-1][-1])
+    steps = _LAST_STEPS * choice.weights.patience
+    coefficients = level.descend(coefficients, choice.weights, steps=steps, stop_mm=LEVELS[-1][-1])
     progress(1.0)
     return BSpline(control, turned(axes, coefficients)), choice
 
@@ -254,13 +261,15 @@ def choose(
     weights: Weights,
     name: str = "bending",
     powers: tuple[int, int] = _POWERS,
+    margin: float | None = None,
 ) -> Choice:
     """One of the weights by two-fold cross-validation, around the value that it has.
 
     One half of the voxels (a chessboard of small cubes) is fitted, the other half's residual is what counts: noise that
     was fitted makes it larger, and so does detail that was smoothed away. Weights are tried in steps of a factor of 3.2
     until the best lies between two others; then the vertex of the parabola through the three, over the weight's
-    logarithm.
+    logarithm. With a margin instead the weight is raised from there for as long as no more than that share is added to
+    what is left.
     """
     found: dict[int, float] = {}
     usual = getattr(weights, name)
@@ -270,7 +279,7 @@ def choose(
         if power not in found:
             tried = replace(weights, **{name: usual * _RATIO**power})
             fitted = level.descend(
-                coefficients, tried, steps=_CHECK_STEPS, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE,
+                coefficients, tried, steps=1, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE,
                 most=_CHECK_MOST,
             )  # fmt: skip
             found[power] = level.at(fitted, halves=1).variance
@@ -279,8 +288,13 @@ def choose(
     best = 0
     while (nearby := min((p for p in (best, best - 1, best + 1) if least <= p <= greatest), key=left_out)) != best:
         best = nearby
-    power, rule = float(best), f"{name} by cross-validation: half of the voxels fitted, the other half's residual least"
-    if least < best < greatest:
+    rule = f"{name} by cross-validation: half of the voxels fitted, the other half's residual least"
+    power = float(best)
+    if margin is not None:
+        while power < greatest and left_out(int(power) + 1) <= (1.0 + margin) * found[best]:
+            power += 1.0
+        rule += f", then raised for as long as that adds no more than {100.0 * margin:g} %"
+    elif least < best < greatest:
         below, here, above = (left_out(best + d) for d in (-1, 0, 1))
         power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
     else:

@@ -18,7 +18,8 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.bspline import spline_basis
 from dvc.image import Grid, Image
 from dvc.resample import fill_missing
-from dvc.splinesums import SplineSums, plane_sums
+from dvc.splinekernels import plane_sums
+from dvc.splinesums import SplineSums
 
 _GAIN_MM = 10.0
 _CUBE = 4  # voxels; finer halves share the noise of neighbours through gradients and interpolation

@@ -3,11 +3,13 @@
 The smooth displacement of `dvc.gaussnewton` is the start of one more stage at full resolution, for a `BorderedSpline`
 u = m v + psi w. Minimised is
 
-    1/(2 s^2) sum r^2 + b/2 int (|D^2 v|^2 + 3 L^2 |D^2 w|^2 + q |w|^2) + v/2 int (J - 1)^2 + k/2 int_skin |E|^2
+    1/(2 s^2) sum r^2 + b/2 int (c l^4 |Δ Δ v|^2 + 3 L^2 c l^4 |Δ Δ w|^2 + q |w|^2) + v/2 int (J - 1)^2
+    + k/2 int_skin |E|^2
 
-with L the reach of a border and q = 0.02 / mm2; the bone has no strain by its making. Images say little about the
-inside of a skin as thin as two voxels. How much it resists strain, k, is chosen as the bending is, by the residual of
-voxels that were left out: what the skin does moves the fat beside it. docs/decisions/0009 has the reasons.
+with L the reach of a border, q = 0.02 / mm2, and c and l as in `dvc.smoothness`; the bone has no strain by its making.
+Images say little about the inside of a skin as thin as two voxels. How much it resists strain, k, is chosen as the
+bending is, by the residual of voxels that were left out: what the skin does moves the fat beside it.
+docs/decisions/0009 has the reasons.
 """
 
 from __future__ import annotations
@@ -27,12 +29,15 @@ from dvc.errors import ParameterError
 from dvc.gaussnewton import LEVELS, Choice, GaussNewton, choose, fit, scaled, turned
 from dvc.image import Image, LabelMap, Mask
 from dvc.kinematics import StrainField
+from dvc.smoothness import REST
 
 _SKIN = "skin"
 USUAL_SKIN = 3.0
-"""Weight of strain in the skin, 1/mm3, to begin with; between those that loaded pairs get, 0.03 to 65."""
+"""Weight of strain in the skin, 1/mm3, to begin with; between those that loaded pairs get, 0.3 to 300."""
 _SKIN_POWERS = -5, 4  # of the square root of ten, times that: 0.01 to 300
+_SKIN_MARGIN = 3e-4  # of the left-out residual: skin is stiff unless the images say more than that against it
 _STEPS = 3
+_LAPLACIANS = 2  # within a tissue; a smooth spline that has to follow jumps does it better with one
 _BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
 _SMOOTH_SHARE = 0.4  # of the time
 
@@ -63,6 +68,8 @@ class AtBorders:
         stage = {
             "usual_skin": USUAL_SKIN,
             "powers": _SKIN_POWERS,
+            "margin": _SKIN_MARGIN,
+            "laplacians": _LAPLACIANS,
             "steps": _STEPS,
             "of_jumps": [_BENDING, _SQUARE],
             "distances": NUMBERS,
@@ -115,19 +122,26 @@ def fit_with_borders(
     scale = float(np.nanpercentile(fixed.values[body.inside], 75))
     pictures = scaled(fixed, scale), scaled(moving, scale)
     factors = borders.at_voxels()
-    rough = ((1.0, 0.0), (_BENDING * borders.reach_mm**2, _SQUARE))
+    rough = ((1.0, REST), (_BENDING * borders.reach_mm**2, _SQUARE))
 
     def level(part: BoolArray) -> Level:
-        return Level(*pictures, inside.inside & part, soft & part, skin & part, control, factors=factors, rough=rough)
+        return Level(
+            *pictures, inside.inside & part, soft & part, skin & part, control, factors=factors, rough=rough,
+            laplacians=_LAPLACIANS,
+        )  # fmt: skip
 
-    whole, slab = level(np.ones_like(soft)), level(_slab(inside.inside))
-    stop_mm = LEVELS[-1][-1]
+    part = _slab(inside.inside)
+    whole, slab = level(np.ones_like(soft)), level(part)
+    steps, stop_mm = _STEPS * weights.patience, LEVELS[-1][-1]
     found: FloatArray = np.concatenate([turned(axes.T, smooth.coefficients_mm), np.zeros((3, *control.shape))])
-    found = whole.descend(found, weights, steps=_STEPS, stop_mm=stop_mm)
-    choice, in_skin = Choice(weights, "bending fixed beforehand"), Choice(weights, "rigidity fixed beforehand")
+    found = whole.descend(found, weights, steps=steps, stop_mm=stop_mm)
+    whole.roughness = slab.roughness = whole.following(found)
+    choice = Choice(weights, "bending fixed beforehand")
+    told = "fixed beforehand" if at_borders.skin is not None else "as usual, as too little of it is in the image"
+    in_skin = Choice(weights, f"rigidity {told}")
     progress(_SMOOTH_SHARE + 0.1)
-    if skin.any() and at_borders.skin is None:
-        in_skin = choose(slab, found, weights, "rigidity", _SKIN_POWERS)
+    if (skin & part).any() and at_borders.skin is None:
+        in_skin = choose(slab, found, weights, "rigidity", _SKIN_POWERS, _SKIN_MARGIN)
         choice = replace(choice, weights=in_skin.weights)
     progress(_SMOOTH_SHARE + 0.3)
     if options.bending is None:
@@ -142,7 +156,7 @@ def fit_with_borders(
         in_bone=None if bone is None else _moved(smooth, bone),
     )
     progress(_SMOOTH_SHARE + 0.5)
-    found = whole.descend(found, choice.weights, steps=_STEPS, stop_mm=stop_mm)
+    found = whole.descend(found, choice.weights, steps=steps, stop_mm=stop_mm)
     progress(1.0)
     smooth, jump = (BSpline(control, turned(axes, c)) for c in np.split(found, 2))
     return BorderedSpline(smooth, jump, borders), choice

@@ -62,6 +62,7 @@ _ENGINE = {
     "imageterm.py",
     "smoothness.py",
     "splinesums.py",
+    "splinekernels.py",
     "borders.py",
     "sharpen.py",
     "nonrigid.py",

@@ -16,7 +16,6 @@ from dvc.errors import GeometryError, InputError
 from dvc.gaussnewton import Choice, GaussNewton, control_grid, fit
 from dvc.image import Grid, Image, LabelMap, Mask
 from dvc.sharpen import AtBorders, fit_with_borders
-from dvc.smoothness import Bending, Roughness
 from dvc.splinesums import SplineSums
 
 NAMES = {1: "bone", 2: "fat", 3: "skin"}
@@ -310,15 +309,3 @@ def test_without_skin_and_bone_and_with_a_fixed_weight():
     assert not choice.tried_in_skin
     assert found.borders.rest == -1
     assert shear_errors(found, 1.0)["fat"] < 0.05
-
-
-def test_roughness_of_two_splines_is_the_weighted_sum():
-    control = Grid((6, 7, 8), np.array([3.0, 4.0, 5.0]), np.zeros(3))
-    v, w = (np.random.default_rng(seed).normal(size=(3, *control.shape)) for seed in (1, 2))
-    both = Roughness(control, ((1.0, 0.0), (0.5, 0.02)))
-    c = np.concatenate([v, w])
-    expected = np.sum(v * Bending(control).product(v)) + 0.5 * np.sum(w * Bending(control).product(w))
-    assert np.sum(c * both.product(c)) == pytest.approx(expected + 0.02 * 60.0 * np.sum(w**2), rel=1e-12)
-    one = np.zeros_like(c)
-    one[4, 2, 3, 5] = 1.0
-    assert both.product(one)[4, 2, 3, 5] == pytest.approx(both.diagonals[1][2, 3, 5], rel=1e-12)

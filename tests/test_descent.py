@@ -12,7 +12,6 @@ from dvc.descent import Level, Weights, cofactors, conjugate_gradients
 from dvc.errors import InputError
 from dvc.gaussnewton import control_grid, spline_through
 from dvc.image import Grid
-from dvc.smoothness import Bending
 from dvc.splinesums import SplineSums
 from tests.textures import GRID, everything, pair_of
 
@@ -76,33 +75,12 @@ def test_cofactors_are_det_times_inverse_transpose():
     np.testing.assert_allclose(cofactors(F), expected, atol=1e-12)
 
 
-def test_bending_of_a_quadratic_displacement_is_its_closed_form():
-    """u = (a x y, b z^2, 0): |D^2 u|^2 = 2 a^2 + 4 b^2, times the volume of the valid region."""
-    a, b = 0.01, -0.02
-    control = Grid((8, 9, 10), np.array([3.0, 4.0, 5.0]), np.array([1.0, 2.0, 3.0]))
-    i, j, k = np.meshgrid(*(np.arange(n) for n in control.shape), indexing="ij")
-    x, y, z = 3.0 * i, 4.0 * j, 5.0 * k
-    c = np.stack([a * x * y, b * (z**2 - 25.0 / 3.0), 0.0 * x])  # the cubic spline of k^2 - 1/3 is t^2
-    energy = np.sum(c * Bending(control).product(c))
-    assert energy == pytest.approx((2.0 * a**2 + 4.0 * b**2) * (5 * 3.0) * (6 * 4.0) * (7 * 5.0), rel=1e-10)
-
-
-def test_an_affine_displacement_does_not_bend_and_the_diagonal_is_the_matrix_own():
-    control = Grid((6, 7, 8), np.array([3.0, 4.0, 5.0]), np.zeros(3))
-    bending = Bending(control)
-    u = control.points() @ np.array([[0.1, 0.2, 0.0], [-0.3, 0.0, 0.1], [0.0, 0.2, 0.3]])
-    assert np.abs(bending.product(np.moveaxis(u, -1, 0).copy())).max() < 1e-12
-    one = np.zeros((3, *control.shape))
-    one[2, 0, 3, 5] = 1.0
-    assert bending.product(one)[2, 0, 3, 5] == pytest.approx(bending.diagonal[0, 3, 5], rel=1e-12)
-
-
 @pytest.fixture(scope="module")
 def level() -> Level:
     fixed, moving = pair_of(Affine(np.eye(3), np.array([0.4, -0.3, 0.2])))
     inside, bone = everything().inside, np.zeros(GRID.shape, dtype=bool)
     bone[10:20, 12:24, 10:22] = True
-    return Level(fixed, moving, inside, inside & ~bone, bone, control_grid(GRID, np.full(3, 5.0)))
+    return Level(fixed, moving, inside, inside & ~bone, bone, control_grid(GRID, np.full(3, 5.0)), rough=((1.0, 0.0),))
 
 
 def rotated(level: Level) -> np.ndarray:

@@ -272,5 +272,5 @@ def test_our_own_engine_and_the_preset_for_heels_come_with_their_error(name: str
     assert stored.parameters_sha256 == hashlib.sha256(Settings.of(name).text.encode()).hexdigest()
     table = stored.table_for(np.full(3, 0.8), 25.0)
     bias, sd = table.expected("fat", np.array([0.02, 0.3]), np.array([6.0, 0.5], dtype=np.float32))
-    assert bias[0] > 0.005  # noise lifts small shears
+    assert bias[0] > 0.002  # noise lifts small shears
     assert sd[1] > sd[0] > 0.002
