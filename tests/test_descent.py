@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from dvc.bspline import BSpline
 from dvc.deformation import Affine, evaluate_on_grid
-from dvc.descent import Level, Weights, cofactors, conjugate_gradients
+from dvc.descent import Level, Weights, _share_at, cofactors, conjugate_gradients
 from dvc.errors import InputError
 from dvc.gaussnewton import control_grid, spline_through
 from dvc.image import Grid
@@ -146,3 +146,18 @@ def test_a_spline_through_a_cubic_deformation_is_that_deformation():
     assert np.abs(fine.displacement(X) - coarse.displacement(X)).max() < 0.05  # of 0.6; the knots are not the same
     with pytest.raises(InputError, match="not defined anywhere"):
         spline_through(coarse, Grid(finer.shape, finer.spacing_mm, finer.origin_mm + 500.0))
+
+
+def test_the_share_of_tissue_at_control_points_is_the_same_in_any_frame():
+    """A half space: whole inside, a half on its border, nothing outside the image."""
+    mask = np.zeros((12, 10, 8), dtype=bool)
+    mask[:6] = True
+    grid = Grid(mask.shape, np.full(3, 0.8), np.array([1.0, -2.0, 3.0]))
+    control = Grid((6, 5, 4), np.full(3, 1.6), grid.origin_mm + 0.4)  # in the middles of cells of voxels
+    share = _share_at(control, mask, grid)
+    np.testing.assert_allclose(share[:, 1, 1], [1.0, 1.0, 1.0, 0.0, 0.0, 0.0], atol=1e-12)
+    shifted = Grid(control.shape, control.spacing_mm, control.origin_mm + np.array([0.8, 0.0, 0.0]))
+    np.testing.assert_allclose(_share_at(shifted, mask, grid)[:, 1, 1], [1.0, 1.0, 0.5, 0.0, 0.0, 0.0], atol=1e-12)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    turned = [Grid(g.shape, g.spacing_mm, turn @ g.origin_mm, turn) for g in (control, grid)]
+    np.testing.assert_allclose(_share_at(turned[0], mask, turned[1]), share, atol=1e-12)

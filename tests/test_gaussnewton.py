@@ -6,15 +6,16 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from dvc.bspline import BSpline
 from dvc.deformation import Affine, evaluate_on_grid
-from dvc.descent import Level
+from dvc.descent import Level, Weights
 from dvc.errors import ParameterError
-from dvc.gaussnewton import USUAL_VOLUME, Choice, GaussNewton, _level, control_grid, fit, spline_through
+from dvc.gaussnewton import USUAL_VOLUME, Choice, GaussNewton, _level, choose, control_grid, fit, spline_through
 from dvc.image import Image, LabelMap
 from dvc.kinematics import StrainField
 from dvc.registration import Settings, register
@@ -73,6 +74,39 @@ def test_what_bends_is_smoothed_less_than_what_does_not():
 
     assert 0.3 < chosen(1.0) < 5.0  # found to 0.12 mm root mean square at 0.45, to 0.17 at 3 and 0.15 at 0.1
     assert chosen(0.0) > 20.0  # found to 0.03 mm at 30, to 0.08 at 1
+
+
+class Residuals:
+    """In place of a level: what is left out, by the power of the root of ten that a weight of 3 is multiplied by."""
+
+    def __init__(self, left: dict[int, float]) -> None:
+        self._left = left
+
+    def descend(self, coefficients, weights, **_):
+        return 2.0 * np.log10(weights.rigidity / 3.0)
+
+    def at(self, power, halves):
+        return SimpleNamespace(variance=self._left[round(power)])
+
+
+@pytest.mark.parametrize(
+    ("left", "margin", "power"),
+    [
+        ({-2: 1.4, -1: 1.1, 0: 1.0, 1: 1.1, 2: 1.4}, None, 0.0),
+        ({-1: 1.3, 0: 1.0, 1: 0.9, 2: 1.0}, None, 1.0),
+        ({-1: 1.3, 0: 1.0, 1: 1.0, 2: 1.3}, None, 0.5),  # between two that are alike
+        ({-1: 1.3, 0: 1.0, 1: 0.9, 2: 0.95}, None, 1.0 + 0.5 * (1.0 - 0.95) / (1.0 - 1.8 + 0.95)),
+        ({-1: 1.1, 0: 1.0, 1: 1.0001, 2: 1.0002, 3: 1.0009}, 3e-4, 2.0),
+        ({-1: 1.1, 0: 1.0, 1: 1.0009, 2: 1.0001}, 3e-4, 0.0),  # raised for as long as
+        ({-1: 1.0, 0: 1.0, 1: 1.0, 2: 1.0, 3: 1.0}, 3e-4, 3.0),  # the images do not tell
+        ({-2: 1.0, -1: 0.9, 0: 1.0, 1: 1.1}, 3e-4, -1.0),
+    ],
+)
+def test_a_weight_is_chosen_by_what_is_left_out(left, margin, power):
+    level = Residuals(left)
+    found = choose(level, np.zeros(1), Weights(3.0, 300.0, 3.0), "rigidity", (-2, 3), margin)
+    assert 2.0 * np.log10(found.weights.rigidity / 3.0) == pytest.approx(power, abs=1e-9)
+    assert min(v for _, v in found.tried) == 1.0
 
 
 def swollen(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

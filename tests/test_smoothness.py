@@ -105,6 +105,16 @@ def test_there_is_less_weight_where_a_displacement_was_curved():
     # as sharply seen at any size of the displacement; one that is straight changes nothing
     np.testing.assert_allclose(rough.following(7.0 * c, tissue).diagonals[0], follows.diagonals[0], rtol=1e-12)
     np.testing.assert_array_equal(rough.following(0.0 * c, tissue).diagonals[0], rough.diagonals[0])
+    np.testing.assert_array_equal(rough.following(c, 0.0 * tissue).diagonals[0], rough.diagonals[0])
+
+
+def test_what_rounding_leaves_of_a_straight_displacement_is_no_curvature():
+    x, y, z = coordinates()
+    straight = np.stack([0.1 * x + 0.2 * z + 3.0, -0.3 * y, x * 0.2 - 0.1 * y])
+    assert 0.0 < np.abs(laplacian(straight)).max() < 1e-14
+    even = Roughness(CONTROL, ALONE)
+    found = even.following(straight, np.ones(CONTROL.shape))
+    np.testing.assert_array_equal(found.diagonals[0], even.diagonals[0])
 
 
 def test_it_is_the_same_on_any_number_of_threads():
