@@ -30,13 +30,13 @@ from pypardiso import PyPardisoSolver
 from scipy import sparse
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
+from benchmarks.nodal import at_corners, located
 from dvc.deformation import Deformation
 from dvc.gaussnewton import scaled
 from dvc.imagefile import read_image
 from dvc.kinematics import StrainField
 from dvc.labels import read_labels
 from dvc.mesh import TetMesh
-from dvc.onmesh import Locator
 from dvc.registration import Settings, register
 from dvc.sharpen import fit_with_borders
 from fe.materials import NeoHooke
@@ -204,17 +204,6 @@ class Correlation:
         folded = int(np.count_nonzero(np.linalg.det(self.F(u)) <= 0.0))
         return u, {"steps": taken, "last_step_mm": round(moved, 4), "folded_cells": folded}
 
-    def at_nodes(self, H):
-        """Gradients of cells averaged at the nodes of each tissue, as values at the cells' corners (m, 4, 3, 3)."""
-        out = np.empty((len(H), 4, 3, 3))
-        for mine in self.mesh.regions.values():
-            nodes, weight = self.mesh.cells[mine].ravel(), np.repeat(self.volumes[mine], 4)
-            total = np.maximum(np.bincount(nodes, weight, minlength=self.nodes), 1e-30)
-            flat = np.repeat(H[mine].reshape(-1, 9), 4, axis=0) * weight[:, None]
-            mean = np.stack([np.bincount(nodes, column, minlength=self.nodes) for column in flat.T], axis=1)
-            out[mine] = (mean / total[:, None]).reshape(-1, 3, 3)[self.mesh.cells[mine]]
-        return out
-
     def _summed(self, of_cells):
         out = np.zeros((self.nodes, 3))
         np.add.at(out, self.mesh.cells, of_cells)
@@ -226,12 +215,6 @@ class Correlation:
         columns = 3 * cells[:, None, :, None, None] + np.arange(3) + zero
         size = 3 * self.nodes
         return sparse.csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size))
-
-
-def located(mesh: TetMesh, points_mm):
-    """Cell of each point, -1 outside, and the weights of its corners (n, 4)."""
-    cell, at = Locator(mesh).find(points_mm)
-    return cell, np.column_stack([1.0 - at.sum(axis=1), at])
 
 
 class Truth:
@@ -280,7 +263,7 @@ class Truth:
         """By the strain of cells, and by that of nodes."""
         H = problem.F(u) - np.eye(3)
         moved = np.einsum("na,nai->ni", self.weights, u[problem.mesh.cells[self.cell]])
-        smooth = np.einsum("na,naij->nij", self.weights, problem.at_nodes(H)[self.cell])
+        smooth = np.einsum("na,naij->nij", self.weights, at_corners(problem.mesh, H)[self.cell])
         return {"cells": self.errors(moved, H[self.cell]), "nodes": self.errors(moved, smooth)}
 
 
