@@ -69,8 +69,8 @@ _ENGINE = {
     "shading.py",
     "registration.py",
 }
-_SECONDS = 36.0  # of one run on one core, as measured, half of it to make and to score the pair
-_BORDERS_SECONDS = 80.0  # with borders of tissues
+_SECONDS = 30.0  # of one run on one core, as measured, half of it to make and to score the pair
+_BORDERS_SECONDS = 52.0  # with borders of tissues
 _ELASTIX_SECONDS = 75.0  # as measured: 3,500 iterations, whatever the voxel
 _MEGABYTES = 5.0  # of one run's samples, as measured at 0.8 mm
 
