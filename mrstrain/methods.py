@@ -156,7 +156,8 @@ def _weights(own: Record, borders: Record | None, on_bone: bool) -> str:
     )
     told = (
         f"a cubic B-spline with control points every {own.get('spacing_mm'):g} mm, least squares over all voxels, and "
-        f"penalties on bending (weight {weight}), on change of volume in soft tissue ({kept}) and "
+        "penalties on bending (the square of the Laplacian of its coefficients, less where the displacement is curved; "
+        f"weight {weight}), on change of volume in soft tissue ({kept}) and "
         f"on strain of the bone ({own.get('rigidity'):g}/mm3)"
     )
     if borders is None:
@@ -166,7 +167,7 @@ def _weights(own: Record, borders: Record | None, on_bone: bool) -> str:
     return (
         f"{told}; from there a second B-spline was added that vanishes on the borders of the label map's tissues, so "
         f"that strain may jump there, {'the bone held at rest and ' if on_bone else ''}strain of a tissue called skin "
-        f"penalised (weight {weight})"
+        f"penalised (weight {weight}), and bending counted by the Laplacian of both splines' Laplacian"
     )
 
 

@@ -235,7 +235,7 @@ def test_the_time_told_beforehand_is_that_of_the_engine() -> None:
         expected_minutes([replace(CASE, preset=p)] * 10, 2) for p in ("gauss-newton", "gauss-newton-borders", "heel-mr")
     )
     assert 1.0 < ours < 0.6 * elastix < 6.0
-    assert borders > 2.0 * ours
+    assert 1.5 * ours < borders < elastix  # two fits and a choice more
     assert expected_minutes([CASE] * 10, 1) == pytest.approx(2.0 * elastix)
 
 
