@@ -209,9 +209,9 @@ def weights_table(choice: Choice) -> Table:
         ("gradient of that change", used.volume_gradient, "1/mm", "used"),
         (stiff, used.rigidity, "1/mm3", "used"),
     ]
-    rows += [("bending", weight, "1/mm", left) for weight, left in choice.tried]
-    rows += [(stiff, weight, "1/mm3", left) for weight, left in choice.tried_in_skin]
-    columns = ("penalty on", "weight", "unit", "residual left out, over the best")
+    rows += [("bending", weight, "1/mm", 100.0 * (left - 1.0)) for weight, left in choice.tried]
+    rows += [(stiff, weight, "1/mm3", 100.0 * (left - 1.0)) for weight, left in choice.tried_in_skin]
+    columns = ("penalty on", "weight", "unit", "residual left out, % above the least")
     return Table("Weights of the registration", columns, tuple(rows), f"{choice.rule}. {choice.volume_told}")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dvc.errors import ParameterError, RegistrationError
-from dvc.gaussnewton import USUAL_BENDING, USUAL_VOLUME, GaussNewton
+from dvc.gaussnewton import USUAL_BENDING, USUAL_VOLUME, Choice, GaussNewton
 from dvc.image import Image
 from dvc.imagefile import read_image
 from dvc.imagewrite import write_image, write_mask
@@ -18,6 +18,7 @@ from dvc.presets import load_preset
 from dvc.registration import Settings
 from dvc.sharpen import AtBorders
 from mrstrain.engines import settings_of
+from mrstrain.page import weights_table
 from mrstrain.registering import register as run
 from mrstrain.registeringone import register_one
 from phantoms.anatomy import Heel
@@ -53,6 +54,13 @@ def test_quality_and_provenance_tell_the_engine_and_how_its_weight_was_chosen(wr
     assert "volume was kept" in told["change_of_volume"]["rule"]
     assert record["parameters"]["stages"] == []
     assert "gauss-newton" in (written / "out" / "report.html").read_text()
+
+
+def test_the_report_tells_apart_what_weights_left():
+    """Residuals differ by hundredths of a percent: over the best all of them would read 1."""
+    table = weights_table(Choice(GaussNewton().weights, "found", ((1.0, 1.00042), (3.0, 1.0)), ((0.9, 1.0003),)))
+    assert table.columns[-1] == "residual left out, % above the least"
+    assert [row[-1] for row in table.rows[-3:]] == pytest.approx([0.042, 0.0, 0.03])
 
 
 def test_another_persons_heel_is_not_trusted(written, small_pair, tmp_path):
