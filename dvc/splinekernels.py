@@ -38,73 +38,6 @@ def _row_sums(plane: FloatArray, first: int, value: FloatArray, slope: FloatArra
 
 
 @njit(cache=True)
-def _point_sums(row: FloatArray, at: int, value: FloatArray, slope: FloatArray, u: FloatArray, H: FloatArray) -> None:
-    for m in range(3):
-        a, x, y, z = 0.0, 0.0, 0.0, 0.0
-        for r in range(4):
-            b = value[r]
-            a += b * row[m, 0, at + r]
-            x += b * row[m, 1, at + r]
-            y += b * row[m, 2, at + r]
-            z += slope[r] * row[m, 0, at + r]
-        u[m], H[m, 0], H[m, 1], H[m, 2] = a, x, y, z
-
-
-@njit(cache=True)
-def _joined_sums(
-    row: FloatArray,
-    at: int,
-    value: FloatArray,
-    slope: FloatArray,
-    factors: FloatArray,
-    room: tuple[FloatArray, FloatArray],
-    u: FloatArray,
-    H: FloatArray,
-) -> None:
-    """The same of splines with factors: u = sum a u_s, H = sum (a H_s + u_s grad a); room to work in for one's u, H."""
-    part, slopes = room
-    u[:], H[:] = 0.0, 0.0
-    for s in range(factors.shape[0]):
-        _point_sums(row[3 * s : 3 * s + 3], at, value, slope, part, slopes)
-        for m in range(3):
-            u[m] += factors[s, 0] * part[m]
-            for n in range(3):
-                H[m, n] += factors[s, 0] * slopes[m, n] + factors[s, n + 1] * part[m]
-
-
-@njit(cache=True)
-def _add_to_row(row: FloatArray, at: int, value: FloatArray, slope: FloatArray, f: FloatArray, P: FloatArray) -> None:
-    for m in range(3):
-        for r in range(4):
-            b = value[r]
-            row[m, 0, at + r] += b * f[m] + slope[r] * P[m, 2]
-            row[m, 1, at + r] += b * P[m, 0]
-            row[m, 2, at + r] += b * P[m, 1]
-
-
-@njit(cache=True)
-def _add_joined(
-    row: FloatArray,
-    at: int,
-    value: FloatArray,
-    slope: FloatArray,
-    factors: FloatArray,
-    room: tuple[FloatArray, FloatArray],
-    f: FloatArray,
-    P: FloatArray,
-) -> None:
-    """The transpose of `_joined_sums`: each spline gets a f + P grad a, and a P."""
-    part, stress = room
-    for s in range(factors.shape[0]):
-        for m in range(3):
-            part[m] = factors[s, 0] * f[m]
-            for n in range(3):
-                part[m] += factors[s, n + 1] * P[m, n]
-                stress[m, n] = factors[s, 0] * P[m, n]
-        _add_to_row(row[3 * s : 3 * s + 3], at, value, slope, part, stress)
-
-
-@njit(cache=True)
 def _add_row_to_plane(row: FloatArray, first: int, value: FloatArray, slope: FloatArray, plane: FloatArray) -> None:
     for m in range(row.shape[0]):
         sums, by_i, by_j = row[m, 0], row[m, 1], row[m, 2]
@@ -114,70 +47,6 @@ def _add_row_to_plane(row: FloatArray, first: int, value: FloatArray, slope: Flo
             for k in range(plane.shape[3]):
                 onto[k] += v * sums[k] + s * by_j[k]
                 onto_slopes[k] += v * by_i[k]
-
-
-@njit(parallel=True, cache=True)
-def evaluate(
-    c: FloatArray,
-    inside: BoolArray,
-    first: tuple[IntArray, IntArray, IntArray],
-    value: tuple[FloatArray, FloatArray, FloatArray],
-    slope: tuple[FloatArray, FloatArray, FloatArray],
-    factors: FloatArray,
-    u: FloatArray,
-    H: FloatArray,
-) -> None:
-    """U (ni, nj, nk, 3) and grad u (ni, nj, nk, 3, 3) at the points that are inside."""
-    alone = factors.shape[3] == 0
-    for i in prange(inside.shape[0]):
-        if not inside[i].any():
-            continue
-        plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], 3, c.shape[3]))
-        plane_sums(c, first[0][i], value[0][i], slope[0][i], plane)
-        room = np.empty(3), np.empty((3, 3))
-        for j in range(inside.shape[1]):
-            if not inside[i, j].any():
-                continue
-            _row_sums(plane, first[1][j], value[1][j], slope[1][j], row)
-            for k in range(inside.shape[2]):
-                if inside[i, j, k]:
-                    at, b, d = first[2][k], value[2][k], slope[2][k]
-                    if alone:
-                        _point_sums(row, at, b, d, u[i, j, k], H[i, j, k])
-                    else:
-                        _joined_sums(row, at, b, d, factors[i, j, k], room, u[i, j, k], H[i, j, k])
-
-
-@njit(parallel=True, cache=True)
-def gather(
-    stress: FloatArray,
-    inside: BoolArray,
-    first: tuple[IntArray, IntArray, IntArray],
-    value: tuple[FloatArray, FloatArray, FloatArray],
-    slope: tuple[FloatArray, FloatArray, FloatArray],
-    factors: FloatArray,
-    half: FloatArray,
-) -> None:
-    """Sums of P : grad B over the points, onto the last two axes' coefficients, plane by plane."""
-    alone = factors.shape[3] == 0
-    for i in prange(inside.shape[0]):
-        half[i] = 0.0
-        if not inside[i].any():
-            continue
-        row, none = np.empty((half.shape[1], 3, half.shape[4])), np.zeros(3)
-        room = np.empty(3), np.empty((3, 3))
-        for j in range(inside.shape[1]):
-            if not inside[i, j].any():
-                continue
-            row[:] = 0.0
-            for k in range(inside.shape[2]):
-                if inside[i, j, k]:
-                    at, b, d = first[2][k], value[2][k], slope[2][k]
-                    if alone:
-                        _add_to_row(row, at, b, d, none, stress[i, j, k])
-                    else:
-                        _add_joined(row, at, b, d, factors[i, j, k], room, none, stress[i, j, k])
-            _add_row_to_plane(row, first[1][j], value[1][j], slope[1][j], half[i])
 
 
 @njit(cache=True)
@@ -300,6 +169,76 @@ def _add_line_to_row(
                 c[0, at + r] += v * h + s * hz
                 c[1, at + r] += v * hx
                 c[2, at + r] += v * hy
+
+
+@njit(parallel=True, cache=True)
+def evaluate(
+    c: FloatArray,
+    inside: BoolArray,
+    first: tuple[IntArray, IntArray, IntArray],
+    value: tuple[FloatArray, FloatArray, FloatArray],
+    slope: tuple[FloatArray, FloatArray, FloatArray],
+    factors: FloatArray,
+    u: FloatArray,
+    H: FloatArray,
+) -> None:
+    """The displacement u (ni, nj, nk, 3), mm, and its gradient H (ni, nj, nk, 3, 3) at the points that are inside."""
+    alone = factors.shape[3] == 0
+    for i in prange(inside.shape[0]):
+        if not inside[i].any():
+            continue
+        plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], 3, c.shape[3]))
+        line = np.empty((c.shape[0], 4, inside.shape[2]))
+        joined = line if alone else np.empty((3, 4, inside.shape[2]))
+        plane_sums(c, first[0][i], value[0][i], slope[0][i], plane)
+        for j in range(inside.shape[1]):
+            ends = _ends(inside[i, j])
+            if ends[0] == ends[1]:
+                continue
+            _row_sums(plane, first[1][j], value[1][j], slope[1][j], row)
+            _line_sums(row, first[2], value[2], slope[2], ends, line)
+            if not alone:
+                _join(line, factors[i, j], ends, joined)
+            for k in range(ends[0], ends[1]):
+                if inside[i, j, k]:
+                    for m in range(3):
+                        u[i, j, k, m] = joined[m, 0, k]
+                        for a in range(3):
+                            H[i, j, k, m, a] = joined[m, a + 1, k]
+
+
+@njit(parallel=True, cache=True)
+def gather(
+    stress: FloatArray,
+    inside: BoolArray,
+    first: tuple[IntArray, IntArray, IntArray],
+    value: tuple[FloatArray, FloatArray, FloatArray],
+    slope: tuple[FloatArray, FloatArray, FloatArray],
+    factors: FloatArray,
+    half: FloatArray,
+) -> None:
+    """Sums of P : grad B over the points that are inside, onto the last two axes' coefficients, plane by plane."""
+    alone = factors.shape[3] == 0
+    for i in prange(inside.shape[0]):
+        half[i] = 0.0
+        if not inside[i].any():
+            continue
+        row, line = np.empty((half.shape[1], 3, half.shape[4])), np.empty((half.shape[1], 4, inside.shape[2]))
+        joined = line if alone else np.empty((3, 4, inside.shape[2]))
+        for j in range(inside.shape[1]):
+            ends = _ends(inside[i, j])
+            if ends[0] == ends[1]:
+                continue
+            for m in range(3):
+                joined[m, 0] = 0.0
+                for k in range(ends[0], ends[1]):
+                    for a in range(3):
+                        joined[m, a + 1, k] = stress[i, j, k, m, a]
+            if not alone:
+                _split(joined, factors[i, j], ends, line)
+            row[:] = 0.0
+            _add_line_to_row(line, inside[i, j], first[2], value[2], slope[2], ends, row)
+            _add_row_to_plane(row, first[1][j], value[1][j], slope[1][j], half[i])
 
 
 @njit(parallel=True, cache=True)
