@@ -7,6 +7,7 @@ import sys
 import time
 import tomllib
 import zipfile
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,17 @@ def test_the_wheel_holds_every_file_of_the_packages_data_files_too(wheel: set[st
     assert files - wheel == set()
     assert {name for name in wheel if ".dist-info/" not in name} - files == set()
     assert any(not name.endswith(".py") for name in files), "no preset or template was found to look for"
+
+
+def test_the_doctests_of_every_package_are_run(wheel: set[str]) -> None:
+    options = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
+    assert {name.split("/")[0] for name in wheel if ".dist-info/" not in name} <= set(options["testpaths"])
+    assert "--doctest-modules" in options["addopts"].split()
+
+
+def test_importing_the_command_does_not_run_it() -> None:
+    main = import_module("mrstrain.__main__")
+    assert main.main is import_module("mrstrain.cli").main
 
 
 def test_the_wheel_carries_the_licence_and_the_command(wheel: set[str], project: dict[str, object]) -> None:
