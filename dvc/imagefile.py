@@ -26,7 +26,7 @@ _log = logging.getLogger("dvc.images")
 
 _MIN_SLICES = 4
 
-_Header = Callable[[Path, int | None, int], StoredVolume]
+_Header = Callable[[Path, int | None, int, bool], StoredVolume]
 _Shape = Callable[[Path], tuple[int, ...]]
 _FORMATS: dict[str, tuple[_Header, _Shape]] = {
     ".nii": (read_nifti_header, nifti_shape),
@@ -107,9 +107,32 @@ def read_voxels(
         return read_dicom_series(place, series=series, max_bytes=max_bytes)
     if series is not None:
         raise InputError(f"{place}: series='{series}' is for DICOM folders; this is a file.")
-    header, _ = _FORMATS[_suffix(place)]
-    stored = header(place, volume, max_bytes)
+    stored = read_header(place, volume=volume, max_bytes=max_bytes)
+    if stored.unit != "mm":
+        _log.warning("%s: lengths converted from %s to mm", place, stored.unit)
     return stored.grid, stored.load()
+
+
+def read_header(
+    path: Path, *, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
+) -> StoredVolume:
+    """Read what a file holds, its voxels not yet read.
+
+    Parameters
+    ----------
+    path : file (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd)
+    volume, max_bytes
+        As in `read_image`.
+    vectors : bool
+        A file of three components per voxel is needed, and no other is read; without, a scalar one.
+
+    Raises
+    ------
+    ImageFileError
+        As `read_image`, but for the checks of the voxels.
+    """
+    header, _ = _FORMATS[_suffix(path)]
+    return header(path, volume, max_bytes, vectors)
 
 
 def estimate_size(path: str | PathLike[str]) -> int:

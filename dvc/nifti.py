@@ -29,20 +29,23 @@ LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Turns an affine to RAS into one to LPS, and back."""
 
 _AGREEMENT_VOXELS = 0.05
-_MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
-_UNIT_NAMES = {0: "unknown", 1: "metres", 2: "mm", 3: "microns"}
+_UNITS = {0: "mm", 1: "metres", 2: "mm", 3: "microns"}
+_MM_PER_UNIT = {"metres": 1000.0, "mm": 1.0, "microns": 0.001}
 _ORTHONORMAL = 1e-4
 _HALF_TURN = 1e-7
 _ROUNDING = 4e-7  # of b^2 + c^2 + d^2 in single precision, with a margin
 
 
-def read_nifti_header(path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES) -> StoredVolume:
+def read_nifti_header(
+    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
+) -> StoredVolume:
     """Read what a NIfTI-1 or NIfTI-2 file holds, and where its voxels lie in LPS mm.
 
     Parameters
     ----------
     path : .nii or .nii.gz
     volume : which volume of a 4D file, from 0
+    vectors : whether a file of three components per voxel, (ni, nj, nk, 1, 3), is needed in place of a scalar one
 
     Raises
     ------
@@ -51,13 +54,15 @@ def read_nifti_header(path: Path, volume: int | None = None, max_bytes: int = MA
         sform that disagree, is sheared, is not 3D, or its voxels are not real numbers.
     """
     header = _header(path)
-    shape, count = _sizes(path, header)
+    shape, count = (_vector_sizes(path, header), 1) if vectors else _sizes(path, header)
+    layout = (*shape, 3) if vectors else shape
     # Size and count come first: a header that is wrong there is not worth a look at its geometry.
-    refuse_if_too_large(path, shape, max_bytes)
+    refuse_if_too_large(path, layout, max_bytes)
     chosen = pick_volume(path, count, volume)
     dtype = _number_type(path, header)
-    grid = _grid(path, header, shape)
-    bytes_each = int(np.prod([int(n) for n in shape])) * dtype.itemsize
+    unit = _unit(path, header)
+    grid = _grid(path, header, shape, _MM_PER_UNIT[unit])
+    bytes_each = int(np.prod([int(n) for n in layout])) * dtype.itemsize
     slope, intercept = _scaling(header)
     start = int(header["vox_offset"])
     smallest = int(header["sizeof_hdr"]) + 4
@@ -65,19 +70,24 @@ def read_nifti_header(path: Path, volume: int | None = None, max_bytes: int = MA
         path=path,
         grid=grid,
         dtype=dtype,
-        layout=shape,
+        layout=layout,
+        unit=unit,
         compressed=_is_compressed(path),
         stream_start=max(start, smallest) + chosen * bytes_each,
         stream_rest=(count - 1 - chosen) * bytes_each,
         slope=slope,
         intercept=intercept,
+        components=3 if vectors else None,
     )
 
 
 def nifti_shape(path: Path) -> tuple[int, ...]:
     """All sizes that the header claims, without any other check."""
-    header = _header(path)
-    return tuple(int(n) for n in header["dim"][1 : 1 + int(header["dim"][0])])
+    return tuple(_dimensions(_header(path)))
+
+
+def _dimensions(header: Any) -> list[int]:
+    return [int(n) for n in header["dim"][1 : 1 + int(header["dim"][0])]]
 
 
 def _is_compressed(path: Path) -> bool:
@@ -119,7 +129,7 @@ def _header(path: Path) -> Any:
 
 
 def _sizes(path: Path, header: Any) -> tuple[tuple[int, int, int], int]:
-    sizes = [int(n) for n in header["dim"][1 : 1 + int(header["dim"][0])]]
+    sizes = _dimensions(header)
     while len(sizes) > 3 and sizes[-1] in (0, 1):
         sizes.pop()
         if len(sizes) == 3:
@@ -133,6 +143,13 @@ def _sizes(path: Path, header: Any) -> tuple[tuple[int, int, int], int]:
             f"{path}: a {len(sizes)}D file of sizes {sizes} (vectors or tensors); a 3D scalar image is needed."
         )
     return (sizes[0], sizes[1], sizes[2]), sizes[3] if len(sizes) == 4 else 1
+
+
+def _vector_sizes(path: Path, header: Any) -> tuple[int, int, int]:
+    sizes = _dimensions(header)
+    if sizes[3:5] != [1, 3] or any(n not in (0, 1) for n in sizes[5:]):
+        raise ImageFileError(f"{path}: a NIfTI of shape {tuple(sizes)}; vectors are (ni, nj, nk, 1, 3).")
+    return sizes[0], sizes[1], sizes[2]
 
 
 def _number_type(path: Path, header: Any) -> np.dtype[Any]:
@@ -156,22 +173,24 @@ def _scaling(header: Any) -> tuple[float, float]:
     return slope, intercept if np.isfinite(intercept) else 0.0
 
 
-def _grid(path: Path, header: Any, shape: tuple[int, int, int]) -> Grid:
-    affine = _ras_affine(path, header, shape)
+def _unit(path: Path, header: Any) -> str:
+    """The header's unit of length; mm where it gives none."""
     code = int(header["xyzt_units"]) & 7
-    if code not in _MM_PER_UNIT:
+    if code not in _UNITS:
         raise ImageFileError(f"{path}: unknown unit of length (xyzt_units code {code}); set it to mm (2).")
     if code == 0:
         _log.warning("%s: the header gives no unit of length; taken as mm", path)
-    elif code != 2:
-        _log.warning("%s: lengths converted from %s to mm", path, _UNIT_NAMES[code])
-    lps = LPS_FROM_RAS @ affine
-    columns = lps[:3, :3] * _MM_PER_UNIT[code]
+    return _UNITS[code]
+
+
+def _grid(path: Path, header: Any, shape: tuple[int, int, int], mm_per_unit: float) -> Grid:
+    lps = LPS_FROM_RAS @ _ras_affine(path, header, shape)
+    columns = lps[:3, :3] * mm_per_unit
     spacing = np.linalg.norm(columns, axis=0)
     if not np.all(np.isfinite(spacing)) or np.any(spacing <= 0):
         raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
     try:
-        return Grid(shape, spacing, lps[:3, 3] * _MM_PER_UNIT[code], _straightened(columns / spacing))
+        return Grid(shape, spacing, lps[:3, 3] * mm_per_unit, _straightened(columns / spacing))
     except GeometryError as error:
         raise ImageFileError(f"{path}: {error}") from error
 

@@ -27,6 +27,7 @@ from dvc.storedvolume import MAX_BYTES, StoredVolume, pick_volume, refuse_if_too
 _log = logging.getLogger("dvc.images")
 
 _HEADER_LIMIT = 1 << 20
+_LARGEST_SIZE = 2.0**63
 _INTEGERS = {"char": "1", "short": "2", "int": "4", "long long": "8", "longlong": "8"}
 _NRRD_TYPES: dict[str, str] = {"float": "f4", "double": "f8"}
 for _name, _size in _INTEGERS.items():
@@ -47,7 +48,7 @@ _SPACES = {
     "ras": "right-anterior-superior",
     "las": "left-anterior-superior",
 }
-_MM_PER_UNIT = {"mm": 1.0, "": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "µm": 0.001, "micron": 0.001}
+_MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "µm": 0.001, "micron": 0.001}
 
 _META_TYPES = {
     "MET_CHAR": "i1",
@@ -99,8 +100,12 @@ def nrrd_shape(path: Path) -> tuple[int, ...]:
     return tuple(_whole_numbers(path, nrrd_fields(path)[0], "sizes"))
 
 
-def read_nrrd_header(path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES) -> StoredVolume:
+def read_nrrd_header(
+    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
+) -> StoredVolume:
     """Read what an NRRD file (.nrrd, .nhdr, .seg.nrrd) holds, and where its voxels lie in LPS mm.
+
+    With ``vectors``, a file of three components per voxel is needed in place of a scalar one.
 
     Raises
     ------
@@ -110,7 +115,12 @@ def read_nrrd_header(path: Path, volume: int | None = None, max_bytes: int = MAX
     """
     fields, _, end = nrrd_fields(path)
     sizes = _whole_numbers(path, fields, "sizes")
-    axes, select = _nrrd_axes(path, fields, sizes, volume)
+    axes, other = _nrrd_axes(path, fields, sizes)
+    select = components = None
+    if vectors:
+        components = _component_axis(path, fields, sizes, other)
+    else:
+        select = _nrrd_volume(path, fields, sizes, other, volume)
     refuse_if_too_large(path, tuple(sizes), max_bytes)
     encoding = fields.get("encoding", "").lower()
     if encoding not in ("raw", "gzip", "gz"):
@@ -136,16 +146,16 @@ def read_nrrd_header(path: Path, volume: int | None = None, max_bytes: int = MAX
         grid=_nrrd_grid(path, fields, sizes, axes),
         dtype=np.dtype((">" if order == "big" else "<") + _NRRD_TYPES[kind]),
         layout=tuple(sizes),
+        unit=_nrrd_unit(path, fields),
         file_start=start,
         compressed=encoding != "raw",
         select=select,
+        components=components,
     )
 
 
-def _nrrd_axes(
-    path: Path, fields: Mapping[str, str], sizes: list[int], volume: int | None
-) -> tuple[list[int], tuple[int, int] | None]:
-    """Find the three axes in space, and which index of a fourth to keep."""
+def _nrrd_axes(path: Path, fields: Mapping[str, str], sizes: list[int]) -> tuple[list[int], int | None]:
+    """Find the three axes in space, and a fourth that is not, if there is one."""
     if len(sizes) < 3:
         raise ImageFileError(f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed.")
     vectors = _vectors(path, fields)
@@ -155,20 +165,42 @@ def _nrrd_axes(
     others = [a for a, vector in enumerate(vectors) if vector is None]
     if len(axes) != 3 or len(others) > 1:
         raise ImageFileError(f"{path}: a {len(axes)}D image of sizes {sizes}; a 3D scalar image is needed.")
-    if not others:
+    return axes, others[0] if others else None
+
+
+def _nrrd_volume(
+    path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None, volume: int | None
+) -> tuple[int, int] | None:
+    """Which index of a fourth axis to keep, if there is one."""
+    if other is None:
         pick_volume(path, 1, volume)
-        return axes, None
-    count = sizes[others[0]]
+        return None
+    count = sizes[other]
     if path.name.lower().endswith(".seg.nrrd") and count > 1:
         raise ImageFileError(
             f"{path}: a segmentation of {count} layers, in which segments overlap; a label map has one "
             "label per voxel. In Slicer, export the segments to a label map, or remove the overlap."
         )
-    kinds = fields.get("kinds", "").split()
-    kind = kinds[others[0]].lower() if len(kinds) == len(sizes) else ""
+    kind = _kind(fields, sizes, other)
     if count > 1 and not any(word in kind for word in ("list", "domain", "time", "?", "none")) and kind:
         raise ImageFileError(f"{path}: each voxel holds {count} values (kind {kind}); a scalar image is needed.")
-    return axes, (others[0], pick_volume(path, count, volume))
+    return other, pick_volume(path, count, volume)
+
+
+def _component_axis(path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None) -> int:
+    """Find the axis of a vector's three components."""
+    kind = "" if other is None else _kind(fields, sizes, other)
+    if other is None or sizes[other] != 3:
+        count = 1 if other is None else sizes[other]
+        raise ImageFileError(f"{path}: {count} components per voxel; vectors of three are needed.")
+    if kind not in ("", "none", "???", "list") and not kind.endswith("vector"):
+        raise ImageFileError(f"{path}: the three values of a voxel are of kind {kind}; a vector is needed.")
+    return other
+
+
+def _kind(fields: Mapping[str, str], sizes: list[int], axis: int) -> str:
+    kinds = fields.get("kinds", "").split()
+    return kinds[axis].lower() if len(kinds) == len(sizes) else ""
 
 
 def _vectors(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
@@ -191,25 +223,28 @@ def _vectors(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
 def _nrrd_grid(path: Path, fields: Mapping[str, str], sizes: list[int], axes: list[int]) -> Grid:
     space = fields["space"].lower()
     signs = np.array(_TO_LPS[_SPACES.get(space, space)], dtype=np.float64)
-    units = {u.strip().lower() for u in re.findall(r'"([^"]*)"', fields.get("space units", ""))} or {"mm"}
     columns = np.stack([v for v in _vectors(path, fields) if v is not None], axis=1)
-    origin = np.array(_numbers(path, fields.get("space origin", "").strip("()"), "space origin"))
-    scale = _scale(path, units)
+    origin = np.array(_numbers(path, fields.get("space origin", "").strip("()"), "space origin", 3))
+    scale = _MM_PER_UNIT[_nrrd_unit(path, fields)]
     return _lps_grid(path, [sizes[a] for a in axes], columns * signs[:, None] * scale, origin * signs * scale)
 
 
-def _scale(path: Path, units: set[str]) -> float:
-    if len(units) != 1 or not units <= set(_MM_PER_UNIT):
+def _nrrd_unit(path: Path, fields: Mapping[str, str]) -> str:
+    return _unit(path, {u.strip().lower() for u in re.findall(r'"([^"]*)"', fields.get("space units", ""))})
+
+
+def _unit(path: Path, units: set[str]) -> str:
+    """The one unit of length; mm where none is given."""
+    known = {unit or "mm" for unit in units} or {"mm"}
+    if len(known) != 1 or not known <= set(_MM_PER_UNIT):
         raise ImageFileError(f"{path}: lengths in {sorted(units)}; the units that are read are mm, cm, m and um.")
-    (unit,) = units
-    if _MM_PER_UNIT[unit] != 1.0:
-        _log.warning("%s: lengths converted from %s to mm", path, unit)
-    return _MM_PER_UNIT[unit]
+    return known.pop()
 
 
 def _lps_grid(path: Path, shape: list[int], columns: FloatArray, origin: FloatArray) -> Grid:
-    spacing = np.linalg.norm(columns, axis=0)
-    if not np.isfinite(columns).all() or np.any(spacing <= 0):
+    with np.errstate(over="ignore"):
+        spacing = np.linalg.norm(columns, axis=0)
+    if not np.isfinite(spacing).all() or np.any(spacing <= 0):
         raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
     try:
         return Grid((shape[0], shape[1], shape[2]), spacing, origin, columns / spacing)
@@ -239,28 +274,35 @@ def meta_shape(path: Path) -> tuple[int, ...]:
     return tuple(_whole_numbers(path, meta_fields(path)[0], "dimsize"))
 
 
-def read_meta_header(path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES) -> StoredVolume:
+def read_meta_header(
+    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
+) -> StoredVolume:
     """Read what a MetaImage file (.mha, .mhd) holds, and where its voxels lie in LPS mm.
+
+    With ``vectors``, a file of three components per voxel is needed in place of a scalar one.
 
     Raises
     ------
     ImageFileError
-        If the header is damaged, claims more than ``max_bytes``, is sheared, is not a 3D scalar image, or its
-        voxels are written as text.
+        If the header is damaged, claims more than ``max_bytes``, is sheared, is not a 3D image of what is needed,
+        or its voxels are written as text.
     """
     fields, end = meta_fields(path)
     sizes = _whole_numbers(path, fields, "dimsize")
     if len(sizes) != 3 or fields.get("ndims") != "3":
         raise ImageFileError(f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed.")
-    refuse_if_too_large(path, tuple(sizes), max_bytes)
+    layout = (3, *sizes) if vectors else tuple(sizes)
+    refuse_if_too_large(path, layout, max_bytes)
     pick_volume(path, 1, volume)
     channels = fields.get("elementnumberofchannels", "1")
-    if channels != "1":
+    if vectors and channels != "3":
+        raise ImageFileError(f"{path}: {channels} components per voxel; vectors of three are needed.")
+    if not vectors and channels != "1":
         raise ImageFileError(f"{path}: each voxel holds {channels} values; a scalar image is needed.")
     kind = fields.get("elementtype", "")
     if kind not in _META_TYPES or not _truth(fields, "binarydata", True):
         raise ImageFileError(f"{path}: voxels of type '{kind}', or written as text, are not read; save it as binary.")
-    if float(fields.get("headersize", "0")) != 0:
+    if _numbers(path, fields.get("headersize", "0"), "HeaderSize", 1) != [0.0]:
         raise ImageFileError(f"{path}: MetaImage files with a HeaderSize are not read; save it again as .mha.")
     data, start = path, end
     if fields["elementdatafile"] != "LOCAL":
@@ -270,15 +312,18 @@ def read_meta_header(path: Path, volume: int | None = None, max_bytes: int = MAX
     origin = _first(fields, ("offset", "position", "origin"), "0 0 0")
     spacing = _first(fields, ("elementspacing", "elementsize"), "1 1 1")
     rows = np.array(_numbers(path, matrix, "TransformMatrix", 9)).reshape(3, 3)
-    scale = _scale(path, {fields.get("distanceunits", "mm").lower()})
+    unit = _unit(path, {fields.get("distanceunits", "mm").lower()})
+    scale = _MM_PER_UNIT[unit]
     # A row of the matrix is the direction of one image axis.
     columns = rows.T * np.array(_numbers(path, spacing, "ElementSpacing", 3))
     return StoredVolume(
         path=data,
         grid=_lps_grid(path, sizes, columns * scale, np.array(_numbers(path, origin, "Offset", 3)) * scale),
         dtype=np.dtype((">" if big else "<") + _META_TYPES[kind]),
-        layout=tuple(sizes),
+        layout=layout,
+        unit=unit,
         file_start=start,
+        components=0 if vectors else None,
         compressed=_truth(fields, "compresseddata", False),
     )
 
@@ -301,7 +346,11 @@ def _detached(path: Path, name: str) -> Path:
     if name.startswith("LIST") or "%" in name:
         raise ImageFileError(f"{path}: voxels spread over several files are not read; save it as one file.")
     data = path.parent / name
-    if not data.is_file():
+    try:
+        there = data.is_file()
+    except OSError:  # no name that a file can have
+        there = False
+    if not there:
         raise ImageFileError(f"{path}: the file of its voxels, '{name}', is not there; keep the two together.")
     return data
 
@@ -317,4 +366,7 @@ def _numbers(path: Path, text: str, field: str, count: int | None = None) -> lis
 
 
 def _whole_numbers(path: Path, fields: Mapping[str, str], field: str) -> list[int]:
-    return [int(n) for n in _numbers(path, fields.get(field, ""), field)]
+    numbers = _numbers(path, fields.get(field, ""), field)
+    if not all(n.is_integer() and abs(n) < _LARGEST_SIZE for n in numbers):
+        raise ImageFileError(f"{path}: the header's '{field}' must be whole numbers; got {numbers}: damaged.")
+    return [int(n) for n in numbers]

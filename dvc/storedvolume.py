@@ -40,18 +40,21 @@ class StoredVolume:
         LPS mm.
     dtype : as stored, with byte order
     layout : sizes, fastest first; three, or four where each voxel holds several values
+    unit : of length, as the header names it; the grid is in mm whatever it is
     file_start : bytes of the file before the stream of voxels
     compressed : whether the stream is gzip or zlib
     stream_start : bytes of the (expanded) stream before this volume
     stream_rest : bytes of the (expanded) stream after this volume, which must be there too
     slope, intercept : value = slope * stored + intercept
     select : (axis, index) of ``layout`` to keep, where it has four
+    components : axis of ``layout`` along which the components of a vector lie, where they are kept
     """
 
     path: Path
     grid: Grid
     dtype: np.dtype[Any]
     layout: tuple[int, ...]
+    unit: str = "mm"
     file_start: int = 0
     compressed: bool = False
     stream_start: int = 0
@@ -59,6 +62,7 @@ class StoredVolume:
     slope: float = 1.0
     intercept: float = 0.0
     select: tuple[int, int] | None = None
+    components: int | None = None
 
     @property
     def size_bytes(self) -> int:
@@ -66,7 +70,7 @@ class StoredVolume:
         return int(np.prod([int(n) for n in self.layout], dtype=object)) * self.dtype.itemsize
 
     def load(self) -> Voxels:
-        """Read the voxels: (ni, nj, nk), in the stored number type where no scaling applies.
+        """Read the voxels: (ni, nj, nk), vectors (ni, nj, nk, 3), in the stored number type where no scaling applies.
 
         Raises
         ------
@@ -77,6 +81,8 @@ class StoredVolume:
         values = raw.view(self.dtype).reshape(self.layout, order="F")
         if self.select is not None:
             values = values.take(self.select[1], axis=self.select[0])
+        if self.components is not None:
+            values = np.moveaxis(values, self.components, -1)
         if (self.slope, self.intercept) == (1.0, 0.0):
             return values
         # Up to 16 bits survive single precision; wider integers are scaled in double.

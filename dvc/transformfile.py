@@ -19,7 +19,6 @@ from dvc.arrays import FloatArray
 from dvc.borderfile import read_bordered_spline
 from dvc.bspline import BSpline
 from dvc.deformation import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
-from dvc.displacementfile import grid_of
 from dvc.elastixtext import Parameters, parse_parameters
 from dvc.errors import InputError, ParameterError
 from dvc.image import Grid
@@ -269,10 +268,10 @@ def _from_sitk(transform: Any) -> Deformation:
             raise InputError(f"a B-spline of order {transform.GetOrder()}; only cubic ones are read.")
         images = transform.GetCoefficientImages()
         coefficients = np.stack([sitk.GetArrayFromImage(image).T for image in images])
-        return BSpline(grid_of(images[0]), coefficients)
+        return BSpline(_grid_of(images[0]), coefficients)
     if isinstance(transform, sitk.DisplacementFieldTransform):
         field = transform.GetDisplacementField()
-        return SampledDisplacement(grid_of(field), sitk.GetArrayFromImage(field).transpose(2, 1, 0, 3))
+        return SampledDisplacement(_grid_of(field), sitk.GetArrayFromImage(field).transpose(2, 1, 0, 3))
     if isinstance(transform, sitk.TranslationTransform):
         return Affine(np.eye(3), np.array(transform.GetOffset()))
     if transform.GetTransformEnum() == sitk.sitkIdentity:
@@ -284,3 +283,10 @@ def _from_sitk(transform: Any) -> Deformation:
     if isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform):
         return RigidMotion.about(np.array(transform.GetCenter()), matrix, np.array(shift))
     return _about(np.array(transform.GetCenter()), matrix, np.array(shift))
+
+
+def _grid_of(image: Any) -> Grid:
+    """Read the grid of a SimpleITK image, which is LPS mm already."""
+    size = image.GetSize()
+    direction = np.reshape(image.GetDirection(), (3, 3))
+    return Grid((size[0], size[1], size[2]), np.array(image.GetSpacing()), np.array(image.GetOrigin()), direction)
