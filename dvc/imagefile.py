@@ -28,13 +28,13 @@ _MIN_SLICES = 4
 
 _Header = Callable[[Path, int | None, int, bool], StoredVolume]
 _Shape = Callable[[Path], tuple[int, ...]]
-_FORMATS: dict[str, tuple[_Header, _Shape]] = {
-    ".nii": (read_nifti_header, nifti_shape),
-    ".nii.gz": (read_nifti_header, nifti_shape),
-    ".nrrd": (read_nrrd_header, nrrd_shape),
-    ".nhdr": (read_nrrd_header, nrrd_shape),
-    ".mha": (read_meta_header, meta_shape),
-    ".mhd": (read_meta_header, meta_shape),
+_FORMATS: dict[str, tuple[str, _Header, _Shape]] = {
+    ".nii": ("NIfTI", read_nifti_header, nifti_shape),
+    ".nii.gz": ("NIfTI", read_nifti_header, nifti_shape),
+    ".nrrd": ("NRRD", read_nrrd_header, nrrd_shape),
+    ".nhdr": ("NRRD", read_nrrd_header, nrrd_shape),
+    ".mha": ("MetaImage", read_meta_header, meta_shape),
+    ".mhd": ("MetaImage", read_meta_header, meta_shape),
 }
 
 
@@ -131,7 +131,7 @@ def read_header(
     ImageFileError
         As `read_image`, but for the checks of the voxels.
     """
-    header, _ = _FORMATS[_suffix(path)]
+    _, header, _ = _FORMATS[_suffix(path)]
     return header(path, volume, max_bytes, vectors)
 
 
@@ -146,15 +146,30 @@ def estimate_size(path: str | PathLike[str]) -> int:
     place = Path(path)
     if not place.is_file():
         raise InputError(f"{place}: no such file. Check the path.")
-    _, shape = _FORMATS[_suffix(place)]
+    _, _, shape = _FORMATS[_suffix(place)]
     return 4 * int(np.prod([max(n, 0) for n in shape(place)], dtype=object))
 
 
+def format_of(name: str) -> str:
+    """Format of an image that was read, by its name alone; a folder's is DICOM.
+
+    Examples
+    --------
+    >>> format_of("Load0.nii.gz"), format_of("Load0.mha"), format_of("Load0")
+    ('NIfTI', 'MetaImage', 'DICOM')
+    """
+    suffix = _known_suffix(name)
+    return "DICOM" if suffix is None else _FORMATS[suffix][0]
+
+
+def _known_suffix(name: str) -> str | None:
+    return next((s for s in sorted(_FORMATS, key=len, reverse=True) if name.lower().endswith(s)), None)
+
+
 def _suffix(path: Path) -> str:
-    name = path.name.lower()
-    for suffix in sorted(_FORMATS, key=len, reverse=True):
-        if name.endswith(suffix):
-            return suffix
+    suffix = _known_suffix(path.name)
+    if suffix is not None:
+        return suffix
     if is_dicom(path):
         raise ImageFileError(f"{path}: one file of a DICOM series. Give its folder instead: {path.parent}")
     raise ImageFileError(

@@ -9,6 +9,7 @@ from typing import Any
 
 from dvc.elastixtext import parse_parameters
 from dvc.errors import ParameterError
+from dvc.imagefile import format_of
 from dvc.viewer import NIIVUE
 from fe.simulate import LoadStep
 from validate.curves import DRAWS
@@ -40,6 +41,10 @@ _PAPERS = {
 }
 METHODS = "Methods, to be pasted"
 """Title of a report's section with these paragraphs."""
+_IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")
+"""Roles in a record of the files that are read as images."""
+_GIVEN = "the displacement was taken as it was given."
+_COARSE = " (every two voxels, if that is more)"
 _PUBLISHED = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")  # tables 2 and 3 of Trebbi 2023
 
 Record = Mapping[str, Any]
@@ -111,7 +116,8 @@ def _measured(measured: Mapping[str, Path]) -> str:
     """How displacement was measured; loads that were registered alike go into one sentence."""
     groups: dict[str, list[str]] = {}
     for load, folder in measured.items():
-        groups.setdefault(_registration(_record(folder / "provenance.json")), []).append(load)
+        record = _record(folder / "provenance.json")
+        groups.setdefault(_registration(record) + _files(record), []).append(load)
     told = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
         told + " Displacement is that of tissue in the unloaded configuration; strain is Green-Lagrange, "
@@ -123,7 +129,7 @@ def _registration(record: Record) -> str:
     given, versions = record.get("parameters", {}), record.get("versions", {})
     stages, own = given.get("stages") or [], given.get("gauss_newton")
     if record.get("command") != "register" or not (stages or own):
-        return "the displacement was taken as it was given."
+        return _GIVEN
     align = {
         "bone": "The loaded image was aligned with the unloaded one rigidly on the bone, and then",
         "image": "The loaded image was aligned with the unloaded one rigidly on the whole image, and then",
@@ -140,8 +146,27 @@ def _registration(record: Record) -> str:
         how += "; rigid alignment by Gauss-Newton least squares (Baker 2004)"
     return (
         f"{align} registered non-rigidly {how}; seed {given.get('seed')}. Beforehand the smooth receive field was "
-        "taken out of both images (N4, Tustison 2010). Images were read and "
-        f"written with SimpleITK {versions.get('SimpleITK', '?')} (Lowekamp 2013)."
+        "taken out of both images (N4, Tustison 2010, as implemented in SimpleITK "
+        f"{versions.get('SimpleITK', '?')}, Lowekamp 2013)."
+    )
+
+
+def _files(record: Record) -> str:
+    """What read a registration's images and wrote its maps: a sentence with a space before it, or nothing."""
+    if _registration(record) == _GIVEN:
+        return ""
+    versions, inputs = record.get("versions", {}), record.get("inputs", {})
+    formats = sorted({format_of(file["name"]) for role in _IMAGES for file in inputs.get(role, [])})
+    done = (
+        f"Images ({', '.join(formats)}) were read, and maps (NIfTI, NRRD) written," if formats else "Maps were written"
+    )
+    of_dicom = (
+        f" and pydicom {versions.get('pydicom', '?')} for DICOM (SimpleITK {versions.get('SimpleITK', '?')} where its "
+        "pixels are compressed in one of the JPEG formats)"
+    )
+    return (
+        f" {done} by mrstrain's own code, with nibabel "
+        f"{versions.get('nibabel', '?')} for the headers of NIfTI files{of_dicom if 'DICOM' in formats else ''}."
     )
 
 
@@ -154,11 +179,16 @@ def _weights(own: Record, borders: Record | None, on_bone: bool) -> str:
         if volume is None
         else f"{volume:g}/mm3"
     )
+    held = (
+        f", on change of volume in soft tissue ({kept}) and on strain of the bone ({own.get('rigidity'):g}/mm3)"
+        if on_bone
+        else f" and on change of volume in the tissue ({kept})"
+    )
     told = (
-        f"a cubic B-spline with control points every {own.get('spacing_mm'):g} mm, least squares over all voxels, and "
+        f"a cubic B-spline with control points every {own.get('spacing_mm'):g} mm{_COARSE}, least squares over all "
+        "voxels of the tissue and 3 mm around it, and "
         "penalties on bending (the square of the Laplacian of its coefficients, less where the displacement is curved; "
-        f"weight {weight}), on change of volume in soft tissue ({kept}) and "
-        f"on strain of the bone ({own.get('rigidity'):g}/mm3)"
+        f"weight {weight}){held}"
     )
     if borders is None:
         return told
@@ -185,7 +215,7 @@ def _stage(stage: Record) -> str:
     spacing = value("FinalGridSpacingInPhysicalUnits")
     return (
         f"parameters '{stage.get('name')}', metric {value('Metric')}, {value('Transform')} with control points every "
-        f"{spacing} mm, {value('NumberOfResolutions')} resolutions, {value('Optimizer')} with "
+        f"{spacing} mm{_COARSE}, {value('NumberOfResolutions')} resolutions, {value('Optimizer')} with "
         f"{value('MaximumNumberOfIterations')} iterations of {value('NumberOfSpatialSamples')} samples"
     )
 

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import re
+import sys
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+import dvc
+from dvc import gaussnewton, imagefile, nonrigid
 from dvc.gaussnewton import GaussNewton
 from dvc.presets import load_preset
+from dvc.registration import Settings
 from dvc.sharpen import AtBorders
+from mrstrain.inputs import read_subject
 from mrstrain.methods import methods
+from mrstrain.registering import record_of
 
-VERSIONS = {"mrstrain": "9.8.7", "itk-elastix": "0.1.2", "SimpleITK": "3.4.5", "pytetwild": "6.7"}
+VERSIONS = {"mrstrain": "9.8.7", "itk-elastix": "0.1.2", "SimpleITK": "3.4.5", "nibabel": "5.4", "pydicom": "7.8"}
+VERSIONS |= {"pytetwild": "6.7"}
 
 
 def measured(folder: Path, load: str, align: str = "bone") -> Path:
@@ -170,7 +183,7 @@ def test_driven_and_levelled_models_are_not_those_of_other_programs(tmp_path: Pa
 def test_the_correction_of_shading_is_told_where_it_was_done(tmp_path: Path) -> None:
     models = {"ansys": tmp_path / "Load1.csv"}
     text = told({"Load1": measured(tmp_path, "Load1")}, models)
-    assert "out of both images (N4, Tustison 2010)" in text
+    assert "out of both images (N4, Tustison 2010, as" in text
     assert text.count("doi:10.1109/TMI.2010.2046908") == 1
     (tmp_path / "given").mkdir()
     assert "Tustison" not in told({"Load1": tmp_path / "given"}, models)
@@ -187,3 +200,87 @@ def test_what_is_not_known_is_not_claimed(tmp_path: Path) -> None:
     assert "without rigid alignment" in text
     assert "Hu 2020" not in text
     assert "Trebbi" not in text
+
+
+def libraries_of(module: str, seen: set[str]) -> set[str]:
+    """Libraries that a module of ours imports, or any of ours that it imports."""
+    seen.add(module)
+    spec = find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    found = set()
+    for node in ast.walk(ast.parse(Path(spec.origin).read_text())):
+        names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        for name in names:
+            if name.split(".")[0] != "dvc":
+                found.add(name.split(".")[0])
+            elif name not in seen:
+                found |= libraries_of(name, seen)
+    return found - set(sys.stdlib_module_names)
+
+
+def with_inputs(folder: Path, *names: str) -> Path:
+    """A measurement whose record names the files that it read."""
+    place = measured(folder, "Load1")
+    record = json.loads((place / "provenance.json").read_text())
+    record["inputs"] = {"load0": [{"name": names[0]}], "loads": [{"name": name} for name in names[1:]]}
+    record["inputs"]["error_model"] = [{"name": "model.json"}]
+    (place / "provenance.json").write_text(json.dumps(record))
+    return place
+
+
+@pytest.mark.parametrize("name", ["Load0.nii.gz", "Load0.nii", "a.nrrd", "a.nhdr", "a.mha", "a.mhd", "series"])
+def test_the_libraries_told_are_those_that_read_and_write(tmp_path: Path, name: str) -> None:
+    text = told({"Load1": with_inputs(tmp_path, name, name)}, {})
+    (sentence,) = re.findall(r"Images \(.*?of the JPEG formats\)\.|Images \(.*?NIfTI files\.", text)
+    suffix = imagefile._known_suffix(name)
+    reader = "dvc.dicom" if suffix is None else imagefile._FORMATS[suffix][1].__module__
+    used = libraries_of(reader, set()) | libraries_of("dvc.imagewrite", set())
+    assert set(re.findall(r"[\w-]+(?= \d)", sentence)) == used - {"numpy"}
+    assert sentence.startswith(f"Images ({imagefile.format_of(name)}) were read, and maps (NIfTI, NRRD) written")
+    for library in used - {"numpy"}:
+        assert f"{library} {VERSIONS[library]}" in sentence
+    # N4, for whatever images
+    assert "SimpleITK" in libraries_of("dvc.shading", set())
+    assert "(N4, Tustison 2010, as implemented in SimpleITK 3.4.5, Lowekamp 2013)" in text
+
+
+def test_every_format_that_was_read_is_told(tmp_path: Path) -> None:
+    text = told({"Load1": with_inputs(tmp_path, "a.nii.gz", "b.mha", "c.nii.gz", "d")}, {})
+    assert "Images (DICOM, MetaImage, NIfTI) were read" in text
+    assert "pydicom 7.8" in text
+
+
+def test_formats_are_those_of_the_record_that_register_makes(tmp_path: Path) -> None:
+    grid = dvc.Grid((8, 8, 8), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    values = np.random.default_rng(1).normal(size=grid.shape)
+    half = np.zeros(grid.shape, dtype=bool)
+    half[:4] = True
+    load0, bone, labels = (tmp_path / name for name in ("Load0.nii.gz", "bone.nrrd", "labels.mha"))
+    dvc.write_image(load0, dvc.Image(grid, values))
+    dvc.write_mask(bone, dvc.Mask(grid, half))
+    dvc.write_labels(labels, dvc.LabelMap(grid, half.astype(int), {1: "fat"}))
+    subject = read_subject(load0, bone=bone, labels=labels, names=tmp_path / "labels.csv")
+    record = record_of(subject, {"loads": [load0]}, Settings.of(), {})
+    (tmp_path / "provenance.json").write_text(json.dumps(record))
+    assert "Images (MetaImage, NIfTI, NRRD) were read" in told({"Load1": tmp_path}, {})
+
+
+def test_a_levelled_model_counts_as_registered_alike_whatever_files_its_images_came_from(tmp_path: Path) -> None:
+    loads = {"Load1": with_inputs(tmp_path / "res", "series0", "series1")}
+    assert "registered as the images were." in told(loads, {"mine-levelled": levelled(tmp_path, "mine", "bone")})
+
+
+def test_what_the_engine_compares_and_holds_is_told(tmp_path: Path) -> None:
+    assert gaussnewton._LEAST_VOXELS == nonrigid._LEAST_VOXELS == 2.0
+    for align, bone in (("bone", True), ("image", False), ("none", False)):
+        place = measured(tmp_path / align, "Load1", align)
+        assert "mm (every two voxels, if that is more)" in told({"Load1": place}, {})
+        record = json.loads((place / "provenance.json").read_text())
+        record["parameters"] |= {"stages": [], "gauss_newton": asdict(GaussNewton())}
+        (place / "provenance.json").write_text(json.dumps(record))
+        text = told({"Load1": place}, {})
+        assert ("strain of the bone (1000/mm3)" in text) == bone
+        assert "3.2 mm (every two voxels, if that is more)" in text
+        assert f"all voxels of the tissue and {nonrigid._MASK_MARGIN_MM:g} mm around it" in text
