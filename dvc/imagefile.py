@@ -1,4 +1,4 @@
-"""Reading images: NIfTI, NRRD, MetaImage and DICOM series, to an Image in LPS mm.
+"""Reading images: NIfTI, NRRD, MetaImage and DICOM, to an Image in LPS mm.
 
 A file that is damaged, or whose place in space can be read in two ways, is refused with the reason. What
 was read differently from how it was written (units, a lone volume of a 4D file) is told by the logger
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from dvc.arrays import Float32Array
-from dvc.dicom import is_dicom, read_dicom_series
+from dvc.dicom import dicom_shape, is_dicom, read_dicom
 from dvc.errors import ImageFileError, InputError
 from dvc.image import Grid, Image
 from dvc.nifti import nifti_shape, read_nifti_header
@@ -50,11 +50,11 @@ def read_image(
 
     Parameters
     ----------
-    path : file (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd) or folder of a DICOM series
+    path : file (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, enhanced DICOM) or folder of a DICOM series
     allow_missing : bool
         Take voxels that are NaN or infinite as missing (NaN) instead of refusing the image.
     series : str, optional
-        Which DICOM series of a folder that holds several; the end of its UID, as the refusal lists them.
+        Which DICOM series, echo, stack or the like, where there are several, as the refusal lists them.
     volume : int, optional
         Which volume of a 4D file, from 0.
     max_bytes : int
@@ -101,12 +101,12 @@ def read_voxels(
     place = Path(path)
     if not place.exists():
         raise InputError(f"{place}: no such file or folder. Check the path.")
-    if place.is_dir():
+    if place.is_dir() or _is_dicom_file(place):
         if volume is not None:
-            raise InputError(f"{place}: volume={volume} is for 4D files; a DICOM folder is chosen from by series.")
-        return read_dicom_series(place, series=series, max_bytes=max_bytes)
+            raise InputError(f"{place}: volume={volume} is for 4D files; DICOM is chosen from by series.")
+        return read_dicom(place, series=series, max_bytes=max_bytes)
     if series is not None:
-        raise InputError(f"{place}: series='{series}' is for DICOM folders; this is a file.")
+        raise InputError(f"{place}: series='{series}' is for DICOM folders and files; this is neither.")
     stored = read_header(place, volume=volume, max_bytes=max_bytes)
     if stored.unit != "mm":
         _log.warning("%s: lengths converted from %s to mm", place, stored.unit)
@@ -146,12 +146,12 @@ def estimate_size(path: str | PathLike[str]) -> int:
     place = Path(path)
     if not place.is_file():
         raise InputError(f"{place}: no such file. Check the path.")
-    _, _, shape = _FORMATS[_suffix(place)]
+    shape = dicom_shape if _is_dicom_file(place) else _FORMATS[_suffix(place)][2]
     return 4 * int(np.prod([max(n, 0) for n in shape(place)], dtype=object))
 
 
 def format_of(name: str) -> str:
-    """Format of an image that was read, by its name alone; a folder's is DICOM.
+    """Format of an image that was read, by its name alone; a folder's, and a file's of no other format, is DICOM.
 
     Examples
     --------
@@ -166,14 +166,17 @@ def _known_suffix(name: str) -> str | None:
     return next((s for s in sorted(_FORMATS, key=len, reverse=True) if name.lower().endswith(s)), None)
 
 
+def _is_dicom_file(path: Path) -> bool:
+    return _known_suffix(path.name) is None and is_dicom(path)
+
+
 def _suffix(path: Path) -> str:
     suffix = _known_suffix(path.name)
     if suffix is not None:
         return suffix
-    if is_dicom(path):
-        raise ImageFileError(f"{path}: one file of a DICOM series. Give its folder instead: {path.parent}")
     raise ImageFileError(
-        f"{path}: images of this kind are not read. What is read: {', '.join(_FORMATS)}, and folders of DICOM files."
+        f"{path}: images of this kind are not read. What is read: {', '.join(_FORMATS)}, enhanced DICOM files and "
+        "folders of DICOM files."
     )
 
 
