@@ -235,7 +235,7 @@ def build_frame(
     kind = Kind(
         str(header.SeriesInstanceUID),
         None if echo_time is None else round(float(echo_time), 2),
-        tuple(str(e) for e in several(echoes)),
+        tuple(str(int(e)) for e in several(echoes)),
         image_type,
         columns,
         rows,

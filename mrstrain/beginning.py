@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jinja2
 
-from dvc.dicom import is_dicom
+from dvc.dicom import is_dicom, is_multiframe
 from dvc.errors import InputError, OutputError
 from dvc.whole import write_whole
 from fe.published import published_names
@@ -107,7 +107,7 @@ def init(folder: Path | str, *, name: str = "Subject 01") -> Begun:
 
 def _look(place: Path) -> Found:
     found = Found()
-    images = sorted(p.name for p in place.iterdir() if p.name.lower().endswith(IMAGES) and p.is_file())
+    images = sorted(p.name for p in place.iterdir() if p.name.lower().endswith(IMAGES) and _is_volume(p))
     folders = sorted(p for p in place.iterdir() if p.is_dir())
     images += [p.name for p in folders if _holds_dicom(p)]
     for name in images:
@@ -134,6 +134,14 @@ def _look(place: Path) -> Found:
         elif _role(inside.name) is not None:
             found.passed_over[inside.name] = "a folder without a DICOM image in it"
     return found
+
+
+def _is_volume(path: Path) -> bool:
+    """Whether a file may be an image by itself; one of DICOM may be a slice."""
+    try:
+        return path.is_file() and (path.suffix.lower() != ".dcm" or is_multiframe(path))
+    except OSError:  # not to be read: none that could be used
+        return False
 
 
 def _holds_dicom(folder: Path) -> bool:

@@ -35,7 +35,7 @@ from mrstrain.options import (
 
 
 def register(
-    load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, or a DICOM folder.")],
+    load0: Annotated[Path, typer.Argument(help="Unloaded image: NIfTI, NRRD, MHA, enhanced DICOM, or a DICOM folder.")],
     loads: Annotated[list[Path], typer.Argument(help="Loaded images.")],
     out: Out,
     bone: Bone = None,

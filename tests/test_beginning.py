@@ -104,3 +104,13 @@ def test_a_dicom_folder_may_hold_many_other_files(tmp_path):
     for name in (*(f"A{n:02d}.bmp" for n in range(25)), "I1.dcm"):
         (tmp_path / "Load0" / name).write_bytes(b"x")
     assert init(tmp_path).found.load0 == "Load0"
+
+
+def test_enhanced_dicom_files_are_found_and_single_slices_left_alone(tmp_path, monkeypatch):
+    for name in ("Load0.dcm", "Load1.DCM", "load2_slice1.dcm", "load2_slice2.dcm", "notes.dcm"):
+        (tmp_path / name).write_bytes(bytes(128) + b"DICM")  # no image at all
+    assert init(tmp_path).found.load0 is None
+    (tmp_path / "study.toml").unlink()
+    monkeypatch.setattr("mrstrain.beginning.is_multiframe", lambda path: path.stem in ("Load0", "Load1"))
+    found = init(tmp_path).found
+    assert (found.load0, found.loads, found.passed_over) == ("Load0.dcm", {"Load1": "Load1.DCM"}, {})

@@ -257,9 +257,14 @@ def test_compressed_frames_are_decoded_and_scaled_by_their_own_slope(tmp_path: P
     frames = [_groups(k, scaling=(str(k + 1), "-5")) for k in _SHUFFLED]
     size = {"Rows": 40, "Columns": 48, "PixelRepresentation": 0}
     path = _write(tmp_path / "e.dcm", frames, change=compress, **size)
+    inverted = _write(tmp_path / "i.dcm", frames, change=compress, PhotometricInterpretation="MONOCHROME1", **size)
     expected = stored.transpose(2, 1, 0) * (np.arange(8) + 1.0) - 5.0
-    np.testing.assert_array_equal(read_image(path).values, expected)
-    _refused(_write(tmp_path / "few.dcm", frames, change=lambda h: compress(h, 5), **size), "damaged or cut short")
+    for written in (path, inverted):  # of display alone
+        np.testing.assert_array_equal(read_image(written).values, expected)
+    _refused(
+        _write(tmp_path / "few.dcm", frames, change=lambda h: compress(h, 5), **size),
+        "claims 8 frames, the file holds 5",
+    )
     _refused(_write(tmp_path / "size.dcm", frames, change=compress, **(size | {"Rows": 41})), "another size|decoded")
     path.write_bytes(path.read_bytes()[:-300])
     _refused(path, "damaged|cut short")
@@ -399,6 +404,10 @@ _REFUSALS: dict[str, tuple[dict[str, Any], str]] = {
     "spacing": ({"change": _strip("PixelMeasuresSequence")}, "without PixelSpacing in the functional groups"),
     "scaling": ({"frames": _without("PixelValueTransformationSequence", 0)}, "without RescaleSlope, .* of frame 2"),
     "slope": ({"frames": [*_ALL[:-1], _groups(4, scaling=("1e999", "0"))]}, "frame 8: .*not finite"),
+    "no width": (
+        {"frames": [_groups(k, PixelMeasuresSequence=_item(PixelSpacing=["0", "1"])) for k in range(8)]},
+        "5 x 6 voxels of 1 x 0 mm; all must be positive",
+    ),
     "pixels": ({"change": _cut}, "cut short: 8 frames of 5 x 6 voxels need 480 bytes, it holds 460"),
     "no pixels": ({"change": lambda header: delattr(header, "PixelData")}, "without pixels"),
     "terabytes": ({"Rows": 65535, "Columns": 65535}, "65535 x 65535 x 8 voxels, about 128.0 GiB"),
@@ -465,8 +474,9 @@ def test_a_file_cut_within_its_first_elements_is_not_left_out(tmp_path: Path) ->
 
 
 def test_what_a_header_holds_by_mistake_is_not_quoted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = _write(tmp_path / "e.dcm", [_groups(k, scaling=("12345678", "0")) for k in _SHUFFLED])
-    path.write_bytes(path.read_bytes().replace(b"12345678", b"Doe^Jane"))
-    caplog.clear()
-    _refused(path, "damaged")
+    slopes = {"frames": [_groups(k, scaling=("12345678", "0")) for k in _SHUFFLED]}
+    for options in (slopes, {"NumberOfFrames": 12345678}):
+        path = _write(tmp_path / "e.dcm", **options)
+        path.write_bytes(path.read_bytes().replace(b"12345678", b"Doe^Jane"))
+        _refused(path, "damaged")
     assert "Doe" not in caplog.text
