@@ -6,7 +6,6 @@ import hashlib
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, fields
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -14,6 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from dvc.mesh import TetMesh
+from dvc.software import software_key
 from dvc.whole import whole_file
 from fe.leg import Kept
 from fe.materials import Material
@@ -35,7 +35,7 @@ def fingerprint(
     fixed: Sequence[str],
     element: str,
 ) -> str:
-    """A hash of all that the last of these loads depends on, the solver's own text and libraries included."""
+    """A hash of all that the last of these loads depends on, the solver and its libraries included (`dvc.software`)."""
     digest = hashlib.sha256()
 
     def add(*things: object) -> None:
@@ -49,10 +49,7 @@ def fingerprint(
     for region, law in laws.items():
         add(region, law.vector, law.nu)
     add(plate.axes, plate.gap_mm, plate.taped, plate.turns, np.asarray(plate.pivot_mm, dtype=np.float64))
-    add(*(astuple(load)[1:] for load in loads), tuple(fixed), element)
-    add(*(version(library) for library in ("numpy", "scipy", "numba")))
-    for file in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(file.read_bytes())
+    add(*(astuple(load)[1:] for load in loads), tuple(fixed), element, software_key("fe"))
     return digest.hexdigest()
 
 

@@ -18,9 +18,9 @@ from distributed import Client, Future, LocalCluster, get_worker
 from filelock import FileLock
 
 from dvc.errors import InputError, MrstrainError
+from dvc.software import software_key
 from dvc.worker import usable_cores
 from mrstrain import stages
-from mrstrain.provenance import own_code
 from mrstrain.stages import Given
 
 _TELL_EVERY_S = 1.0
@@ -164,10 +164,14 @@ def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
     finally:
         for token in tokens:
             token.unlink(missing_ok=True)
-    for worker, (version, daemon, seen) in answers.items():
+    here = software_key("mrstrain").split(", ")
+    for worker, (key, daemon, seen) in answers.items():
         threads = client.nthreads().get(worker, 1)
-        if version != own_code():
-            raise InputError(f"The worker {worker} has mrstrain {version}, and here is {own_code()}: use one version.")
+        if (there := key.split(", ")) != here:
+            theirs, ours = (", ".join(p for p in one if p not in rest) for one, rest in ((there, here), (here, there)))
+            raise InputError(
+                f"The worker {worker} has {theirs}; here is {ours}: start workers in the same environment as here."
+            )
         if not seen:
             raise InputError(
                 f"The worker {worker} does not see {places[0]}: a study has to lie on a disk that all share."
@@ -184,7 +188,8 @@ def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
 
 
 def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:
-    return own_code(), multiprocessing.current_process().daemon, all(Path(token).exists() for token in tokens)
+    seen = all(Path(token).exists() for token in tokens)
+    return software_key("mrstrain"), multiprocessing.current_process().daemon, seen
 
 
 def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: str) -> tuple[Given | str, float]:

@@ -14,13 +14,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from dvc.software import software_key
 from dvc.whole import write_whole
 from mrstrain.plan import Stage
-from mrstrain.provenance import file_hash, own_code, versions, without_folders
+from mrstrain.provenance import file_hash, without_folders
 from mrstrain.stages import Given
-
-_MATTERS = ("itk-elastix", "pytetwild")
-"""Packages beside our own with which results change that are long in the making."""
 
 
 class Record(BaseModel):
@@ -96,14 +94,12 @@ class Ledger:
 
     def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, Record]) -> str:
         """Hash of what a stage would be made from now; ``built_on`` are the stages whose results it reads."""
-        told = versions()
         content = {
             "stage": stage.name,
             "called": [path.name for path in stage.files],
             **made_from,
             "built_on": {name: record.identity for name, record in sorted(built_on.items())},
-            "versions": {name: told[name] for name in _MATTERS},
-            "code": own_code(),
+            "software": software_key("mrstrain"),
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

@@ -9,34 +9,14 @@ import platform
 import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from functools import cache
-from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from dvc.software import distribution_versions
 from dvc.whole import write_whole
 from dvc.worker import usable_cores
 from mrstrain.doctor import usable_memory_bytes
 
-_PACKAGES = (
-    "mrstrain",
-    "itk-elastix",
-    "SimpleITK",
-    "numpy",
-    "scipy",
-    "scikit-image",
-    "numba",
-    "nibabel",
-    "pydicom",
-    "meshio",
-    "pytetwild",
-    "vtk",
-    "pypardiso",
-    "mkl",
-    "ngsolve",
-)
-_OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
 _BLOCK = 1 << 20
 
 
@@ -80,28 +60,8 @@ def _with_named(path: Path) -> list[Path]:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that figures depend on."""
-    found = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-@cache
-def own_code() -> str:
-    """Our version, and a hash of our packages' text and of the data that they bring: a version may be under way."""
-    digest = hashlib.sha256()
-    for package in _OURS:
-        (place,) = (Path(p) for p in import_module(package).__path__)
-        for file in sorted(place.rglob("*")):
-            name = file.relative_to(place)
-            if not file.is_file() or any(part.startswith((".", "__pycache__")) for part in name.parts):
-                continue
-            digest.update(f"{package}/{name.as_posix()}".encode())
-            digest.update(file.read_bytes())
-    return f"{version('mrstrain')}, code {digest.hexdigest()[:12]}"
+    here = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    return here | distribution_versions()
 
 
 def machine() -> dict[str, object]:

@@ -8,17 +8,17 @@ import io
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
 from dvc.errors import InputError, MrstrainError
 from dvc.registration import AT_BORDERS, GAUSS_NEWTON, Settings
+from dvc.software import software_key
 from dvc.whole import write_whole
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.inputs import make_output, refuse_small_disk
-from mrstrain.provenance import provenance, versions, write_json
+from mrstrain.provenance import provenance, write_json
 from mrstrain.studypage import write_study_report
 from phantoms.accuracy import (
     ErrorRow,
@@ -52,23 +52,6 @@ SEEDS = (1, 2)
 LABELS_OFF = (0, 1, -1)
 """By how many voxels bones and skin are too large in label maps, in turn, where the engine believes them."""
 
-# What makes the images: a study goes on only with runs made by the same.
-_MAKING = {"anatomy.py", "bodies.py", "flow.py", "heel.py", "motions.py", "mri.py", "study.py"}
-_ALIGNING = {"align.py", "rigidfit.py", "resample.py", "similarity.py", "deformation.py"}
-# Our own engine, which has no release number as elastix has.
-_ENGINE = {
-    "gaussnewton.py",
-    "descent.py",
-    "imageterm.py",
-    "smoothness.py",
-    "splinesums.py",
-    "splinekernels.py",
-    "borders.py",
-    "sharpen.py",
-    "nonrigid.py",
-    "shading.py",
-    "registration.py",
-}
 _SECONDS = 30.0  # of one run on one core, as measured, half of it to make and to score the pair
 _BORDERS_SECONDS = 52.0  # with borders of tissues
 _ELASTIX_SECONDS = 75.0  # as measured: 3,500 iterations, whatever the voxel
@@ -149,8 +132,8 @@ def accuracy(
     Parameters
     ----------
     out : path
-        Each run's samples are kept in ``runs``, and used again while preset, versions and phantom are the same. Tables
-        and page are of all that lies there: a later call with other cases adds to them.
+        Each run's samples are kept in ``runs``, and used again while preset and software (`dvc.software`) are the
+        same. Tables and page are of all that lies there: a later call with other cases adds to them.
     cases : sequence of Case
         The default of `cases_of` where not given.
     workers : int
@@ -249,18 +232,8 @@ def _check(case: Case) -> None:
 
 def _key(case: Case) -> str:
     """What a run's result depends on beside its case."""
-    told = versions()
     text = Settings.of(case.preset).text
-    sources = (
-        _sources("phantoms", _MAKING)
-        + _sources("dvc", _ALIGNING)
-        + (_sources("dvc", _ENGINE) if case.preset in {GAUSS_NEWTON, AT_BORDERS} else "")
-    )
-    return hashlib.sha256((text + told["mrstrain"] + told["itk-elastix"] + sources).encode()).hexdigest()
-
-
-def _sources(package: str, names: set[str]) -> str:
-    return "".join(file.read_text() for file in sorted(files(package).iterdir(), key=str) if file.name in names)
+    return hashlib.sha256(f"{text}; {software_key('phantoms')}".encode()).hexdigest()
 
 
 def _run_all(

@@ -1,0 +1,113 @@
+"""The software that a result depends on, as one key for everything that is kept to be used again.
+
+A study's stages, the restart files of simulations and the runs of an accuracy study are kept under this key, and made
+anew when it is another. It covers the package that computes the result and those of ours that it imports: every source
+file and every data file in them, by its place and content, in whatever folder it lies, and the versions of mrstrain
+and of the libraries that figures depend on.
+
+Why whole packages: a list of file names goes stale without a word. Following imports from file to file loses what is
+read by name (parameter files, material sets), and ends at nearly all files anyway, since whoever imports from a package
+runs its front door, which imports the rest. So the key of an accuracy run changes with a page template or an error
+model of `dvc`, too, neither of which touches it. Between two releases this costs computing time and never gives a wrong
+result; a user's results are made anew with each release in any case. To make error models, measure all presets on one
+state of the code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+
+_OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
+_IMPORTED = re.compile(rf"\n[ \t]*(?:from|import)[ \t]+({'|'.join(_OURS)})\b".encode())
+_DISTRIBUTIONS = (
+    "mrstrain",
+    "itk-elastix",
+    "SimpleITK",
+    "numpy",
+    "scipy",
+    "scikit-image",
+    "numba",
+    "nibabel",
+    "pydicom",
+    "meshio",
+    "pytetwild",
+    "vtk",
+    "pypardiso",
+    "mkl",
+    "ngsolve",
+)
+
+
+def distribution_versions() -> dict[str, str]:
+    """Versions of mrstrain and of the libraries that figures depend on; "not installed" where there is none."""
+    found = {}
+    for name in _DISTRIBUTIONS:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+@cache
+def software_key(package: str) -> str:
+    """All software that results of one of our packages depend on.
+
+    It is read once in a process.
+
+    Parameters
+    ----------
+    package : str
+        The package that computes the result: "dvc", "fe", "phantoms", "validate" or "mrstrain".
+
+    Returns
+    -------
+    str
+        Versions, and a hash of our own code, in parts that are divided by ", "; two keys differ by the parts that do.
+
+    Examples
+    --------
+    >>> software_key("fe").split(", ")[1][:5]
+    'code '
+    >>> software_key("fe") == software_key("phantoms")
+    False
+    """
+    hashes: dict[str, str] = {}
+    waiting = [package]
+    while waiting:
+        name = waiting.pop()
+        if name not in hashes:
+            hashes[name], imported = _package(name)
+            waiting.extend(imported)
+    code = hashlib.sha256(repr(sorted(hashes.items())).encode()).hexdigest()[:12]
+    own, *libraries = (" ".join(told) for told in distribution_versions().items())
+    return ", ".join([own, f"code {code}", *libraries])
+
+
+@cache
+def _package(package: str) -> tuple[str, frozenset[str]]:
+    """Hash of a package's files, and those of our packages that it imports anywhere, inside functions too."""
+    folder = _folder(package)
+    digest = hashlib.sha256()
+    imported: set[str] = set()
+    for name, file in sorted((file.relative_to(folder).as_posix(), file) for file in folder.rglob("*")):
+        if any(part.startswith((".", "__pycache__")) for part in name.split("/")) or not file.is_file():
+            continue
+        content = file.read_bytes()
+        digest.update(f"{name} {len(content)};".encode())
+        digest.update(content)
+        if file.suffix == ".py":
+            imported.update(found.decode() for found in _IMPORTED.findall(b"\n" + content))
+    return digest.hexdigest(), frozenset(imported)
+
+
+def _folder(package: str) -> Path:
+    spec = find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        raise ModuleNotFoundError(f"mrstrain is not whole: its package '{package}' is missing. Install it again.")
+    return Path(spec.submodule_search_locations[0])
