@@ -47,7 +47,7 @@ class Trial:
 
     def __init__(self, folder: Path, suite: list[str] | None, limit_s: float) -> None:
         self._folder, self._suite, self._limit_s = folder, suite, limit_s
-        self._whole, self._checking = folder / "whole", Lock()
+        self._whole, self._alone = folder / "whole", Lock()  # copied by one, or tested in by one, at a time
         shutil.copytree(ROOT, self._whole, ignore=_LEFT_OUT)
         self._passes = cache(lambda test: self._failed(self._whole, [test]) is None)
 
@@ -63,7 +63,8 @@ class Trial:
 
     def _noticed(self, fault: dict[str, Any]) -> tuple[str, str] | None:
         copy = self._folder / fault["name"]
-        shutil.copytree(self._whole, copy)
+        with self._alone:
+            shutil.copytree(self._whole, copy)
         try:
             seed(copy, fault)
             failed = self._failed(copy, fault["tests"])
@@ -71,7 +72,7 @@ class Trial:
                 failed = self._failed(copy, self._suite)
         finally:
             shutil.rmtree(copy, ignore_errors=True)
-        with self._checking:
+        with self._alone:
             if failed is not None and not self._passes(failed[0]):
                 raise NotTriedError(f"{failed[0]} fails without the fault, too ({failed[1]})")
         return failed
