@@ -119,7 +119,7 @@ def test_the_priors_gradient_is_that_of_its_energy(level, weights):
 
 @pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (10.0, -15.0, 8.0)], ids=["shifted", "turned"])
 def test_the_images_force_is_the_derivative_of_their_residual(turn_deg):
-    """Central differences of the fixed image are not quite the derivative: within 5 %. Turned, they have to turn too."""
+    """Central differences of the fixed image are not quite the derivative: within 5 %. They turn with what turns."""
     turn = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
     motion = Affine(turn, GRID.centre_mm - turn @ GRID.centre_mm + [0.4, -0.3, 0.2])
     inside = np.zeros(GRID.shape, dtype=bool)

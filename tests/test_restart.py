@@ -150,6 +150,8 @@ def test_what_was_made_from_something_else_is_not_used(whole, tmp_path: Path) ->
         made_from(laws=LAWS | {"skin": NeoHooke.of(0.2, nu=0.499)}),
         made_from(plate=Plate(DOWN, ALONG, turns=True, pivot_mm=[0, 1, 0])),
         made_from(plate=Plate(DOWN, ALONG)),
+        made_from(plate=Plate(DOWN, ALONG, taped=False)),
+        made_from(plate=Plate(DOWN, ALONG, turns=True, gap_mm=0.5)),
         made_from(loads=[LoadStep("a", 2.0), LoadStep("b", 2.0, 1.1)]),
         made_from(loads=[LoadStep("a", 2.0), LoadStep("b", 2.0, shear_mm=1.0)]),
         made_from(element="P2"),

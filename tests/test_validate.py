@@ -64,6 +64,9 @@ def test_area_between_curves_of_uniform_strains_has_its_closed_form() -> None:
     # place does not matter, volume does
     assert area_between(shear[::-1], shear, volumes) == pytest.approx(0.0, abs=1e-12)
     assert area_between(2.0 * shear, shear, 3.0 * volumes) == pytest.approx(3.0 * 0.0525, rel=1e-4)
+    # of two cells, 1 and 3 mL, the small one goes from 0.3 to 0.4
+    apart = area_between(np.array([0.3, 0.6]), np.array([0.4, 0.6]), np.array([1.0, 3.0]))
+    assert apart == pytest.approx(0.1, rel=1e-9)
 
 
 def test_a_spot_that_is_moved_is_found_as_far_away() -> None:
