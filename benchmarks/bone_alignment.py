@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dvc import elastix
-from dvc.deformation import RigidMotion
-from dvc.image import Image, Mask
-from dvc.presets import read_parameter_file
-from dvc.rigidfit import RigidFit
-from dvc.shading import without_shading
-from dvc.transformfile import rigid_from_elastix
-from mrstrain.provenance import versions
+from dvc.deformation.protocol import RigidMotion
+from dvc.images.image import Image, Mask
+from dvc.images.shading import without_shading
+from dvc.io.transforms.read import rigid_from_elastix
+from dvc.registration.elastix import run as elastix
+from dvc.registration.elastix.presets import read_parameter_file
+from dvc.registration.rigid_fit import RigidFit
+from mrstrain.records.provenance import versions
 from phantoms.heel import HeelPair, heel_pair
 
 RIGID = Path(__file__).with_name("bone_rigid.txt")

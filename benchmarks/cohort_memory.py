@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from dvc.imagewrite import write_image, write_labels
-from mrstrain.provenance import versions
-from mrstrain.running import run_studies
-from mrstrain.studyfile import read_study
+from dvc.io.images.write import write_image, write_labels
+from mrstrain.records.provenance import versions
+from mrstrain.studies.file import read_study
+from mrstrain.studies.run import run_studies
 from phantoms.heel import heel_pair
 from tests.quick import QUICK
 

@@ -18,8 +18,8 @@ import time
 from pathlib import Path
 
 from benchmarks.memory import peak_kib
-from fe.meshstore import read_tet_mesh
-from mrstrain.provenance import versions
+from fe.mesh_file import read_tet_mesh
+from mrstrain.records.provenance import versions
 
 
 def main() -> None:

@@ -21,20 +21,20 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import elastix
 from dvc.arrays import BoolArray
-from dvc.deformation import Deformation, Motion, evaluate_on_grid
-from dvc.gaussnewton import GaussNewton
-from dvc.image import Mask
-from dvc.kinematics import StrainField
-from dvc.registration import Settings, register
-from dvc.resample import shows
-from dvc.sharpen import AtBorders
+from dvc.deformation.protocol import Deformation, Motion, evaluate_on_grid
+from dvc.deformation.strain import StrainField
+from dvc.images.image import Mask
+from dvc.images.resample import shows
+from dvc.registration.elastix import run as elastix
+from dvc.registration.gauss_newton.fit import GaussNewton
+from dvc.registration.gauss_newton.with_borders import AtBorders
+from dvc.registration.register import Settings, register
 from dvc.worker import Worker
-from mrstrain.provenance import versions
+from mrstrain.records.provenance import versions
+from phantoms.accuracy_run import distances_mm, motion_named
 from phantoms.anatomy import Heel
 from phantoms.heel import HeelPair, heel_pair, pressed
-from phantoms.study import distances_mm, motion_named
 
 ENGINES = {
     "elastix, heel-mr": Settings.of("heel-mr"),

@@ -24,11 +24,11 @@ import numpy as np
 from benchmarks.fe_speed import ours
 from dvc.arrays import IntArray
 from dvc.mesh import TetMesh
-from fe.meshstore import read_tet_mesh, write_tet_mesh
+from fe.mesh_file import read_tet_mesh, write_tet_mesh
 from fe.plate import Plate
 from fe.published import material_set
 from fe.simulate import LoadStep, simulate
-from mrstrain.provenance import versions
+from mrstrain.records.provenance import versions
 
 LOAD = LoadStep("Load1", 140.0)
 FIGURES = ("lift_s", "load_s", "peak_gib")

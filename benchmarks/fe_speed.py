@@ -27,13 +27,13 @@ from fe.assembly import Assembler
 from fe.decks import write_calculix
 from fe.elements import edges_of, element
 from fe.linear import Solver
-from fe.meshstore import read_tet_mesh
+from fe.mesh_file import read_tet_mesh
 from fe.model import Model
 from fe.newton import Tolerance, equilibrium
-from fe.path import PlateState
+from fe.plate_path import PlateState
 from fe.published import material_set
 from fe.simulate import LoadStep, State
-from mrstrain.provenance import versions
+from mrstrain.records.provenance import versions
 
 LIFT_MM = 1.5
 AREA_MM2 = 1500.0  # of the sole that is lifted, about

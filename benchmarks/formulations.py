@@ -18,20 +18,20 @@ from typing import Any
 
 import numpy as np
 
-from dvc.kinematics import StrainField
+from dvc.deformation.strain import StrainField
 from dvc.mesh import TetMesh
 from fe.assembly import Assembler
 from fe.elements import element
 from fe.linear import Solver
 from fe.materials import NeoHooke, Ogden
-from fe.meshstore import read_tet_mesh
+from fe.mesh_file import read_tet_mesh
 from fe.model import Model
 from fe.newton import Tolerance, equilibrium
 from fe.plate import Plate
 from fe.published import material_set
 from fe.result import patch_volumes, volume_percentiles
 from fe.simulate import LoadStep, State, simulate
-from mrstrain.provenance import versions
+from mrstrain.records.provenance import versions
 from tests.blocks import block
 
 ELEMENTS = ("P1", "MINI", "P2")

@@ -22,27 +22,27 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.nodal import Averaged
-from dvc.deformation import SampledDisplacement, evaluate_on_grid
-from dvc.image import Grid, LabelMap
-from dvc.imagewrite import write_image, write_labels
-from dvc.labels import read_labels, read_mask
+from dvc.deformation.protocol import SampledDisplacement, evaluate_on_grid
+from dvc.images.image import Grid, LabelMap
+from dvc.io.images.labels import read_labels, read_mask
+from dvc.io.images.write import write_image, write_labels
 from dvc.mesh import TetMesh
-from dvc.randomfield import GaussianField
-from fe.meshstore import read_tet_mesh, write_tet_mesh
+from dvc.trust.random_field import GaussianField
+from fe.mesh_file import read_tet_mesh, write_tet_mesh
 from mrstrain import mesh as make_mesh
 from mrstrain import run, simulate
-from mrstrain.loads import LOADS
-from mrstrain.measurements import spline_in
-from mrstrain.provenance import versions
+from mrstrain.measurement.measured_folder import spline_in
+from mrstrain.models.loads import LOADS
+from mrstrain.records.provenance import versions
+from phantoms.accuracy_run import distances_mm
 from phantoms.anatomy import Heel
 from phantoms.heel import covering, drawn_motion, heel_grid, labels_of, labels_to_mesh, scan
-from phantoms.score import errors_by_tissue
-from phantoms.study import distances_mm
+from phantoms.tissue_error import errors_by_tissue
 from phantoms.twin import found_back
 from validate.comparison import ALL_LOADS, compare, total
-from validate.levelled import carried_on
+from validate.extrapolation import carried_on
+from validate.fe_result import read_result
 from validate.mapping import ALL
-from validate.sources import read_result
 
 HIDDEN = """
 [hidden]

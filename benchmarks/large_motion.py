@@ -15,15 +15,15 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from dvc.deformation import Composed, Motion
-from dvc.imagewrite import write_image, write_labels
-from dvc.labels import read_labels, read_mask
-from mrstrain.measurements import spline_in
-from mrstrain.provenance import versions
-from mrstrain.registering import register
+from dvc.deformation.protocol import Composed, Motion
+from dvc.io.images.labels import read_labels, read_mask
+from dvc.io.images.write import write_image, write_labels
+from mrstrain.measurement.measured_folder import spline_in
+from mrstrain.measurement.register import register
+from mrstrain.records.provenance import versions
 from phantoms.anatomy import Heel
 from phantoms.heel import centred_grid, drawn_motion, labels_of, pressed, scan, sliding, under_plate
-from phantoms.score import errors_by_tissue
+from phantoms.tissue_error import errors_by_tissue
 
 SEED, SNR = 9300, 25.0
 SHAPE, SPACING_MM = (126, 140, 132), 0.8

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.labels import read_labels
-from dvc.onmesh import OnMesh
+from dvc.deformation.nodal import OnMesh
+from dvc.io.images.labels import read_labels
 from fe.meshing import mesh_labels
-from mrstrain.provenance import versions
+from mrstrain.records.provenance import versions
 
 
 def main() -> None:

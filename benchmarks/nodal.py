@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from dvc.arrays import FloatArray
+from dvc.deformation.nodal import Locator, OnMesh
 from dvc.mesh import TetMesh
-from dvc.onmesh import Locator, OnMesh
 
 
 def at_corners(mesh: TetMesh, H: FloatArray) -> FloatArray:

@@ -21,20 +21,20 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dvc.deformation import RigidMotion
+from dvc.deformation.protocol import RigidMotion
+from dvc.deformation.strain import StrainField
+from dvc.deformation.strain_maps import strain_maps
 from dvc.errors import MrstrainError
-from dvc.image import Grid, Image
-from dvc.imagefile import read_image
-from dvc.kinematics import StrainField
-from dvc.quality import noise_floor
-from dvc.registration import Registration, Settings, register
-from dvc.resample import carry
-from dvc.similarity import local_correlation
-from dvc.strainmaps import strain_maps
-from dvc.tissue import tissue_mask
-from dvc.transformfile import read_transform
+from dvc.images.image import Grid, Image
+from dvc.images.resample import carry
+from dvc.images.similarity import local_correlation
+from dvc.images.tissue import tissue_mask
+from dvc.io.images.read import read_image
+from dvc.io.transforms.read import read_transform
+from dvc.registration.register import Registration, Settings, register
+from dvc.trust.quality import noise_floor
 from dvc.worker import Worker, usable_cores
-from mrstrain.provenance import versions
+from mrstrain.records.provenance import versions
 
 
 def floor_of(found: Registration) -> dict[str, float]:

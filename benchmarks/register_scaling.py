@@ -22,11 +22,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.memory import peak_kib
-from dvc.image import Grid, Image
-from dvc.imagewrite import write_image, write_labels, write_mask
-from dvc.labels import fit_mask
-from dvc.resample import carry
-from mrstrain.provenance import versions
+from dvc.images.image import Grid, Image
+from dvc.images.resample import carry
+from dvc.io.images.labels import fit_mask
+from dvc.io.images.write import write_image, write_labels, write_mask
+from mrstrain.records.provenance import versions
 from phantoms.heel import HeelPair, heel_pair
 
 

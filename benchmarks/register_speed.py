@@ -18,15 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import elastix
-from dvc.elastixtext import format_parameters
-from dvc.image import Mask
-from dvc.presets import load_preset, read_parameter_file
-from dvc.registration import Settings, register
-from dvc.tissue import tissue_mask, widened
+from dvc.images.image import Mask
+from dvc.images.tissue import tissue_mask, widened
+from dvc.io.transforms.elastix_text import format_parameters
+from dvc.registration.elastix import run as elastix
+from dvc.registration.elastix.presets import load_preset, read_parameter_file
+from dvc.registration.register import Settings, register
 from dvc.worker import Worker, usable_cores
-from mrstrain.making import phantom
-from mrstrain.provenance import versions
+from mrstrain.records.provenance import versions
+from mrstrain.truth.phantom import phantom
 from phantoms.heel import HeelPair, heel_pair
 
 RIGID = Path(__file__).with_name("bone_rigid.txt")

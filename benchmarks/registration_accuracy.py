@@ -18,19 +18,19 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import elastix
-from dvc.bspline import BSpline
-from dvc.deformation import Deformation, RigidMotion
-from dvc.elastixtext import parse_parameters
-from dvc.image import Image, Mask
-from dvc.presets import Preset
-from dvc.registration import Settings, register
-from dvc.resample import shows
-from dvc.transformfile import bspline_from_elastix
+from dvc.deformation.bspline import BSpline
+from dvc.deformation.protocol import Deformation, RigidMotion
+from dvc.images.image import Image, Mask
+from dvc.images.resample import shows
+from dvc.io.transforms.elastix_text import parse_parameters
+from dvc.io.transforms.read import bspline_from_elastix
+from dvc.registration.elastix import run as elastix
+from dvc.registration.elastix.presets import Preset
+from dvc.registration.register import Settings, register
 from dvc.worker import Worker, usable_cores
-from mrstrain.provenance import versions
+from mrstrain.records.provenance import versions
 from phantoms.heel import HeelPair, heel_pair
-from phantoms.score import errors_by_tissue
+from phantoms.tissue_error import errors_by_tissue
 
 MARGIN_MM = 4.0
 

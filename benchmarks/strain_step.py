@@ -57,10 +57,10 @@ def measure(threads: int) -> dict[str, object]:
     import itk
     import numpy as np
 
-    from dvc.bspline import BSpline
-    from dvc.image import Grid
-    from dvc.kinematics import StrainField
-    from dvc.transformwrite import write_elastix_transform
+    from dvc.deformation.bspline import BSpline
+    from dvc.deformation.strain import StrainField
+    from dvc.images.image import Grid
+    from dvc.io.transforms.write import write_elastix_transform
 
     grid = Grid(SHAPE, (SPACING_MM,) * 3, (0.0, 0.0, 0.0))
     counts = tuple(int(np.ceil((n - 1) * SPACING_MM / CONTROL_MM)) + 4 for n in SHAPE)

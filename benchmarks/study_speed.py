@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 
 from benchmarks.memory import peak_kib
-from mrstrain.provenance import versions
+from mrstrain.records.provenance import versions
 
 
 def timed(*arguments: str) -> dict[str, float]:

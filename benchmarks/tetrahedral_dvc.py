@@ -31,20 +31,20 @@ from scipy import sparse
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from benchmarks.nodal import at_corners, located
-from dvc.deformation import Deformation
-from dvc.gaussnewton import scaled
-from dvc.imagefile import read_image
-from dvc.kinematics import StrainField
-from dvc.labels import read_labels
+from dvc.deformation.protocol import Deformation
+from dvc.deformation.strain import StrainField
+from dvc.io.images.labels import read_labels
+from dvc.io.images.read import read_image
 from dvc.mesh import TetMesh
-from dvc.registration import Settings, register
-from dvc.sharpen import fit_with_borders
+from dvc.registration.gauss_newton.fit import scaled
+from dvc.registration.gauss_newton.with_borders import fit_with_borders
+from dvc.registration.register import Settings, register
 from fe.materials import NeoHooke
-from fe.meshstore import read_tet_mesh
+from fe.mesh_file import read_tet_mesh
 from fe.published import material_set
-from mrstrain.provenance import versions
-from phantoms.study import distances_mm
-from validate.sources import read_result
+from mrstrain.records.provenance import versions
+from phantoms.accuracy_run import distances_mm
+from validate.fe_result import read_result
 
 GAIN_MM, VOLUME, NU = 10.0, 300.0, 0.45
 STEPS, LONGEST_MM, HALVINGS = 12, 1.5, 4

@@ -3,10 +3,9 @@
 The public surface. All geometry is LPS mm in the reference (unloaded) configuration unless a docstring says otherwise.
 """
 
-from dvc.align import Alignment
-from dvc.borders import BorderedSpline
-from dvc.bspline import BSpline
-from dvc.deformation import (
+from dvc.deformation.bordered_spline import BorderedSpline
+from dvc.deformation.bspline import BSpline
+from dvc.deformation.protocol import (
     Affine,
     Composed,
     Deformation,
@@ -15,24 +14,25 @@ from dvc.deformation import (
     Within,
     evaluate_on_grid,
 )
-from dvc.displacementfile import read_displacement
-from dvc.image import Grid, Image, LabelMap, Mask
-from dvc.imagefile import read_image
-from dvc.imagewrite import write_image, write_labels, write_mask, write_vectors
-from dvc.kinematics import StrainField, plate_axes, principal_values
-from dvc.labels import fit_mask, read_labels, read_mask
-from dvc.landmarks import read_landmarks, target_registration_error
+from dvc.deformation.strain import StrainField, plate_axes, principal_values
+from dvc.deformation.strain_maps import StrainMaps, strain_maps
+from dvc.images.image import Grid, Image, LabelMap, Mask
+from dvc.images.similarity import local_correlation
+from dvc.images.tissue import tissue_mask
+from dvc.io.images.labels import fit_mask, read_labels, read_mask
+from dvc.io.images.read import read_image
+from dvc.io.images.write import write_image, write_labels, write_mask, write_vectors
+from dvc.io.meshes.read import MeshFile, read_mesh
+from dvc.io.transforms.displacement_image import read_displacement
+from dvc.io.transforms.read import read_transform
 from dvc.mesh import TetMesh
-from dvc.meshfile import MeshFile, read_mesh
-from dvc.presets import Preset, load_preset, preset_names, read_parameter_file
-from dvc.quality import Quality, assess, noise_floor
-from dvc.registration import Registration, Settings, register
-from dvc.sharpen import AtBorders
-from dvc.similarity import local_correlation
-from dvc.strainmaps import StrainMaps, strain_maps
-from dvc.tissue import tissue_mask
-from dvc.transformfile import read_transform
-from dvc.verdict import Verdict
+from dvc.registration.align import Alignment
+from dvc.registration.elastix.presets import Preset, load_preset, preset_names, read_parameter_file
+from dvc.registration.gauss_newton.with_borders import AtBorders
+from dvc.registration.register import Registration, Settings, register
+from dvc.trust.landmarks import read_landmarks, target_registration_error
+from dvc.trust.quality import Quality, assess, noise_floor
+from dvc.trust.verdict import Verdict
 
 __all__ = [
     "Affine",

@@ -14,14 +14,14 @@ from xml.etree import ElementTree
 import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
-from dvc.whole import write_whole
 from fe.elements import Space, edges_of
-from fe.facets import BONE
 from fe.hyperelastic import OGDEN
 from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
 from fe.simulate import State
+from fe.surface_sets import BONE
 
 _UNUSED = 1e30  # D of a volumetric term that is not wanted: its stiffness is 1 / D
 _PER_LINE = 12

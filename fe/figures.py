@@ -14,17 +14,17 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from dvc.arrays import FloatArray, IntArray
-from dvc.figures import REGION_COLOURS
-from dvc.kinematics import StrainField
+from dvc.deformation.strain import StrainField
 from dvc.mesh import TetMesh
-from dvc.planes import letters
-from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
+from dvc.report.figures import REGION_COLOURS
+from dvc.report.planes import letters
+from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.convergence import Limit
-from fe.facets import BONE
 from fe.fitting import Curve, Fit
 from fe.plate import Plate
 from fe.result import volume_percentiles
 from fe.simulate import State
+from fe.surface_sets import BONE
 
 _POINTS = 200
 _FLAT_MM = 0.1

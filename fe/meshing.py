@@ -12,13 +12,13 @@ from scipy.spatial import cKDTree
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError, WorkerError
-from dvc.image import Grid, LabelMap
+from dvc.images.image import Grid, LabelMap
 from dvc.mesh import FACES, TetMesh, signed_volumes
 from dvc.worker import Worker
-from fe.facets import BONE, CUT, SKIN
 from fe.slivers import dihedral_angles_deg, without_slivers
-from fe.surfaces import Borders, borders_of, labels_at
-from fe.volumes import with_volumes
+from fe.surface_sets import BONE, CUT, SKIN
+from fe.tissue_surfaces import Borders, borders_of, labels_at
+from fe.tissue_volumes import with_volumes
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
 _FARTHEST = 0.1  # of the smallest voxel edge: how far a node may move at once to keep the tissues' volumes
@@ -124,9 +124,9 @@ def mesh_labels(
     Notes
     -----
     The tetrahedra are fTetWild's (Hu and others 2020, doi:10.1145/3386569.3392385). Borders are then moved, by three
-    tenths of a voxel at the most, until each region has the volume of its voxels (`fe.volumes`); where a cell has an
-    angle under 12 degrees, nodes are moved until there is none or no move helps. They differ a little from one run to
-    the next: keep a mesh, and its hash, with what was computed on it.
+    tenths of a voxel at the most, until each region has the volume of its voxels (`fe.tissue_volumes`); where a cell
+    has an angle under 12 degrees, nodes are moved until there is none or no move helps. They differ a little from one
+    run to the next: keep a mesh, and its hash, with what was computed on it.
     """
     numbers = check_meshing(labels, edge_mm, bones, finer)
     soft = {name: number for name, number in numbers.items() if name not in bones}

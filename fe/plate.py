@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
-from dvc.kinematics import plate_axes
 
 _BEYOND_MM = 0.5
 _SAME_MM = 1e-6  # nodes whose heights differ by less touch together, whatever the frame does to the last digits

@@ -12,13 +12,13 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from dvc.atomic_files import whole_file
 from dvc.mesh import TetMesh
 from dvc.software import software_key
-from dvc.whole import whole_file
-from fe.leg import Kept
+from fe.load_stages import Kept
 from fe.materials import Material
-from fe.path import PlateState
 from fe.plate import Hold, Plate
+from fe.plate_path import PlateState
 from fe.simulate import LoadStep
 
 ENDING = ".restart.npz"

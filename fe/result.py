@@ -12,11 +12,11 @@ import meshio
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.kinematics import StrainField
+from dvc.atomic_files import whole_file, write_whole
+from dvc.deformation.nodal import OnMesh
+from dvc.deformation.strain import StrainField
 from dvc.mesh import TetMesh
-from dvc.onmesh import OnMesh
-from dvc.regions import SHEAR_THRESHOLDS, volume_above
-from dvc.whole import whole_file, write_whole
+from dvc.trust.regions import SHEAR_THRESHOLDS, volume_above
 from fe.materials import Material
 from fe.model import CROWDED
 from fe.simulate import State

@@ -14,13 +14,13 @@ from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 from fe.elements import element
-from fe.facets import BONE, SKIN
-from fe.leg import Kept, Leg
+from fe.load_stages import Kept, Leg
 from fe.materials import Material
 from fe.model import Model
 from fe.newton import Tolerance
-from fe.path import Goal, Path, PlateState
 from fe.plate import Contact, Plate
+from fe.plate_path import Goal, Path, PlateState
+from fe.surface_sets import BONE, SKIN
 
 _TOLERANCE = Tolerance()
 
@@ -87,7 +87,7 @@ class State:
     ----------
     load : LoadStep
     reached, curve, iterations, seconds
-        As in `fe.leg.Kept`; the curve is empty where there is no plate.
+        As in `fe.load_stages.Kept`; the curve is empty where there is no plate.
     u_mm : (n, 3)
         Displacement of the mesh's nodes, mm.
     pressure_mpa : (m, 4)

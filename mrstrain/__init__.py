@@ -9,22 +9,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mrstrain.beginning import init
-    from mrstrain.checking import check
-    from mrstrain.comparing import compare
-    from mrstrain.converging import converge
-    from mrstrain.driving import drive
-    from mrstrain.fitting import fit
-    from mrstrain.levelling import level
-    from mrstrain.making import phantom
-    from mrstrain.meshing import mesh
-    from mrstrain.registering import register
-    from mrstrain.running import run
-    from mrstrain.simulating import simulate
-    from mrstrain.straining import strain
-    from mrstrain.studying import accuracy
-    from mrstrain.subjects import cohort
-    from mrstrain.twinning import twin
+    from mrstrain.comparison.compare import compare
+    from mrstrain.comparison.drive import drive
+    from mrstrain.comparison.level import level
+    from mrstrain.measurement.register import register
+    from mrstrain.measurement.strain import strain
+    from mrstrain.models.converge import converge
+    from mrstrain.models.fit import fit
+    from mrstrain.models.mesh import mesh
+    from mrstrain.models.simulate import simulate
+    from mrstrain.studies.check import check
+    from mrstrain.studies.cohort import cohort
+    from mrstrain.studies.init import init
+    from mrstrain.studies.run import run
+    from mrstrain.truth.accuracy import accuracy
+    from mrstrain.truth.phantom import phantom
+    from mrstrain.truth.twin import twin
 
 __version__ = "0.1.0"
 __all__ = [
@@ -47,22 +47,22 @@ __all__ = [
 ]
 
 _ROOMS = {
-    "accuracy": "studying",
-    "check": "checking",
-    "cohort": "subjects",
-    "compare": "comparing",
-    "converge": "converging",
-    "drive": "driving",
-    "fit": "fitting",
-    "init": "beginning",
-    "level": "levelling",
-    "mesh": "meshing",
-    "phantom": "making",
-    "register": "registering",
-    "run": "running",
-    "simulate": "simulating",
-    "strain": "straining",
-    "twin": "twinning",
+    "accuracy": "truth.accuracy",
+    "check": "studies.check",
+    "cohort": "studies.cohort",
+    "compare": "comparison.compare",
+    "converge": "models.converge",
+    "drive": "comparison.drive",
+    "fit": "models.fit",
+    "init": "studies.init",
+    "level": "comparison.level",
+    "mesh": "models.mesh",
+    "phantom": "truth.phantom",
+    "register": "measurement.register",
+    "run": "studies.run",
+    "simulate": "models.simulate",
+    "strain": "measurement.strain",
+    "twin": "truth.twin",
 }
 
 

@@ -1,6 +1,6 @@
 """`python -m mrstrain`: the command line."""
 
-from mrstrain.cli import main
+from mrstrain.cli.app import main
 
 if __name__ == "__main__":
     main()

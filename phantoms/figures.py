@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dvc.figures import REGION_COLOURS
-from dvc.sheet import INK, chart, label_axes, png_bytes
-from phantoms.accuracy import SOFT, ErrorRow, FloorRow, ResolutionRow, wavelength_recovered
+from dvc.report.figures import REGION_COLOURS
+from dvc.report.sheet import INK, chart, label_axes, png_bytes
+from phantoms.error_tables import SOFT, ErrorRow, FloorRow, ResolutionRow, wavelength_recovered
 
 _MARKS = ("o", "s", "^", "D", "v", "P")
 

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from dvc.arrays import FloatArray, frozen
-from dvc.deformation import Affine
+from dvc.deformation.protocol import Affine
 from dvc.errors import InputError
 
 _UNIT = 1e-6

@@ -9,7 +9,7 @@ from scipy import fft
 
 from dvc.arrays import Float32Array, FloatArray
 from dvc.errors import InputError
-from dvc.image import Grid, Image
+from dvc.images.image import Grid, Image
 
 _FULL = 0.6  # of the highest frequency: up to here k-space is taken as it is, from here on it fades to nothing
 _BIAS = 0.2

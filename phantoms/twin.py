@@ -15,11 +15,11 @@ from scipy.spatial import cKDTree
 from skimage.restoration import denoise_nl_means
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
-from dvc.deformation import Deformation, Motion, RigidMotion, evaluate_on_grid
+from dvc.deformation.protocol import Deformation, Motion, RigidMotion, evaluate_on_grid
 from dvc.errors import InputError
-from dvc.image import Grid, Image, Mask
-from dvc.noise import noise_sd
-from dvc.resample import fill_missing
+from dvc.images.image import Grid, Image, Mask
+from dvc.images.noise import noise_sd
+from dvc.images.resample import fill_missing
 from phantoms.mri import sensitivity
 
 _TOLERANCE_MM = 1e-7

@@ -21,7 +21,7 @@ from pydicom.uid import (
 from scipy.spatial.transform import Rotation
 
 from dvc.errors import ImageFileError, MrstrainError
-from dvc.imagefile import read_image
+from dvc.io.images.read import read_image
 
 SERIES = "1.2.826.0.1.3680043.8.498.111111"
 SHAPE = (5, 6, 8)  # columns, rows, slices

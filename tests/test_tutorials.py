@@ -13,16 +13,16 @@ import typer
 from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 
-from dvc.imagewrite import write_image, write_mask
-from dvc.labels import read_labels
-from fe.meshstore import write_tet_mesh
-from mrstrain.cli import app
-from mrstrain.making import phantom
-from mrstrain.studyfile import read_study
+from dvc.io.images.labels import read_labels
+from dvc.io.images.write import write_image, write_mask
+from fe.mesh_file import write_tet_mesh
+from mrstrain.cli.app import app
+from mrstrain.studies.file import read_study
+from mrstrain.truth.phantom import phantom
 from phantoms.anatomy import Heel
 from phantoms.heel import under_load
+from tests.fe.test_simulate import dome
 from tests.quick import QUICK
-from tests.test_simulate import dome
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

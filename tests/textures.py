@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dvc.deformation import Affine
-from dvc.image import Grid, Image, Mask
+from dvc.deformation.protocol import Affine
+from dvc.images.image import Grid, Image, Mask
 
 GRID = Grid((40, 44, 36), np.array([1.0, 1.0, 1.2]), np.array([-20.0, 5.0, 3.0]))
 

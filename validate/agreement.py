@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
-from dvc.deformation import Deformation
+from dvc.deformation.nodal import OnMesh
+from dvc.deformation.protocol import Deformation
 from dvc.mesh import outer_faces
-from dvc.onmesh import OnMesh
 from validate.mapping import ALL, Mapped
 
 TO_BONE_MM = (0.0, 3.0, 6.0, 12.0)

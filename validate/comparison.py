@@ -10,19 +10,19 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray
-from dvc.deformation import Deformation
-from dvc.image import LabelMap
+from dvc.deformation.protocol import Deformation
+from dvc.images.image import LabelMap
 from dvc.mesh import TetMesh
-from dvc.truths import TruthDraws
-from dvc.uncertainty import ErrorTable
+from dvc.trust.error_model import ErrorTable
+from dvc.trust.truth_draws import TruthDraws
 from validate.agreement import Agreement, Travel, agreements, travel
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands
-from validate.doubt import DRAWS as LOCATED
-from validate.doubt import with_intervals
-from validate.levelled import LEVELLED
+from validate.extrapolation import LEVELLED
+from validate.fe_result import FeResult
 from validate.location import LEAST_ML, Overlap, Threshold, neighbours, overlap
+from validate.location_intervals import DRAWS as LOCATED
+from validate.location_intervals import with_intervals
 from validate.mapping import ALL, Mapped, mapped
-from validate.sources import FeResult
 
 _STRAINED = 0.01
 

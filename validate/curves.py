@@ -14,8 +14,8 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
-from dvc.regions import volume_above
-from dvc.uncertainty import widened
+from dvc.trust.error_model import widened
+from dvc.trust.regions import volume_above
 
 RANGE = (0.2, 0.5)
 """Strains between which curves are compared, by default."""
@@ -117,7 +117,7 @@ class Band:
         What a perfect model would be given: the median area between a truth drawn, made narrower as `bands` tells, and
         the next one.
     widening : float
-        By which intervals of draws are widened; see `dvc.uncertainty.ErrorTable`.
+        By which intervals of draws are widened; see `dvc.trust.error_model.ErrorTable`.
     """
 
     strains: FloatArray
@@ -156,14 +156,14 @@ def bands(
     Parameters
     ----------
     truths : iterable of (n,)
-        Maximal shear of each truth drawn, in the cells; see `dvc.truths.TruthDraws`.
+        Maximal shear of each truth drawn, in the cells; see `dvc.trust.truth_draws.TruthDraws`.
     models : mapping of name to (n,)
         Maximal shear in the cells.
     volumes_ml : (n,)
     tissues : mapping of name to (n,) bool
     widening : float
     narrowed : callable
-        Makes a truth drawn (n,) as narrow as a perfect model is: `dvc.truths.TruthDraws.narrowed`.
+        Makes a truth drawn (n,) as narrow as a perfect model is: `dvc.trust.truth_draws.TruthDraws.narrowed`.
     strains : (low, high)
         Range of the areas; the band begins at 0 and ends at one and a half times its upper end.
 

@@ -10,9 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dvc.arrays import FloatArray
-from dvc.deformation import Deformation
-from dvc.figures import REGION_COLOURS
-from dvc.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
+from dvc.deformation.protocol import Deformation
+from dvc.report.figures import REGION_COLOURS
+from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet
 from validate.agreement import Agreement
 from validate.curves import Band

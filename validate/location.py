@@ -143,7 +143,7 @@ class Overlap:
         95th percentile, by volume, of the distance of either to the other; the larger of the two.
     measured_low_ml, measured_high_ml, dice_low ... : float
         95 % intervals from the measurement's error, and what a perfect model would be given; NaN where the error is
-        not known. See `validate.doubt`.
+        not known. See `validate.location_intervals`.
     """
 
     model: str

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
-from dvc.deformation import Deformation
+from dvc.deformation.protocol import Deformation
+from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
-from dvc.image import LabelMap
-from dvc.kinematics import StrainField
+from dvc.images.image import LabelMap
 from dvc.mesh import TetMesh
-from dvc.regions import volume_above
+from dvc.trust.regions import volume_above
 
 ALL = "all soft tissue"
 """All tissue that is compared, together."""

@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dvc.errors import GeometryError
-from dvc.image import LabelMap
+from dvc.images.image import LabelMap
 from dvc.mesh import TetMesh, box_told
+from validate.fe_result import FeResult
 from validate.mapping import Mapped, tissues_of
-from validate.sources import FeResult
 
 _LEAST_OVERLAP, _GOOD_OVERLAP = 0.85, 0.95
 _SAME_TISSUE = 0.8

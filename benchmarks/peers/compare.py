@@ -30,11 +30,11 @@ import numpy as np
 from benchmarks.memory import peak_kib
 from benchmarks.peers.pairs import PAIRS, pair_named, write_pair
 from benchmarks.registration_accuracy import scored
-from dvc.deformation import Deformation
-from dvc.displacementfile import read_displacement
+from dvc.deformation.protocol import Deformation
 from dvc.errors import MrstrainError
-from dvc.transformfile import read_transform
-from mrstrain.provenance import versions
+from dvc.io.transforms.displacement_image import read_displacement
+from dvc.io.transforms.read import read_transform
+from mrstrain.records.provenance import versions
 from phantoms.heel import HeelPair
 
 ROOT = Path(__file__).resolve().parents[2]

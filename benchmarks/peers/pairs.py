@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.registration_accuracy import without_motion
-from dvc.image import Grid, Image, Mask
-from dvc.imagewrite import write_image, write_labels, write_mask
-from dvc.resample import carry, fill_missing
-from dvc.shading import without_shading
+from dvc.images.image import Grid, Image, Mask
+from dvc.images.resample import carry, fill_missing
+from dvc.images.shading import without_shading
+from dvc.io.images.write import write_image, write_labels, write_mask
+from phantoms.accuracy_run import motion_named
 from phantoms.anatomy import Heel
 from phantoms.heel import HeelPair, heel_pair
-from phantoms.study import motion_named
 
 # Air left around the body: more than tissue moves, so that its true place is inside the aligned image as well.
 MARGIN_MM = 10.0

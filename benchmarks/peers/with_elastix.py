@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 from benchmarks.registration_accuracy import elastix_default
-from dvc.image import Mask
-from dvc.imagefile import read_image
-from dvc.transformwrite import write_elastix_transform
+from dvc.images.image import Mask
+from dvc.io.images.read import read_image
+from dvc.io.transforms.write import write_elastix_transform
 from dvc.worker import Worker
 
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from dvc.borderfile import write_bordered_spline
-from dvc.bspline import BSpline
-from dvc.image import Mask
-from dvc.imagefile import read_image
-from dvc.labels import read_labels
-from dvc.registration import Settings, register
-from dvc.transformwrite import write_elastix_transform
+from dvc.deformation.bspline import BSpline
+from dvc.images.image import Mask
+from dvc.io.images.labels import read_labels
+from dvc.io.images.read import read_image
+from dvc.io.transforms.bordered_spline import write_bordered_spline
+from dvc.io.transforms.write import write_elastix_transform
+from dvc.registration.register import Settings, register
 
 
 def main() -> None:

@@ -1,0 +1,1 @@
+"""What moves tissue: the Deformation protocol, its kinds, and the strain of a displacement gradient."""

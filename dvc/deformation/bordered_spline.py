@@ -1,0 +1,293 @@
+"""Displacements whose gradient jumps where tissues meet: a smooth B-spline, and another that is counted by depth.
+
+Strain is smooth inside a tissue, but not across its border: fat that shears along stiff skin or along bone does so
+right up to them. One B-spline for all carries that strain over the border, as far as its control points lie apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
+from scipy.special import ndtri
+
+from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
+from dvc.deformation.bspline import BSpline, evaluate_spline
+from dvc.errors import GeometryError, InputError
+from dvc.images.image import Grid, LabelMap, Mask
+
+_CHUNK = 200_000
+_BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
+_SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off
+_NEAR = 1.0  # voxels
+_EVEN = 0.7  # voxels
+_LEAST_MM = 0.05  # every voxel stays on its own side of the border
+_GAP_MM = 3.0  # from a tissue: what has no label there belongs to it
+NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm": _LEAST_MM, "gap_mm": _GAP_MM}
+"""Every number that decides where a border lies, for a record."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Borders:
+    """Where tissues meet, and the two factors that a displacement gets by it.
+
+    With b the distance (mm) from the bone at rest and d the depth of a point below the border of its own tissue,
+
+        m = tanh(b / L),   psi = m L tanh(d / L).
+
+    m is 0 in the bone, psi on every border, and their gradients jump there. The skin's border with the air is none:
+    what counts is the border with another tissue.
+
+    Attributes
+    ----------
+    grid : Grid
+    depth : (tissues, ni, nj, nk)
+        Cubic spline coefficients, mode "mirror", of each tissue's depth, mm: positive in it, negative outside.
+    own : (ni, nj, nk) int
+        Of each voxel the number of its tissue in ``depth``; in the air that of the nearest tissue.
+    rest : int
+        Number of the bone at rest; -1 where none is.
+    reach_mm : float
+        L.
+    """
+
+    grid: Grid
+    depth: FloatArray
+    own: IntArray
+    rest: int
+    reach_mm: float
+
+    @classmethod
+    def of(cls, labels: LabelMap, bone: Mask | None, reach_mm: float, body: Mask | None = None) -> Borders:
+        """Borders of the tissues in a label map.
+
+        Parameters
+        ----------
+        labels : LabelMap
+        bone : Mask or None
+            Bone that does not move, on the same grid; it counts as a tissue of its own, whatever its labels are.
+        reach_mm : float
+            L: about the spacing of the control points.
+        body : Mask, optional
+            On the same grid. What of it has no label belongs to the nearest tissue within 3 mm, the bone at rest never
+            being that; and is a tissue of its own beyond.
+
+        Raises
+        ------
+        GeometryError
+            If bone or body are not on the grid of the labels.
+        InputError
+            If no voxel has a label, or the reach is not above zero.
+        """
+        for name, mask in (("bone", bone), ("body", body)):
+            if mask is not None and not mask.grid.same_as(labels.grid):
+                raise GeometryError(f"The {name} is not on the grid of the label map; bring it there (fit_mask).")
+        if not (np.isfinite(reach_mm) and reach_mm > 0):
+            raise InputError(f"The reach of a border must be above 0 mm; got {reach_mm}.")
+        values = labels.labels if bone is None else np.where(bone.inside, -1, labels.labels)
+        if not values.any():
+            raise InputError("The label map has no tissue in the part of the image that is registered.")
+        spacing = labels.grid.spacing_mm
+        if body is not None:
+            values = _labelled(values, body.inside & (values == 0), spacing)
+        nearest = distance_transform_edt(values == 0, sampling=spacing, return_distances=False, return_indices=True)
+        tissues, own = np.unique(values[tuple(nearest)], return_inverse=True)
+        rest = int(np.flatnonzero(tissues == -1)[0]) if bool((tissues == -1).any()) else -1
+        return cls.between(labels.grid, frozen(own.reshape(values.shape), np.int64), rest, float(reach_mm))
+
+    @classmethod
+    def between(cls, grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Borders:
+        """Borders between tissues that are numbered from 0 on; parameters as the attributes."""
+        depths = [_depth_mm(own == number, grid.spacing_mm) for number in range(int(own.max()) + 1)]
+        depth = np.stack([spline_filter(depth, order=3, mode="mirror") for depth in depths])
+        return cls(grid, frozen(depth, np.float64), own, rest, reach_mm)
+
+    def turned(self, rotation: FloatArray) -> Borders:
+        """The borders of a body that is turned about the world's origin."""
+        return replace(self, grid=self.grid.moved_by(rotation, np.zeros(3)))
+
+    def at_voxels(self) -> FloatArray:
+        """Factors at the voxels, (ni, nj, nk, 2, 4): of m and psi the value, and the gradient along the grid's axes.
+
+        On a border the gradient is that of the voxel's own side.
+        """
+        values, slopes = np.zeros(self.grid.shape), np.zeros((*self.grid.shape, 3))
+        for number, coefficients in enumerate(self.depth):
+            mine = self.own == number
+            values[mine] = self._spline_at_voxels(coefficients, mine)
+            slopes[mine] = self._slopes_at_voxels(coefficients, mine)
+        if self.rest < 0:
+            return self._factors(values, slopes, np.full(values.shape, np.inf), np.zeros_like(slopes), self.own)
+        everywhere = np.ones(self.grid.shape, dtype=bool)
+        bone = self._spline_at_voxels(self.depth[self.rest], everywhere).reshape(self.grid.shape)
+        toward = self._slopes_at_voxels(self.depth[self.rest], everywhere).reshape(*self.grid.shape, 3)
+        return self._factors(values, slopes, -bone, -toward, self.own)
+
+    def at(self, points_mm: FloatArray) -> FloatArray:
+        """Factors at points (n, 3) LPS mm, (n, 2, 4): of m and psi the value, and the gradient in LPS."""
+        indices = self.grid.indices_of(np.asarray(points_mm, dtype=np.float64))
+        depths, slopes = evaluate_spline(self.depth, indices, mirror=True)
+        slopes = slopes @ (np.linalg.inv(self.grid.direction) / self.grid.spacing_mm[:, None])
+        own = np.where(np.isnan(depths), -np.inf, depths).argmax(axis=1)
+        each = np.arange(len(own))
+        free = np.full(len(own), np.inf), np.zeros((len(own), 3))
+        away, toward = free if self.rest < 0 else (-depths[:, self.rest], -slopes[:, self.rest])
+        return self._factors(depths[each, own], slopes[each, own], away, toward, own)
+
+    def _factors(
+        self, depth: FloatArray, slope: FloatArray, away: FloatArray, away_slope: FloatArray, own: IntArray
+    ) -> FloatArray:
+        """Factors from depth d and distance b from the bone, and their gradients."""
+        L = self.reach_mm
+        m, psi = np.tanh(np.maximum(away, 0.0) / L), L * np.tanh(np.maximum(depth, 0.0) / L)
+        m_slope = ((1.0 - m**2) / L)[..., None] * away_slope
+        psi_slope = (1.0 - (psi / L) ** 2)[..., None] * slope
+        out = np.empty((*m.shape, 2, 4))
+        out[..., 0, 0], out[..., 1, 0] = m, m * psi
+        out[..., 0, 1:] = m_slope
+        out[..., 1, 1:] = m[..., None] * psi_slope + psi[..., None] * m_slope
+        if self.rest >= 0:
+            out[own == self.rest] = 0.0
+        return out
+
+    def _spline_at_voxels(self, coefficients: FloatArray, where: BoolArray) -> FloatArray:
+        return evaluate_spline(coefficients[None], np.argwhere(where).astype(np.float64), mirror=True)[0][:, 0]
+
+    def _slopes_at_voxels(self, coefficients: FloatArray, where: BoolArray) -> FloatArray:
+        per_voxel = evaluate_spline(coefficients[None], np.argwhere(where).astype(np.float64), mirror=True)[1][:, 0]
+        return np.asarray(per_voxel / self.grid.spacing_mm)
+
+
+def _labelled(values: IntArray, unknown: BoolArray, spacing_mm: FloatArray) -> IntArray:
+    """Labels with those of unknown voxels of the body filled in; -1 is the bone at rest."""
+    filled = np.where(unknown, values.max() + 1, values)
+    if unknown.any() and (values > 0).any():
+        gap_mm, nearest = distance_transform_edt(values <= 0, sampling=spacing_mm, return_indices=True)
+        filled = np.where(unknown & (gap_mm <= _GAP_MM), values[tuple(nearest)], filled)
+    return np.asarray(filled)
+
+
+def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
+    """Signed distance from a mask's border, mm, positive inside; the border is smooth, and not made of voxels' faces.
+
+    Blurred by a Gaussian of s, a plane's mask is the normal distribution of the distance over s: near the border the
+    distance is read off from it. Further away it is that to the nearest place of the border so found.
+    """
+    blurred = gaussian_filter(inside.astype(np.float64), _BLUR, mode="nearest")
+    normal = np.stack(np.gradient(blurred, *spacing_mm), axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    sure = (blurred > _SURE) & (blurred < 1.0 - _SURE)
+    sigma_mm = _BLUR * np.linalg.norm(normal * spacing_mm, axis=-1)
+    near_mm = np.where(sure, sigma_mm * ndtri(np.clip(blurred, _SURE, 1.0 - _SURE)), np.inf)
+    side = np.where(inside, 1.0, -1.0)
+    seeds = np.abs(near_mm) < _NEAR * spacing_mm.mean()
+    if not seeds.any():  # one tissue fills everything
+        return np.asarray(side * float(np.linalg.norm(np.array(inside.shape) * spacing_mm)))
+    places = np.moveaxis(np.indices(inside.shape), 0, -1) * spacing_mm
+    border = places - np.where(seeds, near_mm, 0.0)[..., None] * normal
+    to = distance_transform_edt(~seeds, sampling=spacing_mm, return_distances=False, return_indices=True)
+    far_mm = side * np.linalg.norm(places - border[tuple(to)], axis=-1)
+    depth = gaussian_filter(np.where(sure, near_mm, far_mm), _EVEN, mode="nearest")
+    return np.asarray(np.where(inside, np.maximum(depth, _LEAST_MM), np.minimum(depth, -_LEAST_MM)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BorderedSpline:
+    """x = X + u(X), u = m v + psi w: two cubic B-splines v (mm) and w, and the factors of `Borders`.
+
+    u is continuous, and zero in the bone at rest. Its gradient H = m grad v + v (x) grad m + psi grad w + w (x) grad
+    psi jumps across borders: by 2 m w (x) n, n the border's normal, between two tissues that both may move. On a border
+    it is that of the side on which rounding puts the point.
+
+    Parameters
+    ----------
+    smooth, jump : BSpline
+        v and w on one control grid, LPS.
+    borders : Borders
+
+    Raises
+    ------
+    GeometryError
+        If the control grids differ.
+    """
+
+    smooth: BSpline
+    jump: BSpline
+    borders: Borders
+
+    def __post_init__(self) -> None:
+        if not self.smooth.control.same_as(self.jump.control, tolerance_voxels=1e-6):
+            raise GeometryError("The two splines of a displacement with borders need one control grid.")
+
+    @property
+    def control(self) -> Grid:
+        """Control points of both splines."""
+        return self.smooth.control
+
+    def turned(self, rotation: FloatArray) -> BorderedSpline:
+        """The same displacement of a body that is turned, with its borders, about the world's origin."""
+        return BorderedSpline(self.smooth.turned(rotation), self.jump.turned(rotation), self.borders.turned(rotation))
+
+    def displacement(self, points_mm: FloatArray) -> FloatArray:
+        """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the splines' valid region."""
+        points = np.asarray(points_mm, dtype=np.float64)
+        u = np.empty((len(points), 3))
+        for start in range(0, len(points), _CHUNK):
+            some = points[start : start + _CHUNK]
+            m, psi = np.moveaxis(self.borders.at(some)[..., 0], 1, 0)
+            u[start : start + _CHUNK] = m[:, None] * self.smooth.displacement(some) + psi[
+                :, None
+            ] * self.jump.displacement(some)
+        return u
+
+    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the splines' valid region."""
+        points = np.asarray(points_mm, dtype=np.float64)
+        u, H = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        for start in range(0, len(points), _CHUNK):
+            some = slice(start, start + _CHUNK)
+            u[some], H[some] = self._joined(
+                points[some], self.smooth.evaluate(points[some]), self.jump.evaluate(points[some])
+            )
+        return u, H
+
+    def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid, in the order of ``np.argwhere(where)``.
+
+        Raises
+        ------
+        InputError
+            If ``where`` does not have the shape of ``grid``.
+        """
+        if where.shape != grid.shape:
+            raise InputError(f"The mask 'where' has shape {where.shape}; its grid has {grid.shape}.")
+        step = max(1, _CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: memory stays that of the result
+        found = []
+        for start in range(0, grid.shape[0], step):
+            box = (slice(start, start + step), slice(None), slice(None))
+            here, part = grid.part(box), where[box]
+            found.append(
+                self._joined(
+                    here.points(part), self.smooth.evaluate_on_grid(here, part), self.jump.evaluate_on_grid(here, part)
+                )
+            )
+        return np.concatenate([u for u, _ in found]), np.concatenate([H for _, H in found])
+
+    def _joined(
+        self, points: FloatArray, smooth: tuple[FloatArray, FloatArray], jump: tuple[FloatArray, FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Join u and H of both splines at the same points."""
+        factors = self.borders.at(points)
+        value, slope = factors[..., 0], factors[..., 1:]
+        parts = (smooth, jump)
+        u = sum(value[:, f, None] * part[0] for f, part in enumerate(parts))
+        H = sum(
+            value[:, f, None, None] * part[1] + part[0][:, :, None] * slope[:, f, None, :]
+            for f, part in enumerate(parts)
+        )
+        return np.asarray(u), np.asarray(H)
+
+
+Spline = BSpline | BorderedSpline
+"""What a registration finds: one B-spline, or two that know the tissues' borders."""

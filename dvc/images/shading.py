@@ -1,0 +1,70 @@
+"""Removal of smooth shading: every MR scan has its own receive field, which is not tissue."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import SimpleITK as sitk
+
+from dvc.images.image import Image
+from dvc.images.resample import fill_missing
+from dvc.images.tissue import bright_voxels
+
+_COARSE_MM = 3.5
+_CONTROL_POINTS = 4
+_ITERATIONS = [50, 50, 50]
+
+
+def without_shading(image: Image) -> Image:
+    """The image, above its lowest value, divided by its smooth multiplicative field, found by N4 on a coarse copy.
+
+    Normalised correlation over the whole body takes shading for contrast, and a B-spline then bends tissue to
+    follow it: on a phantom with fields of +-20 % that tripled the strain error. N4: N. Tustison et al., 2010,
+    doi:10.1109/TMI.2010.2046908.
+
+    Notes
+    -----
+    Only the registration sees the corrected image; outputs are made from the image as it was given. Missing
+    voxels stay missing.
+    """
+    known = fill_missing(image)
+    inside = bright_voxels(known)
+    if not inside.any():
+        return image
+    low = float(known.values.min())
+    scan = _to_sitk(image, known.values - low + 1e-3 * float(np.ptp(known.values)))
+    mask = _to_sitk(image, inside.astype(np.uint8))
+    shrink = [
+        int(np.clip(round(_COARSE_MM / s), 1, max(1, n // 8)))
+        for s, n in zip(image.grid.spacing_mm, image.grid.shape, strict=True)
+    ]
+    n4 = sitk.N4BiasFieldCorrectionImageFilter()
+    n4.SetMaximumNumberOfIterations(_ITERATIONS)
+    n4.SetNumberOfControlPoints([_CONTROL_POINTS] * 3)
+    with _one_thread():
+        n4.Execute(sitk.Shrink(scan, shrink), sitk.Shrink(mask, shrink))
+        log_field = sitk.GetArrayFromImage(n4.GetLogBiasFieldAsImage(scan)).T
+    found = log_field[inside]  # away from tissue the spline is extrapolated and may be anything
+    field = np.exp(np.clip(log_field, found.min(), found.max()) - float(np.median(found)))
+    return Image(image.grid, low + (image.values - low) / field.astype(np.float32))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """N4 adds up in parts, one for each thread of ITK's default: in one alone, its bits do not depend on them."""
+    usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
+    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)
+    try:
+        yield
+    finally:
+        sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
+
+
+def _to_sitk(image: Image, values: npt.NDArray[Any]) -> sitk.Image:
+    made = sitk.GetImageFromArray(np.ascontiguousarray(values.T))
+    made.SetSpacing([float(s) for s in image.grid.spacing_mm])
+    return made

@@ -1,0 +1,1 @@
+"""Files in and out: images, meshes, transforms, and the folder of results."""

@@ -1,0 +1,1 @@
+"""Images, masks and label maps as files: NIfTI, NRRD, MetaImage and DICOM."""

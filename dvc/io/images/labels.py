@@ -1,0 +1,340 @@
+"""Masks and label maps: reading them, their names, and bringing them onto an image's grid."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import re
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from dvc.arrays import IntArray
+from dvc.errors import GeometryError, InputError
+from dvc.images.image import Grid, LabelMap, Mask
+from dvc.io.images.nrrd import nrrd_fields
+from dvc.io.images.read import read_voxels
+
+_log = logging.getLogger("dvc.images")
+
+_SHOWN = 12
+_COUNTED = 1 << 16
+_LARGEST_LABEL = 2**31
+_NEEDED_OVERLAP = 0.5
+_POINTS_AT_ONCE = 1 << 20
+_LABEL_COLUMNS = ("label", "value", "index", "id")
+_NAME_COLUMNS = ("name", "label", "structure")
+
+StrPath = str | PathLike[str]
+_OnGrid = TypeVar("_OnGrid", Mask, LabelMap)
+
+
+def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
+    """Read a mask: a file of zeros and one other value (0/1, 0/255, ...).
+
+    Parameters
+    ----------
+    path : .nii, .nii.gz, .nrrd, .nhdr, .mha or .mhd
+    grid : Grid, optional
+        The image's grid, onto which the mask is brought by `fit_mask`.
+
+    Raises
+    ------
+    ImageFileError
+        If the file cannot be read, as `dvc.io.images.read.read_image`.
+    InputError
+        If the mask is empty, or holds several values other than zero; the message lists them.
+    GeometryError
+        If it does not lie on ``grid``.
+    """
+    place = Path(path)
+    own, labels = _integers(place)
+    counts = _counts(labels)
+    if not counts:
+        raise InputError(f"{place}: the mask is empty: all of its {labels.size} voxels are 0.")
+    if len(counts) > 1:
+        names = _segment_names(place)
+        listed = [f"{v}" + (f" ({names[v]})" if v in names else "") + f": {n} voxels" for v, n in counts.items()]
+        raise InputError(
+            f"{place}: a mask holds zeros and one other value; this file holds {len(counts)}: "
+            f"{_shortened(listed)}. It is a label map: name the region that you mean (--bone-label), or "
+            "save that region as a mask."
+        )
+    mask = Mask(own, labels != 0)
+    return mask if grid is None else fit_mask(mask, grid, f"{place}")
+
+
+def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None) -> LabelMap:
+    """Read a label map and the names of its regions.
+
+    Parameters
+    ----------
+    path : .nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, or Slicer's .seg.nrrd, which has its own names
+    names : names file (`read_names`) or mapping, optional
+        Without names label N is called "label-N". Names of labels that the map does not hold are let go.
+
+    Raises
+    ------
+    ImageFileError
+        If a file cannot be read, as `dvc.io.images.read.read_image`.
+    InputError
+        If the map is empty, a value is negative or not a whole number, or a label has no name.
+    """
+    place = Path(path)
+    grid, labels = _integers(place)
+    present = _counts(labels)
+    if not present:
+        raise InputError(f"{place}: the label map is empty: all of its {labels.size} voxels are 0.")
+    if min(present) < 0:
+        raise InputError(f"{place}: labels must not be negative; found {_shortened([v for v in present if v < 0])}.")
+    if names is None:
+        known: Mapping[int, str] = _segment_names(place) or {v: f"label-{v}" for v in present}
+    else:
+        known = names if isinstance(names, Mapping) else read_names(names)
+    nameless = [v for v in present if v not in known]
+    if nameless:
+        source = f" in {names}" if isinstance(names, str | PathLike) else ""
+        raise InputError(
+            f"{place}: labels without a name{source}: {_shortened(nameless)}; names are given for "
+            f"{_shortened(sorted(known))}. Add the missing ones."
+        )
+    return LabelMap(grid, labels, {v: known[v] for v in present})
+
+
+def read_names(path: StrPath) -> dict[int, str]:
+    """Names of labels from a table: CSV, ITK-SNAP's label descriptions, or a Slicer colour table.
+
+    CSV needs a header line with a column of labels (label, value, index or id) and one of names (name, label
+    or structure). ITK-SNAP: ``index r g b a visible mesh "name"``. Slicer: ``index name r g b a``. Label 0 is
+    the background and has no name.
+
+    Raises
+    ------
+    InputError
+        If the file is of no such kind, or gives a label twice.
+    """
+    place = Path(path)
+    try:
+        text = place.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{place}: the names of labels cannot be read ({type(error).__name__}).") from error
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    content = [line for line in lines if not line.startswith("#")]
+    rows = _csv_names(lines) if place.suffix.lower() == ".csv" else [_table_name(line) for line in content]
+    if not rows or None in rows:
+        wrong = content[rows.index(None)] if None in rows and place.suffix.lower() != ".csv" else None
+        raise InputError(
+            f"{place}: not a table of labels and names{f' (line: {wrong[:60]!r})' if wrong else ''}. What "
+            "is read: CSV with a header line 'label,name', ITK-SNAP label descriptions, Slicer colour "
+            "tables."
+        )
+    names: dict[int, str] = {}
+    for row in rows:
+        assert row is not None
+        value, name = row
+        if value in names:
+            raise InputError(f"{place}: label {value} is named twice: '{names[value]}' and '{name}'.")
+        if value != 0:
+            names[value] = name
+    return names
+
+
+def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid:
+    """Bring a mask or label map onto an image's grid.
+
+    On the same grid, up to the last digits of a header, it takes the image's geometry. On another grid of the
+    same frame (cropped, coarser, finer, turned) every voxel of the image takes the nearest value, and a
+    warning tells so.
+
+    Parameters
+    ----------
+    mask_or_labels : Mask or LabelMap
+    grid : Grid
+        The image's grid.
+    what : how messages call it, such as its path
+
+    Raises
+    ------
+    GeometryError
+        If less than half of its volume lies in the image, if it is the image's grid mirrored (RAS taken for
+        LPS), or if nothing of it is left on the grid.
+
+    Examples
+    --------
+    >>> coarse = Mask(Grid((2, 2, 2), (2.0, 2.0, 2.0), (0.5, 0.5, 0.5)), np.ones((2, 2, 2), dtype=bool))
+    >>> fitted = fit_mask(coarse, Grid((5, 5, 5), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)))
+    >>> int(fitted.inside.sum()), coarse.volume_mm3
+    (64, 64.0)
+    """
+    own = mask_or_labels.grid
+    values: npt.NDArray[Any] = _values(mask_or_labels)
+    if own.same_as(grid):
+        return _with_values(mask_or_labels, grid, values)
+    inside, total = _count_inside(own, values, grid)
+    if total == 0:
+        raise GeometryError(f"{what}: it holds no voxel other than 0.")
+    share = inside / total
+    boxes = f"Its grid: {own}. The image's grid: {grid}."
+    if share < _NEEDED_OVERLAP:
+        raise GeometryError(
+            f"{what}: {share:.0%} of its volume lies in the image; at least {_NEEDED_OVERLAP:.0%} is "
+            f"needed. {boxes} It was drawn on another image, or its header lost its place in space."
+        )
+    mirrored = _mirrored_axes(own, grid)
+    if mirrored:
+        raise GeometryError(
+            f"{what}: its grid is the image's with the signs of {mirrored} reversed: a header in RAS was "
+            f"taken for LPS, or the reverse. {boxes} Export it again from the image that it was drawn on."
+        )
+    fitted = _nearest(own, values, grid)
+    left = np.count_nonzero(fitted) * grid.voxel_volume_mm3
+    if left == 0:
+        raise GeometryError(f"{what}: nothing of it is left on the image's grid. {boxes}")
+    _log.warning(
+        "%s: on another grid than the image; resampled to it by nearest neighbour (%.4g mL became %.4g mL, "
+        "%.0f %% of it lies in the image). %s",
+        what,
+        total * own.voxel_volume_mm3 / 1000,
+        left / 1000,
+        100 * share,
+        boxes,
+    )
+    if isinstance(mask_or_labels, LabelMap):
+        lost = sorted(set(_counts(values)) - set(_counts(fitted)))
+        if lost:
+            _log.warning("%s: regions lost by it: %s", what, [mask_or_labels.names[v] for v in lost])
+    return _with_values(mask_or_labels, grid, fitted)
+
+
+def _values(source: Mask | LabelMap) -> npt.NDArray[Any]:
+    return source.inside if isinstance(source, Mask) else source.labels
+
+
+def _with_values(source: _OnGrid, grid: Grid, values: npt.NDArray[Any]) -> _OnGrid:
+    return Mask(grid, values) if isinstance(source, Mask) else LabelMap(grid, values, source.names)
+
+
+def _count_inside(own: Grid, values: npt.NDArray[Any], grid: Grid) -> tuple[int, int]:
+    """Count the voxels other than 0 with their centre in the box of ``grid``, and all of them."""
+    filled = np.flatnonzero(values)
+    inside = 0
+    for start in range(0, len(filled), _POINTS_AT_ONCE):
+        indices = np.stack(np.unravel_index(filled[start : start + _POINTS_AT_ONCE], own.shape), axis=-1)
+        inside += int(np.count_nonzero(grid.contains(own.points_at(indices.astype(np.float64)))))
+    return inside, len(filled)
+
+
+def _mirrored_axes(own: Grid, grid: Grid) -> str:
+    """Name the world axes whose sign turns one grid into the other, or nothing."""
+    wanted = grid.toward_lps()
+    if own.toward_lps().same_as(wanted):
+        return ""
+    for signs in ((-1, -1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, 1, -1), (1, -1, -1), (-1, -1, -1)):
+        flip = np.array(signs, dtype=np.float64)
+        mirror = Grid(own.shape, own.spacing_mm, own.origin_mm * flip, own.direction * flip[:, None])
+        if mirror.toward_lps().same_as(wanted):
+            return " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
+    return ""
+
+
+def _nearest(own: Grid, values: npt.NDArray[Any], grid: Grid) -> npt.NDArray[Any]:
+    """Values of ``own`` at the voxel centres of ``grid``; 0 outside."""
+    step = (np.linalg.inv(own.direction) @ grid.direction) * grid.spacing_mm / own.spacing_mm[:, None]
+    start = own.indices_of(grid.origin_mm)
+    j, k = np.ogrid[: grid.shape[1], : grid.shape[2]]
+    fitted = np.zeros(grid.shape, dtype=values.dtype)
+    for i in range(grid.shape[0]):  # a slice at a time: a whole grid of indices would be large
+        index = []
+        within = np.ones(grid.shape[1:], dtype=bool)
+        for axis in range(3):
+            place = start[axis] + step[axis, 0] * i + step[axis, 1] * j + step[axis, 2] * k
+            # The small shift settles ties, which rounding errors would otherwise scatter.
+            whole = np.floor(place + (0.5 + 1e-9)).astype(np.intp)
+            within &= (whole >= 0) & (whole < own.shape[axis])
+            index.append(np.clip(whole, 0, own.shape[axis] - 1))
+        fitted[i] = np.where(within, values[tuple(index)], 0)
+    return fitted
+
+
+def _integers(path: Path) -> tuple[Grid, IntArray]:
+    """Grid and labels of a file whose values must be whole numbers, in whatever type they are stored."""
+    if path.is_dir():
+        raise InputError(f"{path}: masks and labels are read from one file, not from a folder (DICOM). Convert it.")
+    grid, voxels = read_voxels(path)
+    if voxels.dtype.kind == "f":
+        whole = np.isfinite(voxels) & (np.abs(voxels) < _LARGEST_LABEL)
+        whole &= np.rint(np.where(whole, voxels, 0)) == voxels
+        if not whole.all():
+            odd = np.unique(voxels[~whole])
+            raise InputError(
+                f"{path}: masks and labels hold whole numbers below {_LARGEST_LABEL}; {int((~whole).sum())} "
+                f"voxels do not, such as {_shortened([f'{v:g}' for v in odd[:_SHOWN]])}. Threshold a "
+                "probability map first, and resample labels with nearest neighbour only."
+            )
+    elif int(voxels.max()) >= _LARGEST_LABEL:
+        raise InputError(
+            f"{path}: masks and labels hold whole numbers below {_LARGEST_LABEL}; found {int(voxels.max())}. "
+            "Number the labels anew."
+        )
+    return grid, np.ascontiguousarray(voxels, dtype=np.int64)
+
+
+def _counts(labels: npt.NDArray[Any]) -> dict[int, int]:
+    """Labels other than 0 and their voxels."""
+    if labels.dtype == bool or (labels.min() >= 0 and labels.max() < _COUNTED):  # many times faster
+        counts = np.bincount(labels.ravel())
+        values = np.flatnonzero(counts)
+        counts = counts[values]
+    else:
+        values, counts = np.unique(labels, return_counts=True)
+    return {int(v): int(n) for v, n in zip(values, counts, strict=True) if v != 0}
+
+
+def _shortened(items: list[Any]) -> str:
+    more = len(items) - _SHOWN
+    return ", ".join(str(i) for i in items[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def _segment_names(path: Path) -> dict[int, str]:
+    """Names that Slicer writes into a .seg.nrrd."""
+    if not path.name.lower().endswith((".nrrd", ".nhdr")):
+        return {}
+    _, pairs, _ = nrrd_fields(path)
+    names = {}
+    for key, value in pairs.items():
+        segment = re.fullmatch(r"Segment(\d+)_LabelValue", key)
+        if segment and value.strip().isdigit():
+            names[int(value)] = pairs.get(f"Segment{segment[1]}_Name", f"label-{value.strip()}").strip()
+    return names
+
+
+def _csv_names(lines: list[str]) -> list[tuple[int, str] | None]:
+    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    if not rows:
+        return []
+    head = [cell.strip().lower() for cell in rows[0]]
+    # "label" may head either column: the numbers, or the names beside another column of numbers.
+    name_at = next((head.index(n) for n in _NAME_COLUMNS if n in head and n != "label"), None)
+    label_at = next(
+        (head.index(n) for n in _LABEL_COLUMNS if n in head and (n != "label" or name_at is not None)), None
+    )
+    if name_at is None and "label" in head:
+        name_at = head.index("label")
+    if label_at is None or name_at is None or label_at == name_at:
+        return [None]
+    found: list[tuple[int, str] | None] = []
+    for row in rows[1:]:
+        value = row[label_at].strip() if len(row) > max(label_at, name_at) else ""
+        found.append((int(value), row[name_at].strip()) if value.isdigit() else None)
+    return found
+
+
+def _table_name(line: str) -> tuple[int, str] | None:
+    snap = re.fullmatch(r'(\d+)(?:\s+[\d.]+){6}\s+"(.*)"', line)
+    slicer = re.fullmatch(r"(\d+)\s+(\S.*?)(?:\s+[\d.]+){4}", line)
+    found = snap or slicer
+    return (int(found[1]), found[2].strip()) if found else None

@@ -1,0 +1,270 @@
+"""NIfTI files, read with the checks that the usual readers leave out.
+
+A NIfTI file may say twice where it lies in space (qform and sform), in one of several units, in a frame RAS.
+Readers pick one of the two and differ in which; here they must agree. Everything is returned in LPS mm.
+
+References
+----------
+.. [1] Cox RW et al. A (sort of) new image data format standard: NIfTI-1. Human Brain Mapping 2004.
+   https://nifti.nimh.nih.gov/nifti-1
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.errors import GeometryError, ImageFileError
+from dvc.images.image import Grid
+from dvc.io.images.stored import MAX_BYTES, StoredVolume, expanded, pick_volume, refuse_if_too_large
+
+_log = logging.getLogger("dvc.images")
+
+LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Turns an affine to RAS into one to LPS, and back."""
+
+_AGREEMENT_VOXELS = 0.05
+_UNITS = {0: "mm", 1: "metres", 2: "mm", 3: "microns"}
+_MM_PER_UNIT = {"metres": 1000.0, "mm": 1.0, "microns": 0.001}
+_ORTHONORMAL = 1e-4
+_HALF_TURN = 1e-7
+_ROUNDING = 4e-7  # of b^2 + c^2 + d^2 in single precision, with a margin
+
+
+def read_nifti_header(
+    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
+) -> StoredVolume:
+    """Read what a NIfTI-1 or NIfTI-2 file holds, and where its voxels lie in LPS mm.
+
+    Parameters
+    ----------
+    path : .nii or .nii.gz
+    volume : which volume of a 4D file, from 0
+    vectors : whether a file of three components per voxel, (ni, nj, nk, 1, 3), is needed in place of a scalar one
+
+    Raises
+    ------
+    ImageFileError
+        If the header is damaged, claims more than ``max_bytes``, has no orientation, has a qform and an
+        sform that disagree, is sheared, is not 3D, or its voxels are not real numbers.
+    """
+    header = _header(path)
+    shape, count = (_vector_sizes(path, header), 1) if vectors else _sizes(path, header)
+    layout = (*shape, 3) if vectors else shape
+    # Size and count come first: a header that is wrong there is not worth a look at its geometry.
+    refuse_if_too_large(path, layout, max_bytes)
+    chosen = pick_volume(path, count, volume)
+    dtype = _number_type(path, header)
+    unit = _unit(path, header)
+    grid = _grid(path, header, shape, _MM_PER_UNIT[unit])
+    bytes_each = int(np.prod([int(n) for n in layout])) * dtype.itemsize
+    slope, intercept = _scaling(header)
+    start = int(header["vox_offset"])
+    smallest = int(header["sizeof_hdr"]) + 4
+    return StoredVolume(
+        path=path,
+        grid=grid,
+        dtype=dtype,
+        layout=layout,
+        unit=unit,
+        compressed=_is_compressed(path),
+        stream_start=max(start, smallest) + chosen * bytes_each,
+        stream_rest=(count - 1 - chosen) * bytes_each,
+        slope=slope,
+        intercept=intercept,
+        components=3 if vectors else None,
+    )
+
+
+def nifti_shape(path: Path) -> tuple[int, ...]:
+    """All sizes that the header claims, without any other check."""
+    return tuple(_dimensions(_header(path)))
+
+
+def _dimensions(header: Any) -> list[int]:
+    return [int(n) for n in header["dim"][1 : 1 + int(header["dim"][0])]]
+
+
+def _is_compressed(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"
+
+
+def _header(path: Path) -> Any:
+    start = b""
+    if _is_compressed(path):
+        for block in expanded(path):
+            start += block
+            if len(start) >= 544:
+                break
+    else:
+        with path.open("rb") as file:
+            start = file.read(544)
+    for kind, size, magic in (
+        (nibabel.Nifti1Header, 348, slice(344, 348)),
+        (nibabel.Nifti2Header, 540, slice(4, 8)),
+    ):
+        if len(start) < size:
+            continue
+        written = start[magic]
+        if written[:3] in (b"ni1", b"ni2"):
+            raise ImageFileError(f"{path}: header of a pair of files (.hdr with .img). Convert it to one .nii.gz file.")
+        if written[:3] in (b"n+1", b"n+2"):
+            # The library's own check is left out: it repairs some faults and prints others.
+            header = kind(start[:size], check=False)
+            for field, low, high in (("dim", 1, 7), ("vox_offset", 0, 2**31)):
+                value = float(np.ravel(header[field])[0])
+                if not low <= value <= high:
+                    raise ImageFileError(f"{path}: the NIfTI header is damaged ({field} = {value:g}). Export it again.")
+            return header
+    raise ImageFileError(
+        f"{path}: not a NIfTI file: no NIfTI header at its start ({len(start)} bytes read). Check the "
+        "file's name and copy or export it again."
+    )
+
+
+def _sizes(path: Path, header: Any) -> tuple[tuple[int, int, int], int]:
+    sizes = _dimensions(header)
+    while len(sizes) > 3 and sizes[-1] in (0, 1):
+        sizes.pop()
+        if len(sizes) == 3:
+            _log.info("%s: a file of 4 or more dimensions with one volume; read as 3D", path)
+    if min(sizes) < 1:
+        raise ImageFileError(f"{path}: the header gives the image sizes {sizes}; all must be positive.")
+    if len(sizes) < 3:
+        raise ImageFileError(f"{path}: a {len(sizes)}D image of {sizes} voxels; a 3D image is needed.")
+    if len(sizes) > 4:
+        raise ImageFileError(
+            f"{path}: a {len(sizes)}D file of sizes {sizes} (vectors or tensors); a 3D scalar image is needed."
+        )
+    return (sizes[0], sizes[1], sizes[2]), sizes[3] if len(sizes) == 4 else 1
+
+
+def _vector_sizes(path: Path, header: Any) -> tuple[int, int, int]:
+    sizes = _dimensions(header)
+    if sizes[3:5] != [1, 3] or any(n not in (0, 1) for n in sizes[5:]):
+        raise ImageFileError(f"{path}: a NIfTI of shape {tuple(sizes)}; vectors are (ni, nj, nk, 1, 3).")
+    return sizes[0], sizes[1], sizes[2]
+
+
+def _number_type(path: Path, header: Any) -> np.dtype[Any]:
+    code = int(header["datatype"])
+    try:
+        dtype: np.dtype[Any] = np.dtype(header.get_data_dtype())
+    except KeyError:
+        raise ImageFileError(f"{path}: unknown NIfTI data type {code}; the header is damaged.") from None
+    if dtype.kind not in "iuf" or dtype.itemsize > 8 or dtype.itemsize < 1:
+        raise ImageFileError(
+            f"{path}: the voxels are not plain numbers (NIfTI data type {code}); colour and complex images "
+            "are not read. Save the magnitude image."
+        )
+    return dtype
+
+
+def _scaling(header: Any) -> tuple[float, float]:
+    slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
+    if slope == 0.0 or not np.isfinite(slope):  # both mean: not scaled
+        return 1.0, 0.0
+    return slope, intercept if np.isfinite(intercept) else 0.0
+
+
+def _unit(path: Path, header: Any) -> str:
+    """The header's unit of length; mm where it gives none."""
+    code = int(header["xyzt_units"]) & 7
+    if code not in _UNITS:
+        raise ImageFileError(f"{path}: unknown unit of length (xyzt_units code {code}); set it to mm (2).")
+    if code == 0:
+        _log.warning("%s: the header gives no unit of length; taken as mm", path)
+    return _UNITS[code]
+
+
+def _grid(path: Path, header: Any, shape: tuple[int, int, int], mm_per_unit: float) -> Grid:
+    lps = LPS_FROM_RAS @ _ras_affine(path, header, shape)
+    columns = lps[:3, :3] * mm_per_unit
+    spacing = np.linalg.norm(columns, axis=0)
+    if not np.all(np.isfinite(spacing)) or np.any(spacing <= 0):
+        raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
+    try:
+        return Grid(shape, spacing, lps[:3, 3] * mm_per_unit, _straightened(columns / spacing))
+    except GeometryError as error:
+        raise ImageFileError(f"{path}: {error}") from error
+
+
+def _straightened(direction: FloatArray) -> FloatArray:
+    """Return the nearest orthonormal matrix, where only single precision parts the two; else as given."""
+    left, stretch, right = np.linalg.svd(direction)
+    return np.asarray(left @ right) if np.abs(stretch - 1.0).max() < _ORTHONORMAL / 2 else direction
+
+
+def _ras_affine(path: Path, header: Any, shape: tuple[int, int, int]) -> FloatArray:
+    qforms = _qforms(path, header) if int(header["qform_code"]) > 0 else []
+    sform = None
+    if int(header["sform_code"]) > 0:
+        sform = np.eye(4)
+        sform[:3] = [np.float64(header[f"srow_{axis}"]) for axis in "xyz"]
+    if not qforms and sform is None:
+        raise ImageFileError(
+            f"{path}: the header does not say how the image lies in space (qform_code and sform_code are "
+            "0), and programs guess differently. Export it again with its orientation, or copy the header "
+            "of the image it was made from."
+        )
+    for name, affines in (("qform", qforms), ("sform", [] if sform is None else [sform])):
+        if not np.isfinite(affines).all():
+            raise ImageFileError(f"{path}: the {name} holds values that are not finite; the header is damaged.")
+    if sform is None:
+        return qforms[0]
+    if qforms:
+        _refuse_disagreement(path, qforms, sform, shape)
+    return sform  # a full matrix, which holds its digits better than a quaternion
+
+
+def _qforms(path: Path, header: Any) -> list[FloatArray]:
+    """Compute the affine of the quaternion [1]_, and others that single precision cannot tell from it.
+
+    The header holds b, c, d; a is what is left of a unit quaternion. Near a half turn, which is where axial
+    images lie, rounding of b, c, d leaves a uncertain by up to 5e-4: a voxel at the end of a large image.
+    """
+    b, c, d = (float(header[f"quatern_{name}"]) for name in "bcd")
+    rest = 1.0 - (b * b + c * c + d * d)
+    if not rest > -1e-4:
+        raise ImageFileError(f"{path}: the qform's quaternion is not a rotation; the header is damaged.")
+    nominal = rest if rest >= _HALF_TURN else 0.0  # as the standard's own reader takes it
+    least, most = np.sqrt(max(rest - _ROUNDING, 0.0)), np.sqrt(max(rest + _ROUNDING, 0.0))
+    return [_qform(header, float(a), b, c, d) for a in (np.sqrt(nominal), *np.linspace(least, most, 65))]
+
+
+def _qform(header: Any, a: float, b: float, c: float, d: float) -> FloatArray:
+    """Compute R(a, b, c, d) diag(pixdim), third axis times qfac, with the offsets."""
+    a, b, c, d = np.array([a, b, c, d]) / np.sqrt(a * a + b * b + c * c + d * d)
+    rotation = np.array(
+        [
+            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
+        ]
+    )
+    sizes = np.abs(np.float64(header["pixdim"][1:4]))
+    sizes[2] *= -1.0 if float(header["pixdim"][0]) < 0 else 1.0  # 0 stands for +1
+    affine = np.eye(4)
+    affine[:3, :3] = rotation * sizes
+    affine[:3, 3] = [float(header[f"qoffset_{axis}"]) for axis in "xyz"]
+    return affine
+
+
+def _refuse_disagreement(path: Path, qforms: list[FloatArray], sform: FloatArray, shape: tuple[int, int, int]) -> None:
+    bits = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.float64)
+    corners = bits * [*(np.array(shape) - 1), 1]
+    moved = [np.linalg.norm((corners @ (sform - qform).T)[:, :3], axis=1).max() for qform in qforms]
+    apart = float(min(moved))
+    voxel = float(np.linalg.norm(sform[:3, :3], axis=0).min())
+    if not apart <= _AGREEMENT_VOXELS * voxel:
+        raise ImageFileError(
+            f"{path}: qform and sform place the image's corners up to {apart:.3g} (header units) apart, "
+            f"which is {apart / voxel if voxel > 0 else np.inf:.3g} voxels; programs differ in which of the "
+            "two they use. Set the wrong one's code to 0, or export the image again with one orientation."
+        )

@@ -1,0 +1,200 @@
+"""Reading images: NIfTI, NRRD, MetaImage and DICOM, to an Image in LPS mm.
+
+A file that is damaged, or whose place in space can be read in two ways, is refused with the reason. What
+was read differently from how it was written (units, a lone volume of a 4D file) is told by the logger
+``dvc.images``.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import Float32Array
+from dvc.errors import ImageFileError, InputError
+from dvc.images.image import Grid, Image
+from dvc.io.images.dicom import dicom_shape, is_dicom, read_dicom
+from dvc.io.images.nifti import nifti_shape, read_nifti_header
+from dvc.io.images.nrrd import meta_shape, nrrd_shape, read_meta_header, read_nrrd_header
+from dvc.io.images.stored import MAX_BYTES, StoredVolume, Voxels
+
+_log = logging.getLogger("dvc.images")
+
+_MIN_SLICES = 4
+
+_Header = Callable[[Path, int | None, int, bool], StoredVolume]
+_Shape = Callable[[Path], tuple[int, ...]]
+_FORMATS: dict[str, tuple[str, _Header, _Shape]] = {
+    ".nii": ("NIfTI", read_nifti_header, nifti_shape),
+    ".nii.gz": ("NIfTI", read_nifti_header, nifti_shape),
+    ".nrrd": ("NRRD", read_nrrd_header, nrrd_shape),
+    ".nhdr": ("NRRD", read_nrrd_header, nrrd_shape),
+    ".mha": ("MetaImage", read_meta_header, meta_shape),
+    ".mhd": ("MetaImage", read_meta_header, meta_shape),
+}
+
+
+def read_image(
+    path: str | PathLike[str],
+    *,
+    allow_missing: bool = False,
+    series: str | None = None,
+    volume: int | None = None,
+    max_bytes: int = MAX_BYTES,
+) -> Image:
+    """Read a 3D image, whatever its format, into LPS mm.
+
+    Parameters
+    ----------
+    path : file (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, enhanced DICOM) or folder of a DICOM series
+    allow_missing : bool
+        Take voxels that are NaN or infinite as missing (NaN) instead of refusing the image.
+    series : str, optional
+        Which DICOM series, echo, stack or the like, where there are several, as the refusal lists them.
+    volume : int, optional
+        Which volume of a 4D file, from 0.
+    max_bytes : int
+        Largest image that is read, counted in single precision.
+
+    Returns
+    -------
+    Image
+        Voxels in the order of the file; scaling (slope and intercept) applied.
+
+    Raises
+    ------
+    ImageFileError
+        If the file is damaged, of an unknown kind, not a scalar 3D image of four slices or more, constant, or
+        does not say without contradiction where it lies.
+    InputError
+        If voxels are NaN or infinite and ``allow_missing`` is not set, or ``series`` is missing or unknown.
+    """
+    grid, voxels = read_voxels(path, series=series, volume=volume, max_bytes=max_bytes)
+    if min(grid.shape) < _MIN_SLICES:
+        raise ImageFileError(
+            f"{path}: an image of {' x '.join(map(str, grid.shape))} voxels; a volume needs at least "
+            f"{_MIN_SLICES} slices along each axis, since strain is a matter of three dimensions."
+        )
+    with np.errstate(over="ignore"):  # beyond single precision: infinite, and found below
+        values = np.ascontiguousarray(voxels, dtype=np.float32)
+    return Image(grid, _checked_values(Path(path), values, allow_missing))
+
+
+def read_voxels(
+    path: str | PathLike[str],
+    *,
+    series: str | None = None,
+    volume: int | None = None,
+    max_bytes: int = MAX_BYTES,
+) -> tuple[Grid, Voxels]:
+    """Grid (LPS mm) and voxels (ni, nj, nk) of a file or DICOM folder, in the file's own number type.
+
+    Raises
+    ------
+    ImageFileError, InputError
+        As `read_image`, but for the checks of the values.
+    """
+    place = Path(path)
+    if not place.exists():
+        raise InputError(f"{place}: no such file or folder. Check the path.")
+    if place.is_dir() or _is_dicom_file(place):
+        if volume is not None:
+            raise InputError(f"{place}: volume={volume} is for 4D files; DICOM is chosen from by series.")
+        return read_dicom(place, series=series, max_bytes=max_bytes)
+    if series is not None:
+        raise InputError(f"{place}: series='{series}' is for DICOM folders and files; this is neither.")
+    stored = read_header(place, volume=volume, max_bytes=max_bytes)
+    if stored.unit != "mm":
+        _log.warning("%s: lengths converted from %s to mm", place, stored.unit)
+    return stored.grid, stored.load()
+
+
+def read_header(
+    path: Path, *, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
+) -> StoredVolume:
+    """Read what a file holds, its voxels not yet read.
+
+    Parameters
+    ----------
+    path : file (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd)
+    volume, max_bytes
+        As in `read_image`.
+    vectors : bool
+        A file of three components per voxel is needed, and no other is read; without, a scalar one.
+
+    Raises
+    ------
+    ImageFileError
+        As `read_image`, but for the checks of the voxels.
+    """
+    _, header, _ = _FORMATS[_suffix(path)]
+    return header(path, volume, max_bytes, vectors)
+
+
+def estimate_size(path: str | PathLike[str]) -> int:
+    """Bytes that the image of a file would take in single precision, from its header alone.
+
+    Raises
+    ------
+    ImageFileError
+        If the file is of an unknown kind or its header is damaged.
+    """
+    place = Path(path)
+    if not place.is_file():
+        raise InputError(f"{place}: no such file. Check the path.")
+    shape = dicom_shape if _is_dicom_file(place) else _FORMATS[_suffix(place)][2]
+    return 4 * int(np.prod([max(n, 0) for n in shape(place)], dtype=object))
+
+
+def format_of(name: str) -> str:
+    """Format of an image that was read, by its name alone; a folder's, and a file's of no other format, is DICOM.
+
+    Examples
+    --------
+    >>> format_of("Load0.nii.gz"), format_of("Load0.mha"), format_of("Load0")
+    ('NIfTI', 'MetaImage', 'DICOM')
+    """
+    suffix = _known_suffix(name)
+    return "DICOM" if suffix is None else _FORMATS[suffix][0]
+
+
+def _known_suffix(name: str) -> str | None:
+    return next((s for s in sorted(_FORMATS, key=len, reverse=True) if name.lower().endswith(s)), None)
+
+
+def _is_dicom_file(path: Path) -> bool:
+    return _known_suffix(path.name) is None and is_dicom(path)
+
+
+def _suffix(path: Path) -> str:
+    suffix = _known_suffix(path.name)
+    if suffix is not None:
+        return suffix
+    raise ImageFileError(
+        f"{path}: images of this kind are not read. What is read: {', '.join(_FORMATS)}, enhanced DICOM files and "
+        "folders of DICOM files."
+    )
+
+
+def _checked_values(path: Path, values: Float32Array, allow_missing: bool) -> Float32Array:
+    finite = np.isfinite(values)
+    missing = values.size - int(np.count_nonzero(finite))
+    if missing == values.size:
+        raise ImageFileError(f"{path}: no voxel has a finite value.")
+    if missing:
+        first = tuple(int(n) for n in np.unravel_index(int(np.argmin(finite)), values.shape))
+        found = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
+        if not allow_missing:
+            raise InputError(f"{path}: {found}. Repair the image, or have those voxels left out (allow_missing).")
+        _log.warning("%s: %s; taken as missing", path, found)
+        values = np.where(finite, values, np.float32(np.nan))
+        low, high = np.nanmin(values), np.nanmax(values)
+    else:
+        low, high = values.min(), values.max()
+    if low == high:
+        raise ImageFileError(f"{path}: a constant image (every voxel is {float(low):g}); there is nothing to follow.")
+    return values

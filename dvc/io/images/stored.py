@@ -1,0 +1,210 @@
+"""Voxels as they lie in a file: where they start, how they are coded, and reading them with every check.
+
+Libraries that read images often hand back whatever they found in a file that was cut short or damaged. Here
+the number of bytes is compared with the header, and compressed streams are read to their end, so that
+their checksum counts.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from dvc.errors import ImageFileError
+from dvc.images.image import Grid
+
+MAX_BYTES = 16 * 2**30
+"""Largest image that is read by default, counted as single precision."""
+
+_BLOCK = 1 << 20
+_TRAILING = 4096  # some writers pad the end of a file
+_DEFLATE_LIMIT = 1100  # deflate cannot expand by more than about 1032
+
+Voxels = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredVolume:
+    """One volume of a file, described by its header and not yet read.
+
+    Parameters
+    ----------
+    path : file that holds the voxels
+    grid : Grid
+        LPS mm.
+    dtype : as stored, with byte order
+    layout : sizes, fastest first; three, or four where each voxel holds several values
+    unit : of length, as the header names it; the grid is in mm whatever it is
+    file_start : bytes of the file before the stream of voxels
+    compressed : whether the stream is gzip or zlib
+    stream_start : bytes of the (expanded) stream before this volume
+    stream_rest : bytes of the (expanded) stream after this volume, which must be there too
+    slope, intercept : value = slope * stored + intercept
+    select : (axis, index) of ``layout`` to keep, where it has four
+    components : axis of ``layout`` along which the components of a vector lie, where they are kept
+    """
+
+    path: Path
+    grid: Grid
+    dtype: np.dtype[Any]
+    layout: tuple[int, ...]
+    unit: str = "mm"
+    file_start: int = 0
+    compressed: bool = False
+    stream_start: int = 0
+    stream_rest: int = 0
+    slope: float = 1.0
+    intercept: float = 0.0
+    select: tuple[int, int] | None = None
+    components: int | None = None
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the volume as stored, expanded."""
+        return int(np.prod([int(n) for n in self.layout], dtype=object)) * self.dtype.itemsize
+
+    def load(self) -> Voxels:
+        """Read the voxels: (ni, nj, nk), vectors (ni, nj, nk, 3), in the stored number type where no scaling applies.
+
+        Raises
+        ------
+        ImageFileError
+            If the file is shorter or longer than its header says, or its compressed stream is damaged.
+        """
+        raw = self._bytes()
+        values = raw.view(self.dtype).reshape(self.layout, order="F")
+        if self.select is not None:
+            values = values.take(self.select[1], axis=self.select[0])
+        if self.components is not None:
+            values = np.moveaxis(values, self.components, -1)
+        if (self.slope, self.intercept) == (1.0, 0.0):
+            return values
+        # Up to 16 bits survive single precision; wider integers are scaled in double.
+        narrow = self.dtype.itemsize <= 2 or self.dtype == np.dtype(np.float32)
+        scaled = values.astype(np.float32 if narrow else np.float64)
+        np.multiply(scaled, self.slope, out=scaled)
+        np.add(scaled, self.intercept, out=scaled)
+        return scaled
+
+    def _bytes(self) -> npt.NDArray[np.uint8]:
+        expected = self.stream_start + self.size_bytes + self.stream_rest
+        on_disk = self.path.stat().st_size - self.file_start
+        most = on_disk * _DEFLATE_LIMIT if self.compressed else on_disk
+        if most < expected:
+            raise ImageFileError(_cut_short(self.path, expected, on_disk, self.compressed))
+        raw = np.empty(self.size_bytes, dtype=np.uint8)
+        if not self.compressed:
+            with self.path.open("rb") as file:
+                file.seek(self.file_start + self.stream_start)
+                got = self.stream_start + file.readinto(raw.data) + self.stream_rest
+            found = max(on_disk, got) if got == expected else got
+        else:
+            found = 0
+            for block in expanded(self.path, self.file_start):
+                low = max(self.stream_start - found, 0)
+                high = min(self.stream_start + raw.size - found, len(block))
+                if low < high:
+                    at = found + low - self.stream_start
+                    raw[at : at + high - low] = np.frombuffer(block, np.uint8)[low:high]
+                found += len(block)
+        if found < expected:
+            raise ImageFileError(_cut_short(self.path, expected, found, False))
+        if found > expected + _TRAILING:
+            raise ImageFileError(
+                f"{self.path}: the header describes {expected} bytes of voxels, the file holds {found}: "
+                "header and voxels do not belong together. Export the image again."
+            )
+        return raw
+
+
+def _cut_short(path: Path, expected: int, found: int, compressed: bool) -> str:
+    coded = " compressed" if compressed else ""
+    return (
+        f"{path}: the file is cut short: the header needs {expected} bytes of voxels, the file holds "
+        f"{found}{coded} bytes. Copy or export it again."
+    )
+
+
+def expanded(path: Path, start: int = 0) -> Iterator[bytes]:
+    """Blocks of a gzip or zlib stream that starts at byte ``start`` of a file, to its end and checksum.
+
+    Raises
+    ------
+    ImageFileError
+        If the stream is damaged, its checksum is wrong, or the file ends before it does.
+    """
+    with path.open("rb") as file:
+        file.seek(start)
+        decoder = zlib.decompressobj(wbits=47)  # 47: gzip or zlib, told apart by their first bytes
+        pending = file.read(_BLOCK)
+        while True:
+            try:
+                block = decoder.decompress(pending, _BLOCK)
+            except zlib.error as error:
+                raise ImageFileError(
+                    f"{path}: the compressed voxels are damaged ({error}). Copy or export the file again."
+                ) from error
+            if block:
+                yield block
+            if decoder.eof:
+                # gzip files may be several streams in a row, and padded with zeros.
+                pending = (decoder.unused_data or file.read(_BLOCK)).lstrip(b"\0")
+                while not pending:
+                    more = file.read(_BLOCK)
+                    if not more:
+                        return
+                    pending = more.lstrip(b"\0")
+                decoder = zlib.decompressobj(wbits=47)
+                continue
+            pending = decoder.unconsumed_tail or file.read(_BLOCK)
+            if not pending and not block:
+                raise ImageFileError(
+                    f"{path}: the file is cut short: its compressed voxels have no end. Copy or export it again."
+                )
+
+
+def refuse_if_too_large(path: Path, shape: tuple[int, ...], max_bytes: int) -> int:
+    """Bytes of an image of this shape in single precision.
+
+    Raises
+    ------
+    ImageFileError
+        If that is more than ``max_bytes``, or a size is not positive.
+    """
+    sizes = [int(n) for n in shape]
+    if min(sizes) < 1:
+        raise ImageFileError(f"{path}: the header gives the image sizes {sizes}; all must be positive.")
+    estimate = 4 * int(np.prod(sizes, dtype=object))
+    if estimate > max_bytes:
+        raise ImageFileError(
+            f"{path}: the header claims {' x '.join(map(str, sizes))} voxels, about {estimate / 2**30:,.1f} "
+            f"GiB in single precision; the limit is {max_bytes / 2**30:,.1f} GiB. Either the header is "
+            "damaged, or the image must be cropped or resampled first."
+        )
+    return estimate
+
+
+def pick_volume(path: Path, count: int, volume: int | None, what: str = "volumes") -> int:
+    """Which of ``count`` volumes to read.
+
+    Raises
+    ------
+    ImageFileError
+        If there are several and none was asked for, or the one asked for is not there.
+    """
+    if volume is None:
+        if count == 1:
+            return 0
+        raise ImageFileError(
+            f"{path}: the file holds {count} {what}; one is needed. Take it out into a file of its own: in Python, "
+            f'dvc.write_image("one.nii.gz", dvc.read_image("{path}", volume=N)) with N from 0 to {count - 1}.'
+        )
+    if not 0 <= volume < count:
+        raise ImageFileError(f"{path}: volume={volume} was asked for; the file holds volumes 0 to {count - 1}.")
+    return volume

@@ -1,0 +1,1 @@
+"""Mesh files of other programs, and results on a mesh: Abaqus, ANSYS, CalculiX, FEBio, Gmsh and VTK."""

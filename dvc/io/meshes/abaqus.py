@@ -1,0 +1,272 @@
+"""Nodes, elements and element sets of an Abaqus input file (.inp), with the file's own numbers.
+
+The dialect of Abaqus that CalculiX shares. One part in global coordinates is read; what would move, join or
+make geometry elsewhere in the file is refused: a mesh in the wrong place gives wrong strains in silence.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import FloatArray, IntArray
+from dvc.errors import ImageFileError
+
+_log = logging.getLogger("dvc.io.meshes.abaqus")
+
+# Shape and number of nodes by the stem of the element's name; the rest (H, R, I, M, T ...) chooses
+# the formulation, not the nodes.
+_SHAPES = {
+    "C3D4": ("tetra", 4), "C3D10": ("tetra10", 10),
+    "C3D8": ("hexahedron", 8), "C3D20": ("hexahedron20", 20),
+    "C3D6": ("wedge", 6), "C3D15": ("wedge15", 15), "C3D5": ("pyramid", 5),
+    "S3": ("triangle", 3), "STRI3": ("triangle", 3), "STRI65": ("triangle6", 6), "S6": ("triangle6", 6),
+    "M3D3": ("triangle", 3), "M3D6": ("triangle6", 6), "SFM3D3": ("triangle", 3), "SFM3D6": ("triangle6", 6),
+    "R3D3": ("triangle", 3),
+    "S4": ("quad", 4), "M3D4": ("quad", 4), "SFM3D4": ("quad", 4), "R3D4": ("quad", 4),
+    "S8": ("quad8", 8), "M3D8": ("quad8", 8), "SFM3D8": ("quad8", 8),
+}  # fmt: skip
+_VARIANTS = set("HRIMTSPEW5")
+_READ = {"NODE", "ELEMENT", "ELSET", "NSET"}
+_SET_OF = {"ELSET": "element set", "NSET": "node set"}
+_ELSEWHERE = {"INCLUDE", "SYSTEM", "NGEN", "NCOPY", "NFILL", "ELGEN", "ELCOPY", "NMAP"}
+
+
+@dataclass(slots=True)
+class AbaqusMesh:
+    """What one input file says: ``points`` (n, 3) in the file's unit, their ``node_ids`` (n,), blocks, sets.
+
+    ``blocks`` are pairs of an element shape, in meshio's names, and node *indices* (m, k); ``sets`` give the
+    indices of the elements of each element set, counted through all blocks, ``node_sets`` those of the nodes of
+    each node set.
+    """
+
+    points: FloatArray
+    node_ids: IntArray
+    blocks: list[tuple[str, IntArray]]
+    sets: dict[str, IntArray]
+    node_sets: dict[str, IntArray]
+
+
+@dataclass(slots=True)
+class _Keyword:
+    line: int
+    name: str
+    options: dict[str, str]
+    rows: list[list[str]] = field(default_factory=list)
+
+
+def read_abaqus(path: Path) -> AbaqusMesh:
+    """Read the mesh of an Abaqus or CalculiX input file.
+
+    Reads ``*NODE`` (any number of blocks), ``*ELEMENT`` (solids incl. hybrid and reduced ones, shells,
+    membranes, surface elements), ``*ELSET`` and ``*NSET`` (lists, GENERATE, sets of sets). Springs, trusses, connectors
+    and the reference points of an assembly carry no tissue: they are left out, and logged.
+
+    Raises
+    ------
+    ImageFileError
+        If the file is damaged, holds a solid element of another kind, more than one part, an instance that is
+        moved, or nodes and elements that come from elsewhere (``*INCLUDE``, ``*NGEN`` and their like).
+    """
+    coordinates: dict[int, list[float]] = {}
+    elements: list[tuple[_Keyword, str, list[list[int]]]] = []
+    sets: list[_Keyword] = []
+    parts, in_assembly = 0, False
+    for keyword in _keywords(path):
+        where = f"{path}, *{keyword.name} in line {keyword.line}"
+        parts += keyword.name == "PART"
+        _refuse_what_lies_elsewhere(where, keyword, parts)
+        try:
+            if keyword.name in {"ASSEMBLY", "END INSTANCE"}:
+                in_assembly = True
+            elif keyword.name in {"INSTANCE", "END ASSEMBLY"}:
+                in_assembly = False
+            elif keyword.name == "NODE" and in_assembly:
+                _log.info("%s: %d reference points of the assembly are left out.", where, len(keyword.rows))
+            elif keyword.name == "NODE":
+                for row in keyword.rows:
+                    if int(row[0]) in coordinates:
+                        raise ImageFileError(f"{where}: node {row[0]} is defined twice.")
+                    coordinates[int(row[0])] = ([float(x or 0.0) for x in row[1:4]] + [0.0] * 3)[:3]
+            elif keyword.name == "ELEMENT":
+                block = _elements(where, keyword)
+                if block is not None:
+                    elements.append((keyword, *block))
+            elif keyword.name in {"ELSET", "NSET"}:
+                if "GENERATE" in keyword.options:
+                    keyword.rows = [[str(i) for i in _generated(row)] for row in keyword.rows]
+                sets.append(keyword)
+        except (ValueError, IndexError, KeyError) as error:
+            if isinstance(error, ImageFileError):
+                raise
+            raise ImageFileError(f"{where}: a row or an option could not be read ({error}).") from error
+    if not coordinates or not elements:
+        raise ImageFileError(
+            f"{path} has {len(coordinates)} nodes and {len(elements)} blocks of elements that are read: "
+            "there is no mesh in it."
+        )
+    return _assembled(path, coordinates, elements, sets)
+
+
+def _keywords(path: Path) -> Iterator[_Keyword]:
+    """Yield the keywords with their options and data rows; comments left out, continued heads joined."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ImageFileError(f"{path} cannot be read: {error.strerror}.") from error
+    lines = text.splitlines()
+    current: _Keyword | None = None
+    head, head_line = "", 0
+    for number, raw in enumerate(lines, start=1):
+        line = raw.strip()
+        if not line or line.startswith("**"):
+            continue
+        if line.startswith("*") or head:
+            if not head:
+                if current is not None:
+                    yield current
+                head_line = number
+            head += line
+            if not head.endswith(","):
+                name, *options = (part.strip() for part in head[1:].split(","))
+                pairs = [option.partition("=") for option in options if option]
+                named = {key.strip().upper(): value.strip() for key, _, value in pairs}
+                current, head = _Keyword(head_line, name.upper(), named), ""
+        elif current is not None:
+            current.rows.append([x.strip() for x in line.rstrip(",").split(",")])
+    if current is not None:
+        if head or (current.name in _READ and not text.endswith(("\n", "\r"))):
+            # The format has no mark of its end, and half a number would be another node.
+            raise ImageFileError(
+                f"{path} ends within a line, after *{current.name} in line {current.line}, so it may be cut "
+                "short. If it is whole, end its last line."
+            )
+        yield current
+
+
+def _refuse_what_lies_elsewhere(where: str, keyword: _Keyword, parts: int) -> None:
+    reason = None
+    if parts > 1:
+        reason = "is a second part"
+    elif keyword.name == "INSTANCE" and keyword.rows:
+        reason = "moves the part"
+    elif keyword.name in _ELSEWHERE or (keyword.name in _READ and "INPUT" in keyword.options):
+        reason = "brings in, makes or moves nodes and elements that are not written here"
+    elif keyword.name == "NODE" and keyword.options.get("SYSTEM", "R").upper() != "R":
+        reason = "gives cylindrical or spherical coordinates"
+    if reason is not None:
+        raise ImageFileError(
+            f"{where} {reason}, and that is not read. Write the mesh as one part in global coordinates (an "
+            "orphan mesh), or as VTU."
+        )
+
+
+def _generated(row: list[str]) -> range:
+    first, last, *step = (int(x) for x in row if x)
+    return range(first, last + 1, step[0] if step else 1)
+
+
+def _elements(where: str, keyword: _Keyword) -> tuple[str, list[list[int]]] | None:
+    kind = keyword.options["TYPE"].upper()
+    stems = [s for s in _SHAPES if kind.startswith(s) and set(kind[len(s) :]) <= _VARIANTS]
+    if not stems:
+        if kind.startswith("C3D"):
+            raise ImageFileError(
+                f"{where}: solid elements of type {kind} are not read; known are "
+                f"{', '.join(s for s in _SHAPES if s.startswith('C3D'))} and their variants (H, R, I, M ...)."
+            )
+        _log.warning("%s: elements of type %s carry no tissue and are left out.", where, kind)
+        return None
+    shape, width = _SHAPES[max(stems, key=len)]
+    # An element of many nodes goes over several lines, so rows are joined before they are cut.
+    numbers = [int(x) for row in keyword.rows for x in row if x]
+    if len(numbers) % (width + 1):
+        raise ImageFileError(
+            f"{where}: {kind} elements need {width + 1} numbers each; the {len(numbers)} numbers here are no "
+            "multiple of that. The file may be cut short."
+        )
+    return shape, [numbers[i : i + width + 1] for i in range(0, len(numbers), width + 1)]
+
+
+def _assembled(
+    path: Path,
+    coordinates: dict[int, list[float]],
+    elements: list[tuple[_Keyword, str, list[list[int]]]],
+    sets: list[_Keyword],
+) -> AbaqusMesh:
+    index_of = {number: index for index, number in enumerate(coordinates)}
+    blocks: list[tuple[str, IntArray]] = []
+    position: dict[int, int] = {}
+    element_sets, node_sets = _Sets(path, "ELSET"), _Sets(path, "NSET")
+    for keyword, shape, rows in elements:
+        for number, *nodes in rows:
+            missing = [node for node in nodes if node not in index_of]
+            if missing:
+                raise ImageFileError(
+                    f"{path}: element {number} uses node {missing[0]}, which the file does not define."
+                )
+            if number in position:
+                raise ImageFileError(f"{path}: element {number} is defined twice.")
+            position[number] = len(position)
+        if "ELSET" in keyword.options:
+            element_sets.extend(keyword, (str(row[0]) for row in rows))
+        if rows:
+            nodes_of = [[index_of[node] for node in row[1:]] for row in rows]
+            blocks.append((shape, np.array(nodes_of, dtype=np.int64)))
+    for keyword in sets:
+        chosen = element_sets if keyword.name == "ELSET" else node_sets
+        chosen.extend(keyword, (x for row in keyword.rows for x in row if x))
+    return AbaqusMesh(
+        np.array(list(coordinates.values()), dtype=np.float64),
+        np.array(list(coordinates), dtype=np.int64),
+        blocks,
+        element_sets.resolved(position),
+        node_sets.resolved(index_of),
+    )
+
+
+class _Sets:
+    """Named sets of elements (ELSET) or nodes (NSET) as the file lists them: by number, or by another set's name."""
+
+    def __init__(self, path: Path, kind: str) -> None:
+        self._path, self._kind = path, kind
+        self._spelling: dict[str, str] = {}  # names are the same in any case; the first spelling is kept
+        self._entries: dict[str, list[str]] = {}
+
+    def extend(self, keyword: _Keyword, more: Iterable[str]) -> None:
+        if self._kind not in keyword.options:
+            raise ImageFileError(f"{self._path}, line {keyword.line}: *{self._kind} without a name ({self._kind}=...).")
+        name = keyword.options[self._kind].strip('"')
+        self._spelling.setdefault(name.casefold(), name)
+        self._entries.setdefault(name.casefold(), []).extend(more)
+
+    def resolved(self, position: Mapping[int, int]) -> dict[str, IntArray]:
+        found = {}
+        for key, name in self._spelling.items():
+            try:
+                found[name] = np.unique(np.array(self._members(key, position), dtype=np.int64))
+            except ImageFileError as error:
+                if self._kind == "ELSET":
+                    raise
+                _log.warning("%s The set is left out.", error)  # nodes of an assembly: no tissue is lost with them
+        return {name: index for name, index in found.items() if len(index)}
+
+    def _members(self, name: str, position: Mapping[int, int], seen: tuple[str, ...] = ()) -> list[int]:
+        key = name.strip('"').casefold()
+        if key in seen or key not in self._entries:
+            raise ImageFileError(
+                f"{self._path}: the {_SET_OF[self._kind]} {name!r} is not defined, or contains itself."
+            )
+        found: list[int] = []
+        for entry in self._entries[key]:
+            if entry.isdigit():
+                # A set may name elements that were left out, and GENERATE numbers that no element has.
+                found.extend([position[int(entry)]] if int(entry) in position else [])
+            else:
+                found.extend(self._members(entry, position, (*seen, key)))
+        return found

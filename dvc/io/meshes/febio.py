@@ -1,0 +1,198 @@
+"""FEBio's plot files (.xplt): nodes, elements, parts and the last state's displacements.
+
+A file is a tree of chunks: a tag and a length in bytes (two little-endian integers of 32 bits), then data or further
+chunks. The layout is that of FEBio's specification of its binary database and of the program that writes it (versions
+2.0 to 3.5 of the format, FEBio 3 and 4); states may be compressed, each by itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import FloatArray, IntArray
+from dvc.errors import ImageFileError
+
+_log = logging.getLogger("dvc.io.meshes.febio")
+
+_MAGIC = 0x00464542
+_ROOT, _MESH, _STATE = 0x01000000, 0x01040000, 0x02000000
+_NODAL_NAMES = (0x01020000, 0x01023000)  # dictionary, of nodes
+_ITEM, _ITEM_NAME = 0x01020001, 0x01020004
+_NODE_COUNT, _COORDINATES = (0x01041000, 0x01041100, 0x01041101), (0x01041000, 0x01041200)
+_DOMAINS, _PARTS = 0x01042000, 0x01045000
+_KIND, _PART = (0x01042101, 0x01042102), (0x01042101, 0x01042103)
+_ELEMENTS, _ELEMENT = 0x01042200, 0x01042201
+_PART_ID, _PART_NAME = 0x01045101, 0x01045102
+_NODE_DATA, _STATUS = (0x02020000, 0x02020300), (0x02010000, 0x02010003)
+_VARIABLE_ID, _VARIABLE_DATA = 0x02020002, 0x02020003
+_DISPLACEMENT = "displacement"
+
+# Of FEBio's number of the element type: nodes in the file, and the kind in meshio's names with those that are taken.
+# Bricks of 27 and tetrahedra of 15 nodes begin with the nodes of those of 20 and 10.
+_KINDS = {
+    0: (8, "hexahedron", 8), 1: (6, "wedge", 6), 2: (4, "tetra", 4), 3: (4, "quad", 4), 4: (3, "triangle", 3),
+    6: (20, "hexahedron20", 20), 7: (10, "tetra10", 10), 8: (15, "tetra10", 10), 9: (27, "hexahedron20", 20),
+    10: (6, "triangle6", 6), 11: (8, "quad8", 8), 12: (9, "quad9", 9), 13: (15, "wedge15", 15),
+    16: (5, "pyramid", 5), 17: (5, "tetra", 4), 18: (13, "pyramid13", 13),
+}  # fmt: skip
+_LINES = (5, 19)  # springs and beams, which carry no tissue
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class XpltResult:
+    """What a file says, in its own unit.
+
+    Attributes
+    ----------
+    points : (n, 3)
+    node_ids : (n,)
+        FEBio's numbers of the nodes, where the file has them; else counted from 0.
+    blocks : list of (kind in meshio's names, node indices (m, k))
+    parts : mapping of str to (k,) int
+        Cells of each part, counted through all blocks.
+    displacement : (n, 3) or None
+        Of the last state.
+    """
+
+    points: FloatArray
+    node_ids: IntArray
+    blocks: list[tuple[str, IntArray]]
+    parts: dict[str, IntArray]
+    displacement: FloatArray | None
+
+
+def read_xplt(path: Path) -> XpltResult:
+    """Read a plot file.
+
+    Raises
+    ------
+    ImageFileError
+        If it is none, cut short, changes its mesh between states, or holds elements that are not read.
+    """
+    try:
+        data = path.read_bytes()
+        if len(data) < 4 or struct.unpack_from("<I", data)[0] != _MAGIC:
+            raise ImageFileError(f"{path} is no plot file of FEBio.")
+        root: bytes | None = None
+        mesh: bytes | None = None
+        state: bytes | None = None
+        for tag, body in _sections(data):
+            if tag == _MESH and mesh is not None:
+                raise ImageFileError(f"{path}: its mesh changes between states (remeshing), and one mesh is read.")
+            root, mesh, state = (
+                body if tag == wanted else kept
+                for wanted, kept in ((_ROOT, root), (_MESH, mesh), (_STATE, state))
+            )  # fmt: skip
+        if root is None or mesh is None:
+            raise ImageFileError(f"{path} has no mesh: it is cut short.")
+        points, ids = _nodes(mesh)
+        blocks, parts = _cells(path, mesh)
+        return XpltResult(points, ids, blocks, parts, None if state is None else _moved(path, root, state, len(points)))
+    except (OSError, ValueError, struct.error, zlib.error, StopIteration) as error:
+        if isinstance(error, ImageFileError):
+            raise
+        raise ImageFileError(f"{path} cannot be read as a plot file of FEBio ({error}); it is damaged.") from error
+
+
+def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Top chunks; one that is compressed is known by its tag, which is none."""
+    at = 4
+    while at < len(data):
+        if len(data) >= at + 8 and struct.unpack_from("<I", data, at)[0] in (_ROOT, _MESH, _STATE):
+            tag, size = struct.unpack_from("<II", data, at)
+            if at + 8 + size > len(data):
+                raise ValueError("its last section is cut short")
+            yield tag, data[at + 8 : at + 8 + size]
+            at += 8 + size
+        else:
+            stream = zlib.decompressobj()
+            plain = stream.decompress(data[at:])
+            if not stream.eof:
+                raise ValueError("its last section is cut short")
+            yield from _chunks(plain)
+            at = len(data) - len(stream.unused_data)
+
+
+def _chunks(body: bytes) -> Iterator[tuple[int, bytes]]:
+    at = 0
+    while at < len(body):
+        tag, size = struct.unpack_from("<II", body, at)
+        if at + 8 + size > len(body):
+            raise ValueError(f"chunk {tag:#x} is longer than what holds it")
+        yield tag, body[at + 8 : at + 8 + size]
+        at += 8 + size
+
+
+def _at(body: bytes, *tags: int) -> bytes:
+    """The first chunk down a path of tags."""
+    for tag in tags:
+        body = next((found for name, found in _chunks(body) if name == tag), b"")
+    return body
+
+
+def _number(body: bytes) -> int:
+    return int(struct.unpack_from("<i", body)[0])
+
+
+def _text(body: bytes) -> str:
+    return body.split(b"\0", 1)[0].decode("utf-8", errors="replace").strip()
+
+
+def _nodes(mesh: bytes) -> tuple[FloatArray, IntArray]:
+    count = _number(_at(mesh, *_NODE_COUNT))
+    record = np.dtype([("id", "<i4"), ("x", "<f4", 3)])
+    body = _at(mesh, *_COORDINATES)
+    if len(body) != count * record.itemsize:
+        raise ValueError(f"{len(body)} bytes of coordinates for {count} nodes")
+    found = np.frombuffer(body, record)
+    ids = found["id"].astype(np.int64)
+    return found["x"].astype(np.float64), ids if len(np.unique(ids)) == count else np.arange(count)
+
+
+def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[str, IntArray]]:
+    names = {_number(_at(part, _PART_ID)): _text(_at(part, _PART_NAME)) for _, part in _chunks(_at(mesh, _PARTS))}
+    blocks: list[tuple[str, IntArray]] = []
+    parts: dict[str, list[IntArray]] = {}
+    known = 0
+    for _, domain in _chunks(_at(mesh, _DOMAINS)):
+        number, part = _number(_at(domain, *_KIND)), _number(_at(domain, *_PART))
+        if number in _LINES:
+            _log.info("%s: springs and beams are left out.", path)
+            continue
+        if number not in _KINDS:
+            raise ImageFileError(f"{path}: elements of FEBio's type {number} are not read.")
+        width, kind, taken = _KINDS[number]
+        rows = np.frombuffer(_at(domain, _ELEMENTS), "<u4").reshape(-1, width + 3)
+        if not ((rows[:, 0] == _ELEMENT).all() and (rows[:, 1] == 4 * (width + 1)).all()):
+            raise ValueError(f"an element of a domain of {kind} has another number of nodes")
+        blocks.append((kind, rows[:, 3 : 3 + taken].astype(np.int64)))
+        name = names.get(part) or f"part {part}"
+        parts.setdefault(name, []).append(np.arange(known, known + len(rows)))
+        known += len(rows)
+    return blocks, {name: np.concatenate(found) for name, found in parts.items()}
+
+
+def _moved(path: Path, root: bytes, state: bytes, count: int) -> FloatArray | None:
+    """Displacement in a state, (n, 3)."""
+    status = _at(state, *_STATUS)
+    if status and _number(status):
+        _log.warning("%s: FEBio marks its last state with status %d.", path, _number(status))
+    items = (_at(item, _ITEM_NAME) for tag, item in _chunks(_at(root, *_NODAL_NAMES)) if tag == _ITEM)
+    names = [_text(name) for name in items]
+    if _DISPLACEMENT not in names:
+        return None
+    wanted = names.index(_DISPLACEMENT) + 1
+    for _, variable in _chunks(_at(state, *_NODE_DATA)):
+        if _number(_at(variable, _VARIABLE_ID)) == wanted:
+            _, values = next(_chunks(_at(variable, _VARIABLE_DATA)))
+            if len(values) != 12 * count:
+                raise ValueError(f"{len(values)} bytes of displacement for {count} nodes")
+            return np.frombuffer(values, "<f4").reshape(-1, 3).astype(np.float64)
+    return None

@@ -1,0 +1,95 @@
+"""A displacement with borders as a file: what no transform of ITK can hold, for results that are read again."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import FloatArray, IntArray, frozen
+from dvc.atomic_files import whole_file
+from dvc.deformation.bordered_spline import NUMBERS, BorderedSpline, Borders
+from dvc.deformation.bspline import BSpline
+from dvc.errors import InputError, MrstrainError
+from dvc.images.image import Grid
+
+NAME = "spline_with_borders.npz"
+_FORMAT = 1
+_UNREADABLE = OSError, EOFError, zlib.error, zipfile.BadZipFile, ValueError, KeyError, TypeError
+
+
+def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
+    """Write a displacement with borders, LPS mm, whole or not at all.
+
+    Of the borders the tissues' numbers are kept, from which their depths are computed again.
+    """
+    with whole_file(path) as part, part.open("wb") as file:
+        np.savez_compressed(
+            file,
+            format=_FORMAT,
+            numbers=json.dumps(NUMBERS),
+            smooth=spline.smooth.coefficients_mm,
+            jump=spline.jump.coefficients_mm,
+            own=spline.borders.own.astype(np.int16),
+            rest=spline.borders.rest,
+            reach_mm=spline.borders.reach_mm,
+            control=_told(spline.control),
+            voxels=_told(spline.borders.grid),
+        )
+
+
+def read_bordered_spline(path: Path | str) -> BorderedSpline:
+    """Read what `write_bordered_spline` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is no such displacement.
+    """
+    try:
+        with np.load(io.BytesIO(Path(path).read_bytes())) as file:
+            if int(file["format"]) != _FORMAT:
+                raise ValueError(f"format {int(file['format'])}, not {_FORMAT}")
+            if json.loads(str(file["numbers"])) != NUMBERS:
+                raise ValueError(f"borders found with {file['numbers']}, not {NUMBERS}; register again")
+            control = _grid(file["control"])
+            own = frozen(file["own"], np.int64)
+            borders = _between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
+            return BorderedSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
+    except (*_UNREADABLE, MrstrainError) as failure:
+        raise InputError(
+            f"{path}: no displacement with borders as `mrstrain register` writes it ({type(failure).__name__}: "
+            f"{failure})."
+        ) from failure
+
+
+_latest: list[Borders] = []
+"""Loads of one study have their borders in common, which take seconds to find and room in the memory."""
+
+
+def _between(grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Borders:
+    """Borders as they were last found, if these are the same; found anew otherwise."""
+    known = _latest[-1] if _latest else None
+    if (
+        known is None
+        or (known.rest, known.reach_mm) != (rest, reach_mm)
+        or not np.array_equal(_told(known.grid), _told(grid))
+        or not np.array_equal(known.own, own)
+    ):
+        known = Borders.between(grid, own, rest, reach_mm)
+        _latest[:] = [known]
+    return known
+
+
+def _told(grid: Grid) -> FloatArray:
+    """A grid in rows of three numbers: shape, spacing, origin, and the three of its direction."""
+    return np.vstack([grid.shape, grid.spacing_mm, grid.origin_mm, grid.direction])
+
+
+def _grid(rows: FloatArray) -> Grid:
+    shape, spacing, origin = rows[:3]
+    return Grid((int(shape[0]), int(shape[1]), int(shape[2])), spacing, origin, rows[3:])

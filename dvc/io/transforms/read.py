@@ -1,0 +1,292 @@
+"""Transform files of elastix and ITK, read to a Deformation.
+
+All of them map points of the fixed (reference) image to points of the moving one, in LPS mm; so does a
+Deformation.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import SimpleITK as sitk
+
+from dvc.arrays import FloatArray
+from dvc.deformation.bspline import BSpline
+from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
+from dvc.errors import InputError, ParameterError
+from dvc.images.image import Grid
+from dvc.io.transforms.bordered_spline import read_bordered_spline
+from dvc.io.transforms.elastix_text import Parameters, parse_parameters
+
+StrPath = str | os.PathLike[str]
+
+_ITK_SUFFIXES = (".h5", ".hdf5", ".tfm", ".mat")
+_ITK_TEXT = b"#Insight Transform File"
+_NO_INITIAL = "NoInitialTransform"
+_SAME_CONTROL = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Added:
+    """Displacements added at the same point: u(X) = u_1(X) + u_2(X) + ..., elastix' combination "Add"."""
+
+    parts: tuple[Deformation, ...]
+
+    def displacement(self, points_mm: FloatArray) -> FloatArray:
+        """u(X), (n, 3) mm; NaN where any part is undefined."""
+        return np.asarray(sum(part.displacement(points_mm) for part in self.parts))
+
+    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """u(X) (n, 3) mm and H (n, 3, 3), the sum of the parts'; NaN where any part is undefined."""
+        found = [part.evaluate(points_mm) for part in self.parts]
+        return np.asarray(sum(u for u, _ in found)), np.asarray(sum(H for _, H in found))
+
+
+def read_transform(path: StrPath) -> Deformation:
+    """Read a transform file: elastix' TransformParameters (.txt), ITK's (.h5, .tfm, .mat, .txt), or ours (.npz).
+
+    elastix' chain of initial transforms is followed, combined as each file says: "Compose" (T(x) =
+    T1(T0(x))) or "Add". An initial transform's name is looked for beside the file that names it.
+
+    Returns
+    -------
+    Deformation
+        Of fixed points to moving points, LPS mm. A `BSpline` is NaN outside its valid region, where elastix
+        and ITK answer with the identity. A displacement field inside an ITK file is interpolated by cubic
+        splines (ITK: linearly).
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, not 3D or of a kind that is not read.
+    ParameterError
+        If an elastix file contradicts itself or lacks something.
+    """
+    place = Path(path)
+    if not place.is_file():
+        raise InputError(f"{place}: no such transform file. Check the path.")
+    if place.suffix.lower() == ".npz":
+        return read_bordered_spline(place)
+    if place.suffix.lower() in _ITK_SUFFIXES or place.read_bytes()[: len(_ITK_TEXT)] == _ITK_TEXT:
+        return _read_itk(place)
+    return _read_elastix(place, ())
+
+
+def rigid_from_elastix(parameters: Parameters) -> RigidMotion:
+    """Read an elastix EulerTransform from its parameter map alone (an initial transform is left out).
+
+    ``x = R (X - c) + c + t``, with ``R = Rz Rx Ry``, or ``Rz Ry Rx`` where ComputeZYX is "true".
+
+    Raises
+    ------
+    ParameterError
+        If it is another kind of transform, or parameters are missing.
+    """
+    _require(parameters, ("EulerTransform",))
+    a, b, c, *shift = _numbers(parameters, "TransformParameters", 6)
+    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    rotation = z @ y @ x if _word(parameters, "ComputeZYX", "false") == "true" else z @ x @ y
+    return RigidMotion.about(_numbers(parameters, "CenterOfRotationPoint", 3), rotation, np.array(shift))
+
+
+def bspline_from_elastix(parameters: Parameters) -> BSpline:
+    """Read an elastix B-spline from its parameter map alone (an initial transform is left out).
+
+    Coefficients may be NaN.
+
+    Raises
+    ------
+    ParameterError
+        If it is another kind of transform, not cubic, cyclic, or numbers are missing.
+    """
+    _require(parameters, ("BSplineTransform", "RecursiveBSplineTransform"))
+    if _word(parameters, "BSplineTransformSplineOrder", "3") != "3":
+        raise ParameterError("BSplineTransformSplineOrder is not 3; only cubic B-splines are read.")
+    if _word(parameters, "UseCyclicTransform", "false") == "true":
+        raise ParameterError("UseCyclicTransform is true; cyclic B-splines are not read.")
+    size = _numbers(parameters, "GridSize", 3)
+    shape = (int(size[0]), int(size[1]), int(size[2]))
+    index = _numbers(parameters, "GridIndex", 3) if "GridIndex" in parameters else np.zeros(3)
+    spacing, origin = _numbers(parameters, "GridSpacing", 3), _numbers(parameters, "GridOrigin", 3)
+    direction = np.eye(3)
+    if "GridDirection" in parameters:
+        direction = _numbers(parameters, "GridDirection", 9).reshape(3, 3).T  # written column by column
+    flat = _numbers(parameters, "TransformParameters", 3 * int(np.prod(size)))
+    coefficients = np.stack([c.reshape(shape, order="F") for c in flat.reshape(3, -1)])
+    try:
+        control = Grid(shape, spacing, origin + direction @ (spacing * index), direction)
+        return BSpline(control, coefficients)
+    except InputError as wrong:
+        raise ParameterError(f"The control grid cannot be used: {wrong}") from wrong
+
+
+def _affine_from_elastix(parameters: Parameters) -> Affine:
+    kind = _word(parameters, "Transform", "")
+    if kind == "TranslationTransform":
+        return Affine(np.eye(3), _numbers(parameters, "TransformParameters", 3))
+    centre = _numbers(parameters, "CenterOfRotationPoint", 3)
+    if kind == "AffineTransform":
+        numbers = _numbers(parameters, "TransformParameters", 12)
+        return _about(centre, numbers[:9].reshape(3, 3), numbers[9:])
+    numbers = _numbers(parameters, "TransformParameters", 7)  # SimilarityTransform: versor, translation, scale
+    versor = sitk.VersorTransform(tuple(float(v) for v in (*numbers[:3], np.sqrt(1.0 - numbers[:3] @ numbers[:3]))))
+    return _about(centre, numbers[6] * np.reshape(versor.GetMatrix(), (3, 3)), numbers[3:6])
+
+
+def _about(centre: FloatArray, matrix: FloatArray, translation: FloatArray) -> Affine:
+    return Affine(matrix, centre - matrix @ centre + translation)
+
+
+_ELASTIX: dict[str, Callable[[Parameters], Deformation]] = {
+    "EulerTransform": rigid_from_elastix,
+    "BSplineTransform": bspline_from_elastix,
+    "RecursiveBSplineTransform": bspline_from_elastix,
+    "AffineTransform": _affine_from_elastix,
+    "SimilarityTransform": _affine_from_elastix,
+    "TranslationTransform": _affine_from_elastix,
+}
+
+
+def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
+    if path.resolve() in chain:
+        raise ParameterError(f"{path}: its initial transforms lead back to itself.")
+    try:
+        parameters = parse_parameters(path.read_text())
+    except (OSError, UnicodeDecodeError) as failure:
+        raise InputError(f"{path}: not readable as an elastix transform file ({failure}).") from failure
+    except ParameterError as wrong:
+        raise ParameterError(f"{path}: {wrong}") from wrong
+    try:
+        last = _last_of_chain(path, parameters)
+    except ParameterError as wrong:
+        raise ParameterError(f"{path}: {wrong}") from wrong
+    name = _word(parameters, "InitialTransformParameterFileName", "") or _word(
+        parameters, "InitialTransformParametersFileName", _NO_INITIAL
+    )
+    if name == _NO_INITIAL:
+        return last
+    initial = path.parent / name  # an absolute name stays what it is
+    if not initial.is_file():
+        raise InputError(
+            f"{path}: its initial transform '{name}' is not there. Put it beside this file and write "
+            "its bare name as InitialTransformParameterFileName."
+        )
+    first = _read_elastix(initial, (*chain, path.resolve()))
+    how = _word(parameters, "HowToCombineTransforms", "Compose")
+    if how == "Compose":
+        return Composed([*_flat(first), last])
+    if how != "Add":
+        raise ParameterError(f"{path}: HowToCombineTransforms is '{how}'; it is Compose or Add.")
+    if isinstance(first, BSpline) and isinstance(last, BSpline) and _same(first.control, last.control):
+        return last.plus(first)
+    return Added((first, last))
+
+
+def _same(control: Grid, other: Grid) -> bool:
+    return control.same_as(other, tolerance_voxels=_SAME_CONTROL)
+
+
+def _last_of_chain(path: Path, parameters: Parameters) -> Deformation:
+    kind = _word(parameters, "Transform", "")
+    if kind == "File":
+        named = path.parent / _word(parameters, "TransformFileName", "")
+        if not named.is_file():
+            raise InputError(f"{path}: the ITK transform file '{named.name}' that it names is not there.")
+        return _read_itk(named)
+    _require(parameters, tuple(_ELASTIX))
+    ignored = _word(parameters, "UseDirectionCosines", "true") == "false" and "Direction" in parameters
+    if ignored and np.abs(_numbers(parameters, "Direction", 9) - np.eye(3).ravel()).max() > _SAME_CONTROL:
+        raise ParameterError(
+            "UseDirectionCosines is false, so this transform knows nothing of the image's direction and is "
+            'not in LPS mm. Register again with (UseDirectionCosines "true").'
+        )
+    made = _ELASTIX[kind](parameters)
+    if isinstance(made, BSpline) and not np.isfinite(made.coefficients_mm).all():
+        raise ParameterError("TransformParameters are not all finite: the registration diverged.")
+    return made
+
+
+def _require(parameters: Parameters, kinds: tuple[str, ...]) -> None:
+    kind = _word(parameters, "Transform", "")
+    if kind not in kinds:
+        raise ParameterError(f'(Transform "{kind}") is not read here; what is read: {", ".join(kinds)}.')
+    for name in ("FixedImageDimension", "MovingImageDimension"):
+        if _word(parameters, name, "3") != "3":
+            raise ParameterError(f"{name} is {_word(parameters, name, '')}; transforms of 3D images are read.")
+    if _word(parameters, "UseBinaryFormatForTransformationParameters", "false") == "true":
+        raise ParameterError("its parameters are in a binary file beside it; let elastix write them as text.")
+
+
+def _word(parameters: Parameters, name: str, default: str) -> str:
+    values = parameters.get(name, ())
+    return values[0] if values else default
+
+
+def _numbers(parameters: Parameters, name: str, count: int) -> FloatArray:
+    if name not in parameters:
+        raise ParameterError(f"{name} is missing; {count} numbers are needed.")
+    try:
+        values = np.array(parameters[name], dtype=np.float64)
+    except ValueError as failure:
+        raise ParameterError(f"{name} holds something that is not a number ({failure}).") from failure
+    if len(values) != count:
+        raise ParameterError(f"{name} has {len(values)} numbers; {count} are needed.")
+    return values
+
+
+def _flat(deformation: Deformation) -> tuple[Deformation, ...]:
+    return deformation.parts if isinstance(deformation, Composed) else (deformation,)
+
+
+def _read_itk(path: Path) -> Deformation:
+    try:
+        return _from_sitk(sitk.ReadTransform(os.fspath(path)))
+    except RuntimeError as failure:
+        reason = str(failure).strip().splitlines()[-1].strip()
+        raise InputError(f"{path}: not readable as an ITK transform file ({reason}).") from failure
+    except InputError as wrong:
+        raise InputError(f"{path}: {wrong}") from wrong
+
+
+def _from_sitk(transform: Any) -> Deformation:
+    transform = transform.Downcast()
+    if transform.GetDimension() != 3:
+        raise InputError(f"a {transform.GetDimension()}D transform; a 3D one is needed.")
+    if isinstance(transform, sitk.CompositeTransform):  # the one added last acts first
+        parts = [transform.GetNthTransform(n) for n in reversed(range(transform.GetNumberOfTransforms()))]
+        flat = [piece for part in parts for piece in _flat(_from_sitk(part))]
+        return flat[0] if len(flat) == 1 else Composed(flat or [RigidMotion.identity()])
+    if isinstance(transform, sitk.BSplineTransform):
+        if transform.GetOrder() != 3:
+            raise InputError(f"a B-spline of order {transform.GetOrder()}; only cubic ones are read.")
+        images = transform.GetCoefficientImages()
+        coefficients = np.stack([sitk.GetArrayFromImage(image).T for image in images])
+        return BSpline(_grid_of(images[0]), coefficients)
+    if isinstance(transform, sitk.DisplacementFieldTransform):
+        field = transform.GetDisplacementField()
+        return SampledDisplacement(_grid_of(field), sitk.GetArrayFromImage(field).transpose(2, 1, 0, 3))
+    if isinstance(transform, sitk.TranslationTransform):
+        return Affine(np.eye(3), np.array(transform.GetOffset()))
+    if transform.GetTransformEnum() == sitk.sitkIdentity:
+        return RigidMotion.identity()
+    if not hasattr(transform, "GetMatrix"):
+        raise InputError(f"a transform of the kind {transform.GetName()} is not read.")
+    matrix = np.reshape(transform.GetMatrix(), (3, 3))
+    shift = transform.GetTranslation() if hasattr(transform, "GetTranslation") else np.zeros(3)
+    if isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform):
+        return RigidMotion.about(np.array(transform.GetCenter()), matrix, np.array(shift))
+    return _about(np.array(transform.GetCenter()), matrix, np.array(shift))
+
+
+def _grid_of(image: Any) -> Grid:
+    """Read the grid of a SimpleITK image, which is LPS mm already."""
+    size = image.GetSize()
+    direction = np.reshape(image.GetDirection(), (3, 3))
+    return Grid((size[0], size[1], size[2]), np.array(image.GetSpacing()), np.array(image.GetOrigin()), direction)

@@ -1,0 +1,339 @@
+"""Rigid alignment of a loaded image on a bone of the unloaded one.
+
+First a search that cannot be trapped: the bone is laid at every place of the loaded image in many
+orientations, at low resolution, and normalised correlation is taken by FFT (masked template matching; see
+D. Padfield, Masked object registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Then
+Gauss-Newton refines the best places (`dvc.registration.rigid_fit`); around the best of these, halves of the bone are
+fitted each by itself, begun to either side along each of the six ways to move. The mean of all is the result, and the
+largest distance between two halves the alignment's own measure of how well it repeats.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy import fft
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.deformation.protocol import Deformation, RigidMotion
+from dvc.errors import InputError, RegistrationError
+from dvc.images.image import Grid, Image, Mask
+from dvc.images.resample import carry, fill_missing, smoothed
+from dvc.images.similarity import local_correlation
+from dvc.registration.rigid_fit import RigidFit
+
+AlignOn = Literal["bone", "image", "none"]
+
+_SEARCH_MM = 4.0
+_SEARCH_MARGIN_MM = 4.0
+_ROTATION_STEP_DEG = 9.0
+_ROTATION_LIMIT_DEG = 27.0
+_CANDIDATES = 3
+_SCORE_MARGIN_MM = 2.0
+_SCORE_BLUR_MM = 1.0
+_LOWEST_SIMILARITY = 0.5
+_CERTAIN_SIMILARITY = 0.9
+_LARGEST_SPREAD_MM = 0.5
+_LEAST_COVERED = 0.75
+_INVERTED_TRIES = 7
+_CLEARLY = 0.1
+
+_OTHER_MEASURE = (
+    "the two images have different contrast (water against fat, say). Correlation cannot follow that; mutual "
+    'information could: a parameter file with (Metric "AdvancedMattesMutualInformation")'
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """The rigid motion of the bone between two scans, and how well it is known.
+
+    Attributes
+    ----------
+    motion : RigidMotion
+        Takes points of the reference image to those of the loaded image, LPS mm.
+    on : {"bone", "image", "none"}
+        What was aligned.
+    similarity_before, similarity : float
+        Normalised correlation in and 2 mm around the bone (over the whole mask with "image"), before and after.
+    repeatability_mm : float
+        Root mean square, over the bone's voxels, of the distance between the motions that two halves of them give,
+        begun apart; the largest of six pairs. NaN with "none".
+    bone_shift_mm : (3,)
+        Displacement of the bone's centroid, LPS.
+    """
+
+    motion: RigidMotion
+    on: AlignOn
+    similarity_before: float
+    similarity: float
+    repeatability_mm: float
+    bone_shift_mm: FloatArray
+
+    def turned(self, rotation: FloatArray) -> Alignment:
+        """The same alignment of two images that are both turned about the world's origin."""
+        R, motion = rotation, self.motion
+        same = RigidMotion(R @ motion.rotation @ R.T, R @ motion.translation_mm)
+        return replace(self, motion=same, bone_shift_mm=R @ self.bone_shift_mm)
+
+
+def not_aligned(reference: Image, loaded: Image, mask: Mask) -> Alignment:
+    """The alignment that leaves both images where their headers put them."""
+    similarity = _similarity(reference, loaded, mask, RigidMotion.identity())
+    return Alignment(RigidMotion.identity(), "none", similarity, similarity, float("nan"), np.zeros(3))
+
+
+def refuse_turned_contrast(reference: Image, loaded: Image, tissue: Mask, motion: RigidMotion) -> None:
+    """Refuse images whose contrast is turned round in the tissue, for what registers by correlation.
+
+    Two images of one contrast correlate locally by more than zero even 15 mm apart (phantoms: 0.03 to 0.84), those
+    of turned contrast by as much below zero.
+
+    Raises
+    ------
+    RegistrationError
+        If they do; it names the measure that could follow.
+    """
+    _, found = local_correlation(reference, carry(loaded, reference.grid, motion.apply), tissue)
+    if found < -_CLEARLY:
+        raise RegistrationError(
+            f"The local correlation of the two images in the tissue is {found:.2f} before the non-rigid registration, "
+            f"below zero: {_OTHER_MEASURE}, for --parameters."
+        )
+
+
+def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -> Alignment:
+    """Find the rigid motion of a bone, or of all that the mask holds, from the reference to the loaded image.
+
+    Parameters
+    ----------
+    reference, loaded : Image
+        Without shading (`dvc.images.shading`), which would pull the optimum off by some hundredths of a millimetre.
+    mask : Mask
+        The bone (or tissue) on the reference grid.
+    on : {"bone", "image"}
+        What the mask holds.
+    seed : int
+        Of the halves into which the mask's voxels are divided.
+
+    Raises
+    ------
+    InputError
+        If the mask is empty, or too little of it is seen in the unloaded image.
+    RegistrationError
+        If no place of the loaded image looks like the bone, if the contrast is inverted, or if the fits of two halves
+        disagree by more than 0.5 mm: a failed alignment is not handed on.
+    """
+    if not mask.inside.any():
+        raise InputError("The mask to align on is empty.")
+    fit = RigidFit(reference, loaded, mask, seed)
+    starts, highest = _search(reference, loaded, mask)
+    candidates: list[tuple[float, RigidMotion]] = []
+    for start in starts:
+        try:
+            motion = fit.whole(start)
+        except RegistrationError:
+            continue  # not the place
+        score = _similarity(reference, loaded, mask, motion)
+        if np.isfinite(score):
+            candidates.append((score, motion))
+        if score >= _CERTAIN_SIMILARITY:
+            break  # only the right place looks like this
+    before = _similarity(reference, loaded, mask, RigidMotion.identity())
+    score, motion = max(candidates, key=lambda c: c[0], default=(float("nan"), RigidMotion.identity()))
+    if not score >= _LOWEST_SIMILARITY:
+        raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
+    points = mask.points()
+    advice = (
+        f"the {on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly inside "
+        "the loaded one."
+    )
+    try:
+        pairs = fit.halves(motion)
+    except RegistrationError as why:
+        raise RegistrationError(f"A half of the {on} cannot be fitted by itself ({why}): {advice}") from why
+    spread = max(_apart_mm(one, other, points) for one, other in pairs)
+    if not spread <= _LARGEST_SPREAD_MM:
+        raise RegistrationError(
+            f"Two rigid fits on the {on} differ by {spread:.2f} mm (at most {_LARGEST_SPREAD_MM} is accepted): {advice}"
+        )
+    motion = _midway([half for pair in pairs for half in pair], points.mean(axis=0))
+    centroid = points.mean(axis=0)[None]
+    return Alignment(
+        motion,
+        on,
+        before,
+        _similarity(reference, loaded, mask, motion),
+        spread,
+        motion.displacement(centroid)[0],
+    )
+
+
+def motion_of(deformation: Deformation, mask: Mask) -> RigidMotion:
+    """The rigid motion that comes closest, in the least squares, to what a deformation does to a mask's voxels.
+
+    Raises
+    ------
+    InputError
+        If fewer than four voxels of the mask have a displacement.
+    """
+    X = mask.points()
+    x = X + deformation.displacement(X)
+    known = np.isfinite(x).all(axis=1)
+    if np.count_nonzero(known) < 4:
+        raise InputError("The deformation is not defined in the bone, so its motion cannot be taken away.")
+    X, x = X[known], x[known]
+    rotation, _ = Rotation.align_vectors(x - x.mean(axis=0), X - X.mean(axis=0))
+    R = rotation.as_matrix()
+    return RigidMotion(R, x.mean(axis=0) - R @ X.mean(axis=0))
+
+
+def _midway(motions: list[RigidMotion], centre: FloatArray) -> RigidMotion:
+    rotation = Rotation.from_matrix(np.stack([motion.rotation for motion in motions])).mean().as_matrix()
+    target = np.mean([motion.apply(centre[None])[0] for motion in motions], axis=0)
+    return RigidMotion(rotation, target - rotation @ centre)
+
+
+def _apart_mm(one: RigidMotion, other: RigidMotion, points: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.sum((one.apply(points) - other.apply(points)) ** 2, axis=1))))
+
+
+def _near(mask: Mask, margin_mm: float) -> BoolArray:
+    """Voxels in the mask and up to ``margin_mm`` around it."""
+    distance = distance_transform_edt(~mask.inside, sampling=mask.grid.spacing_mm)
+    return np.asarray(distance <= margin_mm)
+
+
+def _similarity(reference: Image, loaded: Image, mask: Mask, motion: RigidMotion) -> float:
+    """Normalised correlation of the slightly blurred images in and 2 mm around the mask; NaN without overlap."""
+    where = _near(mask, _SCORE_MARGIN_MM)
+    fixed = smoothed(reference, _SCORE_BLUR_MM).values[where]
+    moved = carry(smoothed(loaded, _SCORE_BLUR_MM), reference.grid, motion.apply, where, order=1)[where]
+    known = np.isfinite(moved) & np.isfinite(fixed)
+    if np.count_nonzero(known) < 0.5 * known.size:
+        return float("nan")
+    a, b = fixed[known].astype(np.float64), moved[known].astype(np.float64)
+    a, b = a - a.mean(), b - b.mean()
+    norm = np.sqrt((a * a).sum() * (b * b).sum())
+    return float((a * b).sum() / norm) if norm > 0 else float("nan")
+
+
+def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highest: float, on: AlignOn) -> str:
+    inverted = max(
+        (s for s, _ in _scored(reference, loaded, mask, _rotations()[:_INVERTED_TRIES], sign=-1.0)), default=0.0
+    )
+    found = f"the best normalised correlation found around it is {score:.2f}"
+    if not np.isfinite(score):
+        found = "nowhere does the loaded image look like it"
+    told = f"The rigid alignment on the {on} failed: {found} ({_LOWEST_SIMILARITY} is needed)."
+    if inverted > max(_LOWEST_SIMILARITY, highest + _CLEARLY):
+        return (
+            f"{told} With the contrast turned round it is {inverted:.2f}: {_OTHER_MEASURE}, with --align none where "
+            "the images share a frame."
+        )
+    return (
+        f"{told} Check that both images show the same foot, that the mask covers the bone on the unloaded image, "
+        "and that the bone lies wholly inside the loaded one; or use --align image, or --align none."
+    )
+
+
+# The search at low resolution.
+
+
+def _rotations() -> list[FloatArray]:
+    """Rotations in steps of 9 degrees up to 27 degrees about any axis, the identity first."""
+    steps = np.arange(-_ROTATION_LIMIT_DEG, _ROTATION_LIMIT_DEG + 1e-9, _ROTATION_STEP_DEG)
+    vectors = np.array([(x, y, z) for x in steps for y in steps for z in steps])
+    angle = np.linalg.norm(vectors, axis=1)
+    kept = vectors[angle <= _ROTATION_LIMIT_DEG + 1e-9]
+    kept = kept[np.argsort(np.linalg.norm(kept, axis=1), kind="stable")]
+    return list(Rotation.from_rotvec(np.radians(kept)).as_matrix())
+
+
+def _search(reference: Image, loaded: Image, mask: Mask) -> tuple[list[RigidMotion], float]:
+    """The place of the header and the best few others, far enough apart to be different; and the highest score."""
+    scored = sorted(_scored(reference, loaded, mask, _rotations()), key=lambda s: -s[0])
+    centre = mask.points().mean(axis=0)[None]
+    chosen: list[RigidMotion] = []
+    for _, motion in scored:
+        apart = [
+            np.linalg.norm(motion.apply(centre) - other.apply(centre)) > 2 * _SEARCH_MM
+            or motion.after(other.inverse()).angle_deg > 1.5 * _ROTATION_STEP_DEG
+            for other in chosen
+        ]
+        if all(apart):
+            chosen.append(motion)
+        if len(chosen) == _CANDIDATES:
+            break
+    return [*chosen, RigidMotion.identity()], scored[0][0] if scored else -1.0
+
+
+def _scored(
+    reference: Image, loaded: Image, mask: Mask, rotations: list[FloatArray], sign: float = 1.0
+) -> list[tuple[float, RigidMotion]]:
+    """For each rotation the best translation and its normalised correlation (times ``sign``)."""
+    centre = mask.points().mean(axis=0)
+    template, weight, template_grid = _template(reference, mask, centre)
+    scene, known = _scene(loaded)
+    values = np.where(known, scene.values, np.median(scene.values[known]))
+    size = [fft.next_fast_len(s + t, real=True) for s, t in zip(scene.grid.shape, template_grid.shape, strict=True)]
+    scene_f, square_f, known_f = (fft.rfftn(v, size) for v in (values, values**2, known.astype(np.float64)))
+    places = tuple(slice(0, s) for s in scene.grid.shape)
+    half = (np.array(template_grid.shape) - 1) // 2
+    found = []
+    for rotation in rotations:
+        t, w = _rotated(template, weight, template_grid, centre, rotation)
+        count = w.sum()
+        deviation = t - (t * w).sum() / count
+        energy = (w * deviation * deviation).sum()
+        t = w * deviation
+        w_f = np.conj(fft.rfftn(w, size))
+        cross = fft.irfftn(scene_f * np.conj(fft.rfftn(t, size)), size)
+        mean = fft.irfftn(scene_f * w_f, size) / count
+        variance = fft.irfftn(square_f * w_f, size) / count - mean**2
+        covered = fft.irfftn(known_f * w_f, size) / count
+        floor = 1e-3 * values.var()
+        score = sign * cross / np.sqrt(energy * count * np.maximum(variance, floor))
+        score[covered < _LEAST_COVERED] = -np.inf
+        # A shift s of the template wraps round: its centre lies at index s + half of the scene.
+        score = np.roll(score, tuple(half), axis=(0, 1, 2))[places]
+        best = np.unravel_index(int(np.argmax(score)), score.shape)
+        if not np.isfinite(score[best]):
+            continue  # nowhere does the loaded image show enough of the mask
+        to = scene.grid.points_at(np.array(best, dtype=np.float64))
+        found.append((float(score[best]), RigidMotion(rotation, to - rotation @ centre)))
+    return found
+
+
+def _template(reference: Image, mask: Mask, centre: FloatArray) -> tuple[Image, Image, Grid]:
+    """The reference and its weight around the mask, on a cubic low-resolution grid centred on the mask."""
+    near = Mask(mask.grid, _near(mask, _SEARCH_MARGIN_MM) & ~reference.missing)
+    reach = float(np.linalg.norm(near.points() - centre, axis=1).max())
+    half = int(np.ceil(reach / _SEARCH_MM)) + 1
+    n = 2 * half + 1
+    grid = Grid((n, n, n), np.full(3, _SEARCH_MM), centre - half * _SEARCH_MM)
+    weight = smoothed(Image(mask.grid, near.inside.astype(np.float32)), _SEARCH_MM / 2.0)
+    return smoothed(fill_missing(reference), _SEARCH_MM / 2.0), weight, grid
+
+
+def _rotated(
+    image: Image, weight: Image, grid: Grid, centre: FloatArray, rotation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    back = RigidMotion.about(centre, rotation.T, np.zeros(3))
+    t = np.nan_to_num(carry(image, grid, back.apply, order=1).astype(np.float64))
+    w = np.nan_to_num(carry(weight, grid, back.apply, order=1).astype(np.float64))
+    return t, w
+
+
+def _scene(loaded: Image) -> tuple[Image, BoolArray]:
+    """The loaded image at low resolution on axes L, P, S, and where it is known."""
+    low, high = loaded.grid.bounds_mm()
+    shape = np.maximum(np.ceil((high - low) / _SEARCH_MM).astype(int) + 1, 2)
+    grid = Grid((int(shape[0]), int(shape[1]), int(shape[2])), np.full(3, _SEARCH_MM), low)
+    values = carry(smoothed(loaded, _SEARCH_MM / 2.0), grid, order=1)
+    known = np.isfinite(values)
+    return Image(grid, np.where(known, values, 0.0)), known

@@ -1,0 +1,196 @@
+"""Registration parameters: the named presets, users' own elastix files, and the check of both.
+
+elastix ignores a misspelt parameter in silence. Here every name, and the name of every component, is compared
+with those that elastix knows before anything runs.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+from dvc.errors import InputError, ParameterError
+from dvc.io.transforms.elastix_text import parse_parameters
+
+_FOLDER = "parameters"
+_LABEL = re.compile(
+    r"^(Metric|Transform|Optimizer|Interpolator|ImageSampler|FixedImagePyramid|MovingImagePyramid|Registration)\d*"
+)
+
+# What mrstrain itself decides, so that results are reproducible and can be read back.
+_ALWAYS: dict[str, tuple[str, ...]] = {
+    "FixedImageDimension": ("3",),
+    "MovingImageDimension": ("3",),
+    "FixedInternalImagePixelType": ("float",),
+    "MovingInternalImagePixelType": ("float",),
+    "UseDirectionCosines": ("true",),
+    "WriteResultImage": ("false",),
+    "WriteFinalTransformParameters": ("false",),
+    "WriteIterationInfo": ("true",),
+    "DefaultPixelValue": ("0",),
+    "Resampler": ("DefaultResampler",),
+    "ResampleInterpolator": ("FinalBSplineInterpolator",),
+    "ResultImageFormat": ("nii.gz",),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """elastix parameters with a name and the text they came from.
+
+    Attributes
+    ----------
+    name : str
+        Name of the preset, or of the user's file.
+    text : str
+        The file as written; kept for provenance.
+    parameters : dict
+        Parameter name to values, all as text.
+    """
+
+    name: str
+    text: str
+    parameters: dict[str, tuple[str, ...]]
+
+    def complete(self, *, seed: int, combine: str = "Compose") -> dict[str, tuple[str, ...]]:
+        """All parameters of a run: the preset's, and those that mrstrain sets for every run.
+
+        Parameters
+        ----------
+        seed : int
+            Seed of elastix' random numbers; without one every run would differ.
+        combine : {"Compose", "Add"}
+            How an initial transform is combined with the one sought.
+        """
+        run = {**self.parameters, **_ALWAYS, "HowToCombineTransforms": (combine,)}
+        run["RandomSeed"] = (str(seed),)
+        return run
+
+    @property
+    def iterations(self) -> int:
+        """Iterations over all resolutions, for the time left."""
+        resolutions = int(self.parameters.get("NumberOfResolutions", ("3",))[0])
+        limits = self.parameters.get("MaximumNumberOfIterations", ("500",))
+        return sum(int(limits[min(r, len(limits) - 1)]) for r in range(resolutions))
+
+    @property
+    def transform(self) -> str:
+        """Elastix' name of the transform sought."""
+        return self.parameters["Transform"][0]
+
+
+def preset_names() -> list[str]:
+    """Names of the presets that can be asked for."""
+    folder = files("dvc.registration.elastix") / _FOLDER
+    return sorted(f.name.removesuffix(".txt") for f in folder.iterdir() if f.name.endswith(".txt"))
+
+
+def load_preset(name: str) -> Preset:
+    """A preset by its name.
+
+    Raises
+    ------
+    ParameterError
+        If there is none of that name; the message lists those there are.
+
+    Examples
+    --------
+    >>> load_preset("heel-mr").parameters["Metric"]
+    ('AdvancedNormalizedCorrelation',)
+    """
+    if name not in preset_names():
+        raise ParameterError(f"No preset '{name}'; there are {', '.join(preset_names())}.")
+    text = (files("dvc.registration.elastix") / _FOLDER / f"{name}.txt").read_text()
+    return _checked(name, text, allow_unknown=False)
+
+
+def preset_or_file(name: str) -> Preset:
+    """A preset by its name, or a user's own elastix parameter file by a path that ends in .txt.
+
+    Raises
+    ------
+    ParameterError, InputError
+        As `load_preset` and `read_parameter_file`.
+    """
+    return read_parameter_file(name) if name.endswith(".txt") else load_preset(name)
+
+
+def read_parameter_file(path: Path | str, *, allow_unknown: bool = False) -> Preset:
+    """A user's own elastix parameter file, checked.
+
+    Parameters
+    ----------
+    allow_unknown : bool
+        Accept parameter names that are not in our list (a newer elastix may have more).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    ParameterError
+        For a name, or a component, that elastix does not know: with the nearest that it does.
+    """
+    try:
+        text = Path(path).read_text()
+    except (OSError, UnicodeDecodeError) as failure:
+        raise InputError(f"Cannot read the elastix parameter file {path}: {failure}.") from failure
+    return _checked(Path(path).name, text, allow_unknown=allow_unknown)
+
+
+def _checked(name: str, text: str, *, allow_unknown: bool) -> Preset:
+    try:
+        parameters = parse_parameters(text)
+    except ParameterError as failure:
+        raise ParameterError(f"{name}: {failure}") from failure
+    if not allow_unknown:
+        for parameter in parameters:
+            _check_name(name, parameter)
+    for kind, components in _known_components().items():
+        for value in parameters.get(kind, ()):
+            if value not in components:
+                raise ParameterError(f'{name}: elastix has no {kind} "{value}"; {_nearest(value, components)}')
+    if "Transform" not in parameters:
+        raise ParameterError(f'{name}: no (Transform "...") given; a B-spline or Euler transform is needed.')
+    return Preset(name, text, parameters)
+
+
+def _check_name(file: str, parameter: str) -> None:
+    known = _known_parameters()
+    bare = parameter.rstrip("0123456789")
+    without_label = _LABEL.sub("", parameter)
+    if parameter in known or bare in known or without_label in known:
+        return
+    labelled = _LABEL.match(parameter)
+    if labelled and "Metric" + without_label in known:
+        return
+    raise ParameterError(
+        f"{file}: elastix has no parameter '{parameter}' and would ignore it in silence; "
+        f"{_nearest(parameter, known)} Pass --allow-unknown-parameters if it is right all the same."
+    )
+
+
+def _nearest(name: str, known: Sequence[str] | frozenset[str]) -> str:
+    near = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.5)
+    return f"the nearest that it knows is '{near[0]}'." if near else "nothing that it knows is near."
+
+
+@cache
+def _known() -> dict[str, dict[str, list[str]]]:
+    loaded: dict[str, dict[str, list[str]]] = json.loads(
+        (files("dvc.registration.elastix") / _FOLDER / "known.json").read_text()
+    )
+    return loaded
+
+
+def _known_parameters() -> frozenset[str]:
+    return frozenset(_known()["parameters"])
+
+
+def _known_components() -> dict[str, list[str]]:
+    return _known()["components"]

@@ -1,0 +1,1 @@
+"""The Gauss-Newton engine: image term, roughness prior and the sums over B-splines."""

@@ -1,0 +1,396 @@
+"""Gauss-Newton registration: a cubic B-spline displacement, all voxels, and a prior whose weight the images choose.
+
+Minimised is ``1/(2 s^2) sum r^2 + b/2 int c |Δ u|^2 + v/2 int (J - 1)^2 + w/2 int |E|^2``: residuals r over the voxels
+of a mask with their own variance s^2, the bending of the displacement (and, very little, itself:
+`dvc.registration.gauss_newton.roughness`), the change of volume in soft tissue and the strain of the bone. Bending
+counts alike everywhere (c = 1) at first; in the last steps less where it was found. Four levels from coarse to fine,
+smoothed images first; each step by conjugate gradients that never form the Hessian. Nothing is drawn at random, and
+every sum has a fixed order: the result is the same bit for bit on any number of threads. docs/decisions/0009 has the
+reasons.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_banded
+from scipy.ndimage import distance_transform_edt
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.deformation.bspline import BSpline
+from dvc.deformation.protocol import Deformation
+from dvc.errors import InputError, ParameterError
+from dvc.images.image import Grid, Image, Mask
+from dvc.images.resample import smoothed
+from dvc.registration.gauss_newton.level import Level, Weights
+from dvc.registration.gauss_newton.roughness import NUMBERS
+
+# Of each level: smoothing of both images (mm), control spacing over the finest, most steps, the step that ends it (mm).
+LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 1.0, 3, 0.005))
+_LEAST_VOXELS = 2.0
+_BLURRED = 2.0  # standard deviations: nearer to its ends a blurred image shows what it was padded with
+_RIM_MM = 1.2  # bone nearer to its surface than that may be tissue in part of a voxel
+USUAL_BENDING = 3.0
+"""Weight of the bending, 1/mm, that strongly loaded pairs get, about."""
+USUAL_VOLUME = 300.0
+"""Weight of the change of volume, 1/mm3, of tissue that keeps its volume."""
+# Where the images ask for a change of volume, its gradient is held instead: while it is looked for with this weight
+# over how sharply a displacement is seen (mm4), so that large voxels and small ones are judged alike; then with 1/mm.
+_LOOKING_MM4, _FREED = 1000.0, 100.0
+_ASKED = 0.04  # the change of volume that a hundredth of the soft tissue exceeds: between loads and swelling
+_RATIO = np.sqrt(10.0)
+_POWERS = -4, 3  # powers of the ratio that are tried at the most: weights of 0.03 to 95
+_CHECK_TOLERANCE, _CHECK_MOST = 0.05, 80
+_MIDDLE = 0.7  # of each edge of the mask's box
+_LAST_STEPS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class GaussNewton:
+    """Parameters of the engine.
+
+    Attributes
+    ----------
+    spacing_mm : float
+        Between control points, at the finest level; never less than two voxels.
+    bending : float or None
+        Weight b of the bending, 1/mm; None: chosen for each pair by cross-validation.
+    volume : float or None
+        Weight v of the change of volume in soft tissue, 1/mm3; None: 300, unless the images ask for such a change.
+    rigidity : float
+        Weight w of strain in the bone, 1/mm3.
+
+    Raises
+    ------
+    ParameterError
+        For a spacing that is not above zero, or a weight that is negative or not finite.
+    """
+
+    spacing_mm: float = 3.2
+    bending: float | None = None
+    volume: float | None = None
+    rigidity: float = 1000.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.spacing_mm) and self.spacing_mm > 0):
+            raise ParameterError(f"Control points need a spacing above 0 mm; got {self.spacing_mm}.")
+        if self.bending is not None and not (np.isfinite(self.bending) and self.bending > 0):
+            raise ParameterError(f"The weight of the bending must be above 0; got {self.bending}.")
+        for name in ("volume", "rigidity"):
+            weight = getattr(self, name)
+            if weight is not None and not (np.isfinite(weight) and weight >= 0):
+                raise ParameterError(f"The weight '{name}' must be 0 or more; got {weight}.")
+
+    @property
+    def text(self) -> str:
+        """Every number that decides the result, as JSON: what an error model or a record names the engine by.
+
+        Volume by the rule reads as volume kept, which gives the same result bit for bit unless the rule frees it
+        (`Choice.frees_volume`); of a result for which it did, this text alone says too little.
+        """
+        rule = {
+            "usual": USUAL_BENDING,
+            "ratio": _RATIO,
+            "powers": _POWERS,
+            "steps": [1, _LAST_STEPS],
+        }
+        rims = {"blurred": _BLURRED, "bone_rim_mm": _RIM_MM}
+        told = {"engine": "gauss-newton", "levels": LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
+        told |= {"roughness": NUMBERS}
+        return json.dumps(asdict(self) | {"volume": self.weights.volume} | told)
+
+    @property
+    def weights(self) -> Weights:
+        """Weights to begin with: the usual ones where a rule decides."""
+        bending = USUAL_BENDING if self.bending is None else self.bending
+        return Weights(bending, USUAL_VOLUME if self.volume is None else self.volume, self.rigidity)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The prior's weights that were used, and why.
+
+    Attributes
+    ----------
+    weights : Weights
+    rule : str
+        In words.
+    tried : tuple of (bending, left-out residual)
+        Mean square residual of the half of the voxels that was left out, over that of the best.
+    tried_in_skin : tuple of (rigidity, left-out residual)
+        Likewise for the weight of strain in the skin, where borders of tissues are known.
+    rigidity_of : {"bone", "skin"}
+        Whose strain the weight "rigidity" is of.
+    asked : float or None
+        The change of volume that a hundredth of the soft tissue exceeds if only its gradient is held; None where the
+        weight of the change of volume was fixed beforehand.
+    in_bone : (root mean square displacement in mm, 95th percentile of the maximal shear), optional
+        Within the bone, of the smooth displacement that came before one that holds the bone at rest.
+    """
+
+    weights: Weights
+    rule: str
+    tried: tuple[tuple[float, float], ...] = ()
+    tried_in_skin: tuple[tuple[float, float], ...] = ()
+    rigidity_of: str = "bone"
+    asked: float | None = None
+    in_bone: tuple[float, float] | None = None
+
+    @property
+    def frees_volume(self) -> bool:
+        """Whether the images ask for a change of volume, so that only its gradient was held."""
+        return self.asked is not None and self.asked > _ASKED
+
+    @property
+    def volume_told(self) -> str:
+        """How the change of volume was held, and why."""
+        if self.asked is None:
+            return f"Its weight was fixed beforehand, {self.weights.volume:g}/mm3."
+        found = f"{100.0 * self.asked:.1f} % or more in a hundredth of the soft tissue"
+        if self.frees_volume:
+            return (
+                f"The images ask for a change of volume, of {found}: it was allowed, and only its gradient held "
+                f"({self.weights.volume_gradient:g}/mm)."
+            )
+        return f"The images ask for no more change of volume than noise does, {found}: volume was kept."
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        told: dict[str, object] = {
+            "weights": asdict(self.weights),
+            "rigidity_of": self.rigidity_of,
+            "rule": self.rule,
+            "tried": [{"bending": b, "left_out_over_best": round(v, 6)} for b, v in self.tried],
+            "change_of_volume": {
+                "rule": self.volume_told,
+                "asked": None if self.asked is None else round(self.asked, 4),
+                "allowed_above": None if self.asked is None else _ASKED,
+            },
+        }
+        if self.tried_in_skin:
+            told["tried_in_skin"] = [{"rigidity": w, "left_out_over_best": round(v, 6)} for w, v in self.tried_in_skin]
+        return told
+
+
+def fit(
+    fixed: Image,
+    moving: Image,
+    inside: Mask,
+    body: Mask,
+    bone: Mask | None,
+    options: GaussNewton,
+    start: Deformation | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> tuple[BSpline, Choice]:
+    """Find the displacement that carries the fixed image to the moving one.
+
+    Parameters
+    ----------
+    fixed, moving : Image
+        Without shading; rigid motion already in the moving image's grid. Missing voxels are left out.
+    inside : Mask
+        Voxels of ``fixed`` that are compared.
+    body : Mask
+        Tissue, bone included, on the same grid.
+    bone : Mask or None
+        Of it, what is rigid.
+    options : GaussNewton
+    start : Deformation, optional
+        First guess, u in mm LPS; where it is not defined its nearest value is taken.
+    progress : callable, optional
+        Gets the share that is done.
+
+    Returns
+    -------
+    bspline : BSpline
+        Displacement, LPS mm.
+    choice : Choice
+
+    Raises
+    ------
+    InputError
+        If the tissue has no contrast.
+    RegistrationError
+        If it diverges.
+    """
+    scale = float(np.nanpercentile(fixed.values[body.inside], 75))
+    if not scale > 0:
+        raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
+    pictures = scaled(fixed, scale), scaled(moving, scale)
+    core = np.zeros(body.grid.shape, dtype=bool)
+    if bone is not None:
+        core = distance_transform_edt(bone.inside, sampling=bone.grid.spacing_mm) > _RIM_MM
+    weights, asked = options.weights, None
+    spacing = np.maximum(options.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
+    axes = np.array(fixed.grid.direction)
+    soft = body.inside & ~core
+    coefficients, control = np.zeros(0), fixed.grid
+    for number, (sigma_mm, factor, steps, stop_mm) in enumerate(LEVELS):
+        guess = start if number == 0 else BSpline(control, turned(axes, coefficients))
+        control = control_grid(fixed.grid, factor * spacing)
+        coefficients = (
+            np.zeros((3, *control.shape)) if guess is None else turned(axes.T, spline_through(guess, control))
+        )
+        level = _level(pictures, inside.inside, soft, core, control, sigma_mm)
+        coefficients = level.descend(coefficients, weights, steps=steps * weights.patience, stop_mm=stop_mm)
+        if options.volume is None and number == len(LEVELS) - 2:
+            asked = _volume_asked(level, coefficients, weights)
+            if asked > _ASKED:
+                weights = replace(weights, volume=0.0, volume_gradient=_FREED)
+        progress((number + 1) / (len(LEVELS) + 2))
+    choice = Choice(weights, "fixed beforehand", asked=asked)
+    level.roughness = level.following(coefficients)
+    if options.bending is None:
+        part = _middle(inside.inside)
+        middle = Level(*pictures, inside.inside & part, soft & part, core & part, control)
+        middle.roughness = level.roughness
+        choice = replace(choose(middle, coefficients, weights), asked=asked)
+        progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
+    steps = _LAST_STEPS * choice.weights.patience
+    coefficients = level.descend(coefficients, choice.weights, steps=steps, stop_mm=LEVELS[-1][-1])
+    progress(1.0)
+    return BSpline(control, turned(axes, coefficients)), choice
+
+
+def choose(
+    level: Level,
+    coefficients: FloatArray,
+    weights: Weights,
+    name: str = "bending",
+    powers: tuple[int, int] = _POWERS,
+    margin: float | None = None,
+) -> Choice:
+    """One of the weights by two-fold cross-validation, around the value that it has.
+
+    One half of the voxels (a chessboard of small cubes) is fitted, the other half's residual is what counts: noise that
+    was fitted makes it larger, and so does detail that was smoothed away. Weights are tried in steps of a factor of 3.2
+    until the best lies between two others; then the vertex of the parabola through the three, over the weight's
+    logarithm. With a margin instead the weight is raised from there for as long as no more than that share is added to
+    what is left.
+    """
+    found: dict[int, float] = {}
+    usual = getattr(weights, name)
+    least, greatest = powers
+
+    def left_out(power: int) -> float:
+        if power not in found:
+            tried = replace(weights, **{name: usual * _RATIO**power})
+            fitted = level.descend(
+                coefficients, tried, steps=1, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE,
+                most=_CHECK_MOST,
+            )  # fmt: skip
+            found[power] = level.at(fitted, halves=1).variance
+        return found[power]
+
+    best = 0
+    while (nearby := min((p for p in (best, best - 1, best + 1) if least <= p <= greatest), key=left_out)) != best:
+        best = nearby
+    rule = f"{name} by cross-validation: half of the voxels fitted, the other half's residual least"
+    power = float(best)
+    if margin is not None:
+        while power < greatest and left_out(int(power) + 1) <= (1.0 + margin) * found[best]:
+            power += 1.0
+        rule += f", then raised for as long as that adds no more than {100.0 * margin:g} %"
+    elif least < best < greatest:
+        below, here, above = (left_out(best + d) for d in (-1, 0, 1))
+        power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
+    else:
+        rule += "; it is least at the end of what is tried"
+    chosen = replace(weights, **{name: float(usual * _RATIO**power)})
+    return Choice(chosen, rule, tuple((float(usual * _RATIO**p), found[p] / found[best]) for p in sorted(found)))
+
+
+def _volume_asked(level: Level, coefficients: FloatArray, weights: Weights) -> float:
+    """The change of volume |J - 1| that a hundredth of the soft tissue exceeds once only its gradient is held.
+
+    One step from the result that keeps volume. Held so, a change over 2 cm or more costs little, and noise, or detail
+    that the spline cannot follow without a change of volume, moves it by a hundredth.
+    """
+    held = _LOOKING_MM4 * level.sharpness(coefficients)
+    looking = replace(weights, bending=USUAL_BENDING, volume=0.0, volume_gradient=held)
+    return level.swelling(level.descend(coefficients, looking, steps=1, stop_mm=0.0), 99.0)
+
+
+def _middle(inside: BoolArray) -> BoolArray:
+    """The middle of a mask's box, a third of its volume: enough to choose a weight, in a third of the time."""
+    part = np.zeros_like(inside)
+    sides = []
+    for axis in range(3):
+        at = np.flatnonzero(inside.any(axis=tuple(a for a in range(3) if a != axis)))
+        margin = int(0.5 * (1.0 - _MIDDLE) * (at[-1] - at[0] + 1))
+        sides.append(slice(at[0] + margin, at[-1] + 1 - margin))
+    part[tuple(sides)] = True
+    return part
+
+
+def _level(
+    pictures: tuple[Image, Image], inside: BoolArray, soft: BoolArray, bone: BoolArray, control: Grid, sigma_mm: float
+) -> Level:
+    """Images smoothed, and every so manyth voxel of them: a smooth image needs no more."""
+    if sigma_mm == 0.0:
+        return Level(*pictures, inside, soft, bone, control)
+    fixed, moving = (_thinned(smoothed(i, sigma_mm), sigma_mm) for i in pictures)
+    every = tuple(slice(None, None, int(n)) for n in _stride(pictures[0].grid, sigma_mm))
+    return Level(fixed, moving, inside[every], soft[every], bone[every], control, _BLURRED * sigma_mm)
+
+
+def scaled(image: Image, scale: float) -> Image:
+    """The image over a brightness."""
+    return Image(image.grid, image.values / np.float32(scale))
+
+
+def _stride(grid: Grid, sigma_mm: float) -> FloatArray:
+    return np.maximum(np.floor(sigma_mm / grid.spacing_mm + 1e-6), 1.0)
+
+
+def _thinned(image: Image, sigma_mm: float) -> Image:
+    stride = _stride(image.grid, sigma_mm)
+    values = image.values[tuple(slice(None, None, int(n)) for n in stride)]
+    i, j, k = values.shape
+    return Image(Grid((i, j, k), stride * image.grid.spacing_mm, image.grid.origin_mm, image.grid.direction), values)
+
+
+def control_grid(grid: Grid, spacing_mm: FloatArray) -> Grid:
+    """Control points along a grid's axes whose spline is defined at all of its voxels."""
+    size = (np.array(grid.shape) - 1) * grid.spacing_mm
+    cells = np.ceil(size / spacing_mm).astype(int) + 1
+    i, j, k = (int(n) + 3 for n in cells)
+    before = 0.5 * (cells * spacing_mm - size) + spacing_mm
+    return Grid((i, j, k), spacing_mm, grid.points_at(-before / grid.spacing_mm), grid.direction)
+
+
+def spline_through(deformation: Deformation, control: Grid) -> FloatArray:
+    """Coefficients (3, mi, mj, mk), LPS mm, of the spline that has a deformation's displacement at the control points.
+
+    Where it is not defined there, its nearest value is taken; the second difference at the ends is zero.
+
+    Raises
+    ------
+    InputError
+        If it is defined nowhere.
+    """
+    u = deformation.displacement(control.points().reshape(-1, 3)).reshape(*control.shape, 3)
+    unknown = ~np.isfinite(u).all(axis=-1)
+    if unknown.all():
+        raise InputError("The deformation to start from is not defined anywhere in the unloaded image.")
+    if unknown.any():
+        nearest = distance_transform_edt(
+            unknown, sampling=control.spacing_mm, return_distances=False, return_indices=True
+        )
+        u = u[tuple(nearest)]
+    c = np.moveaxis(u, -1, 0)
+    for axis, n in enumerate(control.shape, start=1):
+        bands = np.repeat([[1.0 / 6.0], [4.0 / 6.0], [1.0 / 6.0]], n, axis=1)
+        bands[1, [0, -1]], bands[0, 1], bands[2, -2] = 1.0, 0.0, 0.0
+        lines = np.moveaxis(c, axis, 0)
+        c = np.moveaxis(solve_banded((1, 1), bands, lines.reshape(n, -1)).reshape(lines.shape), 0, axis)
+    return np.ascontiguousarray(c)
+
+
+def turned(rotation: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Coefficients (3, ...) of a displacement in rotated axes; sums in a fixed order, as BLAS would not do it."""
+    x, y, z = coefficients
+    return np.stack([row[0] * x + row[1] * y + row[2] * z for row in rotation])

@@ -1,0 +1,327 @@
+"""How well a displacement brings two images together, voxel by voxel, and the normal equations of improving it.
+
+The residual is ``r(X) = a(X) I0(X) - I1(X + u(X))``, with a gain a that is smooth (the images' shading differs), over
+all voxels of a mask. Its derivative by u is taken from the *fixed* image, carried by the deformation:
+``grad I1 = a F^-T grad I0``. At voxels, the noise of an image is not correlated with its own central difference; the
+moving image's gradient at places between voxels is correlated with its noise there, and pulls the result after it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from scipy.ndimage import binary_dilation, gaussian_filter, spline_filter
+
+from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from dvc.deformation.bspline import spline_basis
+from dvc.images.image import Grid, Image
+from dvc.images.resample import fill_missing
+from dvc.registration.gauss_newton.spline_kernels import plane_sums
+from dvc.registration.gauss_newton.spline_sums import SplineSums
+
+_GAIN_MM = 10.0
+_CUBE = 4  # voxels; finer halves share the noise of neighbours through gradients and interpolation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Normal:
+    """Normal equations of the images at a displacement, for the voxels that were asked for.
+
+    Attributes
+    ----------
+    matrix : (bi, bj, bk, 6)
+        Sums over each block of ``g g^T``, g the derivative of the moving image: xx, xy, xz, yy, yz, zz.
+    force : (3, mi, mj, mk)
+        Sums over the voxels of ``r g B``, by coefficient.
+    square : float
+        Sum of r^2.
+    count : int
+        Voxels that both images show.
+    """
+
+    matrix: FloatArray
+    force: FloatArray
+    square: float
+    count: int
+
+
+class ImagePair:
+    """Two images, sampled, and the mask and blocks over which they are compared.
+
+    Parameters
+    ----------
+    fixed : Image
+        Its axes are those of the displacement's components.
+    moving : Image
+        In the frame that the displacement leads to.
+    inside : (ni, nj, nk) bool
+        Voxels of ``fixed`` to compare.
+    control : Grid
+        Control points, along the axes of ``fixed`` and around all of it.
+    block : three int
+        Voxels of a block along each axis; normal matrices, gain and strain are held by block.
+    rim_mm : float
+        So far from its ends and gaps the moving image is not used: blurred there, it shows what lies beyond.
+    factors : (ni, nj, nk, splines, 4), optional
+        At the voxels, as in `SplineSums`. Strain is then taken at the first voxel of each block, which lies in one
+        tissue; without, at the block's centre.
+    """
+
+    def __init__(
+        self,
+        fixed: Image,
+        moving: Image,
+        inside: BoolArray,
+        control: Grid,
+        block: IntArray,
+        rim_mm: float = 0.0,
+        factors: FloatArray | None = None,
+    ) -> None:
+        self.grid, self.block = fixed.grid, block
+        missing = fixed.missing
+        self.inside = inside & ~binary_dilation(missing) if missing.any() else inside
+        self._fixed = np.ascontiguousarray(fill_missing(fixed).values)
+        filled = fill_missing(moving).values
+        self._moving = np.ascontiguousarray(spline_filter(filled, order=3, mode="mirror", output=np.float32))
+        self._gaps = _gaps(moving, rim_mm)
+        # Index of the moving image at s mm along the fixed image's axes: start + per_mm s.
+        self._start = moving.grid.indices_of(self.grid.origin_mm)
+        ends = moving.grid.indices_of(self.grid.origin_mm + self.grid.direction.T)
+        self._per_mm = np.ascontiguousarray((ends - self._start).T)
+        self._step = np.array(self.grid.spacing_mm)
+        at = control.indices_of(self.grid.origin_mm)
+        per_voxel = self.grid.spacing_mm / control.spacing_mm
+        count = -(-np.array(self.grid.shape) // block)
+        along = [a + s * np.arange(n) for a, s, n in zip(at, per_voxel, self.grid.shape, strict=True)]
+        self.sums = SplineSums(control, along, self.inside, factors)
+        self._first: tuple[slice, ...] | None = None
+        if factors is None:
+            middles = [s * ((np.arange(n) + 0.5) * b - 0.5) for s, n, b in zip(per_voxel, count, block, strict=True)]
+            self.blocks = SplineSums(control, [a + m for a, m in zip(at, middles, strict=True)], self.share(inside) > 0)
+        else:
+            compared = self.share(inside) > 0
+            self._first = tuple(slice(None, None, int(b)) for b in block)
+            firsts = [a[f] for a, f in zip(along, self._first, strict=True)]
+            self.blocks = SplineSums(control, firsts, compared, np.ascontiguousarray(factors[self._first]))
+        self._carried = np.zeros(self.grid.shape, dtype=np.float32)
+
+    def share(self, where: BoolArray) -> FloatArray:
+        """Volume of each block that lies in ``where``, mm3; with factors, all of it where its first voxel does."""
+        if self._first is not None:
+            return np.asarray(where[self._first] * float(np.prod(self.block)) * self.grid.voxel_volume_mm3)
+        whole = [-(-n // b) * b for n, b in zip(where.shape, self.block, strict=True)]
+        padded = np.pad(where, [(0, w - n) for w, n in zip(whole, where.shape, strict=True)])
+        (a, b, c), (i, j, k) = self.block, (w // b for w, b in zip(whole, self.block, strict=True))
+        counted = padded.reshape(i, a, j, b, k, c).sum(axis=(1, 3, 5))
+        return np.asarray(counted * self.grid.voxel_volume_mm3)
+
+    def normal(self, coefficients: FloatArray, pulled: FloatArray, halves: int = -1) -> Normal:
+        """Normal equations at a displacement.
+
+        Parameters
+        ----------
+        coefficients : (3, mi, mj, mk)
+        pulled : (bi, bj, bk, 3, 3)
+            F^-T at the blocks' centres, which turns gradients of the fixed image into those of the moving one.
+        halves : int
+            0 or 1: of the voxels only one half, every other cube of 4 x 4 x 4 as on a chessboard; -1: all.
+        """
+        shape = self.blocks.inside.shape
+        both, own = np.zeros(shape), np.zeros(shape)
+        first, value, slope = self.sums.table
+        _carry(
+            coefficients, self.inside, first, value, slope, self.sums.factors, self._fixed, self._moving, self._gaps,
+            self._per_mm, self._start, self._step, self.block, self._carried, both, own,
+        )  # fmt: skip
+        sigma = _GAIN_MM / (self.block * self.grid.spacing_mm)
+        smooth = gaussian_filter(own, sigma, mode="constant")
+        gain = gaussian_filter(both, sigma, mode="constant") / np.maximum(smooth, 1e-9 * smooth.max() + 1e-30)
+        matrix, sums = np.zeros((*shape, 6)), np.zeros((shape[0], 2))
+        half = np.zeros((self.grid.shape[0], coefficients.shape[0], 2, *self.sums.control.shape[1:]))
+        _normal(
+            self._fixed, self._carried, self.inside, halves, gain, pulled, self._step, self.block, first,
+            value, self.sums.factors, matrix, sums, half,
+        )  # fmt: skip
+        square, count = sums.sum(axis=0)
+        return Normal(matrix, self.sums.closed(half), float(square), int(count))
+
+
+def _gaps(image: Image, rim_mm: float) -> BoolArray:
+    """Voxels that cannot be used: missing ones, their neighbours, and a rim around them and along the image's ends."""
+    rim = np.rint(rim_mm / image.grid.spacing_mm).astype(int)
+    used = np.zeros(image.grid.shape, dtype=bool)
+    used[tuple(slice(n, size - n) for n, size in zip(rim, used.shape, strict=True))] = True
+    missing = image.missing
+    if missing.any():
+        used &= ~binary_dilation(missing, iterations=max(2, int(rim.max())))
+    return ~used
+
+
+@njit(cache=True)
+def _interpolated(image: Float32Array, gaps: BoolArray, x: float, y: float, z: float) -> float:
+    """Cubic spline at a continuous index; NaN beyond the voxels' centres and near gaps."""
+    ni, nj, nk = image.shape
+    if not (0.0 <= x <= ni - 1 and 0.0 <= y <= nj - 1 and 0.0 <= z <= nk - 1):
+        return np.nan
+    if gaps[int(x + 0.5), int(y + 0.5), int(z + 0.5)]:
+        return np.nan
+    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    a, _ = spline_basis(x - i)
+    b, _ = spline_basis(y - j)
+    c, _ = spline_basis(z - k)
+    total = 0.0
+    for p in range(4):
+        ip = abs(i - 1 + p)
+        ip = ip if ip < ni else 2 * ni - 2 - ip
+        plane = 0.0
+        for q in range(4):
+            jq = abs(j - 1 + q)
+            jq = jq if jq < nj else 2 * nj - 2 - jq
+            if 1 <= k < nk - 2:
+                line = (
+                    c[0] * image[ip, jq, k - 1]
+                    + c[1] * image[ip, jq, k]
+                    + c[2] * image[ip, jq, k + 1]
+                    + c[3] * image[ip, jq, k + 2]
+                )
+            else:
+                line = 0.0
+                for r in range(4):
+                    kr = abs(k - 1 + r)
+                    line += c[r] * image[ip, jq, kr if kr < nk else 2 * nk - 2 - kr]
+            plane += b[q] * line
+        total += a[p] * plane
+    return total
+
+
+@njit(parallel=True, cache=True)
+def _carry(
+    c: FloatArray,
+    inside: BoolArray,
+    first: tuple[IntArray, IntArray, IntArray],
+    value: tuple[FloatArray, FloatArray, FloatArray],
+    slope: tuple[FloatArray, FloatArray, FloatArray],
+    factors: FloatArray,
+    fixed: Float32Array,
+    moving: Float32Array,
+    gaps: BoolArray,
+    per_mm: FloatArray,
+    start: FloatArray,
+    step: FloatArray,
+    block: IntArray,
+    carried: Float32Array,
+    both: FloatArray,
+    own: FloatArray,
+) -> None:
+    """I1(X + u) at the voxels, and sums of I0 I1 and I0 I0 over each block."""
+    ni, nj, nk = inside.shape
+    alone = factors.shape[3] == 0
+    splines = 1 if alone else factors.shape[3]
+    for counted in prange(both.shape[0]):
+        bi = np.int64(counted)
+        plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], c.shape[3]))
+        for i in range(bi * block[0], min(ni, (bi + 1) * block[0])):
+            if not inside[i].any():
+                continue
+            plane_sums(c, first[0][i], value[0][i], slope[0][i], plane)
+            for j in range(nj):
+                if not inside[i, j].any():
+                    continue
+                at = first[1][j]
+                for m in range(row.shape[0]):
+                    for k in range(row.shape[1]):
+                        total = 0.0
+                        for q in range(4):
+                            total += value[1][j, q] * plane[m, 0, at + q, k]
+                        row[m, k] = total
+                for k in range(nk):
+                    if not inside[i, j, k]:
+                        continue
+                    s = (i * step[0], j * step[1], k * step[2])
+                    x, y, z = start[0], start[1], start[2]
+                    for m in range(3):
+                        place = s[m]
+                        for f in range(splines):
+                            a = 1.0 if alone else factors[i, j, k, f, 0]
+                            for r in range(4):
+                                place += a * value[2][k, r] * row[3 * f + m, first[2][k] + r]
+                        x += per_mm[0, m] * place
+                        y += per_mm[1, m] * place
+                        z += per_mm[2, m] * place
+                    found = _interpolated(moving, gaps, x, y, z)
+                    carried[i, j, k] = found
+                    if not np.isnan(found):
+                        here = fixed[i, j, k]
+                        both[bi, j // block[1], k // block[2]] += here * found
+                        own[bi, j // block[1], k // block[2]] += here * here
+
+
+@njit(parallel=True, cache=True)
+def _normal(
+    fixed: Float32Array,
+    carried: Float32Array,
+    inside: BoolArray,
+    halves: int,
+    gain: FloatArray,
+    pulled: FloatArray,
+    step: FloatArray,
+    block: IntArray,
+    first: tuple[IntArray, IntArray, IntArray],
+    value: tuple[FloatArray, FloatArray, FloatArray],
+    factors: FloatArray,
+    matrix: FloatArray,
+    sums: FloatArray,
+    half: FloatArray,
+) -> None:
+    ni, nj, nk = inside.shape
+    alone = factors.shape[3] == 0
+    splines = 1 if alone else factors.shape[3]
+    for counted in prange(gain.shape[0]):
+        bi = np.int64(counted)
+        row = np.empty((half.shape[1], half.shape[4]))
+        for i in range(bi * block[0], min(ni, (bi + 1) * block[0])):
+            before_i, after_i = max(i - 1, 0), min(i + 1, ni - 1)
+            for j in range(nj):
+                if not inside[i, j].any():
+                    continue
+                bj, before_j, after_j = j // block[1], max(j - 1, 0), min(j + 1, nj - 1)
+                row[:] = 0.0
+                for k in range(nk):
+                    found = carried[i, j, k]
+                    if (
+                        not inside[i, j, k]
+                        or np.isnan(found)
+                        or (halves >= 0 and (i // _CUBE + j // _CUBE + k // _CUBE) % 2 != halves)
+                    ):
+                        continue
+                    bk = k // block[2]
+                    a, T = gain[bi, bj, bk], pulled[bi, bj, bk]
+                    r = a * fixed[i, j, k] - found
+                    x = a * (fixed[after_i, j, k] - fixed[before_i, j, k]) / (2.0 * step[0])
+                    y = a * (fixed[i, after_j, k] - fixed[i, before_j, k]) / (2.0 * step[1])
+                    z = a * (fixed[i, j, min(k + 1, nk - 1)] - fixed[i, j, max(k - 1, 0)]) / (2.0 * step[2])
+                    g = (
+                        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
+                        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+                        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
+                    )
+                    N = matrix[bi, bj, bk]
+                    N[0] += g[0] * g[0]
+                    N[1] += g[0] * g[1]
+                    N[2] += g[0] * g[2]
+                    N[3] += g[1] * g[1]
+                    N[4] += g[1] * g[2]
+                    N[5] += g[2] * g[2]
+                    sums[bi, 0] += r * r
+                    sums[bi, 1] += 1.0
+                    for f in range(splines):
+                        share = r if alone else r * factors[i, j, k, f, 0]
+                        for m in range(3):
+                            for q in range(4):
+                                row[3 * f + m, first[2][k] + q] += value[2][k, q] * share * g[m]
+                for m in range(row.shape[0]):
+                    for q in range(4):
+                        for k in range(row.shape[1]):
+                            half[i, m, 0, first[1][j] + q, k] += value[1][j, q] * row[m, k]

@@ -1,0 +1,377 @@
+"""One level of a Gauss-Newton registration: its energy, and steps that lower it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.errors import RegistrationError
+from dvc.images.image import Grid, Image
+from dvc.registration.gauss_newton.image_term import ImagePair, Normal
+from dvc.registration.gauss_newton.roughness import REST, Roughness
+from dvc.registration.gauss_newton.spline_sums import Stiffness
+
+_BLOCKS = 2.5  # blocks between two control points, about
+_LONGEST = 0.45  # of the control spacing: a step of less than that cannot fold by itself
+_HALVINGS = 4
+_SLACK = 1e-3  # the fixed image's gradient is not quite the energy's own: near the end it may rise by as much
+_TOLERANCE, _MOST = 0.1, 60
+_SMALLEST = 1e-6
+_LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
+_FLATTEST = 0.1  # det F below this is taken as this in F^-T
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """Weights of the prior.
+
+    Attributes
+    ----------
+    bending : float
+        1/mm.
+    volume, rigidity : float
+        Of the change of volume in soft tissue, and of strain in what is stiff, 1/mm3.
+    volume_gradient : float
+        Of the gradient of the change of volume in soft tissue, 1/mm: volume may then change, but from place to place
+        only slowly.
+    """
+
+    bending: float
+    volume: float
+    rigidity: float
+    volume_gradient: float = 0.0
+
+    @property
+    def patience(self) -> int:
+        """How many times as many steps to take: where volume may change, each goes less far."""
+        return 2 if self.volume_gradient else 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """A displacement and all that a step from it needs.
+
+    Attributes
+    ----------
+    coefficients : (3 splines, mi, mj, mk)
+    F, cofactor : (bi, bj, bk, 3, 3)
+        Deformation gradient at the blocks' centres, and the derivative of its determinant.
+    J : (bi, bj, bk)
+        det F.
+    bent : (3 splines, mi, mj, mk)
+        Gradient of the bending energy.
+    images : Normal
+    """
+
+    coefficients: FloatArray
+    F: FloatArray
+    cofactor: FloatArray
+    J: FloatArray
+    bent: FloatArray
+    images: Normal
+
+    @property
+    def variance(self) -> float:
+        """Mean square of the residual over the voxels that were asked for."""
+        return self.images.square / self.images.count
+
+
+class Level:
+    """Two images at one resolution, the control points, and the tissue that the prior is about.
+
+    Parameters
+    ----------
+    fixed, moving : Image
+        Components of the displacement are along the axes of ``fixed``; ``moving`` is where it leads.
+    inside : (ni, nj, nk) bool
+        Voxels of ``fixed`` to compare.
+    soft, stiff : (ni, nj, nk) bool
+        Voxels that keep their volume, and voxels that resist strain: bone, if need be skin.
+    control : Grid
+        Control points, around all of ``fixed``.
+    rim_mm : float
+        Along the ends of ``moving``, which is not used there.
+    factors : (ni, nj, nk, splines, 4), optional
+        At the voxels, as in `SplineSums`: the displacement is then a sum of splines.
+    rough : sequence of (float, float)
+        Of each spline, how its bending and its square count beside the first one's bending.
+    laplacians : {1, 2}
+        What its bending is, as in `Roughness`.
+    """
+
+    def __init__(
+        self,
+        fixed: Image,
+        moving: Image,
+        inside: BoolArray,
+        soft: BoolArray,
+        stiff: BoolArray,
+        control: Grid,
+        rim_mm: float = 0.0,
+        factors: FloatArray | None = None,
+        rough: Sequence[tuple[float, float]] = ((1.0, REST),),
+        laplacians: int = 1,
+    ) -> None:
+        block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
+        self.control = control
+        self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm, factors)
+        self.roughness = Roughness(control, rough, laplacians)
+        self._tissue = _share_at(control, soft | stiff, fixed.grid)
+        self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
+        self._resists = self._stiff > 0
+        # between neighbouring blocks of soft tissue: the volume that their difference stands for, over its length^2
+        self._between = [
+            np.minimum(*_neighbours(self._soft, axis)) / length**2
+            for axis, length in enumerate(block * fixed.grid.spacing_mm)
+        ]
+
+    def following(self, coefficients: FloatArray) -> Roughness:
+        """`roughness`, with less weight where this displacement of the tissue is curved."""
+        return self.roughness.following(coefficients, self._tissue)
+
+    def at(self, coefficients: FloatArray, halves: int = -1) -> State:
+        """The state at a displacement; of the voxels all (-1) or one half (0, 1), as in `ImagePair.normal`."""
+        F = self.pair.blocks.evaluate(coefficients)[1] + np.eye(3)
+        cofactor = cofactors(F)
+        J = np.einsum("...a,...a->...", F[..., 0, :], cofactor[..., 0, :])
+        pulled = cofactor / np.maximum(J, _FLATTEST)[..., None, None]
+        images = self.pair.normal(coefficients, pulled, halves)
+        if images.count == 0 or not np.isfinite(images.square):
+            raise RegistrationError("The registration diverged: the two images no longer have a voxel in common.")
+        return State(coefficients, F, cofactor, J, self.roughness.product(coefficients), images)
+
+    def prior(self, state: State, weights: Weights) -> float:
+        """The energy of everything but the images."""
+        strain = _green_lagrange(state.F[self._resists])
+        uneven = weights.volume_gradient * _dot(state.J, self._unevenness(state.J)) if weights.volume_gradient else 0.0
+        return 0.5 * (
+            weights.bending * _dot(state.coefficients, state.bent)
+            + weights.volume * _dot(self._soft, (state.J - 1.0) ** 2)
+            + weights.rigidity * _dot(self._stiff[self._resists], np.einsum("nab,nab->n", strain, strain))
+            + uneven
+        )
+
+    def prior_gradient(self, state: State, weights: Weights) -> FloatArray:
+        """Derivative of `prior` by the coefficients."""
+        pressure = weights.volume * self._soft * (state.J - 1.0)
+        if weights.volume_gradient:
+            pressure += weights.volume_gradient * self._unevenness(state.J)
+        stress = pressure[..., None, None] * state.cofactor
+        F = state.F[self._resists]
+        stress[self._resists] += (weights.rigidity * self._stiff[self._resists])[:, None, None] * (
+            F @ _green_lagrange(F)
+        )
+        return np.asarray(self.pair.blocks.gathered(stress) + weights.bending * state.bent)
+
+    def step(self, state: State, weights: Weights, variance: float, tolerance: float, most: int) -> FloatArray:
+        """The Gauss-Newton step, by conjugate gradients, preconditioned by each control point's own 3 x 3 block."""
+        stiffness: Stiffness = (
+            state.images.matrix / variance,
+            state.cofactor,
+            weights.volume * self._soft,
+            weights.rigidity * self._stiff,
+        )
+        force = state.images.force / variance - self.prior_gradient(state, weights)
+        diagonal = self.pair.blocks.diagonal(self._stiffness_alone(stiffness, weights))
+        for spline, rough in enumerate(self.roughness.diagonals):
+            for entry in (6 * spline, 6 * spline + 3, 6 * spline + 5):
+                diagonal[entry] += weights.bending * rough
+                diagonal[entry] += _SMALLEST * diagonal[entry].max()
+        blocks, roughness = self.pair.blocks, self.roughness
+
+        def product(c: FloatArray) -> FloatArray:
+            out = blocks.product(c, stiffness) + weights.bending * roughness.product(c)
+            if weights.volume_gradient:
+                swelling = np.einsum("...ab,...ab->...", state.cofactor, blocks.evaluate(c)[1])
+                pressure = weights.volume_gradient * self._unevenness(swelling)
+                out += blocks.gathered(pressure[..., None, None] * state.cofactor)
+            return np.asarray(out)
+
+        inverse = np.concatenate([_inverted(own) for own in np.split(diagonal, len(diagonal) // 6)])
+        return conjugate_gradients(product, force, inverse, tolerance, most)
+
+    def descend(
+        self,
+        coefficients: FloatArray,
+        weights: Weights,
+        *,
+        steps: int,
+        stop_mm: float,
+        halves: int = -1,
+        tolerance: float = _TOLERANCE,
+        most: int = _MOST,
+    ) -> FloatArray:
+        """Take steps until they are short, no longer lower the energy, or there were enough.
+
+        Parameters
+        ----------
+        coefficients : (3 splines, mi, mj, mk)
+            To start from.
+        weights : Weights
+        steps : int
+            Most steps.
+        stop_mm : float
+            A step that moves soft tissue by less, root mean square, is the last.
+        halves : int
+            Voxels used: all (-1), or one half (0, 1).
+        tolerance, most : float, int
+            Of the conjugate gradients: reduction of the residual, and iterations.
+        """
+        state = self.at(coefficients, halves)
+        for _ in range(steps):
+            variance = max(state.variance, _LEAST_RESIDUAL**2)
+            count = state.images.count
+
+            def energy(at: State, variance: float = variance, count: int = count) -> float:
+                # with the mean over voxels, so that tissue that leaves the picture does not lower it
+                return 0.5 * count * at.variance / variance + self.prior(at, weights)
+
+            before = energy(state)
+            step = self.step(state, weights, variance, tolerance, most)
+            if not np.isfinite(step).all():
+                raise RegistrationError("The registration diverged: a step is not finite.")
+            step *= min(1.0, _LONGEST / max(self._longest(step), _SMALLEST))
+            for _ in range(_HALVINGS):
+                trial = self.at(state.coefficients + step, halves)
+                if energy(trial) <= before + _SLACK * abs(before):
+                    break
+                step *= 0.5
+            else:
+                break
+            state = trial
+            if self._moved_mm(step) < stop_mm:
+                break
+        return state.coefficients
+
+    def swelling(self, coefficients: FloatArray, percentile: float) -> float:
+        """A percentile of |J - 1| over the blocks that are soft tissue alone."""
+        change = np.abs(self.at(coefficients).J - 1.0)[self._whole_soft]
+        return float(np.percentile(change, percentile))
+
+    def sharpness(self, coefficients: FloatArray) -> float:
+        """How sharply the images see a displacement: median over soft tissue of g^2 / s^2 along an axis, 1/mm5."""
+        state = self.at(coefficients)
+        seen = state.images.matrix[self._whole_soft][:, [0, 3, 5]].mean(axis=1)
+        variance = max(state.variance, _LEAST_RESIDUAL**2)
+        return float(np.median(seen)) / variance / float(self._soft.max())
+
+    @property
+    def _whole_soft(self) -> BoolArray:
+        return np.asarray(self._soft > 0.99 * self._soft.max())
+
+    def _stiffness_alone(self, stiffness: Stiffness, weights: Weights) -> Stiffness:
+        """With what a change of volume in one block alone would cost: for the preconditioner."""
+        if not weights.volume_gradient:
+            return stiffness
+        image, cofactor, volume, shear = stiffness
+        alone = np.zeros_like(self._soft)
+        for axis, between in enumerate(self._between):
+            before, after = _neighbours(alone, axis)
+            before += between
+            after += between
+        return image, cofactor, volume + weights.volume_gradient * alone, shear
+
+    def _unevenness(self, J: FloatArray) -> FloatArray:
+        """Derivative by J of half the integral of |grad J|^2 over soft tissue, by differences, mm."""
+        out = np.zeros_like(J)
+        for axis, between in enumerate(self._between):
+            low, high = _neighbours(J, axis)
+            flow = between * (high - low)
+            before, after = _neighbours(out, axis)
+            before -= flow
+            after += flow
+        return out
+
+    def _longest(self, step: FloatArray) -> float:
+        """The furthest that a step moves tissue, over the control spacing; air may go where it likes."""
+        moved = self.pair.blocks.evaluate(step)[0][(self._soft > 0) | (self._stiff > 0)]
+        return float((np.abs(moved) / self.control.spacing_mm).max(initial=0.0))
+
+    def _moved_mm(self, step: FloatArray) -> float:
+        moved = self.pair.blocks.evaluate(step)[0]
+        square = np.einsum("...a,...a->...", moved, moved)
+        return float(np.sqrt(_dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)))
+
+
+def _share_at(control: Grid, mask: BoolArray, grid: Grid) -> FloatArray:
+    """A mask at control points, 0 to 1, interpolated: the same in any frame, where nearest voxels may be two."""
+    at = np.moveaxis(grid.indices_of(control.points()), -1, 0)
+    return np.asarray(map_coordinates(mask.astype(np.float64), at, order=1, mode="grid-constant"))
+
+
+def _neighbours(field: FloatArray, axis: int) -> tuple[FloatArray, FloatArray]:
+    """Views on the values before and after each border between neighbours along an axis."""
+    along = np.moveaxis(field, axis, 0)
+    return np.moveaxis(along[:-1], 0, axis), np.moveaxis(along[1:], 0, axis)
+
+
+def cofactors(F: FloatArray) -> FloatArray:
+    """Cofactors of matrices (..., 3, 3): cof F = det F F^-T, the derivative of det F."""
+    rows = (np.cross(F[..., 1, :], F[..., 2, :]), np.cross(F[..., 2, :], F[..., 0, :]))
+    return np.stack([*rows, np.cross(F[..., 0, :], F[..., 1, :])], axis=-2)
+
+
+def conjugate_gradients(
+    product: Callable[[FloatArray], FloatArray], force: FloatArray, inverse: FloatArray, tolerance: float, most: int
+) -> FloatArray:
+    """Solve A x = force for a positive definite A given by its product.
+
+    Parameters
+    ----------
+    product : callable
+        A x of x (3 n, ...).
+    force : (3 n, ...)
+    inverse : (6 n, ...)
+        Preconditioner, n symmetric 3 x 3 matrices at each place: xx, xy, xz, yy, yz, zz.
+    tolerance : float
+        Reduction of the residual's preconditioned norm.
+    most : int
+        Iterations at the most.
+    """
+
+    def preconditioned(v: FloatArray) -> FloatArray:
+        out = np.empty_like(v)
+        for n in range(len(v) // 3):
+            xx, xy, xz, yy, yz, zz = inverse[6 * n : 6 * n + 6]
+            x, y, z = v[3 * n : 3 * n + 3]
+            out[3 * n] = xx * x + xy * y + xz * z
+            out[3 * n + 1] = xy * x + yy * y + yz * z
+            out[3 * n + 2] = xz * x + yz * y + zz * z
+        return out
+
+    x, left = np.zeros_like(force), force.copy()
+    weighted = preconditioned(left)
+    along, norm = weighted.copy(), _dot(left, weighted)
+    enough = tolerance**2 * norm
+    for _ in range(most):
+        if norm <= enough:
+            break
+        pushed = product(along)
+        length = norm / _dot(along, pushed)
+        x += length * along
+        left -= length * pushed
+        weighted = preconditioned(left)
+        before, norm = norm, _dot(left, weighted)
+        along = weighted + norm / before * along
+    return x
+
+
+def _inverted(blocks: FloatArray) -> FloatArray:
+    """Inverses of symmetric positive 3 x 3 matrices (6, ...)."""
+    xx, xy, xz, yy, yz, zz = blocks
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    found = np.stack([a, b, c, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy])
+    return np.asarray(found / (xx * a + xy * b + xz * c))
+
+
+def _green_lagrange(F: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (np.swapaxes(F, -1, -2) @ F - np.eye(3)))
+
+
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    """Inner product, summed in an order that does not depend on threads (as BLAS would)."""
+    return float((a * b).sum())

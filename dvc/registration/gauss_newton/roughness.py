@@ -1,0 +1,171 @@
+"""How rough a displacement is: a weight on detail, and less of it where a displacement has been seen to have detail.
+
+Counted is the Laplacian of a cubic B-spline's coefficients, which sees detail of the control points' own size as
+sharply as any, where the spline's own second derivatives let it pass: that detail is noise's. Applied twice, times
+l^4 with l = h / sqrt(2) and h between control points (their mean over the axes), it counts as much as once at a
+wavelength of 4 h, less above and more below; a homogeneous elastic body in equilibrium, whose displacement is
+biharmonic, then costs nothing away from the control grid's faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+from numba import njit, prange
+from scipy.ndimage import gaussian_filter
+
+from dvc.arrays import FloatArray
+from dvc.images.image import Grid
+
+_NEAR_MM = 4.0  # Gaussian over which the square of a Laplacian is averaged
+_LEAST = 0.05  # of its mean: where there is none, the weight still is finite
+_POWER = -0.5  # between a weight that is the same everywhere (0) and one that takes that square for the truth (-1)
+_SMALLEST = 1e-3  # share of a neighbourhood: where less is tissue, the mean of all counts
+_STRAIGHT = 1e-20  # of the square that the largest coefficient would have alone: rounding's, and no curvature
+REST = 1e-5
+"""Of |u|^2 beside the Laplacian's square, 1/mm4: air, which nothing else holds, stays near rest. It outweighs waves
+longer than 11 cm, or 4 cm where the Laplacian counts twice (control points every 3.2 mm)."""
+NUMBERS = {"near_mm": _NEAR_MM, "least": _LEAST, "power": _POWER, "rest": REST}
+"""The numbers that decide what it is, for a record."""
+
+
+class Roughness:
+    """Of several splines on one control grid, ``1/2 int (p c |Δ u|^2 + q |u|^2)``, or with ``l^4 |Δ Δ u|^2``.
+
+    The Laplacian is one of differences between coefficients. On the control grid's faces it leaves out the direction
+    along which there is no neighbour; what costs nothing (but q) is then at most linear along each axis, applied once
+    or twice.
+
+    Parameters
+    ----------
+    control : Grid
+        Control points; coefficients are components along its axes, or in any other orthonormal frame, in mm.
+    weights : sequence of (p, q)
+        Of each spline. The square is counted by the coefficients', times a control cell's volume.
+    laplacians : {1, 2}
+        How often it is applied.
+    here : (ni, nj, nk), optional
+        Weight c at the control points; 1 where it is not given.
+    """
+
+    def __init__(
+        self,
+        control: Grid,
+        weights: Sequence[tuple[float, float]] = ((1.0, REST),),
+        laplacians: int = 1,
+        here: FloatArray | None = None,
+    ) -> None:
+        self._control, self._own, self._times = control, weights, laplacians
+        cell_mm3 = float(np.prod(control.spacing_mm))
+        self._weights = [(p, q * cell_mm3) for p, q in weights]
+        length_mm = float(control.spacing_mm.mean()) / np.sqrt(2.0)
+        scale = cell_mm3 * length_mm ** (4 * (laplacians - 1))
+        self._here = np.full(control.shape, scale) if here is None else scale * here
+        matrices = [_second_differences(n, float(h)) for n, h in zip(control.shape, control.spacing_mm, strict=True)]
+        self._laplacian = [_diagonals(each) for each in matrices]
+        self._transposed = [_diagonals(each.T) for each in matrices]
+        self._diagonal = self._here * _square_of_one(control.spacing_mm, laplacians)
+
+    @property
+    def diagonals(self) -> list[FloatArray]:
+        """Of each spline, about what stands on the matrix' diagonal for any component, (ni, nj, nk).
+
+        Exact where c is the same all around and no face is near.
+        """
+        return [p * self._diagonal + q for p, q in self._weights]
+
+    def product(self, coefficients: FloatArray) -> FloatArray:
+        """The energy's gradient for coefficients (3 splines, ni, nj, nk)."""
+        out = coefficients
+        for _ in range(self._times):
+            out = _summed(out, self._laplacian)
+        out *= self._here
+        for _ in range(self._times):
+            out = _summed(out, self._transposed)
+        for s, (p, q) in enumerate(self._weights):
+            out[3 * s : 3 * s + 3] *= p
+            out[3 * s : 3 * s + 3] += q * coefficients[3 * s : 3 * s + 3]
+        return out
+
+    def following(self, coefficients: FloatArray, tissue: FloatArray) -> Self:
+        """The same with a weight c that is smaller where a displacement is curved, and larger where it is straight.
+
+        c is one over the root of the mean of |Δ u|^2 over the tissue nearby (a Gaussian of 4 mm; in units of the mean
+        over all tissue, to which .05 is added); over all tissue its geometric mean is 1. Of several splines the squares
+        are summed with their weights p. Where there is no curvature but rounding's, c is 1.
+
+        Parameters
+        ----------
+        coefficients : (3 splines, ni, nj, nk)
+            Of that displacement.
+        tissue : (ni, nj, nk)
+            Share of tissue at the control points, 0 to 1.
+        """
+        square = (_summed(coefficients, self._laplacian) ** 2).reshape(-1, 3, *tissue.shape).sum(axis=1)
+        curved = sum(p * each for (p, _), each in zip(self._own, square, strict=True))
+        all_of_it = float(tissue.sum())
+        mean = float((tissue * curved).sum()) / max(all_of_it, _SMALLEST)
+        largest = float(np.abs(coefficients).max() * (2.0 / self._control.spacing_mm**2).sum()) ** 2
+        if mean <= _STRAIGHT * largest:
+            return type(self)(self._control, self._own, self._times)
+        sigma = _NEAR_MM / self._control.spacing_mm
+        share = gaussian_filter(tissue, sigma)
+        nearby = (gaussian_filter(tissue * curved, sigma) + _SMALLEST * mean) / (share + _SMALLEST)
+        here = (nearby / mean + _LEAST) ** _POWER
+        here /= np.exp((tissue * np.log(here)).sum() / all_of_it)
+        return type(self)(self._control, self._own, self._times, here)
+
+
+def _second_differences(count: int, spacing_mm: float) -> FloatArray:
+    """Matrix (count, count) of second differences, 1/mm2; none at the two ends."""
+    found = np.zeros((count, count))
+    row = np.arange(1, count - 1)
+    for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
+        found[row, row + shift] = factor / spacing_mm**2
+    return found
+
+
+def _diagonals(matrix: FloatArray) -> FloatArray:
+    """A tridiagonal matrix (n, n) by its rows' entries below, on and above the diagonal, (3, n)."""
+    found = np.zeros((3, len(matrix)))
+    found[0, 1:], found[1], found[2, :-1] = matrix.diagonal(-1), matrix.diagonal(), matrix.diagonal(1)
+    return found
+
+
+def _square_of_one(spacing_mm: FloatArray, laplacians: int) -> float:
+    """The sum of squares of the Laplacian of one coefficient of 1 mm, far from any face, mm2 over its length."""
+    one = np.zeros((1, 7, 7, 7))
+    one[0, 3, 3, 3] = 1.0
+    for _ in range(laplacians):
+        one = _summed(one, [_diagonals(_second_differences(7, float(h))) for h in spacing_mm])
+    return float((one**2).sum())
+
+
+def _summed(coefficients: FloatArray, along: Sequence[FloatArray]) -> FloatArray:
+    """The sum of three tridiagonal matrices, each applied along its own axis of (m, ni, nj, nk)."""
+    out = np.empty_like(coefficients)
+    _three_axes(coefficients, along[0], along[1], along[2], out)
+    return out
+
+
+@njit(parallel=True, cache=True)
+def _three_axes(c: FloatArray, di: FloatArray, dj: FloatArray, dk: FloatArray, out: FloatArray) -> None:
+    ni, nj, nk = c.shape[1], c.shape[2], c.shape[3]
+    for counted in prange(ni):
+        i = np.int64(counted)  # numba counts without a sign
+        before_i, after_i = i - (i > 0), i + (i < ni - 1)
+        for m in range(c.shape[0]):
+            for j in range(nj):
+                here, onto = c[m, i, j], out[m, i, j]
+                w, x = c[m, before_i, j], c[m, after_i, j]
+                y, z = c[m, i, max(j - 1, 0)], c[m, i, min(j + 1, nj - 1)]
+                middle = di[1, i] + dj[1, j]
+                for k in range(nk):  # written out, so that the compiler takes several k at once
+                    onto[k] = di[0, i] * w[k] + di[2, i] * x[k] + dj[0, j] * y[k] + dj[2, j] * z[k]
+                    onto[k] += (middle + dk[1, k]) * here[k]
+                for k in range(1, nk):
+                    onto[k] += dk[0, k] * here[k - 1]
+                for k in range(nk - 1):
+                    onto[k] += dk[2, k] * here[k + 1]

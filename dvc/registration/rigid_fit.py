@@ -1,0 +1,267 @@
+"""A rigid motion between two images, by Gauss-Newton over the voxels of a mask, from a start right to a few mm.
+
+Sought is the motion T for which I1(T(X)) comes closest to g(X) I0(X) + o at voxels X, with a gain g quadratic in place.
+A small motion d(X) = p + w x (X - c) of the voxels before T changes I1(T(X)) by g grad I0 . d; so what is left of the
+difference is regressed on the six columns of grad I0 . d, and T becomes T after d (inverse compositional; Baker and
+Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). Images are blurred at first, by less and less.
+
+Three things would pull a mask along its edges. Shading, which its correction leaves in part: the gain takes it up.
+Noise in I0, which makes a slope too small that is regressed on it: so the gain is found with the mean of each voxel's
+six neighbours as instrument, whose noise is another (but where a scanner has interpolated its voxels). And the noise
+of a gradient between voxels, which goes with the noise beside it: that of the unloaded image at its voxels, a
+difference of two neighbours, is correlated neither with the voxel between them nor with the neighbours' mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_erosion, convolve, map_coordinates, spline_filter
+from scipy.spatial.transform import Rotation
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.deformation.protocol import RigidMotion
+from dvc.errors import InputError, RegistrationError
+from dvc.images.image import Grid, Image, Mask
+from dvc.images.resample import fill_missing, smoothed
+
+_BLURS_MM = (4.0, 2.0, 1.0, 0.0)
+_FINE_FROM = 1  # of these, for fits that begin near the end
+_VOXELS_PER_BLUR = 1.5  # blurred images are compared at every voxel that lies so much closer than the blur
+_STEPS = 40
+_SMALL_MM = 1e-4  # a step that moves the voxels by less, root mean square, is the last
+_SMALL_SHARE = 0.01  # or by less than this share of the blur, where it is more
+_LONGEST_MM = 2.0
+_LEAST_SHOWN = 0.5
+_LEAST_GAIN = 0.1  # of what the images' standard deviations make it: a gain near zero would blow up what is left
+_SHADED_MM = 10.0  # a mask whose voxels lie nearer to its centre, root mean square, has one gain: too small for more
+_BLOCK_MM = 8.0  # halves of the mask are made of cubes of this size, like a chessboard: neighbours share noise
+_BLOCK_SHARE = 0.7  # or of this share of the root mean square distance to the centre, where that is less
+_LEAST_SHARE = 0.25  # a half that gets less is drawn voxel by voxel
+_LEAST_VOXELS = 16
+_FEW = 0.5  # of the voxels that an image shows
+_ASIDE_MM = 1.5  # by which the two fits of a pair begin to either side
+_FARTHEST_MM = 15.0
+_NEIGHBOURS = np.where(np.abs(np.indices((3, 3, 3)) - 1).sum(axis=0) == 1, 1.0 / 6.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Level:
+    """Both images with one blur: the unloaded one at points of the mask, the loaded one whole.
+
+    Attributes
+    ----------
+    points : (n, 3)
+        LPS mm.
+    values, around : (n,)
+        I0, and the mean of the six neighbours'.
+    places : (n, 10 or 1)
+        Polynomials of place of which the gain is a sum.
+    changes : (n, 6)
+        grad I0 . d for unit steps of the six unknowns.
+    scene, order
+        The loaded image, as coefficients of splines of that order.
+    """
+
+    blur_mm: float
+    points: FloatArray
+    values: FloatArray
+    around: FloatArray
+    places: FloatArray
+    changes: FloatArray
+    scene: Image
+    order: int
+
+
+class RigidFit:
+    """Fits of one mask's voxels in one pair of images, from any start.
+
+    Parameters
+    ----------
+    reference, loaded : Image
+        Of one contrast, but for an offset, and a gain that changes smoothly in place.
+    mask : Mask
+        On the reference grid.
+    seed : int
+        Of the ways in which the mask is divided into halves.
+
+    Raises
+    ------
+    InputError
+        If the unloaded image has values at fewer than 16 of the mask's voxels, or is a single slice.
+    """
+
+    def __init__(self, reference: Image, loaded: Image, mask: Mask, seed: int) -> None:
+        known = _surrounded(reference, mask)
+        points = known.points()
+        if min(mask.grid.shape) < 2:
+            raise InputError("The unloaded image is a single slice: a motion in space takes a volume to align.")
+        if len(points) < _LEAST_VOXELS:
+            raise InputError(f"The unloaded image shows {len(points)} voxels of the mask: too few to align on.")
+        self._centre = points.mean(axis=0)
+        self._radius_mm = float(np.sqrt(np.mean(np.sum((points - self._centre) ** 2, axis=1))))
+        self._block_mm = max(min(_BLOCK_MM, _BLOCK_SHARE * self._radius_mm), float(mask.grid.spacing_mm.max()))
+        self._random = np.random.default_rng(seed)
+        # In units of the bone's own brightness: an offset beside large numbers would be lost in rounding.
+        brightness = float(np.sqrt(np.mean(reference.values[known.inside].astype(np.float64) ** 2))) or 1.0
+        reference, loaded = (Image(i.grid, i.values / np.float32(brightness)) for i in (reference, loaded))
+        missing = loaded.missing
+        self._gaps = Image(loaded.grid, missing.astype(np.float32)) if missing.any() else None
+        scenes = _scenes(fill_missing(loaded))
+        self._levels = [self._level(reference, known, blur, scenes[blur]) for blur in _BLURS_MM]
+
+    def whole(self, start: RigidMotion) -> RigidMotion:
+        """The motion found from a start by all of the voxels.
+
+        Raises
+        ------
+        RegistrationError
+            If half of the voxels leave what the loaded image shows, its contrast there is turned round, or the motion
+            goes off by 15 mm.
+        """
+        motion = start
+        for level in self._levels:
+            motion = self._settled(level, motion, np.ones(len(level.points), dtype=bool))
+        points = self._levels[0].points
+        moved_mm = float(np.sqrt(np.mean(np.sum((motion.apply(points) - start.apply(points)) ** 2, axis=1))))
+        if moved_mm > _FARTHEST_MM:
+            raise RegistrationError(f"The fit went off by {moved_mm:.0f} mm.")
+        return motion
+
+    def halves(self, near: RigidMotion) -> list[tuple[RigidMotion, RigidMotion]]:
+        """Pairs of motions found by one half of the voxels each, begun to either side of one that is near.
+
+        One pair for each way to move on which the images tell something by itself, the axes of the normal equations,
+        and with a division of its own. Along a way of which they tell nothing its pair stays apart, or noise leads the
+        halves to places that agree by chance alone.
+
+        Raises
+        ------
+        RegistrationError
+            If half of a half's voxels leave what the loaded image shows, or its contrast there is turned round.
+        """
+        changes = self._levels[-1].changes
+        _, ways = np.linalg.eigh(np.einsum("ni,nj->ij", changes, changes))
+        pairs = []
+        for way in _ASIDE_MM * ways.T:
+            corner = self._random.uniform(0.0, 2.0 * self._block_mm, 3)
+            halves = [self._divided(level.points, corner) for level in self._levels[_FINE_FROM:]]
+            one = self._part(near.after(self._step(way)), halves)
+            other = self._part(near.after(self._step(-way)), [~half for half in halves])
+            pairs.append((one, other))
+        return pairs
+
+    def _divided(self, points: FloatArray, corner: FloatArray) -> BoolArray:
+        blocks = np.floor((points - self._centre + corner) / self._block_mm).astype(int)
+        half = blocks.sum(axis=1) % 2 == 0
+        if not _LEAST_SHARE <= half.mean() <= 1.0 - _LEAST_SHARE:
+            half = self._random.permuted(np.arange(len(half)) % 2 == 0)
+        return np.asarray(half)
+
+    def _part(self, motion: RigidMotion, parts: list[BoolArray]) -> RigidMotion:
+        for level, part in zip(self._levels[_FINE_FROM:], parts, strict=True):
+            motion = self._settled(level, motion, part)
+        return motion
+
+    def _level(self, reference: Image, mask: Mask, blur_mm: float, scene: Image) -> _Level:
+        box = mask.box(int(np.ceil(3.0 * blur_mm / mask.grid.spacing_mm.min())) + 2)
+        inside, part = mask.inside[box], Image(mask.grid.part(box), reference.values[box])
+        fixed = fill_missing(smoothed(part, blur_mm) if blur_mm else part).values.astype(np.float64)
+        slopes = np.stack(list(np.gradient(fixed, *part.grid.spacing_mm)), axis=-1)
+        thin = np.zeros(inside.shape, dtype=bool)
+        thin[_every(part.grid, blur_mm)] = True
+        at = np.argwhere(inside & thin)
+        if len(at) < _LEAST_VOXELS:
+            at = np.argwhere(inside)
+        points = part.grid.points_at(at.astype(np.float64))
+        gradient = slopes[tuple(at.T)] @ part.grid.direction.T
+        turning = np.cross(points - self._centre, gradient) / self._radius_mm
+        values = fixed[tuple(at.T)]
+        x, y, z = ((points - self._centre) / self._radius_mm).T
+        places = np.column_stack([np.ones(len(at)), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x])
+        if self._radius_mm < _SHADED_MM:
+            places = places[:, :1]
+        around = convolve(fixed, _NEIGHBOURS, mode="nearest")[tuple(at.T)]
+        return _Level(
+            blur_mm, points, values, around, places, np.hstack([gradient, turning]), scene, 1 if blur_mm else 3
+        )
+
+    def _settled(self, level: _Level, motion: RigidMotion, part: BoolArray) -> RigidMotion:
+        """Where steps over some of a level's points come to rest."""
+        small = max(_SMALL_MM, _SMALL_SHARE * level.blur_mm)
+        for _ in range(_STEPS):
+            step = self._next(level, motion, part)
+            length = float(np.linalg.norm(step))
+            motion = motion.after(self._step(step * min(1.0, _LONGEST_MM / max(length, 1e-12))))
+            if length < small:
+                break
+        return motion
+
+    def _next(self, level: _Level, motion: RigidMotion, part: BoolArray) -> FloatArray:
+        """The next step (6,), mm: along the axes, and turns about them times the mask's radius."""
+        moved = motion.apply(level.points[part])
+        at = level.scene.grid.indices_of(moved).T
+        last = np.array(level.scene.grid.shape)[:, None] - 1
+        shown = np.all((at >= 0) & (at <= last), axis=0)
+        if self._gaps is not None:
+            here = self._gaps.grid.indices_of(moved[shown]).T
+            shown[shown] = map_coordinates(self._gaps.values, here, order=1, mode="nearest") < 1e-6
+        if np.count_nonzero(shown) < _LEAST_SHOWN * len(shown):
+            raise RegistrationError("The bone leaves the loaded image.")
+        carried = map_coordinates(level.scene.values, at[:, shown], order=level.order, prefilter=False, mode="mirror")
+        values, places, changes = level.values[part][shown], level.places[part][shown], level.changes[part][shown]
+        if not ((values - values.mean()) * (carried - carried.mean())).sum() > 0.0:
+            raise RegistrationError("What is brighter in the unloaded image is not brighter in the loaded one.")
+        columns, by = (
+            np.column_stack([places * seen[:, None], np.ones(len(seen))])
+            for seen in (values, level.around[part][shown])
+        )
+        found = _regressed(columns, carried, by)
+        gain = np.einsum("ni,i->n", places, found[:-1])
+        gain = np.maximum(gain, _LEAST_GAIN * carried.std() / values.std())
+        return _regressed(changes, values - (carried - found[-1]) / gain)
+
+    def _step(self, step: FloatArray) -> RigidMotion:
+        turn = Rotation.from_rotvec(step[3:] / self._radius_mm).as_matrix()
+        return RigidMotion.about(self._centre, turn, step[:3])
+
+
+def _surrounded(image: Image, mask: Mask) -> Mask:
+    """The voxels of a mask that the image shows with all of their six neighbours; if those are few, all that it shows.
+
+    Beside a gap or the image's end differences and means of neighbours have a voxel's own noise in them.
+    """
+    shown = ~image.missing
+    surrounded, inside = mask.inside & binary_erosion(shown), mask.inside & shown
+    few = np.count_nonzero(surrounded) < _FEW * np.count_nonzero(inside)  # of few slices most lie at an end
+    return Mask(mask.grid, inside if few else surrounded)
+
+
+def _regressed(columns: FloatArray, on: FloatArray, instruments: FloatArray | None = None) -> FloatArray:
+    """Least squares, or with instruments in the columns' place; by sums whose bits do not depend on threads."""
+    by = columns if instruments is None else instruments
+    normal, right = np.einsum("ni,nj->ij", by, columns), np.einsum("ni,n->i", by, on)
+    return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-9)[0])
+
+
+def _scenes(loaded: Image) -> dict[float, Image]:
+    """The loaded image by its blur: cubic coefficients without, and values at fewer voxels the more it is blurred."""
+    scenes, now, blurred = {}, loaded, 0.0
+    for blur in sorted(_BLURS_MM):
+        if not blur:
+            scenes[blur] = Image(loaded.grid, spline_filter(loaded.values, 3, np.float32, "mirror"))
+            continue
+        now, blurred = smoothed(now, float(np.sqrt(blur**2 - blurred**2))), blur
+        every = _every(now.grid, blur)
+        values = now.values[every]
+        spacing = now.grid.spacing_mm * [one.step for one in every]
+        now = Image(Grid(values.shape, spacing, now.grid.origin_mm, now.grid.direction), values)
+        scenes[blur] = now
+    return scenes
+
+
+def _every(grid: Grid, blur_mm: float) -> tuple[slice, slice, slice]:
+    """As many of a grid's voxels as an image needs that is blurred so much."""
+    i, j, k = (slice(None, None, max(1, int(blur_mm / _VOXELS_PER_BLUR / s))) for s in grid.spacing_mm)
+    return i, j, k

@@ -1,0 +1,255 @@
+"""Figures of a registration, each as PNG bytes: slices in three planes through a point, and curves.
+
+All panels of a figure share one scale, so a length is the same everywhere. How slices lie on the page:
+`dvc.report.planes`. Yellow marks at a panel's edge show where the other planes cut. Voxels without a value are never
+drawn as zero: the loaded image is dark blue there, a map leaves the image below it plain.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter
+from scipy.ndimage import map_coordinates
+
+from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.errors import GeometryError, InputError
+from dvc.images.image import Image, LabelMap
+from dvc.report.planes import AXES, Plane, Values, View
+from dvc.report.sheet import DPI, FONT, INK, SHADOW, UNSEEN, WIDTH_IN, Sheet, levelled, png_bytes, window_of
+from dvc.trust.regions import volume_above
+
+# The palette of Okabe and Ito, told apart by all common kinds of colour vision.
+REGION_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_STAGES = ("After the rigid alignment", "After the whole registration")
+_CHECK_MM = 12.0
+_LINE_MM = 5.0
+_HIGHEST_SHEAR = 0.6
+
+
+def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
+    """Unloaded image in green and loaded image in magenta: after the rigid alignment, and after all.
+
+    Where both agree the picture is grey, but for a faint tint over whole regions where the scans' shading differs; a
+    coloured rim is a border that lies elsewhere in the other image. Yellow marks: where the other planes cut.
+    Dark blue: the loaded scan does not show this place.
+    """
+    sheet = Sheet(view, _STAGES)
+    window = window_of(view, reference.values)
+    for row, carried in zip(sheet.rows, (rigid, registered), strict=True):
+        own = window_of(view, carried)
+        for plane, axes in row.items():
+            green = levelled(view.cut(reference.values, plane), window)
+            magenta = levelled(view.cut(carried, plane), own)
+            page = np.stack([magenta, green, magenta], axis=-1)
+            page[np.isnan(page).any(axis=-1)] = UNSEEN
+            sheet.paint(plane, axes, page)
+    return sheet.png()
+
+
+def checkerboard(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
+    """Fields of 12 mm in turn from the unloaded and the loaded image: after the rigid alignment, and after all.
+
+    Where the registration is right, borders run on across the fields without a step.
+    """
+    sheet = Sheet(view, _STAGES)
+    window = window_of(view, reference.values)
+    for row, carried in zip(sheet.rows, (rigid, registered), strict=True):
+        own = window_of(view, carried)
+        for plane, axes in row.items():
+            a = levelled(view.cut(reference.values, plane), window)
+            b = levelled(view.cut(carried, plane), own)
+            _, across, along = AXES[plane]
+            spacing = view.grid.toward_lps().spacing_mm
+            down, right = np.indices(a.shape)
+            odd = (down * spacing[along] // _CHECK_MM + right * spacing[across] // _CHECK_MM) % 2 == 1
+            page = np.repeat(np.where(odd, b, a)[..., None], 3, axis=-1)
+            page[np.isnan(page[..., 0])] = UNSEEN
+            sheet.paint(plane, axes, page)
+    return sheet.png()
+
+
+def strain_slices(
+    view: View, reference: Image, max_shear: Float32Array, largest: float, outline: LabelMap | None = None
+) -> bytes:
+    """Maximal shear strain (E1 - E3)/2 in colour over the unloaded image, in the reference configuration.
+
+    Thin white lines are the borders of the regions. The image stays plain grey where there is no result.
+    """
+    if not largest > 0:
+        raise InputError(f"The end of the colour bar for maximal shear must be positive; got {largest}.")
+    told = "maximal shear strain (E₁ − E₃)/2, no unit"
+    return _coloured(view, reference, max_shear, largest, "viridis", told, outline)
+
+
+def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
+    """Standard deviation of the maximal shear in colour over the unloaded image, by the error model of the preset.
+
+    The image stays plain grey where there is no result, and in bone.
+    """
+    told = "standard deviation of the maximal shear, no unit"
+    return _coloured(view, reference, sigma, largest, "cividis", told, None)
+
+
+def _coloured(
+    view: View, reference: Image, values: Float32Array, largest: float, shades: str, told: str, outline: LabelMap | None
+) -> bytes:
+    sheet = Sheet(view, [""], bar=True)
+    window = window_of(view, reference.values)
+    colours, norm = colormaps[shades], Normalize(0.0, largest)
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, reference.values, window)
+        sheet.colours(plane, axes, values, colours, norm)
+        if outline is not None:
+            labels = view.cut(outline.labels, plane)
+            sheet.outlines(plane, axes, (labels == label for label in outline.names))
+    beyond = bool((view.shown(values) > largest).any())
+    sheet.bar(colours, norm, told, "max" if beyond else "neither")
+    return sheet.png()
+
+
+def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> bytes:
+    """Volume ratio det F in colour over the unloaded image: purple shrinks, orange grows, white keeps its volume.
+
+    Red, with the number of voxels, is where the deformation folds (det F <= 0): no result can be trusted there.
+    """
+    sheet = Sheet(view, [""], bar=True)
+    window = window_of(view, reference.values)
+    shown = view.shown(jacobian)
+    change = np.abs(shown[shown > 0.0] - 1.0)
+    reach = float(np.clip(np.ceil(np.percentile(change, 99.0) * 10) / 10, 0.1, 0.8)) if change.size else 0.1
+    shades, norm = colormaps["PuOr_r"], Normalize(1.0 - reach, 1.0 + reach)
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, reference.values, window)
+        sheet.colours(plane, axes, jacobian, shades, norm)
+        folded = view.cut(jacobian, plane) <= 0.0
+        if folded.any():
+            red = np.zeros((*folded.shape, 4))
+            red[folded] = (1.0, 0.0, 0.0, 1.0)
+            sheet.paint(plane, axes, red, interpolation="nearest")
+            told = f"folded: {np.count_nonzero(folded)} voxels"
+            style: dict[str, Any] = {"color": "#FF8A80", "weight": "bold", "path_effects": SHADOW}
+            axes.text(0.5, 0.08, told, transform=axes.transAxes, ha="center", **style, **FONT)
+    ends = (bool((shown < 1.0 - reach).any()), bool((shown > 1.0 + reach).any()))
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}[ends]
+    sheet.bar(shades, norm, "volume ratio det F, no unit", extend)
+    return sheet.png()
+
+
+def similarity_slices(view: View, rigid: Float32Array, registered: Float32Array) -> bytes:
+    """Local correlation of the loaded with the unloaded image: after the rigid alignment, and after all.
+
+    Yellow: alike. Dark: not alike, or a place without any structure that could be compared.
+    """
+    sheet = Sheet(view, _STAGES, bar=True)
+    shades, norm = colormaps["cividis"], Normalize(0.0, 1.0)
+    for row, values in zip(sheet.rows, (rigid, registered), strict=True):
+        for plane, axes in row.items():
+            page = np.ma.masked_invalid(view.cut(values, plane))
+            sheet.paint(plane, axes, page, cmap=shades, norm=norm, interpolation="nearest")
+    below = any(bool((view.shown(values) < 0.0).any()) for values in (rigid, registered))
+    sheet.bar(shades, norm, "local correlation (1: alike), no unit", "min" if below else "neither")
+    return sheet.png()
+
+
+def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Array, bone: BoolArray | None) -> bytes:
+    """Material lines over the loaded image, whose bone (orange) lies on that of the unloaded one.
+
+    Unloaded, the lines are straight and 5 mm apart; the measured displacement carries them, and they should follow
+    the tissue that is seen below. Only the two components in the plane are drawn; lines end where there is no result.
+    """
+    if displacement_mm.shape[3:] != (3,):
+        raise GeometryError(f"A displacement needs three components per voxel; got shape {displacement_mm.shape}.")
+    planes: tuple[Plane, ...] = ("sagittal", "coronal")
+    sheet = Sheet(view, [""], planes)
+    window = window_of(view, aligned)
+    for plane, axes in sheet.rows[0].items():
+        sheet.grey(plane, axes, aligned, window)
+        lines = carried_lines(view, plane, displacement_mm)
+        axes.add_collection(LineCollection(lines, colors="#56D4FF", linewidths=1.1), autolim=False)
+        if bone is not None:
+            sheet.outlines(plane, axes, [view.cut(bone, plane)], "#FFB000")
+    return sheet.png()
+
+
+def carried_lines(view: View, plane: Plane, displacement_mm: Values) -> list[FloatArray]:
+    """Lines of a square grid of 5 mm in a slice, where the displacement carries them.
+
+    Parameters
+    ----------
+    displacement_mm : (ni, nj, nk, 3)
+        u(X), LPS components; NaN where not defined, which cuts the lines. The component across the slice is left out.
+
+    Returns
+    -------
+    list of (n, 2)
+        Points across and along the page, mm in the frame of `View.extent_mm`.
+    """
+    left, right, bottom, top = view.extent_mm(plane)
+    low, high = min(bottom, top), max(bottom, top)
+    _, across, along = AXES[plane]
+    in_plane = view.grid.toward_lps().direction[:, [across, along]]
+    u = np.asarray(view.cut(displacement_mm, plane), dtype=np.float64) @ in_plane
+    xs, ys = np.arange(left + _LINE_MM / 2, right, _LINE_MM), np.arange(low + _LINE_MM / 2, high, _LINE_MM)
+    fine_x, fine_y = np.arange(left, right, 0.5), np.arange(low, high, 0.5)
+    straight = [np.column_stack([np.full_like(fine_y, x), fine_y]) for x in xs]
+    straight += [np.column_stack([fine_x, np.full_like(fine_x, y)]) for y in ys]
+    carried: list[FloatArray] = []
+    for line in straight:
+        row = (line[:, 1] - top) / (bottom - top) * u.shape[0] - 0.5
+        column = (line[:, 0] - left) / (right - left) * u.shape[1] - 0.5
+        at = np.stack([row, column])
+        moved = line + np.stack([map_coordinates(u[..., c], at, order=1, cval=np.nan) for c in (0, 1)], axis=-1)
+        known = np.isfinite(moved).all(axis=1)
+        breaks = np.flatnonzero(np.diff(known.astype(np.int8))) + 1
+        carried += [part for part in np.split(moved, breaks) if len(part) > 1 and np.isfinite(part[0]).all()]
+    return carried
+
+
+def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float | None = None) -> bytes:
+    """Volume of each region whose maximal shear exceeds a value, mL: the exact step curve, without bins.
+
+    Both panels show the same curves; the logarithmic axis opens up the small volumes at high strain.
+    The legend tells the share of a region that has no result; its curve is a lower bound.
+    """
+    figure = Figure(figsize=(WIDTH_IN, 3.8), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    panels: tuple[Axes, Axes] = figure.subplots(1, 2)
+    at = np.linspace(0.0, _HIGHEST_SHEAR, 1501)  # finer than a dot of the figure; each ordinate is exact
+    voxel_ml = labels.grid.voxel_volume_mm3 / 1000.0
+    for number, (label, name) in enumerate(labels.names.items()):
+        values = max_shear[labels.labels == label]
+        if not np.isfinite(values).any():
+            continue
+        above = volume_above(values, voxel_ml, at)
+        undefined = float(np.isnan(values).mean())
+        told = name if undefined < 0.0005 else f"{name} ({undefined:.1%} without a result)"
+        told = told.replace("$", r"\$")  # a dollar would start a formula
+        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+        dashes = ("-", "--", ":")[number // len(REGION_COLOURS) % 3]
+        for axes, shown in zip(panels, (above, np.where(above > 0, above, np.nan)), strict=True):
+            axes.step(at, shown, where="post", color=colour, linestyle=dashes, linewidth=1.8, label=told)
+    panels[1].set_yscale("log")
+    panels[1].yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    for axes, scale in zip(panels, ("linear", "logarithmic"), strict=True):
+        axes.set_xlim(0.0, _HIGHEST_SHEAR)
+        axes.set_title(f"Volume above a strain, {scale} axis", loc="left", color=INK, fontsize=10)
+        axes.set_xlabel("maximal shear strain (E₁ − E₃)/2, no unit", color=INK, **FONT)
+        axes.set_ylabel("volume above, mL", color=INK, **FONT)
+        axes.grid(True, color="#d9dee4", linewidth=0.6)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=9)
+        if noise_floor is not None:
+            axes.axvspan(0.0, noise_floor, color="#9aa5b1", alpha=0.35, linewidth=0, label="below the noise floor")
+    panels[0].set_ylim(bottom=0.0)
+    if panels[0].get_legend_handles_labels()[0]:
+        panels[0].legend(fontsize=9, frameon=False)
+    return png_bytes(figure)

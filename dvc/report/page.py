@@ -1,0 +1,151 @@
+"""The building blocks of a report page: verdicts, tables and figures in one self-contained HTML file."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import jinja2
+import numpy as np
+
+from dvc.atomic_files import write_whole
+from dvc.errors import InputError
+from dvc.report.viewer import Viewer, script
+from dvc.trust.verdict import Verdict
+
+Cell = str | float | int | None
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_CSS_PIXELS_PER_DOT = 96 / 120  # figures are drawn at 120 dots per inch: text of 10 pt is then 10 pt on the page
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure with what it shows and how to read it.
+
+    Raises
+    ------
+    InputError
+        If ``png`` is not a PNG file.
+    """
+
+    title: str
+    caption: str
+    png: bytes
+
+    def __post_init__(self) -> None:
+        if not self.png.startswith(_PNG_SIGNATURE):
+            raise InputError(f"The figure '{self.title}' is no PNG file; it begins with {self.png[:8]!r}.")
+
+    @property
+    def data(self) -> str:
+        """The picture for an ``img`` element."""
+        return "data:image/png;base64," + base64.b64encode(self.png).decode()
+
+    @property
+    def width(self) -> int:
+        """Width on the page, CSS pixels."""
+        return round(int.from_bytes(self.png[16:20], "big") * _CSS_PIXELS_PER_DOT)
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows under named columns; numbers are shown to three digits, missing ones as a dash.
+
+    Rows ``apart`` stand below a line: what the others are to be seen beside.
+
+    Raises
+    ------
+    InputError
+        If a row has not one cell for each column.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+    apart: tuple[tuple[Cell, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        for number, row in enumerate((*self.rows, *self.apart)):
+            if len(row) != len(self.columns):
+                raise InputError(
+                    f"Row {number} of the table '{self.title}' has {len(row)} cells, its header "
+                    f"{len(self.columns)}; give one for each column."
+                )
+
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """Whether each column holds numbers and missing values alone, and is set flush right."""
+        columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(self.columns)
+        return tuple(bool(column) and not any(isinstance(c, str) for c in column) for column in columns)
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of a report with its own verdict, or without one."""
+
+    title: str
+    verdict: Verdict | None = None
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    paragraphs: tuple[str, ...] = ()
+    viewers: tuple[Viewer, ...] = ()
+
+
+def shown(value: Cell) -> str:
+    """Return a table cell as people read it.
+
+    Examples
+    --------
+    >>> [shown(v) for v in (0.123456, 1234.5, 12, float("nan"), None, "fat")]
+    ['0.123', '1234', '12', '–', '–', 'fat']
+    """
+    if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
+        return "–"
+    if isinstance(value, float | np.floating):
+        return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return str(value)
+
+
+def write_report(
+    path: Path,
+    title: str,
+    verdict: Verdict | None,
+    sections: Sequence[Section],
+    closing: Sequence[Section],
+    provenance: Mapping[str, str],
+    *,
+    notes: Sequence[str] = (),
+) -> None:
+    """Write a report: verdict first, if there is one, then the sections, the closing ones, and where it all came from.
+
+    One HTML file without anything to fetch, and without scripts but for a section's viewer; all text is escaped. A list
+    of the sections with their verdicts stands at the top where there are two or more; ``notes``, a line each, stand
+    between the verdict and it.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["shown"] = shown
+    template = environment.from_string(
+        (files("dvc.report") / "templates" / "report.html.j2").read_text(encoding="utf-8")
+    )
+    page = template.render(
+        title=title,
+        verdict=verdict,
+        sections=list(sections),
+        closing=list(closing),
+        provenance=dict(provenance),
+        notes=list(notes),
+        script=script() if any(section.viewers for section in sections) else "",
+    )
+    write_whole(path, page)

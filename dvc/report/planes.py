@@ -1,0 +1,152 @@
+"""Three planes through a point of a grid, cut out as they lie on the page.
+
+Slices are shown as radiologists read them, whatever the grid's own axes: sagittal seen from the left
+(anterior on the left of the page), coronal from the front and axial from below (the patient's right on the left).
+They are cut along the grid's axes, never resampled; where those are oblique the titles say so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from dvc.arrays import BoolArray
+from dvc.errors import GeometryError
+from dvc.images.image import Grid
+
+Plane = Literal["sagittal", "coronal", "axial"]
+Values = npt.NDArray[Any]
+
+PLANES: tuple[Plane, ...] = ("sagittal", "coronal", "axial")
+# Axes of the L, P, S grid: the one cut, the one across the page, the one up or down it.
+AXES: dict[Plane, tuple[int, int, int]] = {"sagittal": (0, 1, 2), "coronal": (1, 0, 2), "axial": (2, 0, 1)}
+LETTERS: dict[Plane, tuple[str, str, str, str]] = {  # left, right, top, bottom of the page
+    "sagittal": ("A", "P", "S", "I"),
+    "coronal": ("R", "L", "S", "I"),
+    "axial": ("R", "L", "A", "P"),
+}
+OBLIQUE_DEG = 3.0
+_SIDES = (("R", "L"), ("A", "P"), ("I", "S"))  # of the axes L, P, S: against it and along it
+_LEAST_SHARE = 0.3827  # cosine of 67.5 degrees: half-way between one letter and two
+
+
+def letters(direction: npt.ArrayLike) -> str:
+    """Side of the body to which a direction (3,) LPS points: letters of axes within 67.5 degrees of it, nearest first.
+
+    Examples
+    --------
+    >>> letters([0.0, -1.0, 0.0]), letters([0.0, -0.8, 0.6]), letters([0.1, 0.0, 0.99])
+    ('A', 'AS', 'S')
+    """
+    unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(np.asarray(direction, dtype=np.float64))
+    shown = [axis for axis in np.argsort(-np.abs(unit)) if abs(unit[axis]) > _LEAST_SHARE]
+    return "".join(_SIDES[axis][int(unit[axis] > 0.0)] for axis in shown)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Which slices of a grid are shown, and how much of them.
+
+    Attributes
+    ----------
+    grid : Grid
+        Of every array that is drawn through this view; LPS mm.
+    index : (3,) int
+        The three slices, counted along the axes closest to L, P, S.
+    box : three slices
+        The part shown, along the same axes.
+    """
+
+    grid: Grid
+    index: tuple[int, int, int]
+    box: tuple[slice, slice, slice]
+
+    @classmethod
+    def through(
+        cls, grid: Grid, point_mm: npt.ArrayLike, around: BoolArray | None = None, margin_mm: float = 8.0
+    ) -> View:
+        """Return the view of the slices through a point, cropped to a mask and a margin around it.
+
+        Parameters
+        ----------
+        grid : Grid
+        point_mm : (3,)
+            LPS mm; the nearest slices are taken.
+        around : (ni, nj, nk) bool, optional
+            What must be in the picture; the whole grid by default.
+        margin_mm : float
+
+        Raises
+        ------
+        GeometryError
+            If the point lies outside the grid, or the mask has another shape.
+        """
+        lps = grid.toward_lps()
+        point = np.asarray(point_mm, dtype=np.float64)
+        if point.shape != (3,) or not bool(lps.contains(point)):
+            raise GeometryError(
+                f"The point to be shown, LPS {point.tolist()} mm, lies outside the grid: {grid}. "
+                "Give a point inside the image."
+            )
+        nearest = np.clip(np.rint(lps.indices_of(point)), 0, np.array(lps.shape) - 1).astype(int)
+        spans = [slice(0, n) for n in lps.shape]
+        if around is not None:
+            shown = _toward_lps(grid, around)
+            for axis in range(3):
+                hit = np.flatnonzero(shown.any(axis=tuple(a for a in range(3) if a != axis)))
+                if hit.size:
+                    edge = round(margin_mm / lps.spacing_mm[axis])
+                    low, high = min(hit[0], nearest[axis]) - edge, max(hit[-1], nearest[axis]) + edge + 1
+                    spans[axis] = slice(max(0, int(low)), min(lps.shape[axis], int(high)))
+        i, j, k = (int(n) for n in nearest)
+        return cls(grid, (i, j, k), (spans[0], spans[1], spans[2]))
+
+    def cut(self, values: Values, plane: Plane) -> Values:
+        """Return the slice of an array on the grid as it lies on the page: rows downward, columns to the right.
+
+        Raises
+        ------
+        GeometryError
+            If the array is not on the view's grid.
+        """
+        cut = AXES[plane][0]
+        chosen: list[slice | int] = list(self.box)
+        chosen[cut] = self.index[cut]
+        page = _toward_lps(self.grid, values)[tuple(chosen)].swapaxes(0, 1)
+        return page if plane == "axial" else page[::-1]
+
+    def shown(self, values: Values) -> Values:
+        """Return the part of an array inside the box, axes closest to L, P, S."""
+        return _toward_lps(self.grid, values)[self.box]
+
+    def extent_mm(self, plane: Plane) -> tuple[float, float, float, float]:
+        """Return left, right, bottom and top of the slice, mm along the grid's axes from its first voxel's centre."""
+        _, across, along = AXES[plane]
+        spacing = self.grid.toward_lps().spacing_mm
+        left, right = ((n - 0.5) * spacing[across] for n in (self.box[across].start, self.box[across].stop))
+        low, high = ((n - 0.5) * spacing[along] for n in (self.box[along].start, self.box[along].stop))
+        return (left, right, high, low) if plane == "axial" else (left, right, low, high)
+
+    def title(self, plane: Plane) -> str:
+        """Return the name of the plane with the place of the cut, or with a word on oblique axes."""
+        lps = self.grid.toward_lps()
+        cut = AXES[plane][0]
+        tilt = float(np.degrees(np.arccos(np.clip(lps.direction[cut, cut], -1.0, 1.0))))
+        if tilt > OBLIQUE_DEG:
+            return f"{plane.capitalize()}, along image axes (tilted {tilt:.0f}°)"
+        at = lps.points_at(np.array(self.index, dtype=np.float64))[cut]
+        return f"{plane.capitalize()}, {'xyz'[cut]} = {at:.0f} mm".replace("-", "\u2212")
+
+
+def _toward_lps(grid: Grid, values: Values) -> Values:
+    """Return a view of values with the leading axes closest to L, P, S; nothing is copied."""
+    if values.shape[:3] != grid.shape:
+        raise GeometryError(
+            f"An array of shape {values.shape} cannot be shown on a grid of {grid.shape}; bring it there first."
+        )
+    order, flips = grid.axes_to_lps()
+    turned = values.transpose((*order, *range(3, values.ndim)))
+    return turned[tuple(slice(None, None, -1 if f else 1) for f in flips)]

@@ -1,0 +1,200 @@
+"""The page that slices are drawn on: panels at one scale, letters, scale bar, colour bar.
+
+Together with `dvc.report.figures` the only place that plots; nothing here holds state outside a `Sheet`.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps, patheffects
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, Normalize
+from matplotlib.figure import Figure
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.report.planes import AXES, LETTERS, PLANES, Plane, Values, View
+
+DPI = 120
+WIDTH_IN = 9.8
+INK = "#1c2733"
+UNSEEN = (0.16, 0.18, 0.30)  # a voxel without a value: neither black, which is dark tissue, nor a colour
+SHADOW = [patheffects.withStroke(linewidth=2.2, foreground="black")]
+FONT: dict[str, Any] = {"family": "DejaVu Sans", "fontsize": 10}
+_GAP_IN, _TITLE_IN, _BAR_IN, _LEAST_WIDTH_IN = 0.10, 0.26, 0.62, 5.2
+_MARK = "#FFD54A"
+
+
+class Sheet:
+    """Rows of slices at one scale, with letters, a scale bar, and yellow marks where the other planes cut.
+
+    Parameters
+    ----------
+    view : View
+    titles : sequence of str
+        One for each row; empty for none.
+    planes : sequence of plane names
+        Columns.
+    bar : bool
+        Whether room is kept for a colour bar below.
+
+    Attributes
+    ----------
+    rows : list of dict of plane to Axes
+    """
+
+    def __init__(self, view: View, titles: Sequence[str], planes: Sequence[Plane] = PLANES, bar: bool = False) -> None:
+        self.view = view
+        extents = [view.extent_mm(p) for p in planes]
+        widths = [e[1] - e[0] for e in extents]
+        heights = [abs(e[3] - e[2]) for e in extents]
+        gaps = _GAP_IN * (len(planes) - 1)
+        tallest = 4.6 if len(titles) == 1 else 3.6
+        inches = min((WIDTH_IN - gaps) / sum(widths), tallest / max(heights))  # per mm, everywhere
+        width = max(_LEAST_WIDTH_IN, inches * sum(widths) + gaps)
+        strip = _TITLE_IN * (2 if any(titles) else 1)
+        height = len(titles) * (inches * max(heights) + strip) + (_BAR_IN if bar else 0.0) + 0.04
+        self.figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+        FigureCanvasAgg(self.figure)
+        self.rows: list[dict[Plane, Axes]] = []
+        indent = (width - inches * sum(widths) - gaps) / 2
+        top = height
+        for title in titles:
+            if title:
+                at = (indent / width, (top - 0.8 * _TITLE_IN) / height)
+                self.figure.text(*at, title, weight="bold", color=INK, **FONT)
+            left, top = indent, top - strip
+            row: dict[Plane, Axes] = {}
+            for plane, w, h in zip(planes, widths, heights, strict=True):
+                box = (left / width, (top - h * inches) / height, w * inches / width, h * inches / height)
+                row[plane] = self.figure.add_axes(box, xticks=[], yticks=[], facecolor="black")
+                row[plane].set_title(view.title(plane), loc="left", pad=3, color=INK, fontsize=9.5)
+                left += w * inches + _GAP_IN
+            top -= inches * max(heights)
+            self.rows.append(row)
+        length = min(4.2, 0.6 * width)
+        self._bar = ((width - length) / 2 / width, 0.42 / height, length / width, 0.13 / height)
+
+    def paint(self, plane: Plane, axes: Axes, page: Values, **how: Any) -> None:
+        """Lay a page down; what follows is drawn over it."""
+        axes.imshow(page, extent=self.view.extent_mm(plane), origin="upper", aspect="equal", **how)
+
+    def grey(self, plane: Plane, axes: Axes, image: Values, window: tuple[float, float]) -> None:
+        """Lay down a slice of an MR image."""
+        shades = colormaps["gray"].with_extremes(bad=UNSEEN)
+        page = np.ma.masked_invalid(self.view.cut(image, plane))
+        self.paint(plane, axes, page, cmap=shades, vmin=window[0], vmax=window[1])
+
+    def colours(self, plane: Plane, axes: Axes, values: Values, shades: Colormap, norm: Normalize) -> None:
+        """Lay down a slice of a scalar in colour; where it is NaN, what lies below stays plain."""
+        page = np.ma.masked_invalid(self.view.cut(values, plane))
+        self.paint(plane, axes, page, cmap=shades, norm=norm, alpha=0.85, interpolation="nearest")
+
+    def outlines(self, plane: Plane, axes: Axes, pages: Iterable[BoolArray], colour: str = "white") -> None:
+        """Draw the borders of masks, given as pages of this plane, as thin lines."""
+        left, right, bottom, top = self.view.extent_mm(plane)
+        for page in pages:
+            if page.any() and not page.all():
+                rows, columns = page.shape
+                x = left + (np.arange(columns) + 0.5) * (right - left) / columns
+                y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
+                if min(page.shape) > 1:
+                    axes.contour(x, y, page.astype(float), levels=[0.5], colors=[colour], linewidths=0.9)
+
+    def bar(self, shades: Colormap, norm: Normalize, label: str, extend: str = "neither") -> None:
+        """Draw the one colour bar of the sheet, below the panels."""
+        axes = self.figure.add_axes(self._bar)
+        scale = ScalarMappable(norm, shades)
+        bar = self.figure.colorbar(scale, cax=axes, orientation="horizontal", extend=extend)
+        bar.set_label(label, color=INK, labelpad=2, **FONT)
+        bar.ax.tick_params(labelsize=9, length=3, pad=2)
+
+    def png(self) -> bytes:
+        """Add letters, marks and the scale bar, and return the file's bytes."""
+        spacing = self.view.grid.toward_lps().spacing_mm
+        for row in self.rows:
+            for number, (plane, axes) in enumerate(row.items()):
+                left, right, bottom, top = self.view.extent_mm(plane)
+                axes.set(xlim=(left, right), ylim=(bottom, top))
+                white: dict[str, Any] = {"color": "white", "path_effects": SHADOW, "transform": axes.transAxes}
+                _, across, along = AXES[plane]
+                marks = [float(self.view.index[a] * spacing[a]) for a in (across, along)]
+                for mark, line in zip(marks, (axes.axvline, axes.axhline), strict=True):
+                    for low, high in ((0.0, 0.035), (0.965, 1.0)):
+                        line(mark, low, high, color=_MARK, linewidth=1.2)
+                middle_x = _beside((marks[0] - left) / (right - left))
+                middle_y = _beside((marks[1] - bottom) / (top - bottom))
+                spots = (
+                    (0.012, middle_y, "left", "center"),
+                    (0.988, middle_y, "right", "center"),
+                    (middle_x, 0.988, "center", "top"),
+                    (middle_x, 0.012, "center", "bottom"),
+                )
+                for letter, (x, y, ha, va) in zip(LETTERS[plane], spots, strict=True):
+                    axes.text(x, y, letter, ha=ha, va=va, weight="bold", zorder=9, **white, **FONT)
+                if number == 0:
+                    length = scale_length_mm(right - left)
+                    ends = [0.03, 0.03 + length / (right - left)]
+                    axes.plot(ends, [0.035, 0.035], linewidth=2.5, solid_capstyle="butt", **white)
+                    axes.text(0.03, 0.05, f"{length:g} mm", va="bottom", fontsize=9, **white)
+        return png_bytes(self.figure)
+
+
+def _beside(mark: float) -> float:
+    """Return the middle of a side, 0 to 1, or a place beside it where a mark stands there."""
+    return 0.5 if abs(mark - 0.5) > 0.05 else 0.42
+
+
+def scale_length_mm(width_mm: float) -> float:
+    """Return a round length, mm, of at most a third of a panel.
+
+    Examples
+    --------
+    >>> [scale_length_mm(w) for w in (14.0, 100.0)]
+    [2.0, 20.0]
+    """
+    return max((n for n in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0) if n <= width_mm / 3), default=1.0)
+
+
+def chart(panels: int = 1) -> tuple[Figure, tuple[Axes, ...]]:
+    """An empty figure with so many axes side by side, for curves."""
+    figure = Figure(figsize=(0.62 * WIDTH_IN * panels, 3.9), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, tuple(np.atleast_1d(figure.subplots(1, panels)))
+
+
+def label_axes(axes: Axes, x: str, y: str) -> None:
+    """Name the axes of a `chart`, and draw its grid."""
+    axes.set_xlabel(x, color=INK, **FONT)
+    axes.set_ylabel(y, color=INK, **FONT)
+    axes.grid(True, color="#d9dee4", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=9)
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """Return a figure as a PNG file's bytes; equal figures give equal bytes."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
+    return file.getvalue()
+
+
+def window_of(view: View, image: Values) -> tuple[float, float]:
+    """Return the values drawn black and white: the 0.5th and 99.7th percentile of what is shown."""
+    known = view.shown(image)
+    known = known[np.isfinite(known)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = np.percentile(known, (0.5, 99.7))
+    return float(low), float(high if high > low else low + 1.0)
+
+
+def levelled(page: Values, window: tuple[float, float]) -> FloatArray:
+    """Return a page scaled to 0 to 1 within a window; NaN stays."""
+    return np.clip((np.asarray(page, dtype=np.float64) - window[0]) / (window[1] - window[0]), 0.0, 1.0)

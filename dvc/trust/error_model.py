@@ -1,0 +1,392 @@
+"""How sure a maximal shear is: bias and standard deviation measured on phantoms, and the intervals that follow.
+
+An error model is made by an accuracy study of one registration preset: of voxels in which a shear m was found, by
+tissue and distance to bone, how far it lay from the truth on average (bias) and how much that varied (standard
+deviation), for each registration of the study and for all together. Given m, the truth is then about m - bias, with
+that deviation. This holds for tissue that is strained and imaged like the study's phantoms, and for no other.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.errors import InputError
+from dvc.images.image import Grid
+from dvc.trust.random_field import GaussianField
+from dvc.trust.regions import SHEAR_THRESHOLDS
+
+POOLED = "soft tissue"
+"""Name of the row for tissue that the study did not have, or that has no label."""
+
+_FOLDER = "error_models"
+_FORMAT = 1
+_FAR = 1.6  # a table is used for voxels and noise within this factor of its own
+_LATTICE = 30_000
+_DRAWS = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorTable:
+    """Error of the maximal shear for one voxel size and noise.
+
+    Attributes
+    ----------
+    spacing_mm : (3,)
+        Of the voxels, mm.
+    snr : float
+        As `dvc.images.noise.signal_to_noise` finds it.
+    shear : (m,)
+        Values of the shear found, rising, at which bias and deviation are given; linear between, constant beyond.
+    to_bone_mm : (k,)
+        Lower ends of the bins of distance to bone, mm, rising from 0.
+    whole : mapping of tissue to (2, k, m)
+        Mean and standard deviation of found minus true shear, over all registrations of the study.
+    runs : tuple of mapping of tissue to (2, k, m)
+        The same of each registration alone: how errors differ from image to image.
+    correlation_mm : float
+        Distance at which the error's autocorrelation has fallen to 1/e, mm.
+    widening : float
+        Factor on intervals as they are drawn, by which 95 % of the tissues' figures lay in them when each heel of the
+        study was judged by the others; NaN where there was one heel alone, and intervals stay as drawn.
+    """
+
+    spacing_mm: FloatArray
+    snr: float
+    shear: FloatArray
+    to_bone_mm: FloatArray
+    whole: Mapping[str, FloatArray]
+    runs: tuple[Mapping[str, FloatArray], ...]
+    correlation_mm: float
+    widening: float = float("nan")
+
+    @property
+    def factor(self) -> float:
+        """`widening`, and 1 where it is not known."""
+        return 1.0 if np.isnan(self.widening) else self.widening
+
+    def expected(
+        self, tissue: str, shear: FloatArray, to_bone_mm: Float32Array, run: int | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Bias and standard deviation (n,) of shears (n,) found in a tissue at distances (n,) mm from bone.
+
+        Over all registrations, or in the one numbered ``run``.
+        """
+        cells = self.whole if run is None else self.runs[run]
+        rows = cells[tissue if tissue in cells else POOLED]
+        bins = np.clip(np.searchsorted(self.to_bone_mm, to_bone_mm, side="right") - 1, 0, len(self.to_bone_mm) - 1)
+        bias, sd = np.empty(len(shear)), np.empty(len(shear))
+        for k in range(len(self.to_bone_mm)):
+            here = bins == k
+            bias[here] = np.interp(shear[here], self.shear, rows[0, k])
+            sd[here] = np.interp(shear[here], self.shear, rows[1, k])
+        return bias, sd
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorModel:
+    """Error tables of one preset, and what they were made from.
+
+    Attributes
+    ----------
+    preset : str
+    parameters_sha256 : str
+        Of the preset's text: other parameters under the same name have another error.
+    tables : tuple of ErrorTable
+    source : str
+        The study in a sentence.
+    """
+
+    preset: str
+    parameters_sha256: str
+    tables: tuple[ErrorTable, ...]
+    source: str
+
+    def table_for(self, spacing_mm: FloatArray, snr: float) -> ErrorTable:
+        """The table nearest to a voxel and a signal-to-noise ratio: edges, by size, and ratio within 1.6 times.
+
+        Raises
+        ------
+        InputError
+            If none is that near; the message names those there are.
+        """
+        edges = np.sort(spacing_mm)
+
+        def far(table: ErrorTable) -> float:
+            voxel = np.abs(np.log(edges / np.sort(table.spacing_mm))).max()
+            return float(max(voxel, abs(np.log(snr / table.snr))))
+
+        nearest = min(self.tables, key=far)
+        if not far(nearest) <= np.log(_FAR):
+            known = "; ".join(f"{_told(t.spacing_mm)} mm at SNR {t.snr:.0f}" for t in self.tables)
+            raise InputError(
+                f"The error of {self.preset} is known for voxels of {known}. These images have voxels of "
+                f"{_told(spacing_mm)} mm at SNR {snr:.0f}, too far from any of these: measure it with `mrstrain "
+                f"accuracy --preset {self.preset}` (--spacing, --slice-spacing, --snr) and give its file as "
+                "--error-model."
+            )
+        return nearest
+
+    def write(self, path: Path) -> None:
+        """Write as JSON, whole or not at all."""
+        from dvc.atomic_files import write_whole
+
+        def plain(cells: Mapping[str, FloatArray]) -> dict[str, object]:
+            return {tissue: np.round(rows, 4).tolist() for tissue, rows in cells.items()}
+
+        tables = [
+            {
+                "spacing_mm": t.spacing_mm.tolist(),
+                "snr": t.snr,
+                "shear": t.shear.tolist(),
+                "to_bone_mm": t.to_bone_mm.tolist(),
+                "bias_and_sd": plain(t.whole),
+                "bias_and_sd_of_each_run": [plain(run) for run in t.runs],
+                "correlation_mm": t.correlation_mm,
+                "widening": t.widening if np.isfinite(t.widening) else None,
+            }
+            for t in self.tables
+        ]
+        told = {
+            "format": _FORMAT,
+            "preset": self.preset,
+            "parameters_sha256": self.parameters_sha256,
+            "source": self.source,
+            "tables": tables,
+        }
+        write_whole(path, json.dumps(told, allow_nan=False) + "\n")
+
+
+def read_error_model(path: Path | str) -> ErrorModel:
+    """Read what `ErrorModel.write` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is no error model.
+    """
+    try:
+        return _parsed(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError, KeyError, TypeError) as failure:
+        raise InputError(
+            f"{path}: no error model as `mrstrain accuracy` writes it ({type(failure).__name__}: {failure})."
+        ) from failure
+
+
+def error_model_of(preset: str) -> ErrorModel | None:
+    """The error model that comes with a named preset; None where there is none."""
+    stored = files("dvc.trust") / _FOLDER / f"{preset}.json"
+    return _parsed(stored.read_text(encoding="utf-8")) if stored.is_file() else None
+
+
+def _parsed(text: str) -> ErrorModel:
+    told = json.loads(text)
+    if told["format"] != _FORMAT:
+        raise ValueError(f"format {told['format']}, not {_FORMAT}")
+
+    def cells(given: Mapping[str, list[object]]) -> dict[str, FloatArray]:
+        return {tissue: np.asarray(rows, dtype=np.float64) for tissue, rows in given.items()}
+
+    tables = tuple(
+        ErrorTable(
+            np.asarray(t["spacing_mm"], dtype=np.float64),
+            float(t["snr"]),
+            np.asarray(t["shear"], dtype=np.float64),
+            np.asarray(t["to_bone_mm"], dtype=np.float64),
+            cells(t["bias_and_sd"]),
+            tuple(cells(run) for run in t["bias_and_sd_of_each_run"]),
+            float(t["correlation_mm"]),
+            float("nan") if t["widening"] is None else float(t["widening"]),
+        )
+        for t in told["tables"]
+    )
+    if not tables or any(POOLED not in cells for t in tables for cells in (t.whole, *t.runs)):
+        raise ValueError(f"no table, or one without a row '{POOLED}'")
+    for t in tables:
+        shape = (2, len(t.to_bone_mm), len(t.shear))
+        numbers = [rows for cells_of in (t.whole, *t.runs) for rows in cells_of.values()]
+        if not t.runs or any(
+            rows.shape != shape or not np.isfinite(rows).all() or (rows[1] < 0).any() for rows in numbers
+        ):
+            raise ValueError(f"a table without runs, or whose figures are not {shape} finite numbers")
+        rising = np.all(np.diff(t.shear) > 0) and np.all(np.diff(t.to_bone_mm) > 0)
+        if not (rising and t.spacing_mm.shape == (3,) and min(*t.spacing_mm, t.snr, t.correlation_mm) > 0):
+            raise ValueError("a voxel, noise or bin that is not positive and rising")
+    return ErrorModel(str(told["preset"]), str(told["parameters_sha256"]), tables, str(told["source"]))
+
+
+def _told(spacing_mm: FloatArray) -> str:
+    same = np.ptp(spacing_mm) < 1e-6
+    return f"{spacing_mm[0]:.2g}" if same else " x ".join(f"{s:.2g}" for s in spacing_mm)
+
+
+def to_surface_mm(body: BoolArray, spacing_mm: FloatArray) -> Float32Array:
+    """Distance (mm) of voxels' centres to the surface of a body of voxels: 0 inside it, infinite without one.
+
+    The surface lies half an edge from the centre of a voxel that touches it.
+    """
+    if not body.any():
+        return np.full(body.shape, np.inf, dtype=np.float32)
+    touching = np.full(body.shape, np.inf, dtype=np.float32)
+    for axis in range(body.ndim):
+        ahead, behind = [slice(None)] * body.ndim, [slice(None)] * body.ndim
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        differs = body[tuple(ahead)] != body[tuple(behind)]
+        half = np.where(differs, np.float32(0.5 * spacing_mm[axis]), np.float32(np.inf))
+        for side in (tuple(ahead), tuple(behind)):
+            np.minimum(touching[side], half, out=touching[side])
+    touching[body] = np.inf
+    at = np.isfinite(touching)
+    if not at.any():
+        return np.zeros(body.shape, dtype=np.float32)
+    distance, nearest = distance_transform_edt(~at, sampling=spacing_mm, return_indices=True)
+    return np.where(body, 0.0, distance + touching[tuple(nearest)]).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A figure of one tissue, and the interval in which the study's registrations would put the truth.
+
+    Attributes
+    ----------
+    region, figure : str
+        Such as "fat", "p95" or "volume_above_0.3_ml".
+    found : float
+        As measured.
+    estimate, low, high : float
+        Median of the truths drawn, and their 2.5th and 97.5th percentile moved away from it by `ErrorTable.widening`.
+    """
+
+    region: str
+    figure: str
+    found: float
+    estimate: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """Error of a strain map.
+
+    Attributes
+    ----------
+    sigma : (ni, nj, nk)
+        Standard deviation of the maximal shear about its bias; NaN where not defined and outside the regions.
+    intervals : tuple of Interval
+    table : ErrorTable
+    """
+
+    sigma: Float32Array
+    intervals: tuple[Interval, ...]
+    table: ErrorTable
+
+
+def uncertainty_of(
+    max_shear: Float32Array,
+    grid: Grid,
+    regions: Mapping[str, BoolArray],
+    to_bone_mm: Float32Array,
+    table: ErrorTable,
+    *,
+    thresholds: Sequence[float] = SHEAR_THRESHOLDS,
+    seed: int = 1,
+    wider: Mapping[str, float] = MappingProxyType({}),
+) -> Uncertainty:
+    """Error of a map of maximal shear by an error table.
+
+    Parameters
+    ----------
+    max_shear : (ni, nj, nk)
+        NaN where not defined.
+    grid : Grid
+    regions : mapping of name to (ni, nj, nk) bool
+        Soft tissues, each on the grid.
+    to_bone_mm : (ni, nj, nk)
+        Distance to bone, mm.
+    table : ErrorTable
+    thresholds : sequence of float
+        Strains for which the volume above is wanted.
+    seed : int
+        Of the draws.
+    wider : mapping of name to float
+        Factors on the deviation and the intervals of some regions, beside `ErrorTable.widening`.
+
+    Notes
+    -----
+    The truth is drawn 200 times: found shear, less the bias of one of the study's registrations, drawn anew each time,
+    less a Gaussian field of its standard deviation and of the table's correlation length; not below zero. The interval
+    of the draws is widened by a factor found on held-out heels (conformal prediction), so that it holds in 95 % of
+    cases like those of the study.
+    """
+    sigma = np.full(grid.shape, np.nan, dtype=np.float32)
+    intervals: list[Interval] = []
+    random = np.random.default_rng(seed)
+    for name, inside in regions.items():
+        where = inside & np.isfinite(max_shear)
+        if not where.any():
+            continue
+        _, sd = table.expected(name, max_shear[where].astype(np.float64), to_bone_mm[where])
+        factor = wider.get(name, 1.0)
+        sigma[where] = factor * sd
+        intervals += _intervals(name, where, max_shear, to_bone_mm, grid, table, thresholds, random, factor)
+    return Uncertainty(sigma, tuple(intervals), table)
+
+
+def _intervals(
+    name: str,
+    where: BoolArray,
+    max_shear: Float32Array,
+    to_bone_mm: Float32Array,
+    grid: Grid,
+    table: ErrorTable,
+    thresholds: Sequence[float],
+    random: np.random.Generator,
+    factor: float,
+) -> list[Interval]:
+    """Of one region, from draws on a lattice coarse enough to be quick."""
+    box = tuple(slice(int(a.min()), int(a.max()) + 1) for a in np.nonzero(where))
+    step = max(1, int(np.ceil((np.count_nonzero(where) / _LATTICE) ** (1 / 3))))
+    lattice = tuple(slice(b.start, b.stop, step) for b in box)
+    kept = where[lattice]
+    if not kept.any():
+        lattice, kept, step = box, where[box], 1
+    found = max_shear[lattice][kept].astype(np.float64)
+    volume = np.count_nonzero(where) * grid.voxel_volume_mm3 / 1000.0
+    noise = GaussianField(kept.shape, np.nonzero(kept), 0.5 * table.correlation_mm / (step * grid.spacing_mm), random)
+    expected = [table.expected(name, found, to_bone_mm[lattice][kept], run) for run in range(len(table.runs))]
+    drawn = np.empty((_DRAWS, 3 + len(thresholds)))
+    for draw in range(_DRAWS):
+        bias, sd = expected[random.integers(len(expected))]
+        drawn[draw] = figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds)
+    low, middle, high = widened(drawn, factor * table.factor)
+    high[3:] = np.minimum(high[3:], volume)
+    measured = figures_of(max_shear[where].astype(np.float64), volume, thresholds)
+    names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]
+    return [
+        Interval(name, figure, float(m), float(e), float(a), float(b))
+        for figure, m, e, a, b in zip(names, measured, middle, low, high, strict=True)
+    ]
+
+
+def figures_of(shear: FloatArray, volume_ml: float, thresholds: Sequence[float]) -> FloatArray:
+    """Median, 90th and 95th percentile, and the volumes above thresholds (mL) of a tissue of a volume."""
+    above = [volume_ml * np.count_nonzero(shear > t) / len(shear) for t in thresholds]
+    return np.array([*np.percentile(shear, [50.0, 90.0, 95.0]), *above])
+
+
+def widened(drawn: FloatArray, factor: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Lower end, median and upper end of draws (n, figures): 2.5th and 97.5th percentile, ``factor`` times as far out.
+
+    No figure of a shear is below zero.
+    """
+    low, middle, high = np.percentile(drawn, [2.5, 50.0, 97.5], axis=0)
+    return np.maximum(middle - factor * (middle - low), 0.0), middle, middle + factor * (high - middle)

@@ -1,0 +1,223 @@
+"""Landmark pairs: the same anatomical points marked by hand in the unloaded and the loaded image."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.deformation.protocol import Deformation
+from dvc.errors import ImageFileError, InputError
+
+_log = logging.getLogger("dvc.trust.landmarks")
+
+_COLUMNS = ("x0", "y0", "z0", "x1", "y1", "z1")
+_TO_LPS = {"LPS": np.array([1.0, 1.0, 1.0]), "RAS": np.array([-1.0, -1.0, 1.0])}
+_FCSV_FRAMES = {"LPS": "LPS", "RAS": "RAS", "1": "LPS", "0": "RAS"}  # Slicer before 4.11 wrote a number
+
+_Path = str | os.PathLike[str]
+_Points = list[tuple[str, FloatArray]]
+
+
+def read_landmarks(
+    path: _Path | tuple[_Path, _Path], *, frame: str = "LPS"
+) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Read pairs of points, unloaded and loaded.
+
+    Parameters
+    ----------
+    path : path, or a pair of paths
+        A CSV file with the columns x0, y0, z0 (unloaded image), x1, y1, z1 (loaded image), in mm, and
+        optionally name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first.
+    frame : {"LPS", "RAS"}
+        Frame of the CSV's coordinates. Slicer's files tell theirs.
+
+    Returns
+    -------
+    reference_mm, deformed_mm : (n, 3)
+        The points in the unloaded and in the loaded image, each in its own image's frame, LPS mm.
+    names : tuple of str
+        Their names, or their numbers from 1.
+
+    Raises
+    ------
+    InputError
+        If the frame or the kind of file is not one of those above, or two point lists do not match.
+    ImageFileError
+        If a file is missing or damaged, a column or number is missing, or its frame or unit is not known.
+
+    Notes
+    -----
+    Two Slicer lists are paired by name where both hold the same names, each once; where no name is in both,
+    they are paired in their order, which is logged. Anything between is refused.
+    """
+    if frame not in _TO_LPS:
+        raise InputError(f"The frame of landmarks is LPS or RAS; got {frame!r}.")
+    if isinstance(path, tuple):
+        return _paired(Path(path[0]), Path(path[1]))
+    file = Path(path)
+    if file.suffix.lower() != ".csv":
+        raise InputError(
+            f"{file}: landmark pairs are one CSV file, or two point lists of Slicer (.mrk.json, .fcsv) given "
+            "together, the unloaded image's first."
+        )
+    reference, deformed, names = [], [], []
+    rows = csv.DictReader(_text(file).splitlines())
+    header = [str(name).strip().casefold() for name in rows.fieldnames or []]
+    missing = [name for name in _COLUMNS if name not in header]
+    if missing:
+        raise ImageFileError(
+            f"{file}: the column {missing[0]} is missing; a file of landmark pairs needs the columns "
+            f"{', '.join(_COLUMNS)} in its first line. Found: {', '.join(header) or 'nothing'}."
+        )
+    rows.fieldnames = header
+    for count, row in enumerate(rows, start=1):
+        where = f"{file}, line {rows.line_num}"
+        values = [_number(where, name, row[name]) for name in _COLUMNS]
+        reference.append(values[:3])
+        deformed.append(values[3:])
+        names.append((row.get("name") or str(count)).strip())
+    if not reference:
+        raise ImageFileError(f"{file} has no landmark below its header.")
+    return np.array(reference) * _TO_LPS[frame], np.array(deformed) * _TO_LPS[frame], tuple(names)
+
+
+def target_registration_error(
+    deformation: Deformation, reference_mm: FloatArray, deformed_mm: FloatArray
+) -> FloatArray:
+    """Distance between where a deformation puts each landmark and where it was seen, |X + u(X) - x|.
+
+    Parameters
+    ----------
+    deformation : Deformation
+        The whole motion from the unloaded to the loaded image, the bone's motion included, since the
+        landmarks x lie in the loaded image as it was scanned.
+    reference_mm, deformed_mm : (n, 3)
+        Landmarks X in the unloaded and x in the loaded image, LPS mm.
+
+    Returns
+    -------
+    (n,)
+        Error of each landmark, mm; NaN where the deformation is not defined. Count these in any summary: a
+        mean over the others alone looks better than the registration is.
+
+    Raises
+    ------
+    InputError
+        If the two sets have not the same shape (n, 3).
+
+    Examples
+    --------
+    >>> from dvc.deformation.protocol import Affine
+    >>> shift = Affine(np.eye(3), np.array([3.0, 0.0, 0.0]))
+    >>> target_registration_error(shift, np.zeros((1, 3)), np.array([[0.0, 4.0, 0.0]])).tolist()
+    [5.0]
+    """
+    X, x = np.asarray(reference_mm, dtype=np.float64), np.asarray(deformed_mm, dtype=np.float64)
+    if X.shape != x.shape or X.ndim != 2 or X.shape[1] != 3:
+        raise InputError(f"Landmarks must be two arrays (n, 3) of one length; got {X.shape} and {x.shape}.")
+    return np.asarray(np.linalg.norm(X + deformation.displacement(X) - x, axis=1))
+
+
+def _paired(first: Path, second: Path) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    reference, deformed = _slicer_points(first), _slicer_points(second)
+    names, others = [name for name, _ in reference], [name for name, _ in deformed]
+    both = set(names) & set(others)
+    if len(set(names)) == len(names) and len(set(others)) == len(others) and set(names) == set(others):
+        by_name = dict(deformed)
+        deformed = [(name, by_name[name]) for name in names]
+    elif len(names) != len(others) or both:
+        only = sorted(set(names) ^ set(others))
+        repeated = sorted({name for some in (names, others) for name in some if some.count(name) > 1})
+        raise InputError(
+            f"{first} holds {len(names)} points and {second} {len(others)}, and their names do not match one "
+            f"to one (in one file only: {', '.join(only) or 'none'}; repeated: "
+            f"{', '.join(repeated) or 'none'}). Give both lists the same names, each once."
+        )
+    else:
+        _log.warning("%s and %s share no name; their points are paired in order.", first, second)
+    return np.stack([X for _, X in reference]), np.stack([x for _, x in deformed]), tuple(names)
+
+
+def _slicer_points(path: Path) -> _Points:
+    if path.name.lower().endswith(".json"):
+        points = _from_markups(path)
+    elif path.suffix.lower() == ".fcsv":
+        points = _from_fcsv(path)
+    else:
+        raise InputError(f"{path}: a point list of Slicer ends in .mrk.json or .fcsv.")
+    if not points:
+        raise ImageFileError(f"{path} holds no point.")
+    return points
+
+
+def _from_markups(path: Path) -> _Points:
+    try:
+        (markup,) = json.loads(_text(path))["markups"]
+        frame, unit = str(markup["coordinateSystem"]), markup.get("coordinateUnits", "mm")
+        listed: list[dict[str, Any]] = list(markup["controlPoints"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ImageFileError(
+            f"{path} is not a point list of Slicer with one list of points ({type(error).__name__}: {error})."
+        ) from error
+    if frame not in _TO_LPS or unit not in ("mm", ["mm", "UCUM"]):
+        raise ImageFileError(f"{path}: coordinates must be LPS or RAS, in mm; the file says {frame}, {unit}.")
+    points: _Points = []
+    for count, point in enumerate(listed, start=1):
+        name = str(point.get("label") or count)
+        if point.get("positionStatus", "defined") != "defined":
+            raise ImageFileError(f"{path}: point {name!r} was never placed. Place or delete it in Slicer.")
+        position = point.get("position")
+        if not isinstance(position, list) or len(position) != 3:
+            raise ImageFileError(f"{path}: point {name!r} has no position.")
+        where = f"{path}, point {name!r}"
+        points.append((name, np.array([_number(where, "position", x) for x in position]) * _TO_LPS[frame]))
+    return points
+
+
+def _from_fcsv(path: Path) -> _Points:
+    frame: str | None = None
+    columns: list[str] | None = None
+    points: _Points = []
+    for line, text in enumerate(_text(path).splitlines(), start=1):
+        key, _, value = text.removeprefix("#").partition("=")
+        if text.startswith("#"):
+            if key.strip() == "CoordinateSystem":
+                frame = _FCSV_FRAMES.get(value.strip())
+            elif key.strip() == "columns":
+                columns = [name.strip() for name in value.split(",")]
+        elif text.strip():
+            if frame is None or columns is None or not {"x", "y", "z"} <= set(columns):
+                raise ImageFileError(
+                    f"{path}: its header does not tell the frame (CoordinateSystem = LPS or RAS) and the "
+                    "columns. Save the list again in Slicer."
+                )
+            row = dict(zip(columns, next(csv.reader([text])), strict=False))
+            where = f"{path}, line {line}"
+            position = np.array([_number(where, axis, row.get(axis)) for axis in ("x", "y", "z")])
+            points.append((row.get("label") or str(len(points) + 1), position * _TO_LPS[frame]))
+    return points
+
+
+def _number(where: str, name: str, value: object) -> float:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ImageFileError(f"{where}: {name} must be a finite number in mm; got {value!r}.")
+    return number
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImageFileError(f"{path} cannot be read as text: {error}.") from error

@@ -1,0 +1,79 @@
+"""Truths that could lie behind a strain found at scattered points, such as the cells of a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.trust.error_model import ErrorTable
+from dvc.trust.random_field import GaussianField
+
+_STEPS = 4  # of the lattice that noise is drawn on, within a correlation length
+
+
+class TruthDraws:
+    """Draws of the truth, as `dvc.trust.error_model.uncertainty_of` makes them on a grid.
+
+    Parameters
+    ----------
+    points_mm : (n, 3)
+        Reference configuration, LPS mm.
+    shear : (n,)
+        Maximal shear found there.
+    tissue : (n,) str
+    to_bone_mm : (n,)
+        Distance to the surface of bone.
+    table : ErrorTable
+    seed : int
+    """
+
+    def __init__(
+        self,
+        points_mm: FloatArray,
+        shear: FloatArray,
+        tissue: Sequence[str],
+        to_bone_mm: FloatArray,
+        table: ErrorTable,
+        seed: int = 1,
+    ) -> None:
+        self._random = np.random.default_rng(seed)
+        self._shear = shear
+        names = self._names = np.asarray(tissue)
+        self._expected = []
+        for run in range(len(table.runs)):
+            bias, sd = np.empty(len(shear)), np.empty(len(shear))
+            for name in np.unique(names):
+                here = names == name
+                bias[here], sd[here] = table.expected(str(name), shear[here], to_bone_mm[here], run)
+            self._expected.append((bias, sd))
+        step = table.correlation_mm / _STEPS
+        index = np.rint((points_mm - points_mm.min(axis=0)) / step).astype(np.int64)
+        width = np.full(3, 0.5 * table.correlation_mm / step)
+        self._noise = GaussianField(tuple(int(n) + 1 for n in index.max(axis=0)), tuple(index.T), width, self._random)
+
+    def drawn(self) -> FloatArray:
+        """A truth (n,): shear found less a registration's bias, less a Gaussian field of its deviation; not below 0."""
+        bias, sd = self._expected[self._random.integers(len(self._expected))]
+        return np.maximum(self._shear - bias - sd * self._noise.drawn(), 0.0)
+
+    def narrowed(self, truth: FloatArray) -> FloatArray:
+        """A truth drawn (n,) whose spread in each tissue is that of the found shear less the noise, not plus it.
+
+        About the tissue's mean m: m + (x - m) (1 - 2 s^2 / v)^(1/2), with v the variance of x and s^2 the mean square
+        of the noise's deviation, which is in x once as found and once as drawn; uniform where the noise could have made
+        all of the spread.
+        """
+        noise = np.mean([sd**2 for _, sd in self._expected], axis=0)
+        narrow = np.empty(len(truth))
+        for name in np.unique(self._names):
+            here = self._names == name
+            mean, spread = truth[here].mean(), truth[here].var()
+            kept = max(spread - 2.0 * noise[here].mean(), 0.0) / spread if spread > 0.0 else 0.0
+            narrow[here] = mean + np.sqrt(kept) * (truth[here] - mean)
+        return narrow
+
+    def many(self, count: int) -> Iterator[FloatArray]:
+        """So many truths, each drawn when it is asked for."""
+        return (self.drawn() for _ in range(count))

@@ -1,0 +1,89 @@
+"""Meshes made here, kept as files that ParaView opens and that are read back with every name."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import meshio
+import numpy as np
+
+from dvc.arrays import IntArray
+from dvc.atomic_files import whole_file, write_whole
+from dvc.errors import InputError
+from dvc.io.meshes.read import read_mesh
+from dvc.mesh import TetMesh
+from fe.surface_sets import known_name
+
+_FIRST_FACET = 101  # numbers of facets in the array "region"; those of tissues begin at 1
+_MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, beside its components
+
+
+def write_tet_mesh(path: Path, mesh: TetMesh, about: dict[str, object]) -> None:
+    """Write a mesh as VTU, LPS mm: tetrahedra and named triangles, numbered in ``region``.
+
+    The names, and what is told ``about`` it, stand in a JSON file of the same name.
+    """
+    tissues = {name: number for number, name in enumerate(mesh.regions, start=1)}
+    facets = {name: number for number, name in enumerate(mesh.facets, start=_FIRST_FACET)}
+    number = np.zeros(len(mesh.cells), dtype=np.int64)
+    for name, cells in mesh.regions.items():
+        number[cells] = tissues[name]
+    triangles = np.concatenate([*mesh.facets.values(), np.empty((0, 3), dtype=np.int64)])
+    flat = np.repeat(list(facets.values()), [len(rows) for rows in mesh.facets.values()]).astype(np.int64)
+    blocks = [("tetra", mesh.cells)] + ([("triangle", triangles)] if len(triangles) else [])
+    numbers = [number] + ([flat] if len(triangles) else [])
+    with whole_file(path) as part:
+        meshio.vtu.write(part, meshio.Mesh(mesh.points_mm, blocks, cell_data={"region": numbers}), binary=True)
+    names = {str(number): name for named in (tissues, facets) for name, number in named.items()}
+    write_whole(_names_of(path), json.dumps({"regions": names} | about, indent=2) + "\n")
+
+
+def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:
+    """Read a mesh of tetrahedra with its named regions and facets, made here or elsewhere.
+
+    Where a JSON file of the same name tells the names of the numbers in the array ``region``, they are used. A set of
+    all cells is left out where others divide them, and so are the materials of ANSYS where components do. The facets
+    "bone", "skin" and "cut" are called so in whatever case the file has them: ANSYS knows capitals only.
+
+    Raises
+    ------
+    InputError
+        If it cannot be used: as `dvc.io.meshes.read.read_mesh`, for elements other than tetrahedra, or if two facets
+        have one name but for its case.
+    """
+    place = Path(path)
+    read = read_mesh(place, unit=unit, frame=frame)
+    if read.tets is None:
+        raise InputError(f"{place}: the simulation takes tetrahedra; this mesh has cells of other shapes.")
+    names: dict[str, str] = {}
+    if _names_of(place).is_file():
+        try:
+            told = json.loads(_names_of(place).read_text(encoding="utf-8"))["regions"]
+            names = {f"region {number}": str(name) for number, name in told.items()}
+        except (ValueError, KeyError, AttributeError, TypeError) as damaged:
+            raise InputError(f"{_names_of(place)}: no table of regions in it ({damaged}).") from damaged
+    mesh = read.tets
+    regions = {names.get(name, name): cells for name, cells in mesh.regions.items()}
+    count = len(mesh.cells)
+    regions = _without(regions, {name for name, cells in regions.items() if len(cells) == count}, count)
+    regions = _without(regions, {name for name in regions if _MATERIAL.fullmatch(name)}, count)
+    facets: dict[str, IntArray] = {}
+    for name, rows in mesh.facets.items():
+        known = known_name(names.get(name, name))
+        if known in facets:
+            raise InputError(f"{place}: two sets of facets are called '{known}'; case does not count. Rename one.")
+        facets[known] = rows
+    return TetMesh(mesh.points_mm, mesh.cells, regions, facets, mesh.node_ids)
+
+
+def _without(regions: dict[str, IntArray], names: set[str], cell_count: int) -> dict[str, IntArray]:
+    """Regions but for some, if the others still hold every cell; if not, all of them."""
+    others = {name: cells for name, cells in regions.items() if name not in names}
+    held = np.unique(np.concatenate([*others.values(), np.empty(0, dtype=np.int64)]))
+    return others if len(held) == cell_count else regions
+
+
+def _names_of(path: Path) -> Path:
+    return path.with_suffix(".json")

@@ -1,0 +1,113 @@
+"""The command line. It parses, calls one function, and prints; heavy imports wait until a command runs."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from typing import Annotated
+
+import typer
+
+from mrstrain.cli import measurement, models, studies, truth
+
+app = typer.Typer(
+    name="mrstrain",
+    help="Strain inside soft tissue from pairs of MR images, and how far it may be trusted.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from mrstrain import __version__
+
+        typer.echo(f"mrstrain {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+for _command in (
+    studies.init,
+    studies.check,
+    studies.run,
+    studies.cohort,
+    studies.demo,
+    measurement.register,
+    measurement.strain,
+    truth.phantom,
+    truth.twin,
+    truth.accuracy,
+    models.mesh,
+    models.simulate,
+    models.compare,
+    models.drive,
+    models.level,
+    models.converge,
+    models.fit,
+):
+    app.command()(_command)
+
+
+@app.command()
+def doctor() -> None:
+    """Is this machine fit to run mrstrain?"""
+    from mrstrain.records.doctor import examine
+
+    def trial(what: str, module: str) -> Callable[[], str]:
+        def run() -> str:
+            from dvc.worker import Worker
+
+            with Worker(threads=1) as worker:
+                return str(worker.run(f"trying {what}", import_module(module).self_test))
+
+        return run
+
+    tried = {"itk-elastix": "dvc.registration.elastix.run", "pytetwild": "fe.meshing", "sparse solver": "fe.linear"}
+    findings = examine(trials={what: trial(what, module) for what, module in tried.items()})
+    for finding in findings:
+        typer.echo(f"{'ok  ' if finding.ok else 'NOT '} {finding.what}: {finding.detail}")
+        if not finding.ok and finding.advice:
+            typer.echo(f"     {finding.advice}")
+    if not all(f.ok for f in findings):
+        raise typer.Exit(1)
+
+
+def main() -> None:
+    """Entry point: errors made on purpose are printed as sentences, with exit status 2."""
+    if len(sys.argv) > 1 and not {"--help", "-h"} & set(sys.argv[1:]):
+        from mrstrain.records.doctor import refuse_foreign_packages
+
+        try:
+            refuse_foreign_packages()  # before anything of dvc is imported: it might not be ours
+        except ImportError as error:
+            _stop(str(error))
+    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    # Being told to end is like an interrupt: what was started ends too, and nothing half-written stays.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        app()
+    except Exception as error:
+        from dvc.errors import MrstrainError
+
+        if not isinstance(error, MrstrainError):
+            raise
+        _stop(str(error))
+
+
+def _stop(message: str) -> None:
+    typer.echo(f"mrstrain: {message}", err=True)
+    sys.exit(2)

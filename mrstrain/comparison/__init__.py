@@ -1,0 +1,1 @@
+"""`compare`, `drive` and `level`: models against a measurement, and the methods text."""

@@ -1,0 +1,354 @@
+"""What was done, in sentences for a methods section: filled in from the records beside what was compared."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from dvc.errors import ParameterError
+from dvc.io.images.read import format_of
+from dvc.io.transforms.elastix_text import parse_parameters
+from dvc.report.viewer import NIIVUE
+from fe.simulate import LoadStep
+from validate.curves import DRAWS
+from validate.location_intervals import DRAWS as LOCATED
+
+# Checked against the publishers' records or the projects' own pages; a paper whose DOI was not found goes without.
+_PAPERS = {
+    "Klein 2010": "Klein S, Staring M, Murphy K, Viergever MA, Pluim JPW. elastix: a toolbox for intensity-based "
+    "medical image registration. IEEE Trans Med Imaging 29(1):196-205, 2010. doi:10.1109/TMI.2009.2035616",
+    "Shamonin 2014": "Shamonin DP, Bron EE, Lelieveldt BPF, Smits M, Klein S, Staring M. Fast parallel image "
+    "registration on CPU and GPU for diagnostic classification of Alzheimer's disease. Front Neuroinform 7:50, 2014. "
+    "doi:10.3389/fninf.2013.00050",
+    "Baker 2004": "Baker S, Matthews I. Lucas-Kanade 20 years on: a unifying framework. Int J Comput Vis "
+    "56(3):221-255, 2004. doi:10.1023/B:VISI.0000011205.11775.fd",
+    "Lowekamp 2013": "Lowekamp BC, Chen DT, Ibáñez L, Blezek D. The design of SimpleITK. Front Neuroinform 7:45, 2013. "
+    "doi:10.3389/fninf.2013.00045",
+    "Tustison 2010": "Tustison NJ, Avants BB, Cook PA, Zheng Y, Egan A, Yushkevich PA, Gee JC. N4ITK: improved N3 bias "
+    "correction. IEEE Trans Med Imaging 29(6):1310-1320, 2010. doi:10.1109/TMI.2010.2046908",
+    "Hu 2020": "Hu Y, Schneider T, Wang B, Zorin D, Panozzo D. Fast tetrahedral meshing in the wild. ACM Trans Graph "
+    "39(4):117, 2020. doi:10.1145/3386569.3392385",
+    "Trebbi 2023": "Trebbi A, Fougeron N, Payan Y. Definition and evaluation of a finite element model of the human "
+    "heel for diabetic foot ulcer prevention under shearing loads. Med Eng Phys, 2023.",
+    "Dice 1945": "Dice LR. Measures of the amount of ecologic association between species. Ecology 26(3):297-302, "
+    "1945. doi:10.2307/1932409",
+    "Lin 1989": "Lin LI-K. A concordance correlation coefficient to evaluate reproducibility. Biometrics "
+    "45(1):255-268, 1989. doi:10.2307/2532051",
+    "Bland 1986": "Bland JM, Altman DG. Statistical methods for assessing agreement between two methods of clinical "
+    "measurement. Lancet 327(8476):307-310, 1986. doi:10.1016/S0140-6736(86)90837-8",
+}
+METHODS = "Methods, to be pasted"
+"""Title of a report's section with these paragraphs."""
+_IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")
+"""Roles in a record of the files that are read as images."""
+_GIVEN = "the displacement was taken as it was given."
+_COARSE = " (every two voxels, if that is more)"
+_PUBLISHED = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")  # tables 2 and 3 of Trebbi 2023
+
+Record = Mapping[str, Any]
+
+
+def methods(
+    measured: Mapping[str, Path],
+    models: Mapping[str, Path],
+    cells: int,
+    strains: tuple[float, float],
+    thresholds: Sequence[float],
+    least_ml: float,
+    *,
+    error_known: bool,
+    version: str,
+) -> tuple[str, ...]:
+    """Paragraphs for a methods section, the references last.
+
+    Parameters
+    ----------
+    measured : mapping of load to path
+        Folders of the measurement, with their ``provenance.json`` where `register` or `strain` wrote them.
+    models : mapping of name to path
+        A result's file of each; a ``simulation.json`` beside it tells how it was computed.
+    cells : int
+        Number of cells on which fields are compared.
+    strains, thresholds, least_ml
+        As in `mrstrain.comparison.compare.compare`.
+    error_known : bool
+        Whether intervals come from an error model.
+    version : str
+        Of the program that compares.
+    """
+    parts = [
+        _measured(measured),
+        *_simulated(models, measured),
+        _compared(cells, strains, thresholds, least_ml, version),
+    ]
+    if error_known:
+        parts.append(_doubt(measured))
+    parts.append(f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue).")
+    return _with_references(parts)
+
+
+def methods_of_registrations(measured: Mapping[str, Path]) -> tuple[str, ...]:
+    """Paragraphs on the measurement alone, the references last; ``measured`` as in `methods`."""
+    known = _sources(measured)
+    return _with_references([_measured(measured), *([f"Error of the maximal shear: {known}"] if known else [])])
+
+
+def _with_references(parts: Sequence[str]) -> tuple[str, ...]:
+    used = [paper for name, paper in _PAPERS.items() if any(name in part for part in parts)]
+    return (*parts, *(("References", *used) if used else ()))
+
+
+def _record(place: Path) -> Record:
+    try:
+        told = json.loads(place.read_text(encoding="utf-8"))
+        return told if isinstance(told, dict) else {}
+    except (OSError, ValueError):
+        return {}
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _measured(measured: Mapping[str, Path]) -> str:
+    """How displacement was measured; loads that were registered alike go into one sentence."""
+    groups: dict[str, list[str]] = {}
+    for load, folder in measured.items():
+        record = _record(folder / "provenance.json")
+        groups.setdefault(_registration(record) + _files(record), []).append(load)
+    told = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
+    return (
+        told + " Displacement is that of tissue in the unloaded configuration; strain is Green-Lagrange, "
+        "E = (F^T F - I)/2, and maximal shear half the difference of its largest and smallest principal value."
+    )
+
+
+def _registration(record: Record) -> str:
+    given, versions = record.get("parameters", {}), record.get("versions", {})
+    stages, own = given.get("stages") or [], given.get("gauss_newton")
+    if record.get("command") != "register" or not (stages or own):
+        return _GIVEN
+    align = {
+        "bone": "The loaded image was aligned with the unloaded one rigidly on the bone, and then",
+        "image": "The loaded image was aligned with the unloaded one rigidly on the whole image, and then",
+    }.get(str(given.get("align")), "The loaded image was, without rigid alignment,")
+    elastix = f"elastix (Klein 2010, Shamonin 2014; itk-elastix {versions.get('itk-elastix', '?')})"
+    ours = f"mrstrain {versions.get('mrstrain', '?')}"
+    on_bone = given.get("align") == "bone"
+    how = (
+        f"with {elastix} through {ours}: {'; then '.join(_stage(stage) for stage in stages)}"
+        if not own
+        else f"with the Gauss-Newton engine of {ours}: {_weights(own, given.get('borders'), on_bone)}"
+    )
+    if given.get("align") != "none":
+        how += "; rigid alignment by Gauss-Newton least squares (Baker 2004)"
+    return (
+        f"{align} registered non-rigidly {how}; seed {given.get('seed')}. Beforehand the smooth receive field was "
+        "taken out of both images (N4, Tustison 2010, as implemented in SimpleITK "
+        f"{versions.get('SimpleITK', '?')}, Lowekamp 2013)."
+    )
+
+
+def _files(record: Record) -> str:
+    """What read a registration's images and wrote its maps: a sentence with a space before it, or nothing."""
+    if _registration(record) == _GIVEN:
+        return ""
+    versions, inputs = record.get("versions", {}), record.get("inputs", {})
+    formats = sorted({format_of(file["name"]) for role in _IMAGES for file in inputs.get(role, [])})
+    done = (
+        f"Images ({', '.join(formats)}) were read, and maps (NIfTI, NRRD) written," if formats else "Maps were written"
+    )
+    of_dicom = (
+        f" and pydicom {versions.get('pydicom', '?')} for DICOM (SimpleITK {versions.get('SimpleITK', '?')} where its "
+        "pixels are compressed in one of the JPEG formats)"
+    )
+    return (
+        f" {done} by mrstrain's own code, with nibabel "
+        f"{versions.get('nibabel', '?')} for the headers of NIfTI files{of_dicom if 'DICOM' in formats else ''}."
+    )
+
+
+def _weights(own: Record, borders: Record | None, on_bone: bool) -> str:
+    bending = own.get("bending")
+    weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
+    volume = own.get("volume")
+    kept = (
+        "300/mm3, or of its gradient alone where the images ask for such a change"
+        if volume is None
+        else f"{volume:g}/mm3"
+    )
+    held = (
+        f", on change of volume in soft tissue ({kept}) and on strain of the bone ({own.get('rigidity'):g}/mm3)"
+        if on_bone
+        else f" and on change of volume in the tissue ({kept})"
+    )
+    told = (
+        f"a cubic B-spline with control points every {own.get('spacing_mm'):g} mm{_COARSE}, least squares over all "
+        "voxels of the tissue and 3 mm around it, and "
+        "penalties on bending (the square of the Laplacian of its coefficients, less where the displacement is curved; "
+        f"weight {weight}){held}"
+    )
+    if borders is None:
+        return told
+    skin = borders.get("skin")
+    weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
+    return (
+        f"{told}; from there a second B-spline was added that vanishes on the borders of the label map's tissues, so "
+        f"that strain may jump there, {'the bone held at rest and ' if on_bone else ''}strain of a tissue called skin "
+        f"penalised (weight {weight}), and bending counted by the Laplacian of both splines' Laplacian"
+    )
+
+
+def _stage(stage: Record) -> str:
+    try:
+        told = parse_parameters(str(stage.get("text", "")))
+    except ParameterError:
+        return f"parameters '{stage.get('name')}'"
+
+    def value(name: str) -> str:
+        """Values of a parameter, one for all where they are equal."""
+        values = told.get(name, ())
+        return ", ".join(dict.fromkeys(values) if len(set(values)) == 1 else values) or "elastix' default"
+
+    spacing = value("FinalGridSpacingInPhysicalUnits")
+    return (
+        f"parameters '{stage.get('name')}', metric {value('Metric')}, {value('Transform')} with control points every "
+        f"{spacing} mm{_COARSE}, {value('NumberOfResolutions')} resolutions, {value('Optimizer')} with "
+        f"{value('MaximumNumberOfIterations')} iterations of {value('NumberOfSpatialSamples')} samples"
+    )
+
+
+def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list[str]:
+    """How models were computed: those of ours by their own records, others by their files."""
+    parts, others, groups = [], [], dict[str, list[str]]()
+    driven, levelled = [], dict[str, list[str]]()
+    published = False
+    for name, path in models.items():
+        record = _record(path.parent / "simulation.json")
+        given = record.get("parameters", {})
+        if record.get("command") == "drive":
+            driven.append(_driven(name, record))
+            published = published or record["set"] in _PUBLISHED
+            continue
+        if _record(path.parent / "provenance.json").get("command") == "level":
+            levelled.setdefault(_levelled(path, measured), []).append(name)
+            continue
+        if record.get("command") != "simulate" or "set" not in given:
+            others.append(f"{name} ({path.suffix[1:]})")
+            continue
+        laws = "; ".join(f"{region}: {law['law']}" for region, law in given["laws"].items())
+        parts.append(f"{name}: {given['title']} ({laws}).")
+        published = published or given["set"] in _PUBLISHED
+        groups.setdefault(_solver(record), []).append(name)
+    told = []
+    if parts:
+        told.append(" ".join([*(f"{_listed(names)} {how}" for how, names in groups.items()), *parts]))
+    if driven:
+        told.append(f"{_DRIVEN} {' '.join(driven)}")
+    if published:
+        told.append("Published sets of laws are those that Trebbi 2023 compiled.")
+    told += [f"{_listed(names)}: {how}" for how, names in levelled.items()]
+    if others:
+        told.append(f"Results of other programs were taken as given: {_listed(others)}.")
+    return told
+
+
+_DRIVEN = (
+    "Driven models bear no force: each node on the outside of the mesh was moved by the measured displacement, or held "
+    "where the mesh names it bone, and those inside follow from the laws."
+)
+
+
+def _driven(name: str, record: Record) -> str:
+    """One model whose outside went where it was measured."""
+    laws = "; ".join(f"{region}: {law}" for region, law in record["laws"].items())
+    return f"{name}: with mrstrain {record.get('versions', {}).get('mrstrain', '?')} ({laws})."
+
+
+def _levelled(path: Path, measured: Mapping[str, Path]) -> str:
+    """How a model's file came out of the measurement that it was sent through."""
+    work = path.parent.with_name(path.parent.name + "-work") / "registered" / path.stem / path.stem
+    how = _registration(_record(work / "provenance.json"))
+    same = how in {_registration(_record(folder / "provenance.json")) for folder in measured.values()}
+    return (
+        "the model was sent through the measurement: its displacement moved the unloaded image, freed of noise; noise "
+        "and a receive field were drawn anew; and the pair was registered"
+        + (" as the images were." if same else f" as follows. {how}")
+    )
+
+
+def _along(axes: Sequence[Sequence[float]], column: int, sign: float = 1.0) -> str:
+    return "(" + ", ".join(f"{sign * row[column] + 0.0:.3g}" for row in axes) + ")"
+
+
+def _solver(record: Record) -> str:
+    given, versions = record["parameters"], record.get("versions", {})
+    made = given.get("mesh_made")
+    mesh = (
+        f" on a mesh of fTetWild (Hu 2020; pytetwild {made['pytetwild']}) with edges of {made['edge_mm']:g} mm"
+        if made
+        else ""
+    )
+    loads = _listed([f"{step['name']} {LoadStep(**step).told}" for path in given["paths"] for step in path])
+    axes = {load: told.get("plate_axes_lps") for load, told in record.get("outcome", {}).items()}
+    if any(own != first for own in axes.values() for first in axes.values()):
+        loads += "".join(
+            f"; {load} with the plate's outward normal along {_along(own, 0, -1.0)} "
+            f"and shear along {_along(own, 1)} (LPS)"
+            for load, own in axes.items()
+            if own is not None
+        )
+    contact = "bonded to the plate from the first touch" if given.get("taped", True) else "without friction"
+    return (
+        f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh}: {given['element']}; "
+        f"plate {given['plate']}; skin {contact}; fixed: {', '.join(given['fixed'])}; loads {loads}."
+    )
+
+
+def _compared(
+    cells: int, strains: tuple[float, float], thresholds: Sequence[float], least_ml: float, version: str
+) -> str:
+    levels = _listed([f"{t:g}" for t in thresholds])
+    return (
+        f"Models and measurement were compared with mrstrain {version} at the centroids of the same {cells} "
+        "tetrahedra, weighted by volume, in the unloaded configuration. Intensity: area between the curves of tissue "
+        f"volume above a maximal shear, from {strains[0]:g} to {strains[1]:g}. Location: tissue above {levels}; "
+        "overlap (Dice 1945), distance of the centroids, 95th percentile of the Hausdorff distance, clusters of "
+        f"{least_ml:g} mL or more. "
+        "Agreement cell by cell: regression, concordance (Lin 1989), limits of agreement (Bland 1986)."
+    )
+
+
+def _doubt(measured: Mapping[str, Path]) -> str:
+    known, twin = _sources(measured), _twins(measured)
+    return (
+        f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATED} draws) come from truths drawn by the "
+        f"registration's error model: bias, spatially correlated noise. {known} {twin}Displacement has no error model."
+    )
+
+
+def _sources(measured: Mapping[str, Path]) -> str:
+    """Where the registrations' error models come from, each told once."""
+    return " ".join(sorted({str(one["source"]) for one in _errors(measured).values() if one.get("source")}))
+
+
+def _twins(measured: Mapping[str, Path]) -> str:
+    """Which registrations' error bars a twin judged; a sentence with a space after it, or nothing."""
+    judged = [
+        load
+        for load, of in _errors(measured).items()
+        if any(row.get("factor") is not None for row in of.get("twin", []))
+    ]
+    if not judged:
+        return ""
+    return (
+        f"The error bars of {_listed(judged)} were judged by a twin of the pair (the unloaded image moved by what was "
+        "measured, and registered once more), and made wider where they did not hold. "
+    )
+
+
+def _errors(measured: Mapping[str, Path]) -> dict[str, Record]:
+    """What each registration tells of the error of its maximal shear."""
+    return {load: _record(folder / "quality.json").get("error_of_max_shear", {}) for load, folder in measured.items()}

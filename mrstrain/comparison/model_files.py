@@ -1,0 +1,176 @@
+"""Which file is whose: the models and loads of a comparison, and what a model's folder says of its unit and frame."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.errors import ExtentError, InputError
+from dvc.images.image import Grid
+from dvc.mesh import box_told
+from mrstrain.records.inputs import read_matrix
+from validate.fe_result import FeResult, check_overlap, read_result
+
+ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
+SETTINGS = "model.toml"
+"""In a model's folder: mesh, unit, frame and to_image of this model alone."""
+
+IN_IMAGE = 'unit = "mm"\nframe = "LPS"\nto_image = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n'
+"""Settings of results that lie in the image already."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """How a model's files are read; as in `validate.fe_result.read_result`."""
+
+    mesh: Path | None = None
+    unit: str = "mm"
+    frame: str = "LPS"
+    to_image: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelFile:
+    """A model's result for one load."""
+
+    name: str
+    path: Path
+    reading: Reading
+
+    def read(self, grid: Grid) -> FeResult:
+        """The result, which has to lie in the image on this grid; errors as `read_result` and `check_overlap`."""
+        how = self.reading
+        try:
+            result = read_result(
+                self.name, self.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image
+            )
+        except ExtentError as failure:
+            raise ExtentError(f"{failure} The image: {box_told(*grid.bounds_mm())} (LPS mm).") from failure
+        check_overlap(self.path, result.mesh, grid)
+        return result
+
+
+def model_files(
+    loads: Sequence[str], models: Sequence[Path], usual: Reading
+) -> tuple[dict[str, list[ModelFile]], list[str]]:
+    """For each load the models' files, in the order given; and in sentences what is missing.
+
+    Raises
+    ------
+    InputError
+        If a model is not there, two have one name, or none has a file of a measured load.
+    """
+    if not models:
+        raise InputError("No model is given: a folder with a file for each load, or a file.")
+    files: dict[str, list[ModelFile]] = {load: [] for load in loads}
+    notes: list[str] = []
+    taken: set[str] = set()
+    for place in models:
+        name, chosen = _chosen(place, loads)
+        if name in taken:
+            raise InputError(f"Two models are called '{name}': give their folders names of their own.")
+        if not chosen:
+            lacking = f"no file of a measured load ({', '.join(loads)}), ending in {', '.join(ENDINGS)}"
+            if len(models) == 1:
+                raise InputError(f"{place} has {lacking}.")
+            notes.append(f"{name} has {lacking}: it is left out.")
+            continue
+        taken.add(name)
+        reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
+        reading = _reading(place, usual)
+        for load in loads:
+            if load not in chosen:
+                notes.append(f"{name} has no result for {load}.")
+            elif reached.get(load, 0.0 if reached else 1.0) < 1.0:
+                notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}, which is not compared.")
+            else:
+                files[load].append(ModelFile(name, chosen[load], reading))
+                if stable.get(load, 1.0) < 1.0:
+                    notes.append(
+                        f"{name}, {load}: a law of this model is not stable (Drucker) at the strain reached, in up to "
+                        f"{1.0 - stable[load]:.1%} of a tissue. It is compared all the same; do not trust its rank."
+                    )
+    files = {load: of for load, of in files.items() if of}
+    if not files:
+        raise InputError("No model has a whole result for a measured load. " + " ".join(notes))
+    return files, notes
+
+
+def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
+    if place.is_dir():
+        found = {
+            load: file for load in loads for ending in reversed(ENDINGS) if (file := place / (load + ending)).is_file()
+        }
+        return place.resolve().name, found
+    if not place.is_file():
+        raise InputError(f"{place}: there is no such model.")
+    if place.stem in loads:
+        return place.parent.resolve().name, {place.stem: place}
+    if len(loads) > 1:
+        raise InputError(
+            f"{place}: which load is it of? Measured are {', '.join(loads)}: call the file so, or give one load's "
+            "folder as the measurement."
+        )
+    if place.stem in _outcome(place, "reached"):
+        raise InputError(f"{place} is a simulation of {place.stem}, and {loads[0]} was measured.")
+    return place.stem, {loads[0]: place}
+
+
+def files_named(place: Path) -> list[Path]:
+    """Files that a model's settings name, and the settings themselves where they do not lie in its folder."""
+    settings = (place if place.is_dir() else place.parent) / SETTINGS
+    if not settings.is_file():
+        return []
+    try:
+        told = tomllib.loads(settings.read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # said where the model is read
+        return [settings]
+    named = [settings.parent / str(told[key]) for key in ("mesh", "to_image") if isinstance(told.get(key), str)]
+    return [settings, *(path for path in named if path.is_file())]
+
+
+def loads_of(place: Path, has_mesh: bool) -> list[str]:
+    """Loads for which a model's folder has a file: those that a simulation of ours tells, else by the files' names."""
+    told = _outcome(place, "reached")
+    if told:
+        return [load for load in told if any((place / (load + ending)).is_file() for ending in ENDINGS)]
+    kept = [ending for ending in ENDINGS if ending != ".csv" or has_mesh or (place / SETTINGS).is_file()]
+    own = _reading(place, Reading()).mesh
+    return sorted({p.stem for p in place.iterdir() if p.suffix.lower() in kept and p != own})
+
+
+def _outcome(place: Path, key: str) -> dict[str, float]:
+    """What a simulation of ours tells of each load: "reached", its share, or "stable_share"."""
+    folder = place if place.is_dir() else place.parent
+    try:
+        outcome = json.loads((folder / "simulation.json").read_text(encoding="utf-8"))["outcome"]
+        return {load: float(told[key]) for load, told in outcome.items()}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _reading(place: Path, usual: Reading) -> Reading:
+    settings = (place if place.is_dir() else place.parent) / SETTINGS
+    if not settings.is_file():
+        return usual
+    try:
+        told = tomllib.loads(settings.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{settings} is no TOML file ({error}).") from error
+    unknown = sorted(set(told) - {"mesh", "unit", "frame", "to_image"})
+    if unknown:
+        raise InputError(f"{settings}: '{unknown[0]}' is none of mesh, unit, frame, to_image.")
+    made = replace(usual, unit=str(told.get("unit", usual.unit)), frame=str(told.get("frame", usual.frame)))
+    if "mesh" in told:
+        made = replace(made, mesh=settings.parent / str(told["mesh"]))
+    if isinstance(told.get("to_image"), str):
+        made = replace(made, to_image=read_matrix(settings.parent / told["to_image"]))
+    elif "to_image" in told:
+        made = replace(made, to_image=np.asarray(told["to_image"], dtype=np.float64))
+    return made

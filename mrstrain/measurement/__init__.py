@@ -1,0 +1,1 @@
+"""`register` and `strain`: from images or transforms to a folder of strain maps with error bars and a report."""

@@ -1,0 +1,119 @@
+"""What was measured: the loads in a folder that `register` or `strain` wrote."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvc.deformation.protocol import Deformation, Within
+from dvc.errors import InputError
+from dvc.io.images.labels import read_mask
+from dvc.io.transforms.bordered_spline import NAME as BORDERS
+from dvc.io.transforms.displacement_image import read_displacement
+from dvc.io.transforms.read import read_transform
+from dvc.trust.error_model import ErrorTable, read_error_model
+from dvc.trust.verdict import Verdict, worst
+
+_FIELD, _VALID = "displacement.nii.gz", "valid.nii.gz"
+_REPEAT = "repeat"  # a repeat scan is no load
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """One load as it was measured.
+
+    Attributes
+    ----------
+    load : str
+    folder : Path
+    table : ErrorTable or None
+        Error of the maximal shear, where it is known.
+    verdict : Verdict or None
+        On the registration.
+    aligned_on : str
+        "bone", "image" or "none"; empty where it is not told.
+    """
+
+    load: str
+    folder: Path
+    table: ErrorTable | None
+    verdict: Verdict | None
+    aligned_on: str = ""
+
+    @property
+    def field(self) -> Path:
+        """The displacement image."""
+        return self.folder / _FIELD
+
+    @property
+    def files(self) -> list[Path]:
+        """What is read of the displacement."""
+        jumping = self.folder / BORDERS
+        return [jumping, self.folder / _VALID] if jumping.is_file() else [self.field]
+
+    def deformation(self) -> Deformation:
+        """Displacement of tissue relative to its bone: with its jumps of strain at borders, where it has any."""
+        if (self.folder / BORDERS).is_file():
+            return Within(spline_in(self.folder), read_mask(self.folder / _VALID), margin_voxels=0)
+        return read_displacement(self.field)
+
+
+def spline_in(folder: Path) -> Deformation:
+    """The displacement of tissue relative to its bone that `register` found for one load, with its own gradient."""
+    for name in (BORDERS, "TransformParameters.0.txt"):
+        if (folder / name).is_file():
+            return read_transform(folder / name)
+    raise InputError(f"{folder} has neither {BORDERS} nor TransformParameters.0.txt: register this load again.")
+
+
+def measurements_in(place: Path, loads: Sequence[str] = ()) -> list[Measurement]:
+    """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is; or some of them by name.
+
+    Raises
+    ------
+    InputError
+        If there is none, or one that is asked for is missing.
+    """
+    folders = [place] if (place / _FIELD).is_file() else sorted(p.parent for p in place.glob(f"*/{_FIELD}"))
+    folders = [f for f in folders if f == place or f.name != _REPEAT]
+    if not folders:
+        raise InputError(
+            f"{place}: no results of `register` or `strain` here (LOAD/{_FIELD}). Give the folder they wrote."
+        )
+    absent = [load for load in loads if load not in [f.resolve().name for f in folders]]
+    if absent:
+        raise InputError(f"{place} has no results of {', '.join(absent)}.")
+    found = []
+    for folder in folders:
+        if loads and folder.resolve().name not in loads:
+            continue
+        model = folder / "error_model.json"
+        table = read_error_model(model).tables[0] if model.is_file() else None
+        verdict, aligned_on = None, ""
+        if (folder / "quality.json").is_file():
+            told = json.loads((folder / "quality.json").read_text(encoding="utf-8"))
+            verdict = Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"]))
+            aligned_on = str(told.get("alignment", {}).get("on", ""))
+        found.append(Measurement(folder.resolve().name, folder, table, verdict, aligned_on))
+    return found
+
+
+def verdict_on(measurements: Sequence[Measurement], strange: Sequence[str] = ()) -> Verdict | None:
+    """The verdict on a comparison with measurements: the worst of theirs, and of what is ``strange`` about models.
+
+    All reasons for less than trust are told, the worst first; trust is said to be in the measurement, and not in the
+    models. None where no measurement has a verdict and nothing is strange.
+    """
+    given = [Verdict("caution", tuple(strange))] if strange else []
+    for one in measurements:
+        if one.verdict is not None:
+            what = "is not to be trusted" if one.verdict.level == "distrust" else "is to be used with care"
+            told = tuple(f"{one.load}: its registration {what}: {reason}" for reason in one.verdict.reasons)
+            given.append(Verdict(one.verdict.level, () if one.verdict.level == "trust" else told))
+    if not given:
+        return None
+    reasons = {level: [r for v in given if v.level == level for r in v.reasons] for level in ("distrust", "caution")}
+    sound = f"The measurement: {len(given)} registrations are sound. The models are judged below."
+    return Verdict(worst(given).level, (*reasons["distrust"], *reasons["caution"]) or (sound,))

@@ -1,0 +1,174 @@
+"""`strain`: strain maps from a transform or displacement field that any tool has made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvc.deformation.protocol import Composed, Deformation, RigidMotion
+from dvc.errors import InputError
+from dvc.images.image import Mask
+from dvc.images.tissue import tissue_mask
+from dvc.io.transforms.displacement_image import read_displacement
+from dvc.io.transforms.read import read_transform
+from dvc.registration.align import motion_of
+from mrstrain.measurement.page import write_series_report
+from mrstrain.measurement.results import Case, Measured, write_measured
+from mrstrain.records.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.provenance import provenance, write_json
+
+_TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm", ".npz")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """A deformation that was found elsewhere, with the subject it belongs to.
+
+    Attributes
+    ----------
+    subject : Subject
+    whole : Deformation
+        Of points of the reference to points of the loaded image, LPS mm.
+    source : Path
+    record : dict
+        Provenance.
+    """
+
+    subject: Subject
+    whole: Deformation
+    source: Path
+    record: dict[str, object]
+
+    @property
+    def files(self) -> list[Path]:
+        """All files that were read."""
+        return [self.source, *self.subject.files.values()]
+
+    def measured(self, name: str) -> Measured:
+        """The deformation of tissue relative to its bone, where there is one."""
+        relative, motion = without_motion(self.whole, self.subject.bone)
+        body = self.subject.tissue or tissue_mask(self.subject.reference)
+        return Measured(name, self.subject, body, relative, motion)
+
+
+def without_motion(whole: Deformation, bone: Mask | None) -> tuple[Deformation, RigidMotion]:
+    """A deformation without the rigid motion of a mask's voxels (least squares), and that motion; whole without one.
+
+    Raises
+    ------
+    InputError
+        If it is not defined in the mask.
+    """
+    if bone is None:
+        return whole, RigidMotion.identity()
+    motion = motion_of(whole, bone)
+    return Composed([whole, motion.inverse()]), motion
+
+
+def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
+    """A deformation from the file of any tool: a transform, or a displacement image, which may not tell its frame."""
+    source = Path(deformation)
+    if source.suffix.lower() in _TRANSFORMS:
+        if frame is not None:
+            raise InputError(f"{source}: a transform file is in LPS; a frame is told of displacement images alone.")
+        return read_transform(source)
+    return read_displacement(source, frame=frame)
+
+
+def read_deformation(
+    subject: Subject, deformation: Path | str, *, frame: str | None, command: str, parameters: Mapping[str, object]
+) -> Given:
+    """Read a deformation of a subject's unloaded image from the file of any tool."""
+    source, whole = Path(deformation), read_any(deformation, frame)
+    record = provenance(command, {**subject.files, "deformation": source}, {"frame": frame, **parameters})
+    return Given(subject, whole, source, record)
+
+
+@dataclass(frozen=True, slots=True)
+class Strained:
+    """What `strain` gave: the folder and the case in it."""
+
+    out: Path
+    case: Case
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        return [*self.case.summary(), f"Report: {self.out / 'report.html'}"]
+
+
+def strain(
+    reference: Path | str,
+    deformation: Path | str,
+    *,
+    out: Path | str,
+    bone: Path | str | None = None,
+    bone_label: str | None = None,
+    tissue: Path | str | None = None,
+    labels: Path | str | None = None,
+    names: Path | str | None = None,
+    frame: str | None = None,
+    mesh: Path | str | None = None,
+    mesh_unit: str = "mm",
+    mesh_frame: str = "LPS",
+    plate_normal: Sequence[float] | None = None,
+    shear_direction: Sequence[float] | None = None,
+) -> Strained:
+    """Strain maps of a deformation that was found elsewhere.
+
+    Parameters
+    ----------
+    reference : path
+        Unloaded image (reference configuration): gives the voxels.
+    deformation : path
+        An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), a spline with borders of
+        tissues (.npz), or a displacement image. All map points of the reference to points of the loaded image.
+    out : path
+    bone, bone_label, labels, names
+        With a bone, its rigid motion (least squares over its voxels) is taken out of the displacement.
+    tissue : path, optional
+        Where strain is wanted; found by a threshold where it is not given.
+    frame : {"LPS", "RAS"}, optional
+        Frame of a displacement image's components, where no JSON file beside it tells.
+    mesh, mesh_unit, mesh_frame, plate_normal, shear_direction
+        As in `register`.
+
+    Returns
+    -------
+    Strained
+    """
+    target, source = Path(out), Path(deformation)
+    subject = read_subject(
+        reference,
+        bone=bone,
+        bone_label=bone_label,
+        tissue=tissue,
+        labels=labels,
+        names=names,
+        mesh=mesh,
+        mesh_unit=mesh_unit,
+        mesh_frame=mesh_frame,
+        plate_normal=plate_normal,
+        shear_direction=shear_direction,
+    )
+    given = read_deformation(
+        subject,
+        deformation,
+        frame=frame,
+        command="strain",
+        parameters={
+            "bone_label": bone_label,
+            "plate_normal_lps": subject.plate_normal.tolist(),
+            "shear_direction_lps": None if shear_direction is None else list(shear_direction),
+            "mesh_unit": mesh_unit,
+            "mesh_frame": mesh_frame,
+        },
+    )
+    name = case_names([source])[0].removesuffix(source.suffix) or "strain"
+    refuse_touching_inputs(target, [name], given.files)
+    measured = given.measured(name)
+    make_output(target)
+    case = write_measured(target / name, measured, given.record)
+    write_json(target / "provenance.json", given.record)
+    write_series_report(target / "report.html", [case.section], {}, given.record)
+    return Strained(target, case)

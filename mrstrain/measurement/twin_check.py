@@ -1,0 +1,103 @@
+"""The twin of a registered pair: the unloaded image moved by what was measured, and measured again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvc.arrays import Float32Array
+from dvc.deformation.protocol import Deformation
+from dvc.deformation.strain_maps import strain_maps
+from dvc.errors import InputError, MrstrainError
+from dvc.images.noise import signal_to_noise
+from dvc.images.resample import shows
+from dvc.images.tissue import tissue_mask
+from dvc.registration.register import Registration, register
+from dvc.worker import Worker
+from mrstrain.records.inputs import Subject
+from phantoms.twin import loaded_twin
+
+_FOLDED = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwinCheck:
+    """What came back from the twin, or why nothing did.
+
+    Attributes
+    ----------
+    max_shear : (ni, nj, nk) or None
+        Found in the twin, on the unloaded image's grid; NaN where not defined.
+    failure : str
+    """
+
+    max_shear: Float32Array | None
+    failure: str = ""
+
+
+def twin_check(
+    found: Registration,
+    subject: Subject,
+    start: Deformation | None,
+    worker: Worker,
+    tell: Callable[[str, float], None],
+) -> TwinCheck:
+    """Move the unloaded image by what was found, draw its noise anew, and register it as the pair was.
+
+    The twin lies on the loaded image's grid, and is as noisy as the noisier of the two.
+
+    Parameters
+    ----------
+    found : Registration
+        Of the pair. Its strain is the twin's true one.
+    subject : Subject
+    start : Deformation or None
+        What the pair's registration started from.
+    worker : Worker
+    tell : callable
+        ``tell(stage, fraction)``.
+    """
+    tell("making the twin", 0.0)
+    motion, seed = found.alignment.motion, found.settings.seed
+    try:
+        twin = loaded_twin(
+            found.reference,
+            found.tissue,
+            found.total,
+            near=motion,
+            seed=seed,
+            onto=found.loaded.grid,
+            noisier=_noisier(found),
+            beyond_missing=True,
+        ).image
+        tell("making the twin", 1.0)
+        again = register(
+            found.reference,
+            twin,
+            bone=subject.bone,
+            tissue=found.tissue,
+            labels=subject.labels,
+            settings=found.settings,
+            start=start,
+            worker=worker,
+            progress=lambda stage, fraction: tell(f"twin: {stage}", fraction),
+        )
+    except MrstrainError as reason:
+        return TwinCheck(None, str(reason))
+    placed, edge = again.alignment.motion, float(again.bspline.control.spacing_mm.min())
+    maps = strain_maps(again.deformation, again.tissue, lambda x: shows(twin, placed.apply(x), edge))
+    folded = float(np.mean(maps.jacobian[found.tissue.inside] <= 0.0))
+    if folded > _FOLDED:
+        return TwinCheck(None, f"Its registration folds in {folded:.1%} of the tissue, so it tells nothing.")
+    return TwinCheck(maps.max_shear)
+
+
+def _noisier(found: Registration) -> float:
+    """How many times noisier the loaded image is than the unloaded one, for its signal; at least 1."""
+    try:
+        loaded = signal_to_noise(found.loaded, tissue_mask(found.loaded))
+    except InputError:  # no threshold finds the body there
+        return 1.0
+    return max(1.0, signal_to_noise(found.reference, found.tissue) / loaded)

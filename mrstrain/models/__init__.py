@@ -1,0 +1,1 @@
+"""`mesh`, `simulate`, `converge` and `fit`: finite-element models made, loaded and fitted."""

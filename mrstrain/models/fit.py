@@ -1,0 +1,144 @@
+"""`fit`: parameters of a material law from a stretch-stress curve, with intervals, a picture and a material set."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dvc.atomic_files import whole_file, write_whole
+from fe import figures
+from fe.fitting import Fit, read_curves
+from fe.fitting import fit as fit_law
+from fe.hyperelastic import OGDEN
+from fe.materials import Material, Ogden
+from fe.published import as_toml
+from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.provenance import provenance, write_json
+
+_FILES = ["fit.json", "fit.csv", "fit.png", "material.toml"]
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """What `fit` gave, and the folder it is in."""
+
+    out: Path
+    found: Fit
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        found = self.found
+        lines = [found.material.told]
+        for p in found.parameters:
+            scale, unit = (1.0, "") if p.name.startswith("alpha") else (1000.0, " kPa")
+            lines.append(
+                f"  {p.name} {scale * p.value:.4g}{unit}, 95 % from {scale * p.low:.4g} to {scale * p.high:.4g}"
+            )
+        lines.append("R2 " + ", ".join(f"{mode} {r2:.4f}" for mode, r2 in found.r2.items()))
+        for mode, (low, high) in found.reached.items():
+            stable = found.stable[mode]
+            lines.append(
+                f"{mode}: measured at stretches {low:.3g} to {high:.3g}, stable from {stable[0]:.3g} to {stable[1]:.3g}"
+            )
+        lines += _in_programs(found.material)
+        for p in found.parameters:
+            if p.at_bound:
+                lines.append(
+                    f"These curves do not determine {p.name}: alone they would have it lower than a law may have it, "
+                    "and its value is that bound. Measure nearer to a stretch of 1, or take a law with fewer "
+                    "parameters."
+                )
+            elif p.low <= 0.0 <= p.high:
+                lines.append(
+                    f"These curves do not determine {p.name}: its interval holds 0. Take a law with fewer parameters."
+                )
+        if not found.stable_where_measured:
+            lines.append("NOT stable (Drucker) at every stretch measured: take another law, or simulate less strain.")
+        lines += [f"These curves cannot tell it from: {other.told}" for other in found.others]
+        return [*lines, f"Results: {self.out}"]
+
+
+def _in_programs(law: Material) -> list[str]:
+    """The numbers of an Ogden law as three programs want them, kPa."""
+    if not isinstance(law, Ogden):
+        return []
+    pairs = law.vector[OGDEN:].reshape(-1, 2).tolist()
+    told = {
+        "ANSYS (mu, alpha)": [(2000.0 * mu / alpha, alpha) for mu, alpha in pairs],
+        "Abaqus, CalculiX (mu, alpha)": [(1000.0 * mu, alpha) for mu, alpha in pairs],
+        "FEBio (c, m)": [(2000.0 * mu, alpha) for mu, alpha in pairs],
+    }
+    return [
+        f"  as {program}: " + "; ".join(f"{first:.4g} kPa, {second:.4g}" for first, second in values)
+        for program, values in told.items()
+    ]
+
+
+def fit(
+    curve: Path | str,
+    law: str,
+    *,
+    out: Path | str,
+    test: str | None = None,
+    nu: float = 0.4999,
+    tissue: str = "fat",
+) -> Fitted:
+    """Fit a law to the curves of a CSV file.
+
+    Parameters
+    ----------
+    curve : path
+        As `fe.fitting.read_curves` takes it: stretch, and nominal or true stress in kPa or MPa.
+    law : str
+        A name of `fe.fitting.LAWS`.
+    out : path
+        Gets ``fit.json``, ``fit.csv`` (measured and fitted), ``fit.png``, and ``material.toml`` with the law.
+    test : str, optional
+        Kind of test where the file has no column for it: uniaxial, equibiaxial, pure shear.
+    nu : float
+        Poisson's ratio to simulate with; the fit takes the tissue as incompressible.
+    tissue : str
+        Region that the law is for, in ``material.toml``.
+
+    Raises
+    ------
+    InputError
+        If the file or its curves cannot be used; before anything is written.
+    """
+    path, target = Path(curve), Path(out)
+    curves = read_curves(path, test)
+    found = fit_law(curves, law, nu)
+    refuse_touching_inputs(target, _FILES, [path])
+    make_output(target)
+    given = {"law": law, "test": test, "nu": nu, "tissue": tissue}
+    record = provenance("fit", {"curve": path}, given)
+    told = asdict(found) | {"material": found.material.told, "others": [o.told for o in found.others]}
+    write_json(
+        target / "fit.json",
+        told
+        | {
+            "mu_of_ogden": "initial shear modulus of the term, MPa (Abaqus' convention)",
+            "in_programs": [line.strip() for line in _in_programs(found.material)],
+            "stable_where_measured": found.stable_where_measured,
+            "provenance": record,
+        },
+    )
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["test", "stretch", "nominal_stress_kpa", "fitted_kpa"])
+    for c in curves:
+        fitted = 1000.0 * found.material.nominal_stress(c.stretch, c.mode)
+        for row in np.column_stack([c.stretch, 1000.0 * c.stress_mpa, fitted]):
+            writer.writerow([c.mode, *(f"{v:.8g}" for v in row)])
+    write_whole(target / "fit.csv", text.getvalue())
+    with whole_file(target / "fit.png") as part:
+        part.write_bytes(figures.stress_stretch(curves, found))
+    source = f"{law} fitted to {path.name}"
+    if at_bound := [p.name for p in found.parameters if p.at_bound]:
+        source += f", which does not determine {', '.join(at_bound)}"
+    write_whole(target / "material.toml", as_toml(path.stem, source, {tissue: found.material}))
+    return Fitted(target, found)

@@ -1,0 +1,111 @@
+"""`mesh`: a label map's soft tissues as tetrahedra, with a table of the mesh's quality and a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from dvc.atomic_files import whole_file
+from dvc.errors import InputError, OutputError
+from dvc.io.images.labels import read_labels
+from dvc.mesh import TetMesh
+from fe import figures
+from fe.mesh_file import write_tet_mesh
+from fe.meshing import MeshQuality, mesh_labels
+from fe.plate import Plate
+from fe.surface_sets import BONE, SKIN
+from mrstrain.records.inputs import is_bones_name, make_output
+from mrstrain.records.provenance import provenance
+
+_CARE_VOLUME, _CARE_ANGLE_DEG = 0.02, 10.0
+_INFERIOR, _FORWARD = (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Meshed:
+    """What `mesh` wrote."""
+
+    out: Path
+    mesh: TetMesh
+    quality: MeshQuality
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        q = self.quality
+        volumes = ", ".join(f"{name} {made:.1f} ({kept:.1f})" for name, made, kept in q.volumes_ml)
+        low, middle, high = q.edge_mm
+        lines = [
+            f"{q.cells} tetrahedra, {q.nodes} nodes; edges {middle:.2f} mm ({low:.2f} to {high:.2f}), dihedral angles "
+            f"{q.least_angle_deg:.1f} to {q.greatest_angle_deg:.1f} degrees",
+            f"Volumes, mL (in the label map): {volumes}",
+            "Facets: " + ", ".join(f"{name} {len(rows)}" for name, rows in self.mesh.facets.items()),
+        ]
+        lines += [
+            f"CARE: {name} differs by {made / given - 1.0:+.1%} from its volume in the label map."
+            for name, made, given in q.volumes_ml
+            if abs(made - given) > _CARE_VOLUME * given
+        ]
+        if q.least_angle_deg < _CARE_ANGLE_DEG:
+            lines.append(f"CARE: the least dihedral angle is {q.least_angle_deg:.1f} degrees.")
+        lines += [
+            f"{share:.0%} of the cells of {name} reach through it, one cell thick; --finer makes it thicker."
+            for name, share in q.thin
+        ]
+        lines += [
+            f"CARE: {name} is meshed as soft tissue, and called as a bone is: cut it out with --bone {name}."
+            for name in self.mesh.regions
+            if is_bones_name(name)
+        ]
+        if not any(name.casefold() == SKIN for name in self.mesh.regions):
+            lines.append(
+                "CARE: no tissue is called skin, so the cut (where the label map ends) cannot be told from the outer "
+                "surface: it counts as 'skin', which the plate may touch, and there are no facets 'cut'."
+            )
+        return [*lines, f"Mesh: {self.out}"]
+
+
+def mesh(
+    labels: Path | str,
+    *,
+    out: Path | str,
+    edge_mm: float = 2.0,
+    names: Path | str | None = None,
+    bones: Sequence[str] = (BONE,),
+    finer: tuple[str, float] | None = None,
+    limit_s: float = 3600.0,
+    watch: Callable[[float], None] = lambda _: None,
+) -> Meshed:
+    """Mesh the soft tissues of a label map.
+
+    Parameters
+    ----------
+    labels, names : path
+        As in `register`.
+    out : path
+        The mesh, ending in .vtu; beside it a .json with names and quality, and a .png.
+    edge_mm, bones, finer, limit_s, watch
+        As in `fe.meshing.mesh_labels`.
+
+    Raises
+    ------
+    InputError, OutputError, MrstrainError
+        As there; or if the output is not a .vtu, or would replace an input.
+    """
+    target = Path(out)
+    if target.suffix.lower() != ".vtu":
+        raise InputError(f"--out is the mesh itself and ends in .vtu; got {target}.")
+    inputs = {"labels": Path(labels)} | ({} if names is None else {"names": Path(names)})
+    written = [target, target.with_suffix(".json"), target.with_suffix(".png")]
+    for path in inputs.values():
+        if path.resolve() in [w.resolve() for w in written]:
+            raise OutputError(f"{path} would be replaced by a result. Choose another --out.")
+    given = read_labels(labels, names)
+    make_output(target.parent)
+    made, quality = mesh_labels(given, edge_mm, bones=bones, finer=finer, limit_s=limit_s, watch=watch)
+    record = provenance("mesh", inputs, {"edge_mm": edge_mm, "bones": list(bones), "finer": finer})
+    write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
+    plate = Plate(_INFERIOR, _FORWARD)
+    with whole_file(target.with_suffix(".png")) as part:
+        part.write_bytes(figures.mesh_slice(made, plate))
+    return Meshed(target, made, quality)

@@ -1,0 +1,255 @@
+"""Whether this machine and this environment are fit for a run.
+
+Nothing of ours is imported here but the standard library: another distribution may own the name ``dvc`` or
+``validate``, and that is the first thing to find out.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+_OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
+# Distributions known to bring a top-level package of one of our names.
+_RIVALS = {
+    "dvc": ("dvc", "Data Version Control"),
+    "configobj": ("validate", "ConfigObj"),
+    "validate": ("validate", ""),
+}
+_NEEDED = (
+    "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "meshio", "nibabel", "pydicom", "numba",
+    "matplotlib", "jinja2", "rich", "typer", "loky", "distributed", "filelock", "pydantic", "pytetwild", "pyvista",
+    "vtk",
+)  # fmt: skip
+_ELASTIX = "0.25."  # the series that the parameters and their checks were written for
+_OLDEST_PYTHON = (3, 11)
+_GIB = 1024**3
+_LEAST_MEMORY_GIB = 6.0  # a pair of 256^3 images
+_LEAST_DISK_GIB = 2.0  # one loaded image's results at that size
+
+
+class ForeignPackageError(ImportError):
+    """A package of one of our names that is not ours.
+
+    An ImportError and no `dvc.errors.MrstrainError`: `dvc.errors` may be not ours either.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes
+    ----------
+    what : str
+        What was looked at.
+    ok : bool
+        Whether it is as a run needs it.
+    detail : str
+        What was found.
+    advice : str
+        What to do where it is not ok; empty otherwise.
+    """
+
+    what: str
+    ok: bool
+    detail: str
+    advice: str = ""
+
+
+def examine(
+    folder: str | os.PathLike[str] = ".", *, trials: Mapping[str, Callable[[], str]] | None = None
+) -> list[Finding]:
+    """Look at all that a run depends on, and stop at nothing.
+
+    Parameters
+    ----------
+    folder : path
+        Where results would be written; its disk is looked at. The nearest existing parent counts.
+    trials : mapping of str to callable, optional
+        By what each tries: does something small, and returns a line on how it went; raises where it
+        failed.
+
+    Returns
+    -------
+    list of Finding
+        In the order in which they are best mended.
+    """
+    findings = [_python(), _foreign(), *_packages(), _cores(), _memory(), _disk(Path(folder)), _temporary()]
+    return [*findings, *(_tried(what, trial) for what, trial in (trials or {}).items())]
+
+
+def refuse_foreign_packages() -> None:
+    """Refuse to run where ``dvc``, ``validate`` or another of our packages is somebody else's.
+
+    Takes a few milliseconds: the first line of every run.
+
+    Raises
+    ------
+    ForeignPackageError
+        If one of the names resolves to a place that is not ours, or a distribution that writes into the same
+        folder is installed beside mrstrain (the later one of the two overwrote files of the other).
+    """
+    reasons = _foreign_packages()
+    if reasons:
+        raise ForeignPackageError(
+            f"{' '.join(reasons)} Install mrstrain in an environment of its own: python -m venv "
+            "mrstrain-env, then mrstrain-env/bin/pip install mrstrain (or: uv tool install mrstrain)."
+        )
+
+
+def _foreign_packages() -> list[str]:
+    home = Path(__file__).resolve().parents[2]
+    reasons = []
+    for name, (package, title) in _RIVALS.items():
+        try:
+            rival = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        if _brings(rival, package):
+            called = f"{name} ({title})" if title else name
+            reasons.append(
+                f"The distribution {called} {rival.version} is installed here, and its package {package!r} "
+                "has the name of one of mrstrain's."
+            )
+    for package in _OURS:
+        try:
+            spec = importlib.util.find_spec(package)
+        except ValueError:  # a module in sys.modules without a spec
+            spec = None
+        places = [Path(place).resolve() for place in spec.submodule_search_locations or ()] if spec else []
+        if home / package not in places:
+            found = spec.origin if spec and spec.origin else "nowhere"
+            reasons.append(f"The package {package!r} should be in {home} and is found in {found}.")
+    return reasons
+
+
+def _brings(distribution: importlib.metadata.Distribution, package: str) -> bool:
+    files = distribution.files
+    if files is None:  # no record of files: some system packages
+        return package in (distribution.read_text("top_level.txt") or package).split()
+    return any(file.parts[0] in {package, f"{package}.py"} for file in files)
+
+
+def _foreign() -> Finding:
+    reasons = _foreign_packages()
+    if not reasons:
+        return Finding("package names", True, f"{', '.join(_OURS)} are mrstrain's own")
+    advice = "Install mrstrain in an environment of its own."
+    return Finding("package names", False, " ".join(reasons), advice)
+
+
+def _python() -> Finding:
+    detail = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    if sys.version_info[:2] < _OLDEST_PYTHON:
+        return Finding("Python", False, detail, "Install Python 3.11 or newer.")
+    if sys.maxsize <= 2**32:
+        return Finding("Python", False, f"{detail}, 32 bit", "Install a 64-bit Python.")
+    return Finding("Python", True, detail)
+
+
+def _packages() -> list[Finding]:
+    findings = []
+    for name in _NEEDED:
+        try:
+            version = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            advice = f"pip install {name}"
+            if name == "itk-elastix":
+                advice += "; wheels: Linux (glibc 2.28), macOS 15 on Apple silicon, Windows x64"
+            findings.append(Finding(name, False, "not installed", advice))
+            continue
+        ok = name != "itk-elastix" or version.startswith(_ELASTIX)
+        advice = "" if ok else f"pip install 'itk-elastix=={_ELASTIX}*': parameters are checked against it."
+        findings.append(Finding(name, ok, version, advice))
+    return findings
+
+
+def _cores() -> Finding:
+    try:
+        count = len(os.sched_getaffinity(0))  # what this process may use, not what the machine has
+    except AttributeError:
+        count = os.cpu_count() or 1
+    return Finding("processor cores", True, str(count))
+
+
+def _memory() -> Finding:
+    total = usable_memory_bytes()
+    if total is None:
+        return Finding("memory", True, "not known on this system")
+    detail = f"{total / _GIB:.1f} GiB"
+    if total < _LEAST_MEMORY_GIB * _GIB:
+        advice = (
+            f"A pair of 256 x 256 x 256 voxels takes up to {_LEAST_MEMORY_GIB:.0f} GiB: crop the images, or "
+            "use a larger machine."
+        )
+        return Finding("memory", False, detail, advice)
+    return Finding("memory", True, detail)
+
+
+def usable_memory_bytes() -> int | None:
+    """Memory that this process may use: the machine's, or less where a container limits it."""
+    try:
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return _memory_bytes_windows()
+    for limit_file in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        try:
+            total = min(total, int(Path(limit_file).read_text()))
+        except (OSError, ValueError):  # no such file, or "max"
+            continue
+    return total
+
+
+def _memory_bytes_windows() -> int | None:
+    import ctypes
+
+    if not hasattr(ctypes, "windll"):
+        return None
+    kilobytes = ctypes.c_ulonglong()
+    if not ctypes.windll.kernel32.GetPhysicallyInstalledSystemMemory(ctypes.byref(kilobytes)):
+        return None
+    return kilobytes.value * 1024
+
+
+def _disk(folder: Path) -> Finding:
+    existing = folder.absolute()
+    while not existing.exists():
+        existing = existing.parent
+    free = shutil.disk_usage(existing).free
+    detail = f"{free / _GIB:.1f} GiB free for results"
+    if free < _LEAST_DISK_GIB * _GIB:
+        advice = (
+            f"Results of one loaded image take up to {_LEAST_DISK_GIB:.0f} GiB: make room, or choose another folder."
+        )
+        return Finding("disk", False, detail, advice)
+    if not os.access(existing, os.W_OK):
+        return Finding("disk", False, f"{existing} is not writable", "Choose another folder for the results.")
+    return Finding("disk", True, detail)
+
+
+def _temporary() -> Finding:
+    try:
+        with tempfile.TemporaryFile() as file:
+            file.write(b"0" * 4096)
+            file.flush()
+    except OSError as error:
+        return Finding("temporary folder", False, str(error), "Set TMPDIR to a writable folder.")
+    return Finding("temporary folder", True, f"{tempfile.gettempdir()} is writable")
+
+
+def _tried(what: str, trial: Callable[[], str]) -> Finding:
+    try:
+        return Finding(f"trial of {what}", True, trial())
+    except Exception as error:
+        # whatever goes wrong in the worker is a finding here, and not the end of the examination
+        advice = "Reinstall mrstrain in an environment of its own; the line above is what the trial said."
+        return Finding(f"trial of {what}", False, f"{type(error).__name__}: {error}", advice)

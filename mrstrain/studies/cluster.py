@@ -1,0 +1,215 @@
+"""Where stages run: a Dask cluster, of this machine's cores by default, or one that is there already."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import queue
+import time
+import traceback
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import dask
+from distributed import Client, Future, LocalCluster, get_worker
+from filelock import FileLock
+
+from dvc.errors import InputError, MrstrainError
+from dvc.software import software_key
+from dvc.worker import usable_cores
+from mrstrain.studies import stages
+from mrstrain.studies.stages import Given
+
+_TELL_EVERY_S = 1.0
+_CONNECT_S, _WORKERS_S = 10.0, 60.0
+_LOOK_EVERY_S, _ALONE_S = 5.0, 120.0
+_SETTINGS = {
+    "distributed.worker.daemon": False,  # a stage starts processes of its own
+    "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself
+    "distributed.worker.memory.terminate": False,  # what needs much runs in those processes
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.profile.enabled": False,
+    "logging.distributed": "error",
+}
+
+
+class Cluster:
+    """Runs stages, several at once; made by `cluster`."""
+
+    def __init__(self, client: Client, watch: Callable[[str, str, float], None]) -> None:
+        self._client = client
+        self._topic = f"mrstrain-{uuid.uuid4().hex}"
+        self._under_way: dict[Future[Any], str] = {}
+        self._finished: queue.Queue[Future[Any]] = queue.Queue()
+        client.subscribe_topic(self._topic, lambda event: watch(*event[1]))
+
+    @property
+    def slots(self) -> int:
+        """Stages that run at once."""
+        return sum(self._client.nthreads().values())
+
+    def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path) -> None:
+        """Start a stage as soon as a worker is free, and nobody else holds its lock."""
+        key = f"{name.replace(' ', '-')}-{uuid.uuid4().hex}"
+        future = self._client.submit(_run, self._topic, name, function, dict(arguments), str(lock), key=key, pure=False)
+        self._under_way[future] = name
+        future.add_done_callback(self._finished.put)
+
+    def next(self) -> tuple[str, Given | str, float]:
+        """Wait for the next stage to end: its name, what it gave or why it failed, and the seconds it took."""
+        alone_since: float | None = None
+        while True:
+            try:
+                future = self._finished.get(timeout=_LOOK_EVERY_S)
+                break
+            except queue.Empty:
+                left = self._client.status == "running" and self._client.nthreads()
+                alone_since = None if left else alone_since or time.monotonic()
+                if alone_since is not None and time.monotonic() - alone_since > _ALONE_S:
+                    future = next(iter(self._under_way))
+                    return self._under_way.pop(future), "No worker and no scheduler is left that could run it.", 0.0
+        name = self._under_way.pop(future, "")
+        if not name:  # given up before
+            return self.next()
+        if future.status == "finished":
+            outcome, seconds = future.result()
+            return name, outcome, seconds
+        error = future.exception() if future.status == "error" else None
+        if error is None:
+            return name, f"The scheduler was lost, or ended it ({future.status}).", 0.0
+        return name, f"The worker that ran it was lost more than once ({error}). {_MEMORY}", 0.0
+
+    @property
+    def busy(self) -> bool:
+        """Whether a stage is under way."""
+        return bool(self._under_way)
+
+
+_MEMORY = "Most often memory runs short: use fewer --workers, or machines with more."
+
+
+@contextmanager
+def cluster(
+    watch: Callable[[str, str, float], None],
+    places: Sequence[Path],
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+) -> Iterator[Cluster]:
+    """A cluster of this machine's cores, or the one at an address; its stages end with it.
+
+    Parameters
+    ----------
+    watch : callable
+        ``watch(stage, what, fraction)``.
+    places : sequence of Path
+        Folders of results, which every worker has to see.
+    scheduler : str, optional
+        Address of a scheduler, such as tcp://node1:8786.
+    workers : int, optional
+        Of the local cluster; by default one for each core.
+
+    Raises
+    ------
+    InputError
+        If the scheduler cannot be reached, has no workers, or they are not fit.
+    """
+    logging.getLogger("distributed").setLevel(logging.ERROR)  # stages have a log of their own
+    with dask.config.set(_SETTINGS):
+        if scheduler is None:
+            with (
+                LocalCluster(
+                    n_workers=workers or usable_cores(), threads_per_worker=1, processes=True, dashboard_address=":0",
+                    host="127.0.0.1", silence_logs=50, memory_limit=0,
+                ) as local,
+                Client(local) as client,
+            ):  # fmt: skip
+                yield Cluster(client, watch)
+            return
+        try:
+            client = Client(scheduler, timeout=_CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"No Dask scheduler answers at {scheduler} ({error}). Start one: see docs/cluster.md."
+            ) from error
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=_WORKERS_S)
+            except TimeoutError as none:
+                raise InputError(
+                    f"The scheduler at {scheduler} has no workers after {_WORKERS_S:.0f} s; see docs/cluster.md."
+                ) from none
+            _refuse_unfit(client, scheduler, places)
+            made = Cluster(client, watch)
+            try:
+                yield made
+            finally:
+                client.cancel(list(made._under_way))
+
+
+def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
+    tokens = [out / f".seen-{uuid.uuid4().hex}" for out in places]
+    for token in tokens:
+        token.touch()
+    try:
+        answers = client.run(_about, [str(token) for token in tokens])
+    except ImportError as error:
+        raise InputError(
+            f"The workers at {address} have no mrstrain ({error}). Start them in its environment."
+        ) from error
+    finally:
+        for token in tokens:
+            token.unlink(missing_ok=True)
+    here = software_key("mrstrain").split(", ")
+    for worker, (key, daemon, seen) in answers.items():
+        threads = client.nthreads().get(worker, 1)
+        if (there := key.split(", ")) != here:
+            theirs, ours = (", ".join(p for p in one if p not in rest) for one, rest in ((there, here), (here, there)))
+            raise InputError(
+                f"The worker {worker} has {theirs}; here is {ours}: start workers in the same environment as here."
+            )
+        if not seen:
+            raise InputError(
+                f"The worker {worker} does not see {places[0]}: a study has to lie on a disk that all share."
+            )
+        if threads > 1:
+            raise InputError(
+                f"The worker {worker} runs {threads} stages at once; each needs a process of its own: --nthreads 1."
+            )
+        if daemon:
+            raise InputError(
+                f"The worker {worker} may not start processes. Start workers with "
+                "DASK_DISTRIBUTED__WORKER__DAEMON=False in their environment."
+            )
+
+
+def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:
+    seen = all(Path(token).exists() for token in tokens)
+    return software_key("mrstrain"), multiprocessing.current_process().daemon, seen
+
+
+def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: str) -> tuple[Given | str, float]:
+    """Run a stage in a worker, alone; errors come back as sentences."""
+    began, told = time.monotonic(), -_TELL_EVERY_S
+    worker = get_worker()
+
+    def tell(what: str, fraction: float) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if fraction >= 1.0 or now - told >= _TELL_EVERY_S:
+            told = now
+            worker.log_event(topic, (name, what, float(fraction)))
+
+    tell("begun", 0.0)
+    try:
+        with FileLock(lock):
+            outcome: Given | str = getattr(stages, function)(tell, **arguments)
+    except MrstrainError as error:
+        outcome = str(error)
+    except Exception:
+        outcome = "A fault of mrstrain, please report it:\n" + traceback.format_exc()
+    return outcome, time.monotonic() - began

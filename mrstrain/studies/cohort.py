@@ -1,0 +1,259 @@
+"""`cohort`: the studies of many subjects run on one cluster, and one table and report of them all."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from dvc.atomic_files import write_whole
+from dvc.errors import InputError
+from dvc.report.page import Picture, Section, Table, write_report
+from dvc.trust.verdict import Verdict, worst
+from mrstrain.measurement.page import flat, said
+from mrstrain.measurement.register import REPEAT
+from mrstrain.records.inputs import make_output
+from mrstrain.records.provenance import provenance, write_json
+from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
+from mrstrain.studies.file import FILE, read_study
+from mrstrain.studies.plan import COMPARISON
+from mrstrain.studies.run import Ran, Told, run_studies
+from validate import figures
+from validate.cohort import Standing, standings
+from validate.comparison import NOTHING
+from validate.extrapolation import LEVELLED
+from validate.mapping import ALL
+
+_TOTAL = "all loads"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cohort:
+    """What `cohort` gave.
+
+    Attributes
+    ----------
+    out : Path
+        With ``report.html``, ``cohort.csv`` (areas of every subject, model and load) and ``ranking.csv``.
+    ran : tuple of Ran
+        The studies, in the order given.
+    ranking : tuple of Standing
+        The models over all loads, the nearest first; empty where no subject has a result of all.
+    notes : tuple of str
+        Who is not among those ranked over, what is unlike between subjects, and whose registrations are doubtful.
+    """
+
+    out: Path
+    ran: tuple[Ran, ...]
+    ranking: tuple[Standing, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every study is."""
+        return all(one.complete for one in self.ran)
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        lines = [f"{one.study.study.name}: not complete, see {one.study.out}" for one in self.ran if not one.complete]
+        lines += [
+            f"{place}. {s.model}: {100 * s.mean:.2f} % ({100 * s.low:.2f} to {100 * s.high:.2f}), nearest in "
+            f"{s.nearest_in} of {s.subjects} subjects"
+            + ("" if place == 1 or s.told_apart else "; not told from the first")
+            for place, s in enumerate(self.ranking, start=1)
+        ]
+        return [*lines, *self.notes, f"Report: {self.out / 'report.html'}"]
+
+
+def cohort(
+    studies: Sequence[Path | str],
+    *,
+    out: Path | str,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    progress: Told | None = None,
+) -> Cohort:
+    """Run the studies of many subjects, and rank the models over them.
+
+    Parameters
+    ----------
+    studies : sequence of path
+        Study files, or their folders; each with a name of its own.
+    out : path
+        For the cohort's report and tables; each study keeps its own results.
+    scheduler, workers, progress
+        As in `mrstrain.run`.
+
+    Raises
+    ------
+    InputError
+        If a study cannot be read, two have one name, a material set has other laws in one than in another, or no
+        subject has been compared with a model.
+    """
+    told = [read_study(place) for place in studies]
+    names = [study.study.name for study in told]
+    if not told or len(set(names)) < len(names):
+        raise InputError(f"A cohort needs studies, each with a name of its own ([study] name); got {', '.join(names)}.")
+    target = Path(out)
+    make_output(target)
+    ranges = {study.compare.strains for study in told}
+    if len(ranges) > 1:
+        raise InputError(f"The studies compare over different ranges of strain ([compare] strains): {sorted(ranges)}.")
+    refuse_other_laws(told)
+    ran = run_studies(told, scheduler=scheduler, workers=workers, progress=progress)
+    without = {one.study.study.name: why for one in ran if (why := _uncounted(one))}
+    areas = {name: _areas(one.study.out) for one in ran if (name := one.study.study.name) not in without}
+    if not any(areas.values()):
+        raise InputError(
+            "No subject was compared with a model: " + "; ".join(line for r in ran for line in r.summary())
+        )
+    shares, notes = _shares(areas)
+    notes = [f"{name} is not counted: {why}" for name, why in without.items()] + notes
+    notes += unlike([one.study for one in ran if one.study.study.name not in without])
+    notes += _doubts([one for one in ran if any(one.study.study.name in of for of in shares.values())])
+    try:
+        ranking = standings(shares)
+    except InputError as none:
+        ranking = ()
+        notes.append(str(none))
+    _write_tables(target, areas, ranking)
+    files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
+    record = provenance("cohort", {"studies": files}, {"subjects": names})
+    write_json(target / "provenance.json", record)
+    _write_page(target / "report.html", ran, shares, ranking, notes, record)
+    return Cohort(target, tuple(ran), ranking, tuple(notes))
+
+
+def _uncounted(one: Ran) -> str:
+    """Why a study's areas are not ranked over; empty where they are.
+
+    A table may be there all the same: an earlier run's, of other inputs, where `compare` was not run now.
+    """
+    compared = one.outcomes.get("compare")
+    if compared is None:
+        return "its study compares no model ([models] sets, results)."
+    return "" if compared.whole else f"compare {compared.words}. {compared.reason}".rstrip()
+
+
+def _areas(out: Path) -> list[dict[str, str]]:
+    """The areas of all soft tissue in the table of a study's results."""
+    with (out / COMPARISON / "areas.csv").open(newline="", encoding="utf-8") as file:
+        return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
+
+
+def _doubts(ran: Sequence[Ran]) -> list[str]:
+    """Of each subject, the registrations that are not to be trusted and yet count in its areas."""
+    notes = []
+    for one in ran:
+        doubted = [load for load, v in _registered(one).items() if v.level == "distrust" and load != REPEAT]
+        if doubted:
+            notes.append(
+                f"{one.study.study.name}: the registration of {', '.join(doubted)} is not to be trusted, and counts in "
+                "its areas and in the ranking. Mend it, or leave this subject out."
+            )
+    return notes
+
+
+def _registered(one: Ran) -> dict[str, Verdict]:
+    """Verdict on each registration of a study that has one."""
+    return {
+        name.removeprefix("register "): section.verdict
+        for name, outcome in one.outcomes.items()
+        if outcome.record is not None and name.startswith("register ")
+        for section in outcome.record.given.sections
+        if section.verdict is not None
+    }
+
+
+def _judged(model: str) -> bool:
+    return model != NOTHING and not model.endswith(LEVELLED)
+
+
+def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Model to subject to the area over all loads, over volume and range; and what is to be said of it.
+
+    With the measurement's bias taken out where every subject's error is known, else as found for all.
+    """
+    own = {subject: [row for row in rows if _judged(row["model"])] for subject, rows in areas.items()}
+    known = all(not np.isnan(float(row["estimate_ml"])) for rows in own.values() for row in rows)
+    shares: dict[str, dict[str, float]] = {}
+    loads = {subject: frozenset(row["load"] for row in rows) - {_TOTAL} for subject, rows in own.items()}
+    for subject, rows in own.items():
+        for row in rows:
+            if row["load"] != (_TOTAL if len(loads[subject]) > 1 else next(iter(loads[subject]))):
+                continue
+            found = float(row["ml"])
+            scale = float(row["estimate_ml"]) / found if known and found > 0.0 else 1.0
+            shares.setdefault(row["model"], {})[subject] = scale * float(row["share"])
+    notes = [] if known else ["The measurement's error is not known in every subject: areas are those found."]
+    rare = {model: of for model, of in shares.items() if 2 * len(of) < len(areas)}
+    notes += [
+        f"{model} is not ranked: it has an area over all loads in only {len(of)} of {len(areas)} subjects."
+        for model, of in rare.items()
+    ]
+    shares = {model: of for model, of in shares.items() if model not in rare}
+    for subject in areas:
+        lacking = [model for model, of in shares.items() if subject not in of]
+        if lacking:
+            notes.append(f"{subject} is not ranked over: it has no area over all loads of {', '.join(lacking)}.")
+    if len(set(loads.values())) > 1:
+        told = "; ".join(f"{subject}: {', '.join(sorted(of)) or 'none'}" for subject, of in loads.items())
+        notes.append(f"Subjects have different loads, so their means are not alike: {told}.")
+    return shares, notes
+
+
+def _write_tables(target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[Standing]) -> None:
+    first = next(row for rows in areas.values() for row in rows)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["subject", *first])
+    writer.writerows([subject, *row.values()] for subject, rows in areas.items() for row in rows)
+    write_whole(target / "cohort.csv", text.getvalue())
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([f.name for f in fields(Standing)])
+    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in astuple(s)] for s in ranking)
+    write_whole(target / "ranking.csv", text.getvalue())
+
+
+def _write_page(
+    path: Path,
+    ran: Sequence[Ran],
+    shares: Mapping[str, Mapping[str, float]],
+    ranking: Sequence[Standing],
+    notes: Sequence[str],
+    record: Mapping[str, object],
+) -> None:
+    order = [s.model for s in ranking] or list(shares)
+    ranked = Table(
+        "Models over all subjects and loads, the nearest first",
+        ("model", "mean, %", "95 % from", "to", "least", "greatest", "nearest in", "subjects", "behind the first, %",
+         "from", "to", "told from the first"),
+        tuple(
+            (s.model, 100 * s.mean, 100 * s.low, 100 * s.high, 100 * s.least, 100 * s.greatest, s.nearest_in,
+             s.subjects, 100 * s.behind, 100 * s.behind_low, 100 * s.behind_high,
+             "–" if at == 0 else "yes" if s.told_apart else "no")
+            for at, s in enumerate(ranking)
+        ),
+        "Area between volume-strain curves divided by the tissue's volume and the width of the range of strain. "
+        "Intervals of the mean are over subjects (Student's t); those of the difference to the first, subject by "
+        "subject, hold for all models at once (Tukey): a model is told from the first where it does not hold zero.",
+    )  # fmt: skip
+    names = [one.study.study.name for one in ran]
+    by_subject = Table(
+        "By subject, %",
+        ("subject", *order),
+        tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in names),
+    )
+    drawn = Picture("Distribution over subjects", said(figures.over_subjects), figures.over_subjects(shares, order))
+    sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
+    for one in ran:
+        failed = [f"{o.stage}: {o.words}. {o.reason}" for o in one.outcomes.values() if o.record is None]
+        verdicts = list(_registered(one).values())
+        verdict = worst(verdicts) if verdicts else None
+        sections.append(Section(one.study.study.name, verdict, paragraphs=tuple(f"Not whole: {why}" for why in failed)))
+    write_report(path, "Models over subjects", None, sections, [], flat(record))

@@ -1,0 +1,173 @@
+"""What the rest of a study takes: minutes, memory and room on the disk, told before it is run."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+
+import numpy as np
+
+from dvc.images.image import LabelMap
+from dvc.io.images.labels import read_labels
+from dvc.io.images.read import read_image
+from dvc.mesh import TetMesh
+from dvc.registration.register import GAUSS_NEWTON
+from fe.mesh_file import read_tet_mesh
+from fe.simulate import LoadStep
+from mrstrain.measurement.engines import engine_of
+from mrstrain.models.loads import paths_of
+from mrstrain.records.doctor import usable_memory_bytes
+from mrstrain.studies.file import Study
+from mrstrain.studies.plan import Stage, labels_to_mesh
+
+# Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
+_REGISTER_S, _REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 35.0, 7.0, 3.5
+_BORDERS = 2.5  # times as long with borders of tissues (docs/decisions/0009)
+_TWIN = 1.3  # times as long again: the twin is made and registered
+_CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
+# Of P1's time and memory: P2 20 times as long on 60,000 cells of the heel, MINI a third of P2's time on 56,000, where
+# P2 took 2.2 GiB, MINI .84.
+_ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
+_ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
+_MESH_S = 100.0
+_COMPARE_S, _MODEL_S = 8.0, 4.0
+# GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
+# with borders 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells .84.
+_REGISTER_GIB, _REGISTER_GIB_PER_MVOXEL, _BORDERS_GIB_PER_MVOXEL, _ELASTIX_GIB = 0.65, 0.175, 0.1, 0.75
+_SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
+_OTHER_GIB = 1.5
+_BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
+_SHAPE = 0.1  # volume of a cell over its edge cubed, as meshes come out
+_LEAST_CELLS = 0.9 * _CELLS  # thin tissues get shorter edges than are asked for
+_GIB = 1024.0**3
+
+
+def cells_expected(labels: LabelMap, bones: Sequence[str], edge_mm: float) -> float:
+    """About how many cells the mesh of a label map's soft tissue will have."""
+    soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in bones and n != 0])
+    volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3
+    return max(volume / (_SHAPE * edge_mm**3), _LEAST_CELLS)
+
+
+def sizes_of(study: Study) -> tuple[float, float]:
+    """Voxels of the unloaded image, and about how many cells sets are simulated on; 0 without sets.
+
+    Raises
+    ------
+    InputError
+        If the image, the mesh or the label map to be meshed cannot be read.
+    """
+    voxels = float(np.prod(read_image(study.path(study.images.load0), allow_missing=True).grid.shape))
+    if not study.models.sets:
+        return voxels, 0.0
+    if study.mesh.file is not None:
+        return voxels, float(len(mesh_given(study, study.mesh.file).cells))
+    labels = read_labels(*labels_to_mesh(study))
+    return voxels, cells_expected(labels, study.mesh.bones, study.mesh.edge_mm)
+
+
+def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
+    """About how long a stage takes on one core.
+
+    Parameters
+    ----------
+    stage : Stage
+    study : Study
+    voxels : float
+        Of the unloaded image.
+    cells : float
+        Of the mesh.
+    """
+    loads = len(study.loads)
+    slower = _BORDERS if _with_borders(study) else 1.0
+    registering = _REGISTER_S + (slower * _REGISTER_S_PER_MVOXEL + _MAPS_S_PER_MVOXEL) * voxels / 1e6
+    if stage.kind == "register":
+        return (1.0 + _TWIN * bool(stage.arguments.get("twin"))) * registering
+    if stage.kind == "level":
+        return 1.5 * registering
+    if stage.kind == "mesh":
+        return _MESH_S
+    if stage.kind == "compare":
+        models = len({value for of in (stage.some.get("models", {}),) for value in of.values()})
+        return loads * (_COMPARE_S + _MODEL_S * (models + len(study.models.results)))
+    seconds = float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
+    if stage.kind != "simulate":
+        return seconds
+    seconds *= _ELEMENT_TIMES[study.models.element]
+    paths = paths_of([LoadStep(**load) for load in stage.arguments["loads"]], stage.arguments["towards"])
+    limit = stage.arguments["limit_s"]
+    return seconds if limit is None else min(seconds, len(paths) * limit)
+
+
+def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
+    """About how much memory a stage takes, GiB, all its processes together; parameters as in `seconds_of`."""
+    if stage.kind in ("register", "level"):
+        more = _BORDERS_GIB_PER_MVOXEL if _with_borders(study) else 0.0
+        loading = 0.0 if _by_gauss_newton(study) else _ELASTIX_GIB
+        return _REGISTER_GIB + loading + (_REGISTER_GIB_PER_MVOXEL + more) * voxels / 1e6
+    if stage.kind in ("simulate", "drive"):
+        times = _ELEMENT_GIB[study.models.element] if stage.kind == "simulate" else 1.0
+        return _SIMULATE_GIB + times * _SIMULATE_GIB_PER_CELL * cells
+    return _OTHER_GIB
+
+
+def disk_bytes(stage: Stage, study: Study, voxels: float) -> float:
+    """About how much room the results of a stage take; parameters as in `seconds_of`."""
+    if stage.kind == "register":
+        return _BYTES_VOXEL * voxels
+    if stage.kind == "level":  # of one load
+        return _BYTES_VOXEL * voxels + 1e6 * _MB_MODEL
+    return 1e6 * _MB_MODEL * (1 if stage.kind == "mesh" else len(study.loads))
+
+
+def _longest(left: Sequence[Stage], seconds: Sequence[float]) -> float:
+    """Seconds of the longest row of stages that wait for one another: no number of cores makes less of it."""
+    until: dict[str, float] = {}
+    for stage, own in zip(left, seconds, strict=True):
+        until[stage.name] = own + max((until.get(name, 0.0) for name in stage.before), default=0.0)
+    return max(until.values())
+
+
+def mesh_given(study: Study, file: str) -> TetMesh:
+    """The mesh made elsewhere that a study names."""
+    return read_tet_mesh(study.path(file), unit=study.mesh.unit, frame=study.mesh.frame)
+
+
+def _by_gauss_newton(study: Study) -> bool:
+    how = study.registration
+    return engine_of(how.engine, how.preset, how.parameters) == GAUSS_NEWTON
+
+
+def _with_borders(study: Study) -> bool:
+    return _by_gauss_newton(study) and study.registration.borders is not False
+
+
+def costs(
+    study: Study, stages: Sequence[Stage], left: Sequence[Stage], voxels: float, cells: float, workers: int
+) -> list[str]:
+    """About how long the stages that are ``left`` take, and how much memory and disk; in sentences.
+
+    Other parameters are those of `seconds_of`; ``workers`` are the stages at once.
+    """
+    seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
+    minutes = max(sum(seconds) / workers, _longest(left, seconds)) / 60.0
+    gib = sorted((gib_of(stage, study, voxels, cells) for stage in left), reverse=True)
+    needed = sum(gib[:workers])  # whichever of them meet
+    disk = sum(disk_bytes(stage, study, voxels) for stage in left) / 1e9
+    free = shutil.disk_usage(study.place).free / 1e9
+    lines = [
+        f"To do: {len(left)} of {len(stages)} stages, about {minutes:.0f} minutes on {workers} cores, "
+        f"{needed:.1f} GiB of memory, {disk:.1f} GB on the disk ({free:.0f} GB free)."
+    ]
+    if disk > free:
+        lines.append("CARE: the disk has too little room.")
+    there = usable_memory_bytes()
+    if there is not None and needed > there / _GIB:
+        fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
+        advice = (
+            f"run with --workers {fitting}."
+            if fitting
+            else "one stage alone is too large: crop the images, take a coarser mesh, or a larger machine."
+        )
+        lines.append(f"CARE: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
+    return lines

@@ -1,0 +1,178 @@
+"""`init`: a study file, written from what a folder holds."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+import jinja2
+
+from dvc.atomic_files import write_whole
+from dvc.errors import InputError, OutputError
+from dvc.io.images.dicom import is_dicom, is_multiframe
+from fe.published import published_names
+from mrstrain.comparison.model_files import ENDINGS
+from mrstrain.models.loads import LOADS
+from mrstrain.records.inputs import IMAGE_ENDINGS as IMAGES
+from mrstrain.studies.file import FILE
+
+_UNLOADED = re.compile(r"load[ _-]?0|unloaded|no[ _-]?load|baseline", re.IGNORECASE)
+_AGAIN = re.compile(r"again|repeat|rescan|retest", re.IGNORECASE)
+_LOADED = re.compile(r"load[ _-]?[1-9]\d*|loaded", re.IGNORECASE)
+_LABELS = re.compile(r"label|tissue|seg", re.IGNORECASE)
+_TO_MESH = re.compile(r"to[ _-]?mesh", re.IGNORECASE)
+_BONE = re.compile(r"calcaneus|calcaneum|bone", re.IGNORECASE)
+_VARIANT = "-as-published"  # a set in another reading of its numbers
+_SOFTEST = "friedman"  # takes hours, so it is for whoever asks for it
+_ROLES = {
+    "labels": "the label map", "mesh_labels": "the label map to be meshed", "bone_mask": "the bone",
+    "repeat": "the repeat scan", "load": "the load of that name",
+}  # fmt: skip
+_LOOKED_AT = 20
+_TABLES = (".csv", ".txt", ".label", ".ctbl")
+
+
+@dataclass(slots=True)
+class Found:
+    """What a folder holds, by the role that its names suggest; names relative to it."""
+
+    load0: str | None = None
+    repeat: str | None = None
+    loads: dict[str, str] = field(default_factory=dict)
+    labels: str | None = None
+    names: str | None = None
+    bone_mask: str | None = None
+    mesh_labels: str | None = None
+    mesh_names: str | None = None
+    results: list[str] = field(default_factory=list)
+    passed_over: dict[str, str] = field(default_factory=dict)  # images without a role, and why
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """What `init` wrote."""
+
+    path: Path
+    found: Found
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+        found = self.found
+        lines = [f"Load0: {found.load0 or 'NOT FOUND'}", f"Loads: {', '.join(found.loads.values()) or 'NONE FOUND'}"]
+        lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
+        lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
+        lines += [f"NOT USED: {name}, {why}" for name, why in found.passed_over.items()]
+        todo = (
+            "Put the forces in"
+            if found.load0 and found.loads and found.labels
+            else "Put in what was not found, and the forces"
+        )
+        return [*lines, f"Study file: {self.path}. {todo}; then: mrstrain check {self.path.parent}"]
+
+
+def init(folder: Path | str, *, name: str = "Subject 01") -> Begun:
+    """Write a study file with comments from the files in a folder.
+
+    Parameters
+    ----------
+    folder : path
+        With the images, the label map and its names, and perhaps results of other codes in folders of their own.
+    name : str
+        Of the study, in its report; nothing that names a patient. Each of a cohort has its own.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, or two files seem to be the unloaded image.
+    OutputError
+        If it has a study file already.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise InputError(f"{place} is no folder.")
+    target = place / FILE
+    if target.exists():
+        raise OutputError(f"{target} is there already; remove it to have it written anew.")
+    found = _look(place)
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # TOML knows no pairs of surrogates
+    template = environment.from_string(
+        (files("mrstrain.studies") / "templates" / "study.toml.j2").read_text(encoding="utf-8")
+    )
+    forces = {load.name: (load.normal_n, load.shear_n) for load in LOADS}
+    sets = [name for name in published_names() if not name.endswith(_VARIANT) and name != _SOFTEST]
+    write_whole(target, template.render(found=found, name=name, forces=forces, sets=sets))
+    return Begun(target, found)
+
+
+def _look(place: Path) -> Found:
+    found = Found()
+    images = sorted(p.name for p in place.iterdir() if p.name.lower().endswith(IMAGES) and _is_volume(p))
+    folders = sorted(p for p in place.iterdir() if p.is_dir())
+    images += [p.name for p in folders if _holds_dicom(p)]
+    for name in images:
+        role = _role(_stem(name))
+        if role == "load":
+            taken = found.loads.setdefault(_stem(name), name)
+        elif role is None:
+            found.passed_over[name] = "whose name tells no role"
+            continue
+        else:
+            taken = getattr(found, role) or name
+            setattr(found, role, taken)
+        if taken != name and role == "load0":
+            raise InputError(f"{place}: both {taken} and {name} seem to be the unloaded image; rename one.")
+        if taken != name:
+            found.passed_over[name] = f"since {taken} is taken for {_ROLES[role]}"
+    found.names = _table(place, found.labels)
+    found.mesh_names = _table(place, found.mesh_labels)
+    for inside in folders:
+        if inside.name in images:
+            continue
+        if any((inside / (load + ending)).is_file() for load in found.loads for ending in ENDINGS):
+            found.results.append(inside.name)
+        elif _role(inside.name) is not None:
+            found.passed_over[inside.name] = "a folder without a DICOM image in it"
+    return found
+
+
+def _is_volume(path: Path) -> bool:
+    """Whether a file may be an image by itself; one of DICOM may be a slice."""
+    try:
+        return path.is_file() and (path.suffix.lower() != ".dcm" or is_multiframe(path))
+    except OSError:  # not to be read: none that could be used
+        return False
+
+
+def _holds_dicom(folder: Path) -> bool:
+    """Whether a folder's files are DICOM images, by a name or by what the first of them hold."""
+    try:
+        files = sorted(p for p in folder.iterdir() if p.is_file())
+        return any(p.suffix.lower() == ".dcm" for p in files) or any(is_dicom(p) for p in files[:_LOOKED_AT])
+    except OSError:  # not to be read: none that could be used
+        return False
+
+
+def _role(stem: str) -> str | None:
+    """What an image's name suggests that it is, as a field of `Found`, or "load"; None where it suggests nothing."""
+    if _LABELS.search(stem):
+        return "mesh_labels" if _TO_MESH.search(stem) else "labels"
+    if _BONE.search(stem):
+        return "bone_mask"
+    again = _AGAIN.search(stem) is not None
+    if _UNLOADED.search(stem):
+        return "repeat" if again else "load0"
+    return "load" if _LOADED.search(stem) and not again else None
+
+
+def _stem(name: str) -> str:
+    return next((name[: -len(s)] for s in IMAGES if name.lower().endswith(s)), name)
+
+
+def _table(place: Path, image: str | None) -> str | None:
+    """The table of names that is called as a label map."""
+    if image is None:
+        return None
+    return next((_stem(image) + e for e in _TABLES if (place / (_stem(image) + e)).is_file()), None)

@@ -1,0 +1,178 @@
+"""What a study has finished: a record of each stage, from what and with which outcome, in files that outlive a kill."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from dvc.atomic_files import write_whole
+from dvc.software import software_key
+from mrstrain.records.provenance import file_hash, without_folders
+from mrstrain.studies.plan import Stage
+from mrstrain.studies.stages import Given
+
+
+class Record(BaseModel):
+    """A finished stage.
+
+    Attributes
+    ----------
+    stage : str
+    key : str
+        Hash of all that it was made from.
+    made_utc : str
+    seconds : float
+    files : dict
+        What it made, below the study's results, with the size in bytes.
+    given : Given
+    made_from : dict
+        Hashes of its input files by their names, and its arguments.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, ser_json_bytes="base64", val_json_bytes="base64", ser_json_inf_nan="constants"
+    )
+
+    stage: str
+    key: str
+    made_utc: str
+    seconds: float
+    files: dict[str, int]
+    given: Given
+    made_from: dict[str, Any] = {}
+
+    @property
+    def identity(self) -> str:
+        """What stages that build on it are made from: it made anew is another, even of the same inputs."""
+        return hashlib.sha256(f"{self.key} {self.made_utc}".encode()).hexdigest()
+
+
+class Ledger:
+    """The records of a study's results folder.
+
+    Parameters
+    ----------
+    out : Path
+        The study's results.
+    home : Path
+        The study's own folder.
+    """
+
+    def __init__(self, out: Path, home: Path) -> None:
+        self.out, self.home = out, home
+        self.folder = out / ".study"
+        self._hashes: dict[tuple[str, int, int], str] = {}
+
+    def impersonal(self, text: str, stage: Stage) -> str:
+        """A text without folders above the study, a stage's files and the home folder: they may name a person."""
+        told = [place for file in stage.files for place in (file.parent, *([file] if file.is_dir() else []))]
+        told += [Path(os.path.normpath(place)) for place in told]
+        outside = [place for place in told if not Path(os.path.normpath(place)).is_relative_to(self.home)]
+        shortened = {place: ("", "a folder") for place in outside}
+        shortened |= {Path.home(): (f"~{os.sep}", "~"), self.home: ("", ".")}
+        for place in sorted(shortened, key=lambda one: -len(str(one))):  # what lies in another first
+            if place != place.parent:
+                within, alone = shortened[place]
+                begin = rf"(?<![\w.-]){re.escape(str(place))}"
+                text = re.sub(begin + re.escape(os.sep), within.replace("\\", r"\\"), text)
+                text = re.sub(rf"{begin}(?![\w.-])", alone, text)
+        return text
+
+    def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:
+        """Hashes of a stage's input files, and its arguments without folders: a study that is moved stays finished."""
+        files = [[without_folders(str(path), self.home), self._hash(path)] for path in stage.files]
+        return {"files": files, "arguments": without_folders(arguments, self.home)}
+
+    def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, Record]) -> str:
+        """Hash of what a stage would be made from now; ``built_on`` are the stages whose results it reads."""
+        content = {
+            "stage": stage.name,
+            "called": [path.name for path in stage.files],
+            **made_from,
+            "built_on": {name: record.identity for name, record in sorted(built_on.items())},
+            "software": software_key("mrstrain"),
+        }
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def _hash(self, path: Path) -> str:
+        if path.is_dir():
+            return file_hash(path)
+        told = path.stat()
+        at = (str(path), told.st_size, told.st_mtime_ns)
+        if at not in self._hashes:
+            self._hashes[at] = file_hash(path)
+        return self._hashes[at]
+
+    def finished(self, stage: Stage) -> Record | None:
+        """The record of a stage whose results are all there, whatever it was made from."""
+        try:
+            record = Record.model_validate_json(self._place(stage.name).read_bytes())
+        except (OSError, ValidationError):
+            return None
+        there = all(
+            (self.out / name).is_file() and (self.out / name).stat().st_size == size
+            for name, size in record.files.items()
+        )
+        return record if there else None
+
+    def forget(self, stage: Stage, reason: str = "") -> None:
+        """Take a stage as not finished, and note why; what it had made stays for it to go on from."""
+        self._place(stage.name).unlink(missing_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if reason:
+            write_whole(self._reason(stage.name), reason)
+        else:
+            self._reason(stage.name).unlink(missing_ok=True)
+
+    def reason(self, stage: Stage) -> str:
+        """Why a stage has no result; empty where it was never run."""
+        try:
+            return self._reason(stage.name).read_text(encoding="utf-8")
+        except OSError:
+            return ""
+
+    def lock(self, stage: Stage) -> Path:
+        """A file that whoever runs the stage holds locked: a run that was killed may still be at it on a cluster."""
+        return self.folder / f"{stage.name}.lock"
+
+    def remove(self, stage: Stage, reason: str = "") -> None:
+        """Forget a stage and remove what it had made."""
+        self.forget(stage, reason)
+        for place in stage.gives:
+            if place.is_dir():
+                shutil.rmtree(place)
+            else:
+                place.unlink(missing_ok=True)
+
+    def keep(self, stage: Stage, key: str, made_from: Mapping[str, Any], given: Given, seconds: float) -> Record:
+        """Record that a stage is finished."""
+        found = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
+        files = {p.relative_to(self.out).as_posix(): p.stat().st_size for p in found if p.is_file()}
+        made = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+        record = Record(
+            stage=stage.name,
+            key=key,
+            made_utc=made,
+            seconds=round(seconds, 1),
+            files=files,
+            given=given,
+            made_from=dict(made_from),
+        )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_whole(self._place(stage.name), record.model_dump_json())
+        return record
+
+    def _place(self, name: str) -> Path:
+        return self.folder / f"{name}.json"
+
+    def _reason(self, name: str) -> Path:
+        return self.folder / f"{name}.failed.txt"

@@ -1,0 +1,309 @@
+"""A study as stages: what each makes, from which files and numbers, and which others it waits for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dvc.errors import InputError
+from fe.published import material_set
+from fe.simulate import LoadStep
+from fe.surface_sets import BONE
+from mrstrain.comparison.drive import ENDING
+from mrstrain.comparison.model_files import files_named
+from mrstrain.measurement.register import REPEAT
+from mrstrain.studies.file import Study, Vector, as_folder
+from validate.extrapolation import LEVELLED
+
+KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
+"""Kinds of stages, in the order in which they come."""
+
+_AS_MEASURED = ("load0", "images", "bone", "engine", "borders", "preset", "parameters", "seed")
+
+REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One piece of work.
+
+    Attributes
+    ----------
+    name : str
+        Its kind, and what it is of: "register Load1".
+    arguments : mapping
+        Of the function of its kind in `mrstrain.studies.stages`; plain values.
+    files : tuple of Path
+        What it reads that no other stage makes, by content.
+    after : tuple of str
+        Stages that it cannot do without.
+    some : mapping
+        Argument to stages, at least one of which it needs; it gets what each that succeeded is listed with.
+    perhaps : mapping
+        The same of stages without which it does as well.
+    gives : tuple of Path
+        What it makes, all of it: removed before it is made anew.
+    """
+
+    name: str
+    arguments: Mapping[str, Any]
+    files: tuple[Path, ...]
+    gives: tuple[Path, ...]
+    after: tuple[str, ...] = ()
+    some: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    perhaps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> str:
+        """One of KINDS."""
+        return self.name.split(" ", 1)[0]
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it finds by itself what it did before it was cut, and takes of that only what still holds."""
+        return self.kind == "simulate"
+
+    @property
+    def before(self) -> tuple[str, ...]:
+        """Every stage that it waits for."""
+        chosen = (name for of in (*self.some.values(), *self.perhaps.values()) for name in of)
+        return tuple(dict.fromkeys((*self.after, *chosen)))
+
+
+def plan(study: Study) -> tuple[Stage, ...]:
+    """The stages of a study, each behind those that it waits for.
+
+    Raises
+    ------
+    InputError
+        If two material sets or models would share a folder, a load that is simulated has no force, or models are
+        levelled without a bone.
+    """
+    stages = _registrations(study)
+    loads = tuple(study.loads)
+    measured = {f"register {load}": load for load in loads}
+    models: dict[str, str] = {}
+    if study.models.sets:
+        meshed = _mesh(study)
+        stages += meshed
+        for one in study.models.sets:
+            simulated = _simulation(study, one, tuple(stage.name for stage in meshed))
+            folder = simulated.gives[0]
+            if str(folder) in models.values():
+                raise InputError(f"[models] two sets are called '{folder.name}'; each needs a name of its own.")
+            stages.append(simulated)
+            models[simulated.name] = str(folder)
+            if study.models.drive:
+                stages.append(_driven(study, one, folder.name, tuple(stage.name for stage in meshed), measured))
+                models[stages[-1].name] = str(stages[-1].gives[0])
+            if study.models.level:
+                for load in load_steps(study):
+                    stages.append(_levelled(study, folder, load))
+                    models[stages[-1].name] = str(folder) + LEVELLED
+    if models or study.models.results:
+        stages.append(_comparison(study, measured, models))
+    _refuse_mixing(study, stages)
+    return tuple(stages)
+
+
+def _refuse_mixing(study: Study, stages: Sequence[Stage]) -> None:
+    """Refuse results outside the results' folder or in one another's, and inputs in it: they would be replaced."""
+    out = study.out.resolve()
+    made: dict[Path, str] = {}
+    for stage in stages:
+        for place in stage.gives:
+            real = place.resolve()
+            if out not in real.parents:
+                raise InputError(f"{stage.name} would write to {real}, which is not below the results {out}.")
+            near = [other for other in made if other == real or other in real.parents or real in other.parents]
+            if near:
+                raise InputError(f"{stage.name} and {made[near[0]]} would both write to {real}: rename one.")
+            made[real] = stage.name
+        for path in stage.files:
+            real = path.resolve()
+            if real == out or out in real.parents or real in out.parents:
+                raise InputError(
+                    f"{path} is an input and lies in the folder of the results ({out}), or that in it: results would "
+                    "replace it. Move it, or give another [study] out."
+                )
+
+
+def _registrations(study: Study) -> list[Stage]:
+    images, how = study.images, study.registration
+    aside = {
+        key: str(study.path(given))
+        for key in ("labels", "names", "tissue", "bone_mask")
+        if (given := getattr(images, key)) is not None
+    }
+    load0 = study.path(images.load0)
+    own = [study.path(p) for p in how.parameters]
+    error_model = [] if how.error_model is None else [study.path(how.error_model)]
+    shared: dict[str, Any] = {
+        "load0": str(load0), "images": aside, "bone": study.bone, "align": how.align,
+        "engine": how.engine, "borders": how.borders, "preset": how.preset,
+        "parameters": [str(p) for p in own], "error_model": str(error_model[0]) if error_model else None,
+        "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
+        "seed": study.study.seed, "threads": 1,
+    }  # fmt: skip
+    shared |= {"allow_missing": True} if images.allow_missing else {}
+    weights = {"bending": how.bending, "volume": how.volume}
+    shared |= {name: weight for name, weight in weights.items() if weight is not None}
+    files = (load0, *(Path(p) for p in aside.values()), *own, *error_model)
+    folder, own_directions = study.out / REGISTRATION, towards(study)
+
+    def one(load: str, image: str, repeat: bool, after: str | None) -> Stage:
+        place = study.path(image)
+        more: dict[str, Any] = {
+            "load": str(place), "out": str(folder / load),
+            "after": None if after is None else str(folder / after),
+        }  # fmt: skip
+        if load in own_directions:
+            more["plate_normal"], more["shear_direction"] = own_directions[load]
+        if how.twin and load != REPEAT:
+            more["twin"] = True
+        waits = () if after is None else (f"register {after}",)
+        floor = {"repeat": {f"register {REPEAT}": str(folder / REPEAT)} if repeat else {}}
+        return Stage(f"register {load}", shared | more, (*files, place), (folder / load,), waits, {}, floor)
+
+    stages = [] if images.repeat is None else [one(REPEAT, images.repeat, False, None)]
+    last: str | None = None
+    for name, load in study.loads.items():
+        stages.append(one(name, load.image, images.repeat is not None, last if how.chain else None))
+        last = name
+    return stages
+
+
+def mesh_place(study: Study) -> Path:
+    """The mesh on which sets are simulated: one made here, or a file."""
+    return study.out / MESH if study.mesh.file is None else study.path(study.mesh.file)
+
+
+def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:
+    """The label map that is meshed, and the table of its names."""
+    own = study.mesh.labels
+    labels, names = (own, study.mesh.names) if own else (study.images.labels, study.images.names)
+    return study.path(labels), None if names is None else study.path(names)
+
+
+def _mesh(study: Study) -> list[Stage]:
+    how = study.mesh
+    if how.file is not None:
+        return []
+    labels, names = labels_to_mesh(study)
+    arguments = {
+        "out": str(study.out / MESH), "labels": str(labels), "names": None if names is None else str(names),
+        "edge_mm": how.edge_mm, "bones": how.bones, "limit_s": 60.0 * how.limit_minutes,
+        "finer": None if how.finer is None else how.finer.model_dump(),
+    }  # fmt: skip
+    files = (labels,) if names is None else (labels, names)
+    return [Stage("mesh", arguments, files, ((study.out / MESH).parent,))]
+
+
+def _own(study: Study, one: str) -> tuple[Path, ...]:
+    own = [study.path(one)] if one.endswith(".toml") else []
+    if study.mesh.file is None:
+        return tuple(own)
+    mesh = study.path(study.mesh.file)
+    return (*own, mesh, *(p for p in (mesh.with_suffix(".json"),) if p.is_file()))  # names of regions stand beside it
+
+
+def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
+    name = material_set(study.set_given(one)).name
+    try:
+        as_folder(name)
+    except ValueError as wrong:
+        raise InputError(f"The material set '{name}' of {one} needs {wrong}.") from wrong
+    steps = load_steps(study)
+    arguments = {
+        "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
+        "loads": [asdict(step) for step in steps.values()],
+        "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
+        "towards": {name: of for name, of in towards(study).items() if name in steps},
+        "taped": study.plate.taped, "turns": study.plate.turns, "pivot_mm": study.plate.pivot_mm,
+        "gap_mm": study.plate.gap_mm,
+        "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))), "element": study.models.element,
+        "decks": study.models.decks,
+        "limit_s": None if study.models.limit_minutes is None else 60.0 * study.models.limit_minutes,
+        "mesh_unit": study.mesh.unit, "mesh_frame": study.mesh.frame,
+    }  # fmt: skip
+    return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
+
+
+def towards(study: Study) -> dict[str, tuple[Vector, Vector]]:
+    """Plate's normal and direction of shear of the loads that go in directions of their own."""
+    plate = study.plate
+    return {
+        name: (load.plate_normal or plate.normal, load.shear_direction or plate.shear_direction)
+        for name, load in study.loads.items()
+        if load.plate_normal is not None or load.shear_direction is not None
+    }
+
+
+def load_steps(study: Study) -> dict[str, LoadStep]:
+    """The loads that are simulated: those with a force or a travel along the normal.
+
+    Raises
+    ------
+    InputError
+        If a load has only a shear, or both force and travel along an axis, or none has anything.
+    """
+    steps = {}
+    for name, load in study.loads.items():
+        along = (load.normal_n, load.normal_mm)
+        if along == (None, None):
+            if (load.shear_n, load.shear_mm) != (None, None):
+                raise InputError(f"[loads.{name}] normal_n is missing: a plate that shears has to press.")
+            continue
+        steps[name] = LoadStep(name, load.normal_n, load.shear_n, load.normal_mm, load.shear_mm)
+    if not steps:
+        first = next(iter(study.loads))
+        raise InputError(f"[loads.{first}] normal_n is missing: no load has a force to simulate [models] sets under.")
+    return steps
+
+
+def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured: Mapping[str, str]) -> Stage:
+    arguments = {
+        "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "dvc": str(study.out / REGISTRATION),
+        "material": study.set_given(one), "mesh_unit": study.mesh.unit, "mesh_frame": study.mesh.frame,
+    }  # fmt: skip
+    gives = (study.out / MODELS / (name + ENDING),)
+    return Stage(f"drive {name}", arguments, _own(study, one), gives, meshed, {"loads": measured})
+
+
+def _levelled(study: Study, folder: Path, load: str) -> Stage:
+    if study.bone is None and study.images.bone_mask is None:
+        raise InputError("[models] level = true needs a bone, where models are at rest: [images] bone, or bone_mask.")
+    sent = _registrations(study)[-1].arguments
+    arguments = {key: sent[key] for key in _AS_MEASURED}
+    arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}
+    own = [Path(p) for p in (arguments["load0"], *arguments["images"].values(), *arguments["parameters"])]
+    gives = (folder.with_name(folder.name + LEVELLED) / f"{load}.vtu",)
+    return Stage(f"level {folder.name} {load}", arguments, tuple(own), gives, (f"simulate {folder.name}",))
+
+
+def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, str]) -> Stage:
+    how = study.compare
+    labels = study.path(study.images.labels)
+    names = None if study.images.names is None else study.path(study.images.names)
+    thresholds = None if how.thresholds is None else study.path(how.thresholds)
+    elsewhere = [study.path(place) for place in study.models.results]
+    taken = {Path(place).name for place in models.values()}
+    twice = [place.name for place in elsewhere if place.name in taken]
+    if twice:
+        raise InputError(f"[models] a folder of results and a set are both called '{twice[0]}': rename the folder.")
+    arguments = {
+        "dvc": str(study.out / REGISTRATION), "out": str(study.out / COMPARISON), "labels": str(labels),
+        "names": None if names is None else str(names), "bones": study.mesh.bones,
+        "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
+        "towards": towards(study), "strains": how.strains,
+        "thresholds": None if thresholds is None else str(thresholds),
+        "least_ml": how.least_ml, "elsewhere": [str(place) for place in elsewhere],
+    }  # fmt: skip
+    named = [file for place in elsewhere if place.exists() for file in files_named(place)]
+    files = [p for p in (labels, names, thresholds, *elsewhere, *named) if p is not None]
+    some: dict[str, Mapping[str, str]] = {"loads": measured}
+    if models:
+        some["models"] = models
+    return Stage("compare", arguments, tuple(files), (study.out / COMPARISON,), (), some)

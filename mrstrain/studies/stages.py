@@ -1,0 +1,160 @@
+"""The stages of a study, each a function of plain values and files: what a worker runs, here or on another machine.
+
+Every function takes ``tell(stage, fraction)`` and what the plan gave it, writes its results whole, and returns what the
+study's report and log say of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dvc.report.page import Section
+from dvc.worker import Worker
+
+Tell = Callable[[str, float], None]
+Paths = Mapping[str, str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What a stage gave.
+
+    Attributes
+    ----------
+    lines : tuple of str
+        For a person.
+    sections : tuple of Section
+        Its part of the study's report.
+    closing : tuple of Section
+        What belongs at the report's end: how to read its part.
+    complete : bool
+        Whether all of it was reached; a model that carried a part of its load was not.
+    retry : bool
+        Whether a part of it failed in a way that may not come again: it is run anew next time.
+    timed_out : bool
+        Whether all that it lacks is what its limit of time did not let it reach.
+    """
+
+    lines: tuple[str, ...]
+    sections: tuple[Section, ...] = ()
+    closing: tuple[Section, ...] = ()
+    complete: bool = True
+    retry: bool = False
+    timed_out: bool = False
+
+
+def register(tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone: str | None, **options: Any) -> Given:
+    """One loaded image against the unloaded one; as `mrstrain.measurement.register_one.register_one`."""
+    from mrstrain.measurement.register_one import register_one
+
+    mask = images.get("bone_mask")
+    case = register_one(
+        Path(load0),
+        Path(load),
+        out=Path(out),
+        labels=Path(str(images["labels"])),
+        names=_path(images.get("names")),
+        bone=bone if mask is None else Path(mask),
+        tissue=_path(images.get("tissue")),
+        parameters=[Path(p) for p in options.pop("parameters")],
+        error_model=_path(options.pop("error_model")),
+        repeat=_path(next(iter(options.pop("repeat")), None)),
+        after=_path(options.pop("after")),
+        tell=tell,
+        **options,
+    )
+    return Given(tuple(case.summary()), (case.section,))
+
+
+def mesh(tell: Tell, *, out: str, labels: str, names: str | None, **options: Any) -> Given:
+    """A label map's soft tissue as tetrahedra; as `mrstrain.mesh`."""
+    from mrstrain.models.mesh import mesh as run
+
+    finer = options.pop("finer")
+    made = run(
+        labels,
+        out=out,
+        names=names,
+        finer=None if finer is None else (finer["region"], finer["edge_mm"]),
+        watch=lambda share: tell("meshing", share),
+        **options,
+    )
+    return Given(tuple(made.summary()))
+
+
+def simulate(
+    tell: Tell, *, out: str, mesh: str, material: str, loads: Sequence[Mapping[str, Any]], **options: Any
+) -> Given:
+    """One material set under all loads; as `mrstrain.simulate`."""
+    from fe.simulate import LoadStep
+    from mrstrain.models.simulate import simulate as run
+
+    steps = [LoadStep(**load) for load in loads]
+    begun: dict[str, float] = {}
+
+    def told(case: str, stage: str, fraction: float) -> None:
+        begun[case] = fraction
+        tell(stage, sum(begun.values()) / max(len(begun), 2 if len(loads) > 1 else 1))
+
+    done = run(mesh, out=out, sets=[material], loads=steps, workers=1, threads=1, progress=told, **options)
+    timed_out = any(one.timed_out for one in done.sets)  # one set, if it did not fail
+    return Given(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), timed_out=timed_out)
+
+
+def drive(tell: Tell, *, out: str, mesh: str, dvc: str, material: str, loads: Sequence[str], **options: Any) -> Given:
+    """One material set whose outside goes where it was measured; as `mrstrain.drive`."""
+    with Worker(threads=1) as worker:
+        done = worker.run(f"driving {material}", _driven, mesh, dvc, out, material, tuple(loads), options)
+    return Given(tuple(done.summary()[:-1]), complete=done.complete)
+
+
+def _driven(mesh: str, dvc: str, out: str, material: str, loads: Sequence[str], options: Mapping[str, Any]) -> Any:
+    from mrstrain.comparison.drive import drive as run
+
+    return run(mesh, dvc, out=out, sets=[material], loads=loads, threads=1, **options)
+
+
+def level(
+    tell: Tell, *, out: str, load0: str, model: str, load: str, images: Paths, bone: str | None, **options: Any
+) -> Given:
+    """One model's load sent through the measurement; as `mrstrain.level`."""
+    from mrstrain.comparison.level import level as run
+
+    mask = images.get("bone_mask")
+    done = run(
+        load0,
+        model,
+        out=out,
+        bone=mask,
+        bone_label=bone if mask is None else None,
+        labels=images["labels"],
+        names=images.get("names"),
+        tissue=images.get("tissue"),
+        loads=[load],
+        threads=1,
+        progress=lambda _, stage, fraction: tell(stage, fraction),
+        **options,
+    )
+    return Given(tuple(done.summary()[:-1]))
+
+
+def compare(tell: Tell, **options: Any) -> Given:
+    """All models against the measurement; as `mrstrain.compare`, in a process whose memory is given back."""
+    with Worker(threads=1) as worker:
+        return worker.run("comparing", _compared, options)
+
+
+def _compared(options: dict[str, Any]) -> Given:
+    from mrstrain.comparison.compare import compare as run
+
+    strains = options.pop("strains")
+    models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
+    done = run(options.pop("dvc"), models, strains=(strains[0], strains[1]), **options)
+    return Given(tuple(done.summary()[:-1]), done.sections, done.closing)
+
+
+def _path(given: str | None) -> Path | None:
+    return None if given is None else Path(given)

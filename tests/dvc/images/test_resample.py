@@ -1,0 +1,104 @@
+"""Images carried in space: closed forms, and missing voxels that touch nothing beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+
+from dvc.deformation.protocol import RigidMotion
+from dvc.images.image import Grid, Image, Mask
+from dvc.images.resample import carry, fill_missing, shows, smoothed
+from dvc.images.shading import without_shading
+from dvc.registration.align import _scored
+from mrstrain.records.provenance import file_hash
+
+GRID = Grid((20, 18, 16), np.array([1.0, 1.5, 2.0]), np.array([-5.0, 3.0, 8.0]))
+
+
+def linear(points: np.ndarray) -> np.ndarray:
+    return 2.0 * points[..., 0] - points[..., 1] + 0.5 * points[..., 2] + 50.0
+
+
+@pytest.mark.parametrize("order", [1, 3])
+def test_a_linear_image_is_carried_exactly_and_is_nan_outside(order):
+    image = Image(GRID, linear(GRID.points()))
+    fine = Grid((12, 12, 12), np.full(3, 0.7), np.array([0.0, 8.0, 14.0]))
+    shift = np.array([0.3, -0.4, 0.9])
+    got = carry(image, fine, lambda X: X + shift, order=order)
+    np.testing.assert_allclose(got, linear(fine.points() + shift), rtol=2e-3 if order == 3 else 1e-6)
+    beyond = carry(image, GRID, lambda X: X + np.array([5.0, 0.0, 0.0]), order=order)
+    assert np.isnan(beyond[-4:]).all()
+    assert np.isfinite(beyond[:14]).all()
+
+
+@pytest.mark.parametrize("order", [1, 3])
+def test_a_gap_is_nan_and_bends_nothing_beside_it(order):
+    values = linear(GRID.points())
+    whole = carry(Image(GRID, values), GRID, lambda X: X + 0.4, order=order)
+    values[:6] = np.nan
+    holed = Image(GRID, values)
+    got = carry(holed, GRID, lambda X: X + 0.4, order=order)
+    assert np.isnan(got[:6]).all()
+    np.testing.assert_allclose(got[9:-1, :-1, :-1], whole[9:-1, :-1, :-1], rtol=3e-3)
+    seen = shows(holed, GRID.points()[2:9].reshape(-1, 3)).reshape(7, 18, 16)
+    assert not seen[:4].any()
+    assert seen[4:].all()
+
+
+def test_gaps_are_filled_from_the_nearest_in_space():
+    values = np.ones(GRID.shape)
+    values[10:] = 5.0
+    values[8:10] = np.nan
+    filled = fill_missing(Image(GRID, values)).values
+    assert (filled[8] == 1.0).all()
+    assert (filled[9] == 5.0).all()
+    assert np.isnan(smoothed(Image(GRID, values), 1.0).values[8:10]).all()
+
+
+def test_the_search_scores_an_image_with_itself_as_one():
+    random = np.random.default_rng(2)
+    from scipy.ndimage import gaussian_filter
+
+    grid = Grid((48, 48, 48), np.ones(3), np.zeros(3))
+    image = Image(grid, gaussian_filter(random.normal(size=grid.shape), 4.0))
+    inside = np.zeros(grid.shape, dtype=bool)
+    inside[16:32, 14:34, 16:30] = True
+    ((score, motion),) = _scored(image, image, Mask(grid, inside), [np.eye(3)])
+    assert score == pytest.approx(1.0, abs=0.05)
+    assert np.linalg.norm(motion.displacement(np.full((1, 3), 24.0))) < 4.0
+    assert isinstance(motion, RigidMotion)
+
+
+@pytest.mark.parametrize("offset", [0.0, 300.0])
+def test_shading_is_removed_whatever_the_images_zero(offset):
+    grid = Grid((40, 40, 40), np.full(3, 2.0), np.zeros(3))
+    X = grid.points() / 80.0
+    body = np.linalg.norm(X - 0.5, axis=-1) < 0.42
+    random = np.random.default_rng(4)
+    tissue = np.where(body, np.where(random.random(grid.shape) < 0.5, 100.0, 60.0), 0.0)
+    field = 1.0 + 0.3 * (X[..., 0] - 0.5) + 0.2 * np.sin(3.0 * X[..., 1])
+    noisy = tissue * field + random.normal(scale=1.0, size=grid.shape)
+    corrected = without_shading(Image(grid, noisy + offset)).values - offset
+
+    def unevenness(values: np.ndarray) -> float:
+        bright = body & (tissue == 100.0)
+        return float(values[bright].std() / values[bright].mean())
+
+    assert unevenness(corrected) < 0.5 * unevenness(noisy)
+    usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
+    try:
+        for threads in (1, 2, 4):
+            sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(threads)
+            again = without_shading(Image(grid, noisy + offset)).values - offset
+            assert np.array_equal(again, corrected)
+    finally:
+        sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
+
+
+def test_a_hash_follows_the_voxels_that_a_header_names(tmp_path):
+    (tmp_path / "a.mhd").write_text("NDims = 3\nElementDataFile = a.raw\n")
+    (tmp_path / "a.raw").write_bytes(b"one")
+    first = file_hash(tmp_path / "a.mhd")
+    (tmp_path / "a.raw").write_bytes(b"two")
+    assert file_hash(tmp_path / "a.mhd") != first

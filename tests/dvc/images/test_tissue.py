@@ -1,0 +1,19 @@
+"""Where the body is: gaps in the tissue mask are closed as by an ellipsoid laid at every voxel."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_closing, gaussian_filter
+
+from dvc.images.tissue import _closed, _ellipsoid
+
+
+@pytest.mark.parametrize("radius", [(2, 2, 2), (3, 1, 0), (5, 4, 2), (0, 0, 0)])
+@pytest.mark.parametrize("level", [-9.0, 0.01, 0.1, 9.0])
+def test_closing_by_the_surface_alone_is_closing_by_every_voxel(radius: tuple[int, int, int], level: float) -> None:
+    mask = gaussian_filter(np.random.default_rng(3).normal(size=(36, 30, 25)), 1.5) > level
+    padded = np.pad(mask, [(r, r) for r in radius], mode="edge")
+    inner = tuple(slice(r, r + n) for r, n in zip(radius, mask.shape, strict=True))
+    expected = binary_closing(padded, structure=_ellipsoid(np.array(radius)))[inner]
+    assert np.array_equal(_closed(mask, np.array(radius)), expected)
+    if 0.0 < level < 1.0 and max(radius) > 0:
+        assert np.count_nonzero(expected) > 1.01 * np.count_nonzero(mask)

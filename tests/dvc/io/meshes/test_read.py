@@ -1,0 +1,297 @@
+"""Mesh files: a file's own nodes, numbers, frame and unit are read, and come back with results on them."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+
+from dvc.deformation.protocol import Affine
+from dvc.errors import GeometryError, ImageFileError, InputError, OutputError
+from dvc.io.meshes.read import MeshFile, read_mesh
+from dvc.io.meshes.write import write_nodal_displacements, write_on_mesh
+from tests.meshfiles import TAGS, block, skin, write_abaqus, write_ansys, written
+
+KINDS = ["vtu", "vtk", "msh-22", "msh-41", "msh-41-binary", "inp", "cdb"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1.0), ("m", 1e-3)])
+@pytest.mark.parametrize(("frame", "signs"), [("LPS", (1, 1, 1)), ("RAS", (-1, -1, 1))])
+def test_every_format_unit_and_frame_gives_the_same_mesh(
+    tmp_path: Path, kind: str, unit: str, scale: float, frame: str, signs: tuple[int, int, int]
+) -> None:
+    points, cells = block()
+    mesh = read_mesh(written(tmp_path, kind, scale, signs), unit=unit, frame=frame)
+    np.testing.assert_allclose(mesh.points_mm, points, atol=1e-9)
+    assert mesh.tets is not None
+    np.testing.assert_array_equal(mesh.tets.cells, cells)
+    named = kind in {"inp", "cdb"} or kind.startswith("msh")
+    fat, dermis, sole = ("fat", "skin", "sole") if named else ("tissue 1", "tissue 2", "tissue 7")
+    regions = {name.casefold(): index for name, index in mesh.tets.regions.items()}
+    np.testing.assert_array_equal(regions[fat], np.arange(20))
+    np.testing.assert_array_equal(regions[dermis], np.arange(20, 48))
+    facets = {name.casefold(): faces for name, faces in mesh.tets.facets.items()}
+    np.testing.assert_array_equal(facets[sole], skin(cells))
+    np.testing.assert_array_equal(mesh.node_ids, TAGS if named else np.arange(27))
+    assert mesh.cell_count == 50
+    np.testing.assert_allclose(mesh.centroids_mm[2:], mesh.tets.centroids_mm, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["inp", "cdb"])
+def test_a_set_of_nodes_names_the_outer_triangles_between_them(tmp_path: Path, kind: str) -> None:
+    points, cells = block()
+    top = np.flatnonzero(points[:, 2] == points[:, 2].max())
+    path = tmp_path / f"heel.{kind}"
+    if kind == "cdb":
+        write_ansys(path, points, cells, top)
+    else:
+        write_abaqus(path, points, cells)
+        middle = len(top) // 2
+        sets = ["*NSET, NSET=half", ", ".join(str(TAGS[n]) for n in top[:middle]), "*NSET, NSET=Top", "HALF,"]
+        strange = ["*NSET, NSET=elsewhere", "Part-1.5"]
+        path.write_text(
+            path.read_text() + "\n".join([*sets, ", ".join(str(TAGS[n]) for n in top[middle:]), *strange]) + "\n"
+        )
+    mesh = read_mesh(path).tets
+    assert mesh is not None
+    found = mesh.facets["TOP" if kind == "cdb" else "Top"]
+    assert len(found) == 8  # two for each of the four squares
+    assert np.unique(found).tolist() == top.tolist()
+    assert "elsewhere" not in mesh.facets
+
+
+@pytest.mark.parametrize(("nodes", "kind"), [(4, "tetra"), (10, "tetra10")])
+def test_bricks_that_are_tetrahedra_are_read_as_such(tmp_path: Path, nodes: int, kind: str) -> None:
+    path = tmp_path / "heel.cdb"
+    points = np.array([[0, 0, 0], [6, 0, 0], [0, 6, 0], [0, 0, 6]], dtype=float)
+    edges = [(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)]
+    points = np.concatenate([points, [points[list(e)].mean(axis=0) for e in edges]])[:nodes]
+    i, j, k, m, *mid = range(1, nodes + 1)
+    brick = [i, j, k, k, m, m, m, m]
+    if mid:
+        q, r, t, y, z, a = mid
+        brick += [q, r, k, t, m, m, m, m, y, z, a, a]
+    head = [1, 1, 1, 1, 0, 0, 0, 0, len(brick), 0, 1]
+    lines = [f"ET,1,{186 if mid else 185}", f"NBLOCK,6,SOLID,{nodes},{nodes}", "(3i9,6e21.13e3)"]
+    lines += [f"{n:9d}{0:9d}{0:9d}" + "".join(f"{x:21.13E}" for x in p) for n, p in enumerate(points, start=1)]
+    lines += ["-1", "EBLOCK,19,SOLID,1,1", "(19i9)", "".join(f"{v:9d}" for v in head + brick[:8])]
+    lines += ["".join(f"{v:9d}" for v in brick[8:])] if mid else []
+    path.write_text("\n".join([*lines, "       -1"]) + "\n")
+    mesh = read_mesh(path)
+    assert [(b.kind, b.nodes.tolist()) for b in mesh.blocks] == [(kind, [list(range(nodes))])]
+    path.write_text(path.read_text().replace("ET,1,185", "ET,1,170").replace("ET,1,186", "ET,1,170"))
+    with pytest.raises(ImageFileError, match="no volume cells"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("kind", ["msh-22", "msh-41", "msh-41-binary"])
+def test_a_volume_and_its_surface_may_share_a_name(tmp_path: Path, kind: str) -> None:
+    _, cells = block()
+    path = written(tmp_path, kind)
+    path.write_bytes(path.read_bytes().replace(b'"sole"', b'"skin"'))
+    mesh = read_mesh(path)
+    assert mesh.tets is not None
+    assert set(mesh.tets.regions) == {"fat", "skin"}
+    np.testing.assert_array_equal(mesh.tets.regions["skin"], np.arange(20, 48))
+    assert set(mesh.tets.facets) == {"skin"}
+    np.testing.assert_array_equal(mesh.tets.facets["skin"], skin(cells))
+    np.testing.assert_array_equal(mesh.node_ids, TAGS)
+
+
+def test_gmsh_22_binary_numbers_are_read(tmp_path: Path) -> None:
+    points, cells = block()
+    path = tmp_path / "heel.msh"
+    meshio.write(path, meshio.Mesh(points, [("tetra", cells)]), file_format="gmsh22", binary=True)
+    data = path.read_bytes()
+    start = data.index(b"$Nodes\n27\n") + len(b"$Nodes\n27\n")
+    nodes = np.frombuffer(data, [("tag", "<i4"), ("x", "<f8", 3)], 27, start).copy()
+    assert nodes["tag"].tolist() == list(range(1, 28))
+    np.testing.assert_array_equal(read_mesh(path).node_ids, np.arange(1, 28))
+
+
+def test_a_quadratic_mesh_keeps_its_mid_side_nodes_and_is_checked_by_its_corners(tmp_path: Path) -> None:
+    corners = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
+    middles = [corners[[i, j]].mean(axis=0) for i, j in ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))]
+    path = tmp_path / "quadratic.vtu"
+    meshio.write(path, meshio.Mesh(np.vstack([corners, middles]), [("tetra10", [list(range(10))])]))
+    mesh = read_mesh(path)
+    assert mesh.points_mm.shape == (10, 3)
+    np.testing.assert_allclose(mesh.centroids_mm, [[2.5, 2.5, 2.5]])
+    assert mesh.tets is not None
+    assert mesh.tets.cells.tolist() == [[0, 1, 2, 3]]
+    assert mesh.tets.points_mm.shape == (4, 3)
+
+
+def hexahedron(folder: Path) -> MeshFile:
+    points = np.array(list(itertools.product((0.0, 10.0), repeat=3)))
+    path = folder / "brick.vtu"
+    meshio.write(path, meshio.Mesh(points, [("hexahedron", [[0, 4, 6, 2, 1, 5, 7, 3]])]))
+    return read_mesh(path)
+
+
+def test_a_mesh_of_bricks_takes_results_though_it_has_no_tetrahedra(tmp_path: Path) -> None:
+    mesh = hexahedron(tmp_path)
+    assert mesh.tets is None
+    np.testing.assert_allclose(mesh.centroids_mm, [[5, 5, 5]])
+    write_on_mesh(tmp_path / "out.vtu", mesh, {}, {"max_shear": np.array([0.25])})
+    back = meshio.read(tmp_path / "out.vtu")
+    assert back.cells[0].type == "hexahedron"
+    assert back.cell_data["max_shear"][0].tolist() == [0.25]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_cut_anywhere_is_refused(tmp_path: Path, kind: str) -> None:
+    path = written(tmp_path, kind)
+    data = path.read_bytes()
+    whole = read_mesh(path)
+    for end in range(0, len(data) - 1, len(data) // 60):
+        if kind == "inp" and data[:end].endswith(b"\n"):
+            continue  # the format has no mark of its end: a cut between two lines cannot be seen
+        path.write_bytes(data[:end])
+        try:
+            cut = read_mesh(path)
+        except ImageFileError:
+            continue
+        # only the closing words were lost
+        np.testing.assert_array_equal(cut.centroids_mm, whole.centroids_mm, err_msg=f"cut at {end}")
+
+
+def test_what_cannot_be_a_mesh_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"\.inp, \.cdb, \.frd, \.xplt, \.msh, \.vtu, \.vtk; got '\.stl'"):
+        read_mesh(tmp_path / "heel.stl")
+    with pytest.raises(ImageFileError, match="no such file"):
+        read_mesh(tmp_path / "heel.vtu")
+    with pytest.raises(InputError, match="mm or m; got 'inch'"):
+        read_mesh(written(tmp_path, "vtu"), unit="inch")
+    with pytest.raises(InputError, match="LPS or RAS; got 'LAS'"):
+        read_mesh(written(tmp_path, "vtu"), frame="LAS")
+    points, cells = block()
+    meshio.write(tmp_path / "surface.vtu", meshio.Mesh(points, [("triangle", skin(cells))]))
+    with pytest.raises(ImageFileError, match=r"no volume cells \(found: triangle\)"):
+        read_mesh(tmp_path / "surface.vtu")
+    cells[3, 0] = cells[3, 1]
+    meshio.write(tmp_path / "flat.vtu", meshio.Mesh(points, [("tetra", cells)]))
+    with pytest.raises(GeometryError, match=r"flat\.vtu: 1 of 48 tetrahedra are degenerate"):
+        read_mesh(tmp_path / "flat.vtu")
+    with pytest.raises(GeometryError, match=r"heel\.vtu: .*--mesh-unit m"):
+        read_mesh(written(tmp_path, "vtu", 1e-3))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("*HEADING", "*INCLUDE, INPUT=nodes.inp", r"\*INCLUDE in line 1 brings in"),
+        ("*HEADING", "*PART, NAME=a\n*END PART\n*PART, NAME=b", r"\*PART in line 3 is a second part"),
+        ("*HEADING", "*INSTANCE, NAME=a, PART=b\n0., 0., 12.", r"\*INSTANCE in line 1 moves the part"),
+        ("*NODE, NSET=N1", "*NODE, SYSTEM=C", "cylindrical"),
+        ("type=C3D4H", "type=C3D27", "solid elements of type C3D27 are not read"),
+        ("type=C3D4H", "type=C3D10", "need 11 numbers each; the 100 numbers"),
+        ("\n48, ", "\n47, ", "element 47 is defined twice"),
+        ("*Node\n", f"*Node\n{TAGS[0]}, 0, 0, 0\n", f"node {TAGS[0]} is defined twice"),
+        ("*Node\n", "*Node\nfour, 0, 0, 0\n", "could not be read .*'four'"),
+        ("PART ONE", "PART TWO", "'PART TWO' is not defined"),
+        ("PART ONE", "Skin", "'Skin' is not defined, or contains itself"),
+        ("\n21, ", f"\n21, {TAGS[0] + 1}, {TAGS[1]}, 1, 1\n22, ", "which the file does not define"),
+    ],
+)
+def test_what_is_not_read_in_an_abaqus_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = written(tmp_path, "inp")
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(ImageFileError, match=message):
+        read_mesh(path)
+
+
+def test_what_carries_no_tissue_in_an_abaqus_file_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = written(tmp_path, "inp")
+    spring = f"*ELEMENT, TYPE=SPRINGA\n999, {TAGS[0]}, {TAGS[1]}\n"
+    reference_point = f"*ASSEMBLY, NAME=a\n*NODE\n{TAGS[0]}, 900., 900., 900.\n*END ASSEMBLY\n"
+    path.write_text(path.read_text() + spring + reference_point)
+    mesh = read_mesh(path)
+    assert mesh.cell_count == 50
+    np.testing.assert_allclose(mesh.bounds_mm, [[5, -20, 40], [15, -10, 50]])
+    assert "elements of type SPRINGA carry no tissue" in caplog.text
+
+
+H = np.array([[0.02, 0.30, -0.01], [0.05, -0.10, 0.04], [-0.03, 0.20, 0.07]])
+MOVED = Affine(np.eye(3) + H, np.array([1.0, -2.0, 3.0]))
+CASES = [("mm", 1.0, "LPS", (1, 1, 1)), ("mm", 1.0, "RAS", (-1, -1, 1)), ("m", 1e-3, "RAS", (-1, -1, 1))]
+
+
+@pytest.mark.parametrize(("unit", "scale", "frame", "signs"), CASES)
+def test_results_come_back_in_the_frame_and_unit_of_the_users_mesh(
+    tmp_path: Path, unit: str, scale: float, frame: str, signs: tuple[int, int, int]
+) -> None:
+    mesh = read_mesh(written(tmp_path, "inp", scale, signs), unit=unit, frame=frame)
+    u, _ = MOVED.evaluate(mesh.points_mm)
+    _, gradients = MOVED.evaluate(mesh.centroids_mm)
+    out = tmp_path / "out.vtu"
+    missing = write_on_mesh(out, mesh, {"u_mm": u}, {"H": gradients, "max_shear": np.linspace(0, 1, 50)})
+    assert missing == {f"u_{unit}": 0, "H": 0, "max_shear": 0}
+
+    back = meshio.read(out)
+    own_points, _ = block()
+    np.testing.assert_allclose(back.points, own_points * scale * signs, rtol=1e-12)
+    turned = np.diag(signs) @ H @ np.diag(signs)
+    expected = back.points @ turned.T + np.array([1.0, -2.0, 3.0]) * signs * scale
+    np.testing.assert_allclose(back.point_data[f"u_{unit}"], expected, rtol=1e-9)
+    np.testing.assert_allclose(back.cell_data["H"][1], np.tile(turned.ravel(), (48, 1)), rtol=1e-12)
+    np.testing.assert_allclose(back.cell_data["max_shear"][1], np.linspace(0, 1, 50)[2:], rtol=1e-12)
+    np.testing.assert_array_equal(back.point_data["node"], TAGS)
+    assert [cells.type for cells in back.cells] == ["triangle", "tetra"]
+
+    assert write_nodal_displacements(tmp_path / "bc.csv", mesh, u) == 0
+    with (tmp_path / "bc.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["node", *(f"{name}_{unit}" for name in ("x", "y", "z", "ux", "uy", "uz"))]
+    assert [int(row["node"]) for row in rows] == TAGS.tolist()
+    table = np.array([[float(x) for x in list(row.values())[1:]] for row in rows])
+    np.testing.assert_allclose(table, np.hstack([back.points, expected]), rtol=1e-8, atol=1e-9)
+    declared = json.loads((tmp_path / "bc.json").read_text())
+    assert (declared["frame"], declared["unit"], declared["nodes"]) == (frame, unit, 27)
+    assert declared["node"] == "number in the mesh file"
+
+
+def test_a_node_without_a_displacement_is_empty_and_counted_never_zero(tmp_path: Path) -> None:
+    mesh = read_mesh(written(tmp_path, "vtu"))
+    u = MOVED.displacement(mesh.points_mm).copy()
+    u[4], u[9, 1] = np.nan, np.nan
+    assert write_nodal_displacements(tmp_path / "bc.csv", mesh, u) == 2
+    lines = (tmp_path / "bc.csv").read_text().splitlines()
+    assert [line.endswith(",,,") for line in lines[1:]] == [node in {4, 9} for node in range(27)]
+    assert "nan" not in "".join(lines)
+    declared = json.loads((tmp_path / "bc.json").read_text())
+    assert declared["nodes_without_displacement"] == 2
+    assert declared["node"] == "index in the mesh file, counted from 0"
+    assert write_on_mesh(tmp_path / "out.vtu", mesh, {"u_mm": u}, {}) == {"u_mm": 2}
+    assert np.isnan(meshio.read(tmp_path / "out.vtu").point_data["u_mm"]).sum() == 4
+
+
+def test_what_cannot_be_written_is_refused_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    mesh = read_mesh(written(tmp_path, "vtu"))
+    before = mesh.path.read_bytes()
+    u = np.zeros_like(mesh.points_mm)
+    with pytest.raises(InputError, match="is the mesh itself"):
+        write_on_mesh(mesh.path, mesh, {}, {})
+    with pytest.raises(InputError, match=r"must end in \.csv"):
+        write_nodal_displacements(tmp_path / "bc.txt", mesh, u)
+    with pytest.raises(InputError, match=r"each of the 50 cells.* got shape \(48,\)"):
+        write_on_mesh(tmp_path / "out.vtu", mesh, {}, {"J": np.ones(48)})
+    with pytest.raises(InputError, match=r"shape \(27, 3\).* got \(26, 3\)"):
+        write_nodal_displacements(tmp_path / "bc.csv", mesh, u[1:])
+    with pytest.raises(InputError, match="'node' is kept"):
+        write_on_mesh(tmp_path / "out.vtu", mesh, {"node": u}, {})
+    with pytest.raises(OutputError, match="folder exists"):
+        write_on_mesh(tmp_path / "nowhere" / "out.vtu", mesh, {}, {})
+    (tmp_path / "taken.csv").mkdir()
+    with pytest.raises(OutputError, match=r"taken\.csv: cannot be written"):
+        write_nodal_displacements(tmp_path / "taken.csv", mesh, u)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["heel.vtu", "taken.csv"]
+    assert mesh.path.read_bytes() == before

@@ -1,0 +1,170 @@
+"""The Gauss-Newton engine's sums, prior and steps against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dvc.deformation.bspline import BSpline
+from dvc.deformation.protocol import Affine, evaluate_on_grid
+from dvc.errors import InputError
+from dvc.images.image import Grid
+from dvc.registration.gauss_newton.fit import control_grid, spline_through
+from dvc.registration.gauss_newton.level import Level, Weights, _share_at, cofactors, conjugate_gradients
+from dvc.registration.gauss_newton.spline_sums import SplineSums
+from tests.textures import GRID, everything, pair_of
+
+
+@pytest.fixture(scope="module")
+def sums() -> tuple[SplineSums, BSpline]:
+    """A spline with random coefficients and the sums over some voxels of a small grid."""
+    grid = Grid((9, 8, 10), np.array([1.0, 1.1, 0.9]), np.zeros(3))
+    control = control_grid(grid, np.array([3.0, 3.5, 4.0]))
+    random = np.random.default_rng(1)
+    at, step = control.indices_of(grid.origin_mm), grid.spacing_mm / control.spacing_mm
+    along = [a + s * np.arange(n) for a, s, n in zip(at, step, grid.shape, strict=True)]
+    inside = random.uniform(size=grid.shape) < 0.7
+    return SplineSums(control, along, inside), BSpline(control, random.normal(size=(3, *control.shape)))
+
+
+def test_sums_are_those_of_the_spline(sums):
+    points, spline = sums
+    u, H = points.evaluate(spline.coefficients_mm)
+    grid = Grid((9, 8, 10), np.array([1.0, 1.1, 0.9]), np.zeros(3))
+    true_u, true_H = evaluate_on_grid(spline, grid, points.inside)
+    np.testing.assert_allclose(u[points.inside], true_u, atol=1e-12)
+    np.testing.assert_allclose(H[points.inside], true_H, atol=1e-12)
+    assert not H[~points.inside].any()
+
+
+def test_gathering_is_the_transpose_of_evaluating(sums):
+    points, spline = sums
+    stress = np.random.default_rng(3).normal(size=(*points.inside.shape, 3, 3)) * points.inside[..., None, None]
+    H = points.evaluate(spline.coefficients_mm)[1]
+    assert np.sum(points.gathered(stress) * spline.coefficients_mm) == pytest.approx(np.sum(stress * H), rel=1e-12)
+
+
+def test_product_and_diagonal_are_those_of_the_quadratic_form(sums):
+    points, spline = sums
+    random = np.random.default_rng(4)
+    shape = points.inside.shape
+    root = random.normal(size=(*shape, 3, 3))
+    N = root @ np.swapaxes(root, -1, -2)
+    packed = np.stack([N[..., 0, 0], N[..., 0, 1], N[..., 0, 2], N[..., 1, 1], N[..., 1, 2], N[..., 2, 2]], axis=-1)
+    F = np.eye(3) + 0.2 * random.normal(size=(*shape, 3, 3))
+    volume, shear = random.uniform(size=shape), random.uniform(size=shape)
+    c, cof = spline.coefficients_mm, cofactors(F)
+    u, H = points.evaluate(c)
+    sym = 0.5 * (H + np.swapaxes(H, -1, -2))
+    cost = np.einsum("...a,...ab,...b", u, N, u) + volume * np.einsum("...ab,...ab", cof, H) ** 2
+    cost = (cost + shear * np.einsum("...ab,...ab", sym, sym))[points.inside].sum()
+    assert np.sum(c * points.product(c, (packed, cof, volume, shear))) == pytest.approx(cost, rel=1e-12)
+    unstrained = (packed, np.broadcast_to(np.eye(3), cof.shape).copy(), volume, shear)
+    blocks = points.diagonal(unstrained)[:, 2, 2, 3]
+    for m, entries in enumerate(([0, 1, 2], [1, 3, 4], [2, 4, 5])):
+        one = np.zeros_like(c)
+        one[m, 2, 2, 3] = 1.0
+        np.testing.assert_allclose(blocks[entries], points.product(one, unstrained)[:, 2, 2, 3], rtol=1e-10)
+        assert blocks[entries][m] > 0.01
+
+
+def test_cofactors_are_det_times_inverse_transpose():
+    F = np.eye(3) + 0.3 * np.random.default_rng(5).normal(size=(20, 3, 3))
+    expected = np.linalg.det(F)[:, None, None] * np.swapaxes(np.linalg.inv(F), -1, -2)
+    np.testing.assert_allclose(cofactors(F), expected, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def level() -> Level:
+    fixed, moving = pair_of(Affine(np.eye(3), np.array([0.4, -0.3, 0.2])))
+    inside, bone = everything().inside, np.zeros(GRID.shape, dtype=bool)
+    bone[10:20, 12:24, 10:22] = True
+    return Level(fixed, moving, inside, inside & ~bone, bone, control_grid(GRID, np.full(3, 5.0)), rough=((1.0, 0.0),))
+
+
+def rotated(level: Level) -> np.ndarray:
+    """Coefficients of a rotation by 20 degrees."""
+    turn = Rotation.from_rotvec([10.0, -15.0, 8.0], degrees=True).as_matrix()
+    return spline_through(Affine(turn, np.zeros(3)), level.control)
+
+
+def test_the_prior_of_a_stretch_is_its_closed_form(level):
+    """F = diag(1.1, 1, 0.95): J = 1.045 and E = diag(0.105, 0, -0.04875)."""
+    c = spline_through(Affine(np.diag([1.1, 1.0, 0.95]), np.zeros(3)), level.control)
+    state = level.at(c)
+    mm3 = GRID.voxel_volume_mm3
+    bone = 10 * 12 * 12 * mm3
+    soft = everything().inside.sum() * mm3 - bone
+    assert level.prior(state, Weights(7.0, 0.0, 0.0)) == pytest.approx(0.0, abs=1e-9)
+    assert level.prior(state, Weights(0.0, 2.0, 0.0)) == pytest.approx(soft * 0.045**2, rel=1e-6)
+    assert level.prior(state, Weights(0.0, 0.0, 2.0)) == pytest.approx(bone * (0.105**2 + 0.04875**2), rel=1e-6)
+
+
+def test_a_rotation_costs_nothing(level):
+    assert level.prior(level.at(rotated(level)), Weights(1.0, 1.0, 1.0, 1.0)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    "weights", [Weights(2.0, 0.0, 0.0), Weights(0.0, 3.0, 0.0), Weights(0.0, 0.0, 4.0), Weights(0, 0, 0, 5.0)]
+)
+def test_the_priors_gradient_is_that_of_its_energy(level, weights):
+    random = np.random.default_rng(6)
+    c = rotated(level) + 0.3 * random.normal(size=(3, *level.control.shape))
+    d = random.normal(size=c.shape)
+    h = 1e-5
+    difference = (level.prior(level.at(c + h * d), weights) - level.prior(level.at(c - h * d), weights)) / (2.0 * h)
+    assert np.sum(level.prior_gradient(level.at(c), weights) * d) == pytest.approx(difference, rel=1e-6)
+
+
+@pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (10.0, -15.0, 8.0)], ids=["shifted", "turned"])
+def test_the_images_force_is_the_derivative_of_their_residual(turn_deg):
+    """Central differences of the fixed image are not quite the derivative: within 5 %. They turn with what turns."""
+    turn = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
+    motion = Affine(turn, GRID.centre_mm - turn @ GRID.centre_mm + [0.4, -0.3, 0.2])
+    inside = np.zeros(GRID.shape, dtype=bool)
+    inside[10:-10, 10:-10, 10:-10] = True
+    level = Level(*pair_of(motion), inside, inside, np.zeros_like(inside), control_grid(GRID, np.full(3, 5.0)))
+    true = spline_through(motion, level.control)
+    for axis in range(3):
+        bump = np.zeros_like(true)
+        bump[axis, 3:8, 3:8, 3:7] = 0.3
+        c, h = true + bump, 1e-3
+        difference = (level.at(c + h * bump).images.square - level.at(c - h * bump).images.square) / (2.0 * h)
+        assert -2.0 * np.sum(level.at(c).images.force * bump) == pytest.approx(difference, rel=0.05)
+
+
+def test_conjugate_gradients_solve_a_small_system():
+    random = np.random.default_rng(7)
+    root = random.normal(size=(12, 12))
+    A = root @ root.T + np.eye(12)
+    true = np.arange(12.0).reshape(3, 4)
+    unit = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])[:, None]
+    x = conjugate_gradients(lambda v: (A @ v.ravel()).reshape(3, 4), (A @ true.ravel()).reshape(3, 4), unit, 1e-10, 100)
+    np.testing.assert_allclose(x, true, atol=1e-6)
+
+
+def test_a_spline_through_a_cubic_deformation_is_that_deformation():
+    control = control_grid(GRID, np.full(3, 6.0))
+    finer = control_grid(GRID, np.full(3, 3.0))
+    coarse = BSpline(control, np.random.default_rng(9).normal(size=(3, *control.shape)))
+    fine = BSpline(finer, spline_through(coarse, finer))
+    X = GRID.points(everything().inside)[::97]
+    assert np.abs(fine.displacement(X) - coarse.displacement(X)).max() < 0.05  # of 0.6; the knots are not the same
+    with pytest.raises(InputError, match="not defined anywhere"):
+        spline_through(coarse, Grid(finer.shape, finer.spacing_mm, finer.origin_mm + 500.0))
+
+
+def test_the_share_of_tissue_at_control_points_is_the_same_in_any_frame():
+    """A half space: whole inside, a half on its border, nothing outside the image."""
+    mask = np.zeros((12, 10, 8), dtype=bool)
+    mask[:6] = True
+    grid = Grid(mask.shape, np.full(3, 0.8), np.array([1.0, -2.0, 3.0]))
+    control = Grid((6, 5, 4), np.full(3, 1.6), grid.origin_mm + 0.4)  # in the middles of cells of voxels
+    share = _share_at(control, mask, grid)
+    np.testing.assert_allclose(share[:, 1, 1], [1.0, 1.0, 1.0, 0.0, 0.0, 0.0], atol=1e-12)
+    shifted = Grid(control.shape, control.spacing_mm, control.origin_mm + np.array([0.8, 0.0, 0.0]))
+    np.testing.assert_allclose(_share_at(shifted, mask, grid)[:, 1, 1], [1.0, 1.0, 0.5, 0.0, 0.0, 0.0], atol=1e-12)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    turned = [Grid(g.shape, g.spacing_mm, turn @ g.origin_mm, turn) for g in (control, grid)]
+    np.testing.assert_allclose(_share_at(turned[0], mask, turned[1]), share, atol=1e-12)

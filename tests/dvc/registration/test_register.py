@@ -1,0 +1,339 @@
+"""Alignment and registration on a phantom whose motion is known, and what must be refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from dvc.deformation.bspline import BSpline
+from dvc.deformation.protocol import Composed, RigidMotion, evaluate_on_grid
+from dvc.deformation.strain import StrainField
+from dvc.errors import InputError, ParameterError, RegistrationError
+from dvc.images.image import Grid, Image, Mask
+from dvc.images.resample import carry, shows
+from dvc.images.shading import without_shading
+from dvc.images.tissue import tissue_mask
+from dvc.registration.align import Alignment, align, motion_of
+from dvc.registration.elastix.presets import Preset, load_preset
+from dvc.registration.gauss_newton.fit import GaussNewton
+from dvc.registration.register import Settings, register
+from phantoms.heel import heel_pair
+
+COARSE_MM = 0.1  # at voxels of 1.6 mm; the full size, 0.8 mm, is held to 0.05 mm and 0.05 degrees below
+QUICK = {
+    "MaximumNumberOfIterations": ("150",),
+    "NumberOfSpatialSamples": ("3000",),
+    "FinalGridSpacingInPhysicalUnits": ("6.0",),
+}
+
+
+def quick(**changes: tuple[str, ...]) -> Settings:
+    preset = load_preset("heel-mr")
+    return Settings((Preset("quick", preset.text, preset.parameters | QUICK | changes),))
+
+
+def rms_over(mask: Mask, a: RigidMotion, b: RigidMotion) -> float:
+    X = mask.points()
+    return float(np.sqrt(np.mean(np.sum((a.apply(X) - b.apply(X)) ** 2, axis=1))))
+
+
+@pytest.fixture(scope="session")
+def found(small_pair, worker):
+    return register(small_pair.reference, small_pair.loaded, bone=small_pair.bone, settings=quick(), worker=worker)
+
+
+def test_the_bones_motion_is_found(found, small_pair):
+    assert rms_over(small_pair.bone, found.alignment.motion, small_pair.foot_motion) < COARSE_MM
+    assert found.alignment.similarity > 0.9
+    assert found.alignment.repeatability_mm < COARSE_MM  # of two halves, which know half as much each
+
+
+def test_strain_is_that_of_the_tissue_relative_to_its_bone(found, small_pair):
+    grid = small_pair.reference.grid
+    fat = small_pair.labels.region("fat").inside
+    U, true_H = evaluate_on_grid(small_pair.deformation, grid, fat)
+    seen = small_pair.loaded.grid.contains(small_pair.foot_motion.apply(grid.points(fat) + U))
+    u, H = evaluate_on_grid(found.bspline, grid, fat)
+    distance = np.linalg.norm(u - U, axis=1)[seen]
+    error = (StrainField.from_gradient(H).max_shear - StrainField.from_gradient(true_H).max_shear)[seen]
+    # No registration at all would leave a median of 0.7 mm and a root mean square of 0.15.
+    assert np.median(distance) < 0.45
+    assert np.sqrt(np.mean(error**2)) < 0.09
+    assert np.isfinite(distance).all()
+
+
+def test_the_total_motion_holds_the_bones_motion_as_well(found, small_pair):
+    X = small_pair.bone.points()[::50]
+    whole = X + found.total.displacement(X)
+    apart = found.alignment.motion.apply(X + found.bspline.displacement(X))
+    np.testing.assert_allclose(whole, apart, atol=1e-9)
+
+
+def test_same_seed_same_result_bit_for_bit_other_seed_another(found, small_pair, worker):
+    again = register(small_pair.reference, small_pair.loaded, bone=small_pair.bone, settings=quick(), worker=worker)
+    np.testing.assert_array_equal(again.bspline.coefficients_mm, found.bspline.coefficients_mm)
+    np.testing.assert_array_equal(again.alignment.motion.rotation, found.alignment.motion.rotation)
+    other = register(
+        small_pair.reference,
+        small_pair.loaded,
+        bone=small_pair.bone,
+        settings=replace(quick(), seed=2),
+        worker=worker,
+    )
+    assert np.abs(other.bspline.coefficients_mm - found.bspline.coefficients_mm).max() > 1e-6
+
+
+def test_an_image_stored_in_another_orientation_gives_the_same_result(found, small_pair, worker):
+    loaded = small_pair.loaded
+    turned_grid = Grid(
+        (loaded.grid.shape[2], loaded.grid.shape[0], loaded.grid.shape[1]),
+        loaded.grid.spacing_mm[[2, 0, 1]],
+        loaded.grid.points_at(np.array([0.0, loaded.grid.shape[1] - 1.0, 0.0])),
+        loaded.grid.direction[:, [2, 0, 1]] * np.array([1.0, 1.0, -1.0]),
+    )
+    turned = Image(turned_grid, loaded.values[:, ::-1].transpose(2, 0, 1))
+    np.testing.assert_array_equal(turned.toward_lps().values, loaded.values)
+    again = register(small_pair.reference, turned, bone=small_pair.bone, settings=quick(), worker=worker)
+    np.testing.assert_allclose(again.bspline.coefficients_mm, found.bspline.coefficients_mm, atol=1e-9)
+
+
+def test_a_start_is_where_elastix_begins_and_is_corrected_against_the_images(found, small_pair, worker):
+    """Chained: the start's B-spline and the correction add up to one on the same control points."""
+
+    def from_start(start: BSpline | None, settings: Settings) -> BSpline:
+        return register(
+            small_pair.reference,
+            small_pair.loaded,
+            bone=small_pair.bone,
+            settings=settings,
+            start=start,
+            worker=worker,
+        ).bspline
+
+    X = small_pair.labels.region("fat").points()[::7]
+    truth = small_pair.deformation.displacement(X)
+
+    def off(bspline: BSpline) -> float:
+        return float(np.median(np.linalg.norm(bspline.displacement(X) - truth, axis=1)))
+
+    # In one iteration at each resolution nothing is found; what is there was there at the start.
+    few = quick(MaximumNumberOfIterations=("1",))
+    begun, bare = from_start(found.bspline, few), from_start(None, few)
+    assert begun.control.same_as(found.bspline.control)
+    assert off(begun) < 0.4  # .20 at the start, .27 after an iteration
+    assert off(bare) > 0.6  # .69
+    wrong = replace(found.bspline, coefficients_mm=1.3 * found.bspline.coefficients_mm)
+    mended = from_start(wrong, quick())
+    assert off(wrong) > 1.2 * off(mended)
+    assert off(mended) < off(found.bspline) + 0.1
+
+
+def test_without_a_bone_the_whole_image_can_be_aligned(tiny_pair, worker):
+    settings = replace(Settings.of(), gauss_newton=GaussNewton(bending=4.0), align_on="image")
+    found = register(tiny_pair.reference, tiny_pair.repeat, settings=settings, worker=worker)
+    assert found.alignment.on == "image"
+    assert rms_over(tiny_pair.bone, found.alignment.motion, tiny_pair.foot_motion) < 2.5 * COARSE_MM
+    assert rms_over(tiny_pair.bone, RigidMotion.identity(), tiny_pair.foot_motion) > 1.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 12])
+def test_row_9_a_foot_moved_by_20_mm_and_15_degrees_is_found(seed):
+    random = np.random.default_rng(seed)
+    axis, way = random.normal(size=(2, 3))
+    rotation = Rotation.from_rotvec(np.radians(15.0) * axis / np.linalg.norm(axis)).as_matrix()
+    motion = RigidMotion.about(np.array([0.0, 5.0, 0.0]), rotation, 20.0 * way / np.linalg.norm(way))
+    pair = heel_pair(seed=seed, foot_motion=motion)
+    found = aligned(pair.reference, pair.loaded, pair.bone)
+    assert rms_over(pair.bone, found.motion, motion) < 0.03  # elastix, in its place: 0.05
+    assert found.motion.after(motion.inverse()).angle_deg < 0.03
+
+
+def test_row_9_another_centre_is_no_obstacle(small_pair):
+    far = RigidMotion(np.eye(3), np.array([300.0, -150.0, 800.0]))
+    moved = Image(small_pair.loaded.grid.moved_by(far.rotation, far.translation_mm), small_pair.loaded.values)
+    found = aligned(small_pair.reference, moved, small_pair.bone)
+    assert rms_over(small_pair.bone, found.motion, far.after(small_pair.foot_motion)) < COARSE_MM
+
+
+def aligned(reference: Image, loaded: Image, bone: Mask) -> Alignment:
+    return align(without_shading(reference), without_shading(loaded), bone, "bone", 1)
+
+
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+@pytest.mark.parametrize("along", [[0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, -2.0, 1.0]], ids=str)
+def test_row_9_a_bone_along_which_fits_slide_is_not_located(along, noise):
+    """A rod of uniform signal looks the same all along: fits begun apart stay apart, but for one with a knob."""
+    random, axis = np.random.default_rng(3), np.array(along) / np.linalg.norm(along)
+    grid = Grid((36, 36, 36), np.full(3, 2.0), np.full(3, -35.0))
+    X = grid.points()
+    ahead = X @ axis
+    rod = np.linalg.norm(X - ahead[..., None] * axis, axis=-1) < 9.0
+    aside = np.cross(axis, [0.3, 0.5, -0.4])
+    knob = np.linalg.norm(X - 9.0 * aside / np.linalg.norm(aside) - 3.0 * axis, axis=-1) < 8.0
+    bone = Mask(grid, (rod | knob) & (np.abs(ahead) < 16.0))
+
+    def seen(shape: np.ndarray) -> Image:
+        clean = gaussian_filter(np.where(shape, 100.0, 40.0), 0.7)
+        return Image(grid, (clean + noise * random.normal(size=shape.shape)).astype(np.float32))
+
+    with pytest.raises(RegistrationError, match="the bone is not located"):
+        align(seen(rod), seen(rod), bone, "bone", 1)
+    found = align(seen(rod | knob), seen(rod | knob), bone, "bone", 1)
+    assert found.repeatability_mm < (0.4 if noise else 0.02)
+
+
+@pytest.mark.parametrize("noise", [0.5, 3.0])
+def test_row_9_a_bone_whose_turning_nothing_shows_is_not_located(noise):
+    """A ball looks the same however it is turned, a flat one when it is about its axis; with three axes it does not."""
+    random, grid = np.random.default_rng(3), Grid((36, 36, 36), np.full(3, 2.0), np.full(3, -35.0))
+
+    def pair(axes: list[float]) -> tuple[Image, Image, Mask]:
+        radius = np.linalg.norm(grid.points() / axes, axis=-1)
+        clean = 40.0 + 60.0 / (1.0 + np.exp(radius - 14.0))
+        images = (clean + noise * random.normal(size=grid.shape) for _ in range(2))
+        one, other = (Image(grid, values.astype(np.float32)) for values in images)
+        return one, other, Mask(grid, radius < 14.0)
+
+    for axes in ([1.0, 1.0, 1.0], [1.0, 1.0, 0.6]):
+        with pytest.raises(RegistrationError, match="the bone is not located"):
+            align(*pair(axes), "bone", 1)
+    assert align(*pair([1.0, 1.6, 0.6]), "bone", 1).repeatability_mm < 0.2 * noise
+
+
+def test_row_9_an_image_without_the_bone_is_refused(small_pair, worker):
+    random = np.random.default_rng(5)
+    noise = gaussian_filter(random.normal(size=small_pair.loaded.grid.shape), 2.0).astype(np.float32)
+    with pytest.raises(RegistrationError, match="nowhere does the loaded image look like it"):
+        register(
+            small_pair.reference,
+            Image(small_pair.loaded.grid, noise),
+            bone=small_pair.bone,
+            settings=quick(),
+            worker=worker,
+        )
+
+
+def test_row_27_inverted_contrast_is_refused_and_the_measure_that_could_is_named(small_pair, worker):
+    turned = Image(small_pair.loaded.grid, small_pair.loaded.values.max() - small_pair.loaded.values)
+    with pytest.raises(RegistrationError, match="AdvancedMattesMutualInformation"):
+        register(small_pair.reference, turned, bone=small_pair.bone, settings=quick(), worker=worker)
+
+
+@pytest.mark.parametrize("air_too", [True, False])
+@pytest.mark.parametrize("settings", [Settings.of(), quick()], ids=["gauss-newton", "elastix"])
+def test_row_27_without_alignment_too(settings, air_too, small_pair, worker):
+    loaded, back = small_pair.loaded, small_pair.foot_motion.inverse()
+    grid = loaded.grid.moved_by(back.rotation, back.translation_mm)
+    inside = np.ones(grid.shape, dtype=bool) if air_too else tissue_mask(loaded).inside
+    turned = Image(grid, np.where(inside, loaded.values.max() - loaded.values, loaded.values))
+    with pytest.raises(RegistrationError, match=r"below zero: .*AdvancedMattesMutualInformation"):
+        register(small_pair.reference, turned, settings=replace(settings, align_on="none"), worker=worker)
+
+
+def test_row_27_mutual_information_follows_turned_contrast(small_pair, worker):
+    turned = Image(small_pair.loaded.grid, small_pair.loaded.values.max() - small_pair.loaded.values)
+    settings = replace(quick(Metric=("AdvancedMattesMutualInformation",)), align_on="none")
+    found = register(small_pair.reference, turned, settings=settings, worker=worker)
+    fat = small_pair.labels.region("fat").points()[::7]
+    total = found.total.displacement(fat)
+    truth = Composed([small_pair.deformation, small_pair.foot_motion]).displacement(fat)
+    # 3 mm without any registration
+    assert np.nanmedian(np.linalg.norm(total - truth, axis=1)) < 1.0
+
+
+def test_row_8_identical_images_are_refused(small_pair):
+    with pytest.raises(InputError, match="every voxel is equal"):
+        register(small_pair.reference, small_pair.reference, bone=small_pair.bone)
+
+
+def test_the_bone_is_needed_to_align_on_it(small_pair):
+    with pytest.raises(InputError, match="--bone"):
+        register(small_pair.reference, small_pair.loaded)
+
+
+def test_a_rigid_transform_is_no_nonrigid_stage(small_pair, worker):
+    with pytest.raises(ParameterError, match="no B-spline"):
+        register(
+            small_pair.reference,
+            small_pair.loaded,
+            bone=small_pair.bone,
+            worker=worker,
+            settings=quick(Transform=("EulerTransform",)),
+        )
+
+
+def test_elastix_own_reason_is_told(small_pair, worker):
+    with pytest.raises(RegistrationError, match=r"elastix failed: .*[Ss]pline"):
+        register(
+            small_pair.reference,
+            small_pair.loaded,
+            bone=small_pair.bone,
+            worker=worker,
+            settings=quick(BSplineTransformSplineOrder=("7",)),
+        )
+
+
+def test_missing_voxels_are_left_out(small_pair, worker):
+    """A tenth of the bone is not shown: neither an edge for the rigid fit, nor a result there."""
+    grid, inside = small_pair.loaded.grid, small_pair.bone.points()
+    front = np.percentile(small_pair.foot_motion.apply(inside)[:, 1], 10.0)
+    values = np.array(small_pair.loaded.values)
+    values[grid.points()[..., 1] < front] = np.nan
+    cut = Image(grid, values)
+    found = register(small_pair.reference, cut, bone=small_pair.bone, settings=quick(), worker=worker)
+    assert rms_over(small_pair.bone, found.alignment.motion, small_pair.foot_motion) < 2 * COARSE_MM
+    assert np.isfinite(found.bspline.coefficients_mm).all()
+    X = small_pair.bone.points()
+    assert 0.02 < 1.0 - shows(cut, found.alignment.motion.apply(X)).mean() < 0.2
+
+
+def test_stages_that_end_on_other_control_points_are_refused_first(small_pair):
+    preset = quick().presets[0]
+    other = replace(preset, parameters=preset.parameters | {"FinalGridSpacingInPhysicalUnits": ("5.0",)})
+    with pytest.raises(ParameterError, match="must be the same"):
+        register(small_pair.reference, small_pair.loaded, bone=small_pair.bone, settings=Settings((preset, other)))
+
+
+def test_progress_tells_stages_and_rises(small_pair, worker):
+    told: list[tuple[str, float]] = []
+    register(
+        small_pair.reference,
+        small_pair.loaded,
+        bone=small_pair.bone,
+        settings=quick(),
+        worker=worker,
+        progress=lambda stage, fraction: told.append((stage, fraction)),
+    )
+    assert next(s for s, _ in told) == "aligning"
+    fractions = [f for s, f in told if s == "registering"]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert len(fractions) > 2
+
+
+def test_the_motion_of_a_bone_is_taken_from_any_deformation(small_pair):
+    motion = small_pair.foot_motion
+    found = motion_of(Composed([small_pair.deformation, motion]), small_pair.bone)
+    assert rms_over(small_pair.bone, found, motion) < 1e-9
+
+
+def test_control_points_are_never_closer_than_two_voxels(small_pair, worker, caplog):
+    """Thick slices: a spacing that the image cannot carry is widened, and that is told."""
+    thick = Grid((64, 72, 14), np.array([1.6, 1.6, 8.0]), small_pair.reference.grid.origin_mm)
+
+    def slices(image: Image) -> Image:
+        return Image(thick, np.nan_to_num(carry(image, thick, order=1)))
+
+    found = register(
+        slices(small_pair.reference),
+        slices(small_pair.loaded),
+        settings=replace(quick(), align_on="none"),
+        worker=worker,
+    )
+    np.testing.assert_allclose(found.bspline.control.spacing_mm, [6.0, 6.0, 16.0])
+    assert "too coarse" in caplog.text

@@ -1,0 +1,63 @@
+"""Folders that take their name only when they are complete."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from dvc.atomic_files import whole_folder
+from dvc.errors import OutputError
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """A folder of an earlier run, with one file."""
+    folder = tmp_path / "Load1"
+    folder.mkdir()
+    (folder / "quality.json").write_text("old")
+    return folder
+
+
+def half_filled(folder: Path, error: Exception) -> None:
+    with whole_folder(folder) as partial:
+        (partial / "regions.csv").write_text("half")
+        raise error
+
+
+def test_a_folder_is_replaced_as_a_whole(old: Path) -> None:
+    with whole_folder(old) as partial:
+        (partial / "regions.csv").write_text("new")
+        assert (old / "quality.json").read_text() == "old"
+    assert [p.name for p in old.parent.iterdir()] == ["Load1"]
+    assert [p.name for p in old.iterdir()] == ["regions.csv"]
+
+
+def test_a_disk_that_fills_midway_leaves_the_old_folder_and_nothing_else(old: Path) -> None:
+    with pytest.raises(OutputError, match=r"Load1: .*No space left"):
+        half_filled(old, OSError(errno.ENOSPC, "No space left on device"))
+    assert [p.name for p in old.parent.iterdir()] == ["Load1"]
+    assert [p.name for p in old.iterdir()] == ["quality.json"]
+
+
+def test_an_error_that_is_none_of_the_disk_stays_itself(old: Path) -> None:
+    with pytest.raises(KeyError):
+        half_filled(old.with_name("Load2"), KeyError("a region"))
+    assert [p.name for p in old.parent.iterdir()] == ["Load1"]
+
+
+def test_a_folder_that_cannot_take_its_name_gives_it_back(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The old folder has been moved aside when the new one's renaming fails."""
+    rename = Path.replace
+
+    def refusing(self: Path, target: Path) -> Path:
+        if self.name.endswith(".partial"):
+            raise OSError(errno.EACCES, "Permission denied")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "replace", refusing)
+    with pytest.raises(OutputError, match="Permission denied"), whole_folder(old) as partial:
+        (partial / "regions.csv").write_text("new")
+    assert [p.name for p in old.parent.iterdir()] == ["Load1"]
+    assert (old / "quality.json").read_text() == "old"

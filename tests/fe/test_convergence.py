@@ -1,0 +1,96 @@
+"""Extrapolation gives back a known limit and order; `converge` makes meshes, loads and table, and keeps its meshes."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dvc.errors import InputError
+from dvc.images.image import LabelMap
+from dvc.io.images.write import write_labels
+from fe.convergence import extrapolated
+from mrstrain.cli.app import app
+from tests.fe.test_meshing import half_onion
+
+
+@pytest.mark.parametrize("order", [0.8, 1.0, 2.0])
+def test_a_known_order_and_limit(order: float) -> None:
+    h = np.array([5.0, 3.0, 2.0, 1.5])
+    found = extrapolated(h, 7.0 - 0.2 * h**order)
+    assert found.limit == pytest.approx(7.0, abs=0.01)
+    assert found.order == pytest.approx(order, abs=0.03)
+    assert found.error == pytest.approx(-0.2 * 1.5**order / 7.0, rel=0.05)
+
+
+def test_what_seems_to_converge_faster_than_it_can_is_not_called_converged() -> None:
+    """The plate's travel on a heel, as `converge` found it: the last two meshes agree by chance."""
+    h, travel = np.array([1.36, 1.12, 0.87, 0.70]), np.array([10.2547, 10.3734, 10.4355, 10.4373])
+    found = extrapolated(h, travel)
+    assert found.order == 2.0
+    assert found.limit == pytest.approx(10.526, abs=0.002)
+    assert found.error == pytest.approx(-0.0084, abs=0.0003)  # a hundred times what the last two differ by
+    cubic = extrapolated(h, 7.0 - 0.2 * h**3)
+    assert cubic.order == 2.0
+    assert abs(cubic.error) > 0.2 * 0.7**3 / 7.0
+
+
+def test_a_limit_that_is_passed_already_is_none() -> None:
+    h, f = np.array([2.02, 1.73, 0.82, 0.71]), np.array([0.15, 1.68, 2.21, 3.63])  # steady, but scattered
+    assert np.isnan(extrapolated(h, f).limit)
+
+
+def test_no_limit_is_told_where_there_is_none() -> None:
+    h = np.array([5.0, 4.0, 3.0, 2.0])
+    found = extrapolated(h, np.array([1.0, 1.2, 0.9, 1.1]))
+    assert found.scatter > 0.05
+    assert np.isnan(found.limit)
+    assert np.isnan(extrapolated(h[1:], np.array([1.0, 1.1, 1.3])).limit)  # runs away: an order below 0.5
+    for sizes in (h[:2], np.array([2.0, 1.9, 1.8])):
+        with pytest.raises(InputError, match=r"3 or more meshes, the coarsest 1\.5 times the size"):
+            extrapolated(sizes, sizes)
+
+
+def test_the_command(tmp_path: Path) -> None:
+    onion = half_onion()
+    plain = LabelMap(onion.grid, np.where(onion.labels == 3, 2, onion.labels), {1: "bone", 2: "fat"})  # nothing thin
+    write_labels(tmp_path / "map.nii.gz", plain)
+    sizes = [text for edge in ("4.5", "2.8", "1.7") for text in ("--edge-mm", edge)]
+    given = [*sizes, "--names", str(tmp_path / "map.csv"), "--load", "pressed=3", "--set", "luboz"]
+    out = tmp_path / "study"
+    done = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "Size of the cells, mm" in done.output
+    with (out / "convergence.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximal shear of fat, p50"]
+    assert 0.1 < float(rows[0]["edge_1.7_mm"]) < 10.0
+    assert any(row["limit"] for row in rows) == (out / "convergence.png").is_file()
+    before = (out / "mesh-2.8.vtu").read_bytes()
+    again = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
+    assert again.exit_code == 0
+    assert (out / "mesh-2.8.vtu").read_bytes() == before  # the mesher is not deterministic: it was not asked again
+    assert again.output.splitlines()[-6:] == done.output.splitlines()[-6:]
+
+
+def test_a_misspelt_set_or_region_is_refused_before_meshing(tmp_path: Path) -> None:
+    from mrstrain.models.converge import converge
+
+    write_labels(tmp_path / "map.nii.gz", half_onion())
+    for wrong, said in (
+        ({"material": "trebi"}, "the nearest is 'trebbi'"),
+        ({"region": "fatt"}, "No soft tissue 'fatt'"),
+    ):
+        with pytest.raises(InputError, match=said):
+            converge(
+                tmp_path / "map.nii.gz", [6.0, 4.0, 2.0], names=tmp_path / "map.csv", out=tmp_path / "out", **wrong
+            )
+    assert not list((tmp_path / "out").glob("*.vtu"))
+
+
+def test_two_sizes_are_too_few(tmp_path: Path) -> None:
+    from mrstrain.models.converge import converge
+
+    with pytest.raises(InputError, match="3 edge lengths or more; got 2"):
+        converge("map.nii.gz", [4.0, 2.0], out=tmp_path)

@@ -1,0 +1,206 @@
+"""A simulation that was cut goes on: the same end as of one that was not, and nothing is solved twice."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
+
+import meshio
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dvc.mesh import TetMesh
+from fe.load_stages import Kept
+from fe.materials import NeoHooke
+from fe.mesh_file import write_tet_mesh
+from fe.plate import Plate
+from fe.restart import fingerprint, read_kept, write_kept
+from fe.simulate import LoadStep, State, simulate
+from mrstrain.cli.app import app
+from mrstrain.studies import stages
+from tests.fe.test_simulate import ALONG, DOWN, LAWS, dome
+
+PLATE = Plate(DOWN, ALONG, turns=True)
+LOADS = [LoadStep("a", 2.0), LoadStep("b", 2.0, 1.0)]
+GIVEN = ["--load", "a=2", "--load", "b=2,1", "--load", "c=2,2", "--set", "luboz", "--plate-normal", "-1", "0", "0"]
+GIVEN += ["--shear-direction", "0", "1", "0", "--workers", "1"]
+
+
+def run(loads: list[LoadStep] = LOADS, **others) -> tuple[list[State], list[str], list[tuple[str, Kept]]]:
+    told: list[str] = []
+    way: list[tuple[str, Kept]] = []
+    settled = lambda load, kept: way.append((load.name, kept))  # noqa: E731
+    states = simulate(dome((3, 4, 4)), LAWS, PLATE, loads, tell=told.append, settled=settled, **others)
+    return states, told, way
+
+
+@pytest.fixture(scope="module")
+def whole() -> tuple[list[State], list[str], list[tuple[str, Kept]]]:
+    return run()
+
+
+def test_going_on_from_a_load_ends_where_an_uncut_run_ends(whole, tmp_path: Path) -> None:
+    states, told, _ = whole
+    write_kept(tmp_path / "a.npz", states[0].kept, "this")
+    again, lines, _ = run(earlier=[read_kept(tmp_path / "a.npz", "this")])
+    for state, other in zip(states, again, strict=True):
+        assert np.abs(other.u_mm - state.u_mm).max() < 1e-9
+        assert np.abs(other.pressure_mpa - state.pressure_mpa).max() < 1e-9
+        assert other.force_n == pytest.approx(state.force_n, abs=1e-9)
+        assert other.plate.turn_deg == pytest.approx(state.plate.turn_deg, abs=1e-9)
+        assert (other.reached, other.iterations) == (state.reached, state.iterations)
+        assert len(other.curve) == len(state.curve)
+        assert other.on_plate.tolist() == state.on_plate.tolist()
+    assert 0 < len(lines) < len(told)
+    assert lines == told[-len(lines) :]  # the second load's steps, and none of the first's
+    assert not any("moved" in line for line in lines)
+
+
+@pytest.mark.parametrize("load", ["a", "b"])
+def test_going_on_from_the_middle_of_a_load(whole, load: str) -> None:
+    states, told, way = whole
+    on_way = [kept for name, kept in way if name == load and kept.reached < 1.0]
+    kept = on_way[len(on_way) // 2]
+    assert 0.0 < kept.reached < 1.0
+    again, lines, _ = run(earlier=[kept] if load == "a" else [states[0].kept, kept])
+    assert len(lines) < len(told)
+    for state, other in zip(states, again, strict=True):
+        assert other.reached == 1.0
+        assert other.force_n == pytest.approx(state.force_n, abs=2e-3)
+        assert np.abs(other.u_mm - state.u_mm).max() < 0.02 * np.abs(state.u_mm).max()  # other steps, other places
+
+
+def test_a_path_whose_time_is_over_ends_where_it_stands_and_goes_on(
+    whole, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("fe.simulate.time", SimpleNamespace(monotonic=count().__next__))
+    cut, _, _ = run(limit_s=2)  # asked before every step: two are made
+    assert [state.load.name for state in cut] == ["a"]
+    assert cut[0].out_of_time
+    assert 0.0 < cut[0].reached < 1.0
+    assert cut[0].force_n[0] == pytest.approx(2.0 * cut[0].reached, rel=0.01)
+    write_kept(tmp_path / "a.npz", cut[0].kept, "this")
+    on, _, _ = run(earlier=[read_kept(tmp_path / "a.npz", "this")])
+    for state, other in zip(whole[0], on, strict=True):
+        assert (other.reached, other.out_of_time, state.out_of_time) == (1.0, False, False)
+        assert other.force_n == pytest.approx(state.force_n, abs=2e-3)
+
+
+@pytest.mark.parametrize("turns", [False, True])
+@pytest.mark.parametrize("steps", [0, 1, 2])
+def test_a_path_cut_while_the_plate_approaches_ends_where_an_uncut_one_does(
+    monkeypatch: pytest.MonkeyPatch, turns: bool, steps: int
+) -> None:
+    plate = Plate(DOWN, ALONG, turns=turns)
+
+    def going(**others) -> State:
+        return simulate(dome((3, 4, 4)), LAWS, plate, LOADS[:1], **others)[0]
+
+    whole = going()
+    with monkeypatch.context() as clock:
+        clock.setattr("fe.simulate.time", SimpleNamespace(monotonic=count().__next__))
+        cut = going(limit_s=steps)
+    assert cut.out_of_time
+    assert 0.0 <= cut.reached < 1.0
+    on = going(earlier=[cut.kept])
+    assert on.travel_mm[0] == pytest.approx(whole.travel_mm[0], abs=2e-3)
+    assert np.abs(on.u_mm - whole.u_mm).max() < 0.01 * np.abs(whole.u_mm).max()
+
+
+def test_the_command_tells_that_time_was_over(tmp_path: Path) -> None:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
+    given = [*GIVEN, "--out", str(tmp_path / "out"), "--limit-minutes", "0.00001"]
+    ended = CliRunner().invoke(app, ["simulate", str(tmp_path / "dome.vtu"), *given])
+    assert ended.exit_code == 1
+    assert "a: its time was over before the first equilibrium" in ended.output
+    assert "b was not tried" in ended.output
+
+
+@pytest.mark.parametrize(("limit_s", "timed_out"), [(1e-6, True), (None, False)])
+def test_a_stage_tells_that_nothing_but_time_was_lacking(
+    tmp_path: Path, limit_s: float | None, timed_out: bool
+) -> None:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
+    given = stages.simulate(
+        lambda *_: None, out=str(tmp_path / "out"), mesh=str(tmp_path / "dome.vtu"), material="luboz",
+        loads=[asdict(load) for load in LOADS[:1]], plate_normal=DOWN, shear_direction=ALONG, limit_s=limit_s,
+    )  # fmt: skip
+    assert given.timed_out is timed_out
+    assert given.complete is not timed_out
+    assert not given.retry
+
+
+def test_what_was_made_from_something_else_is_not_used(whole, tmp_path: Path) -> None:
+    mesh = dome((3, 4, 4))
+
+    def made_from(mesh: TetMesh = mesh, laws=LAWS, plate: Plate = PLATE, loads=LOADS, element: str = "P1") -> str:
+        return fingerprint(mesh, laws, plate, loads, ["bone"], element)
+
+    shifted = TetMesh(mesh.points_mm + 1e-9, mesh.cells, mesh.regions, mesh.facets)
+    less = TetMesh(mesh.points_mm, mesh.cells, mesh.regions, mesh.facets | {"bone": mesh.facets["bone"][1:]})
+    others = [
+        made_from(shifted),
+        made_from(less),
+        made_from(laws=LAWS | {"skin": NeoHooke.of(0.2, nu=0.499)}),
+        made_from(plate=Plate(DOWN, ALONG, turns=True, pivot_mm=[0, 1, 0])),
+        made_from(plate=Plate(DOWN, ALONG)),
+        made_from(plate=Plate(DOWN, ALONG, taped=False)),
+        made_from(plate=Plate(DOWN, ALONG, turns=True, gap_mm=0.5)),
+        made_from(loads=[LoadStep("a", 2.0), LoadStep("b", 2.0, 1.1)]),
+        made_from(loads=[LoadStep("a", 2.0), LoadStep("b", 2.0, shear_mm=1.0)]),
+        made_from(element="P2"),
+    ]
+    assert len({made_from(), *others}) == len(others) + 1
+    renamed = [LoadStep("x", 2.0), LoadStep("b", 2.0, 1.0)]
+    assert made_from(dome((3, 4, 4)), loads=renamed) == made_from()
+    place = tmp_path / "a.restart.npz"
+    write_kept(place, whole[0][0].kept, made_from())
+    assert read_kept(place, made_from()) is not None
+    assert read_kept(place, others[0]) is None
+    assert read_kept(tmp_path / "b.restart.npz", made_from()) is None
+    place.write_bytes(place.read_bytes()[:-200])
+    assert read_kept(place, made_from()) is None
+
+
+def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((4, 6, 6)), {})
+    command = ["simulate", str(tmp_path / "dome.vtu"), *GIVEN]
+    uncut = CliRunner().invoke(app, [*command, "--out", str(tmp_path / "uncut")])
+    assert uncut.exit_code == 0, uncut.output
+    out = tmp_path / "cut" / "luboz"
+    started = subprocess.Popen(
+        [sys.executable, "-m", "mrstrain", *command, "--out", str(out.parent)],
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        while not (out / "a.vtu").exists():  # written when the load is done; a restart file may be of a load on its way
+            assert started.poll() is None
+            time.sleep(0.02)
+    finally:
+        os.killpg(started.pid, signal.SIGKILL)
+        started.wait()
+    assert not (out / "simulation.json").exists()
+    assert not (out / "c.restart.npz").exists()
+    so_far = (out / "log-a.txt").read_text().splitlines()
+    assert any(line.startswith("moved: travel") for line in so_far)  # each step is there as it is made
+    again = CliRunner().invoke(app, [*command, "--out", str(out.parent)])
+    assert again.exit_code == 0, again.output
+    log = (out / "log-a.txt").read_text().splitlines()
+    assert log[0] == "a: 100% of it was there from an earlier run"
+    assert not any(line.startswith("moved") for line in log)
+    for load in ("a", "b", "c"):
+        one, other = (meshio.read(folder / "luboz" / f"{load}.vtu") for folder in (tmp_path / "uncut", out.parent))
+        assert np.abs(one.point_data["displacement_mm"] - other.point_data["displacement_mm"]).max() < 1e-9
+        assert np.abs(one.point_data["displacement_mm"]).max() > 0.5
+    # what is there already is taken, and what no load is called any more is taken away
+    CliRunner().invoke(app, [*command[:2], *GIVEN[2:], "--out", str(out.parent)])
+    assert not (out / "a.restart.npz").exists()
+    assert (out / "b.restart.npz").exists()

@@ -1,0 +1,372 @@
+"""A plate pressed and sheared against a dome of tissue on fixed bone: balance, tape, symmetry, frame, refusals."""
+
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dvc.deformation.strain import StrainField
+from dvc.errors import InputError
+from dvc.mesh import TetMesh
+from fe.materials import NeoHooke, Ogden
+from fe.newton import Tolerance
+from fe.plate import Plate
+from fe.result import cauchy_stress, region_figures
+from fe.simulate import LoadStep, State, simulate
+from tests.blocks import block
+from tests.fe.test_assembly import needs_ngsolve
+
+FAT, SKIN = Ogden.from_ansys(0.0034, 6.2), NeoHooke.of(0.2)
+LAWS = {"skin": SKIN, "fat": FAT}
+DOWN, ALONG = [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+PRESS = [LoadStep("pressed", 2.0)]
+SHEARED = LoadStep("sheared", 2.0, 1.0)
+
+
+def dome(count: tuple[int, int, int] = (4, 6, 6)) -> TetMesh:
+    """20 x 20 mm, 10 mm high toward the plate at x = 0, its middle 1.5 mm lower than its rim; bone at x = 10."""
+    box = block(count, (10.0, 20.0, 20.0), layers=4, wobble=0.15)
+    points = box.points_mm.copy()
+    radius = np.hypot(points[:, 1] - 10.0, points[:, 2] - 10.0) / 10.0
+    points[:, 0] += 1.5 * radius**2 * (1.0 - points[:, 0] / 10.0)
+    fat = np.concatenate([box.regions[f"layer {k}"] for k in (1, 2, 3)])
+    return TetMesh(
+        points,
+        box.cells,
+        {"skin": box.regions["layer 0"], "fat": fat},
+        {"bone": box.facets["x1"], "skin": box.facets["x0"]},
+    )
+
+
+def press(mesh: TetMesh, loads: list[LoadStep], laws=LAWS, **others) -> list[State]:
+    plate = Plate(others.pop("normal", DOWN), others.pop("shear", ALONG), taped=others.pop("taped", True))
+    return simulate(mesh, laws, plate, loads, **others)
+
+
+@pytest.fixture(scope="module")
+def sheared() -> list[State]:
+    return press(dome(), [LoadStep("pressed", 2.0), LoadStep("sheared", 2.0, 1.0), LoadStep("more", 2.0, 2.0)])
+
+
+def test_the_force_is_the_one_asked_for(sheared: list[State]) -> None:
+    for state, force in zip(sheared, ([2, 0, 0], [2, 1, 0], [2, 2, 0]), strict=True):
+        assert state.reached == 1.0
+        assert state.force_n == pytest.approx(force, abs=1e-3 * np.linalg.norm(force))
+
+
+def test_one_path_from_load_to_load(sheared: list[State]) -> None:
+    start = sheared[0].curve[0]
+    assert [*start.travel_mm, *start.force_n, start.area_mm2] == [0.0] * 7
+    for before, after in itertools.pairwise(sheared):
+        assert after.curve[0] is before.curve[-1]
+        assert (np.diff([at.travel_mm[1] for at in after.curve]) > 0).all()  # sheared ever further
+    assert sheared[1].travel_mm[1] < sheared[2].travel_mm[1]
+    assert len(sheared[2].on_plate) >= len(sheared[1].on_plate) >= len(sheared[0].on_plate) > 4
+
+
+def test_taped_nodes_never_slide_and_lie_on_the_plate(sheared: list[State]) -> None:
+    mesh = dome()
+    bottom = np.unique(mesh.facets["skin"])
+    at = mesh.points_mm + sheared[0].u_mm
+    on_plate = bottom[np.isclose(at[bottom, 0], at[bottom, 0].min(), atol=1e-9)]
+    assert len(on_plate) == len(sheared[0].on_plate)
+    moved = (sheared[2].u_mm - sheared[0].u_mm)[on_plate]
+    assert np.ptp(moved, axis=0).max() < 1e-9
+    assert moved[0] == pytest.approx(sheared[2].travel_mm - sheared[0].travel_mm, abs=1e-9)
+    assert (at[bottom, 0] > at[on_plate[0], 0] - 1e-9).all()  # nothing is past the plate
+
+
+def test_bone_does_not_move_and_volume_is_kept(sheared: list[State]) -> None:
+    mesh = dome()
+    for state in sheared:
+        assert np.abs(state.u_mm[np.unique(mesh.facets["bone"])]).max() == 0.0
+        J = StrainField.from_gradient(state.gradients).jacobian
+        assert (J * mesh.volumes_mm3).sum() == pytest.approx(mesh.volumes_mm3.sum(), rel=1e-3)
+
+
+def test_another_frame_gives_the_same(sheared: list[State]) -> None:
+    turn = Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix()
+    mesh = dome()
+    moved = TetMesh(mesh.points_mm @ turn.T + [3.0, -50.0, 20.0], mesh.cells, mesh.regions, mesh.facets)
+    again = press(
+        moved, [LoadStep("pressed", 2.0), LoadStep("sheared", 2.0, 1.0)], normal=turn @ DOWN, shear=turn @ ALONG
+    )
+    for state, turned in zip(sheared, again, strict=False):
+        assert np.abs(turned.u_mm @ turn - state.u_mm).max() < 1e-6
+        assert np.abs(turn.T @ turned.gradients @ turn - state.gradients).max() < 1e-6
+
+
+def test_a_mirrored_problem_has_the_mirrored_answer(sheared: list[State]) -> None:
+    mesh = dome()
+    flip = np.array([1.0, -1.0, 1.0])
+    mirrored = TetMesh(mesh.points_mm * flip, mesh.cells[:, [0, 1, 3, 2]], mesh.regions, mesh.facets)
+    again = press(mirrored, [LoadStep("pressed", 2.0), LoadStep("sheared", 2.0, 1.0)], shear=[0.0, -1.0, 0.0])
+    for state, other in zip(sheared, again, strict=False):
+        assert np.abs(other.u_mm * flip - state.u_mm).max() < 1e-6
+
+
+def test_threads_do_not_change_the_digits_that_matter(sheared: list[State]) -> None:
+    again = press(dome(), PRESS, threads=2)
+    assert np.abs(again[0].u_mm - sheared[0].u_mm).max() < 1e-9
+
+
+@pytest.mark.parametrize("library", ["superlu", pytest.param("ngsolve", marks=needs_ngsolve)])
+def test_another_library_finds_the_same_state(
+    sheared: list[State], library: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fe.linear._fastest", lambda: library)
+    again = press(dome(), [LoadStep("pressed", 2.0), LoadStep("sheared", 2.0, 1.0)])
+    for state, other in zip(sheared, again, strict=False):
+        assert np.abs(other.u_mm - state.u_mm).max() < 1e-6
+
+
+def nodal_forces(mesh: TetMesh, F: np.ndarray, cauchy_mpa: np.ndarray) -> np.ndarray:
+    """What the cells' stress exerts at the nodes, N: the sum of V P grad N over their cells."""
+    P = np.linalg.det(F)[:, None, None] * cauchy_mpa @ np.linalg.inv(F).transpose(0, 2, 1)
+    corners = mesh.points_mm[mesh.cells]
+    slopes = np.linalg.inv(corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+    slopes = np.concatenate([-slopes.sum(axis=1, keepdims=True), slopes], axis=1)
+    forces = np.zeros_like(mesh.points_mm)
+    np.add.at(forces, mesh.cells, mesh.volumes_mm3[:, None, None] * np.einsum("mij,maj->mai", P, slopes))
+    return forces
+
+
+def test_stress_is_in_balance_at_every_node() -> None:
+    mesh = dome((5, 8, 8))
+    state = press(mesh, [LoadStep("sheared", 2.0, 1.0)])[0]
+    stress = cauchy_stress(state, mesh, LAWS)
+    assert np.abs(stress - stress.transpose(0, 2, 1)).max() < 1e-9 * np.abs(stress).max()
+    forces, bone = nodal_forces(mesh, np.eye(3) + state.gradients, stress), np.unique(mesh.facets["bone"])
+    free = np.setdiff1d(np.arange(len(forces)), np.concatenate([bone, state.on_plate]))
+    assert len(free) > 200
+    assert np.abs(forces[free]).max() < 1e-4
+    assert forces[state.on_plate].sum(axis=0) == pytest.approx([2.0, 1.0, 0.0], abs=2e-3)
+    assert forces[bone].sum(axis=0) == pytest.approx([-2.0, -1.0, 0.0], abs=2e-3)
+
+
+def test_a_plate_without_friction_only_pushes_and_along_its_normal() -> None:
+    mesh, soft = dome(), {"skin": FAT, "fat": FAT}
+    for taped in (False, True):
+        state = press(mesh, PRESS, soft, taped=taped)[0]
+        stress = cauchy_stress(state, mesh, soft)
+        forces = nodal_forces(mesh, np.eye(3) + state.gradients, stress)[state.on_plate]
+        assert len(forces) > 4
+        assert forces[:, 0].sum() == pytest.approx(2.0, abs=2e-3)
+        across = np.abs(forces[:, 1:]).max()
+        if taped:
+            assert across > 0.01  # held where it touched
+        else:
+            assert across < 1e-4
+            assert forces[:, 0].min() > -1e-4
+
+
+def test_without_tape_the_surface_slides() -> None:
+    mesh, soft = dome(), {"skin": FAT, "fat": FAT}
+    taped, slid = (press(mesh, PRESS, soft, taped=tape)[0] for tape in (True, False))
+    assert slid.reached == 1.0
+    assert slid.travel_mm[0] > 1.03 * taped.travel_mm[0]  # softer without the tape's hold: 5 % here
+    assert slid.force_n == pytest.approx([2.0, 0.0, 0.0], abs=2e-3)
+    bottom = np.unique(mesh.facets["skin"])
+    at = mesh.points_mm[bottom] + slid.u_mm[bottom]
+    on_plate = np.isclose(at[:, 0], at[:, 0].min(), atol=1e-9)
+    assert np.ptp(slid.u_mm[bottom][on_plate][:, 1]) > 0.1
+
+
+def test_elements_agree_on_a_fine_mesh() -> None:
+    # Linear tetrahedra without a pressure of their own would be several times too stiff here.
+    mesh = dome((6, 12, 12))
+    travel = {name: press(mesh, PRESS, formulation=name)[0].travel_mm[0] for name in ("P1", "MINI", "P2")}
+    assert travel["P1"] == pytest.approx(travel["P2"], rel=0.1)
+    assert travel["MINI"] == pytest.approx(travel["P2"], rel=0.15)
+
+
+def test_a_load_too_large_ends_with_the_last_state_in_balance() -> None:
+    loads = [LoadStep("pressed", 2.0), LoadStep("far too much", 2.0, 300.0), LoadStep("never", 2.0, 400.0)]
+    weak = {"skin": NeoHooke.of(0.067, nu=0.495), "fat": NeoHooke.of(0.01, nu=0.49)}
+    states = press(dome((3, 4, 4)), loads, weak)
+    assert [state.load.name for state in states] == ["pressed", "far too much"]
+    last = states[-1]
+    assert 0.0 < last.reached < 1.0
+    assert last.force_n == pytest.approx([2.0, 300.0 * last.reached, 0.0], abs=1e-3 * last.force_n[1])
+    straight = press(dome((3, 4, 4)), [loads[0], LoadStep("as far", 2.0, float(last.force_n[1]))], weak)[-1]
+    assert straight.reached == 1.0
+    assert np.abs(straight.u_mm - last.u_mm).max() < 0.1 * np.abs(last.u_mm).max()  # steps differ, so does the tape
+
+
+def test_balance_alone_does_where_steps_do_not_get_small(sheared: list[State]) -> None:
+    (state,) = press(dome(), PRESS, tolerance=Tolerance(1e-4, 0.0))
+    assert state.reached == 1.0
+    assert np.abs(state.u_mm - sheared[0].u_mm).max() < 1e-3
+
+
+def test_normal_first_then_shear() -> None:
+    alone, after = (press(dome(), loads)[-1] for loads in ([SHEARED], [*PRESS, SHEARED]))
+    assert np.abs(alone.u_mm - after.u_mm).max() < 1e-6
+    assert alone.curve[0].travel_mm.tolist() == alone.curve[0].force_n.tolist() == [0.0] * 3
+
+
+def test_halved_steps_put_the_tape_in_the_same_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    soft = {"skin": FAT, "fat": FAT}
+    loads = [LoadStep("pressed", 4.0)]
+    plain = press(dome((3, 7, 7)), loads, soft)[0]
+    monkeypatch.setattr("fe.plate_path._MOST_APPROACH_MM", 0.1)
+    monkeypatch.setattr("fe.plate_path._APPROACH_MM", 0.1)
+    monkeypatch.setattr("fe.plate_path._FIRST_STEP", 0.05)
+    monkeypatch.setattr("fe.plate_path._GROWTH", 1.0)
+    small = press(dome((3, 7, 7)), loads, soft)[0]
+    assert len(small.curve) > 2 * len(plain.curve)
+    assert plain.travel_mm[0] == pytest.approx(small.travel_mm[0], rel=0.005)
+    assert np.abs(plain.u_mm - small.u_mm).max() < 0.06
+
+
+EXACT = Tolerance(force=1e-9, step_mm=1e-8)
+
+
+@pytest.fixture(scope="module")
+def moved() -> list[State]:
+    loads = [LoadStep("in", normal_mm=1.5), LoadStep("along", normal_mm=1.5, shear_mm=1.0)]
+    return press(block_under_plate(), loads, tolerance=EXACT)
+
+
+def block_under_plate() -> TetMesh:
+    box = block((4, 5, 5), (10.0, 20.0, 20.0), layers=4, wobble=0.15)
+    fat = np.concatenate([box.regions[f"layer {k}"] for k in (1, 2, 3)])
+    facets = {"bone": box.facets["x1"], "skin": box.facets["x0"]}
+    return TetMesh(box.points_mm, box.cells, {"skin": box.regions["layer 0"], "fat": fat}, facets)
+
+
+def test_the_travel_is_the_one_asked_for(moved: list[State]) -> None:
+    assert [state.reached for state in moved] == [1.0, 1.0]
+    assert moved[0].travel_mm[0] == pytest.approx(1.5, abs=1e-9)
+    assert moved[1].travel_mm[:2] == pytest.approx([1.5, 1.0], abs=1e-9)
+    assert np.abs(moved[0].force_n[1:]).max() < 1e-6  # free across, where no travel is given
+    assert abs(moved[1].force_n[2]) < 1e-6
+    assert (np.diff([at.travel_mm[0] for at in moved[0].curve]) <= 0.6 + 1e-9).all()
+
+
+def test_the_force_of_a_travel_gives_that_travel(moved: list[State]) -> None:
+    forces = [LoadStep(state.load.name, float(state.force_n[0]), float(state.force_n[1])) for state in moved]
+    forces[0] = LoadStep("in", forces[0].normal_n)
+    for travelled, pushed in zip(moved, press(block_under_plate(), forces, tolerance=EXACT), strict=True):
+        assert pushed.travel_mm == pytest.approx(travelled.travel_mm, abs=1e-6)
+        assert np.abs(pushed.u_mm - travelled.u_mm).max() < 1e-6
+        assert np.abs(pushed.u_mm).max() > 1.0
+
+
+def test_a_force_along_the_normal_and_a_travel_across(moved: list[State]) -> None:
+    normal = float(moved[1].force_n[0])
+    state = press(block_under_plate(), [LoadStep("both", normal_n=normal, shear_mm=1.0)], tolerance=EXACT)[0]
+    assert state.travel_mm == pytest.approx(moved[1].travel_mm, abs=1e-6)
+    assert state.force_n == pytest.approx(moved[1].force_n, abs=1e-5)
+
+
+def test_a_travel_too_far_ends_with_the_last_state_in_balance() -> None:
+    state = press(dome((3, 4, 4)), [LoadStep("in", normal_mm=9.5)])[0]
+    assert 0.3 < state.reached < 1.0
+    assert state.travel_mm[0] == pytest.approx(9.5 * state.reached)
+
+
+@pytest.mark.parametrize("given", [{}, {"normal_n": 1.0, "normal_mm": 1.0}])
+def test_a_load_is_a_force_or_a_travel(given: dict) -> None:
+    with pytest.raises(InputError, match="the normal force or the travel along it, and not both"):
+        LoadStep("x", **given)
+    with pytest.raises(InputError, match="the shear force or the travel along it, and not both"):
+        LoadStep("x", 1.0, 1.0, shear_mm=1.0)
+
+
+def test_a_plate_from_the_wrong_side_is_refused() -> None:
+    with pytest.raises(InputError, match=r"would pass through .* mm of tissue that is not its surface"):
+        press(dome(), PRESS, normal=[1.0, 0.0, 0.0])
+
+
+def test_tissue_that_hangs_on_no_bone_is_refused() -> None:
+    mesh = dome((3, 4, 4))
+    skin = mesh.cells[mesh.regions["skin"]]
+    own = np.unique(skin)
+    new = np.full(len(mesh.points_mm), -1)
+    new[own] = len(mesh.points_mm) + np.arange(len(own))
+    cells = mesh.cells.copy()
+    cells[mesh.regions["skin"]] = new[skin]
+    facets = {"bone": mesh.facets["bone"], "skin": new[mesh.facets["skin"]]}
+    apart = TetMesh(np.concatenate([mesh.points_mm, mesh.points_mm[own]]), cells, mesh.regions, facets)
+    with pytest.raises(InputError, match="are not joined to what is fixed"):
+        press(apart, PRESS)
+
+
+def test_a_plate_without_friction_carries_no_shear() -> None:
+    with pytest.raises(InputError, match="carries no shear"):
+        press(dome(), [SHEARED], taped=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"loads": [LoadStep("pulled", -1.0)]}, "pulled: the normal force must press"),
+        ({"loads": []}, "No load"),
+        ({"laws": {"fat": FAT}}, "Regions without a law: skin"),
+        ({"laws": LAWS | {"bone": FAT}}, "no region 'bone'; it has skin, fat"),
+        ({"facets": {"skin": None}}, "no facets 'bone'"),
+        ({"formulation": "P3"}, "No element 'P3'"),
+        ({"normal": [1.0, 0, 0], "shear": [1.0, 0, 0]}, "parallel"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(change: dict, said: str) -> None:
+    mesh = dome((2, 2, 2))
+    if "facets" in change:
+        mesh = TetMesh(mesh.points_mm, mesh.cells, mesh.regions, {"skin": mesh.facets["skin"]})
+        change = {}
+    loads, laws = change.pop("loads", PRESS), change.pop("laws", LAWS)
+    with pytest.raises(InputError, match=said):
+        press(mesh, loads, laws, **change)
+
+
+def test_the_plate_travels_its_gap_first(sheared: list[State]) -> None:
+    plate = Plate(DOWN, ALONG, gap_mm=2.5)
+    state = simulate(dome(), LAWS, plate, PRESS)[0]
+    assert state.travel_mm == pytest.approx(np.add(sheared[0].travel_mm, [2.5, 0.0, 0.0]), abs=1e-9)
+    assert np.abs(state.u_mm - sheared[0].u_mm).max() < 1e-9
+
+
+def test_a_gap_must_not_be_negative() -> None:
+    with pytest.raises(InputError, match="0 mm or more"):
+        Plate(DOWN, ALONG, gap_mm=-1.0)
+
+
+def test_where_stiff_skin_buckles_over_soft_fat_the_way_goes_downhill(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A published pair of laws, skin a thousand times as stiff as fat; without the way down a third is reached."""
+    soft = {"skin": NeoHooke.of(0.3247, nu=0.495), "fat": NeoHooke.of(0.00029, nu=0.495)}
+    loads = [LoadStep("pressed", 10.0)]
+    (there,) = press(dome((5, 8, 8)), loads, soft)
+    assert there.reached == 1.0
+    assert there.force_n == pytest.approx([10.0, 0.0, 0.0], abs=0.01)
+    crowded = {row.region: row.crowded_share for row in region_figures(dome((5, 8, 8)), there, soft)}
+    assert crowded["skin"] == 0.0
+    assert 0.01 < crowded["fat"] < 0.5
+    with monkeypatch.context() as clock:  # time is asked before every step, those downhill as well
+        clock.setattr("fe.simulate.time", SimpleNamespace(monotonic=itertools.count().__next__))
+        (cut,) = press(dome((5, 8, 8)), loads, soft, limit_s=60.0)
+    assert cut.out_of_time
+    assert 0.0 < cut.reached < there.reached
+    assert cut.iterations < 0.9 * there.iterations
+    monkeypatch.setattr("fe.plate_path.descend", lambda *_: None)
+    (before,) = press(dome((5, 8, 8)), loads, soft)
+    assert before.reached < 0.5
+
+
+def test_how_much_is_done_is_told_from_the_first_touch_on() -> None:
+    shares: list[float] = []
+    press(dome(), [*PRESS, SHEARED], progress=shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert sum(0.0 < share < 0.4 for share in shares) > 2  # on the way of the plate to the first load
+    assert any(0.5 < share < 1.0 for share in shares)
+    at_once: list[float] = []
+    press(dome(), [SHEARED], progress=at_once.append)  # normal first, and half of it all
+    assert sum(0.0 < share < 0.5 for share in at_once) > 2
+
+
+def test_a_plate_needs_a_surface_that_is_free() -> None:
+    with pytest.raises(InputError, match="nothing to touch"):
+        press(dome(), PRESS, fixed=("bone", "skin"))

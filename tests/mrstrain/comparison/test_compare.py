@@ -1,0 +1,297 @@
+"""`compare` from files to report: loads matched by name, partial ones left out, one self-contained page."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import gzip
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import meshio
+import nibabel
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dvc.errors import GeometryError, InputError, OutputError
+from dvc.io.images.write import write_labels
+from dvc.io.result_folder import write_displacement
+from mrstrain.cli.app import app
+from mrstrain.comparison.compare import compare
+from tests.validate.test_comparison import cube, error_table, labels, sheared
+
+LOADS = {"Load1": 0.8, "Load2": 0.4}
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """Measured shear of two loads, and the models "right" (the same) and "half"; a label map and its names."""
+    tissues = labels()
+    write_labels(tmp_path / "tissues.nii.gz", tissues)
+    (tmp_path / "tissues.csv").write_text("label,name\n1,fat\n2,skin\n3,bone\n")
+    mesh = cube(6)
+    points = tissues.grid.points().reshape(*tissues.grid.shape, 3)
+    for load, gamma in LOADS.items():
+        folder = tmp_path / "measured" / load
+        folder.mkdir(parents=True)
+        u = sheared(gamma).displacement(points.reshape(-1, 3)).reshape(points.shape)
+        write_displacement(folder, tissues.grid, u.astype(np.float32))
+        for model, factor in (("right", 1.0), ("half", 0.5)):
+            place = tmp_path / model / f"{load}.vtu"
+            place.parent.mkdir(exist_ok=True)
+            moved = sheared(factor * gamma).displacement(mesh.points_mm)
+            meshio.write(place, meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"displacement": moved}))
+    return tmp_path
+
+
+def given(study: Path) -> dict[str, object]:
+    plate = {"plate_normal": (1.0, 0.0, 0.0), "shear_direction": (0.0, 1.0, 0.0)}
+    return {"labels": study / "tissues.nii.gz", "names": study / "tissues.csv", "out": study / "out"} | plate
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def with_errors(study: Path, bias: float, sd: float) -> None:
+    from dvc.trust.error_model import ErrorModel
+
+    for load in LOADS:
+        ErrorModel("heel-mr", "0", (error_table(bias, sd),), "test").write(
+            study / "measured" / load / "error_model.json"
+        )
+
+
+def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
+    with_errors(study, 0.0, 0.02)
+    done = compare(study / "measured", [study / "half", study / "right"], on_image=True, **given(study))
+    assert [a.model for a in done.totals] == ["right", "half"]
+    assert done.totals[0].ml == pytest.approx(0.0, abs=1e-3)
+    assert "Nearest over all loads, by the area: right. It is told apart from all others." in done.noise
+    areas = {(r["model"], r["load"], r["tissue"]): r for r in rows(study / "out" / "areas.csv")}
+    # all 8 mL are above 0.2 to 0.43 by the measurement, and to 0.204 by the model, minus what lies at the border
+    volume = json.loads((study / "out" / "comparison.json").read_text())["coverage_ml"]["Load1"]["common"]
+    expected = volume * (np.hypot(0.8, 0.32) - np.hypot(0.4, 0.08)) / 2.0
+    found = areas["half", "Load1", "all soft tissue"]
+    assert float(found["ml"]) == pytest.approx(expected, rel=1e-3)
+    assert float(found["low_ml"]) < expected < float(found["high_ml"])
+    assert float(areas["half", "Load1", "fat"]["ml"]) == pytest.approx(expected / 2.0, rel=0.05)
+    # a model that predicts nothing has the measured curve itself as its area, from 0.2 on; it stands below the others
+    nothing = areas["no deformation", "Load1", "all soft tissue"]
+    assert float(nothing["ml"]) == pytest.approx(volume * (np.hypot(0.8, 0.32) / 2.0 - 0.2), rel=1e-3)
+    assert float(nothing["low_ml"]) < float(nothing["ml"]) < float(nothing["high_ml"])
+    page = (study / "out" / "report.html").read_text()
+    assert page.index("<tfoot>") < page.index("no deformation") < page.index("</tfoot>")
+    assert not any("no deformation" in sentence for sentence in done.noise)
+    places = {(r["model"], r["load"], r["threshold"]): r for r in rows(study / "out" / "location.csv")}
+    right = places["right", "Load1", "0.3"]
+    assert float(right["measured_low_ml"]) <= float(right["measured_ml"]) <= float(right["measured_high_ml"])
+    assert float(right["dice_high"]) == 1.0
+    assert float(right["dice_perfect"]) > 0.95
+    assert float(places["half", "Load1", "0.3"]["dice_high"]) < 0.5
+    travel = {(r["model"], r["load"]): r for r in rows(study / "out" / "travel.csv")}
+    assert float(travel["right", "Load1"]["model_along_mm"]) >= 0.0
+    for load, gamma in LOADS.items():
+        names = {p.name for p in (study / "out" / load).iterdir()}
+        assert names >= {
+            "fields.vtu",
+            "curves.png",
+            "slices.png",
+            "agreement.png",
+            "right_max_shear.nii.gz",
+            "provenance.json",
+        }
+        fields = meshio.read(study / "out" / load / "fields.vtu").cell_data
+        inside = fields["compared"][0] == 1.0
+        assert fields["half_max_shear"][0][inside] == pytest.approx(0.5 * np.hypot(gamma / 2, gamma**2 / 8))
+    curves = [
+        r
+        for r in rows(study / "out" / "curves.csv")
+        if (r["load"], r["tissue"], r["field"]) == ("Load2", "fat", "half")
+    ]
+    above = {float(r["max_shear"]): float(r["volume_above_ml"]) for r in curves}
+    assert above[0.1] == pytest.approx(volume / 2.0, rel=0.05)
+    assert above[0.105] == 0.0
+    assert {r["quantity"] for r in rows(study / "out" / "agreement.csv")} == {"max_shear", "u_mm"}
+    assert {float(r["threshold"]) for r in rows(study / "out" / "location.csv")} == {0.2, 0.3, 0.5}
+
+
+def test_the_report_needs_nothing_else_and_says_what_it_rests_on(study: Path) -> None:
+    compare(study / "measured", [study / "right", study / "half"], **given(study))
+    page = (study / "out" / "report.html").read_text()
+
+    class Fetched(HTMLParser):
+        def __init__(self) -> None:
+            super().__init__()
+            self.found: list[str] = []
+
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            self.found += [
+                v or "" for k, v in attrs if k in ("src", "href") and not (v or "").startswith(("data:", "#"))
+            ]
+
+    parser = Fetched()
+    parser.feed(page)
+    assert parser.found == []
+    assert len(re.findall("<figure>", page)) == 5 * len(LOADS)
+    assert page.count("Agreement by distance to bone") == len(LOADS)
+    assert page.count("It goes through the lowest point of bone.") == len(LOADS)
+    assert len(re.findall('<figure class="viewer">', page)) == len(LOADS)
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
+    assert policy is not None
+    assert "default-src 'none'" in policy[1]
+    assert "http" not in policy[1]
+    held = {name: text for name, text in re.findall(r'class="overlay" data-title="([^"]*)"[^>]*>([^<]*)<', page)}
+    right, measured = (
+        nibabel.Nifti1Image.from_bytes(gzip.decompress(base64.b64decode(held[n]))) for n in ("right", "measured")
+    )
+    middle = right.get_fdata()[tuple(n // 2 for n in right.shape)]
+    assert middle == pytest.approx(0.5 * np.hypot(0.4, 0.08), abs=0.005)  # the last of the loads, "Load2"
+    assert measured.get_fdata()[tuple(n // 2 for n in right.shape)] == pytest.approx(middle, abs=0.005)
+    corner = right.affine @ [4, 4, 4, 1]  # RAS: x and y turn their sign
+    assert corner[:3].tolist() == [-0.5, -0.5, 0.5]
+    text = re.sub(r"\s+", " ", page)
+    assert "there is none of displacement" in text
+    assert "the displacement was taken as it was given" in text
+    assert "measurement&#39;s error is not known" in text
+    assert text.index("Models and loads") < text.index("Volume above a strain")
+
+
+def test_without_an_error_no_difference_counts_as_seen(study: Path) -> None:
+    done = compare(study / "measured", [study / "right", study / "half"], **given(study))
+    assert done.noise == ()
+    assert np.isnan(done.totals[0].low_ml)
+    assert all(one.not_told_apart() == (("right", "half"),) for one in done.comparisons)
+    assert "<td>1–2</td>" in (study / "out" / "report.html").read_text()
+    with_errors(study, 0.0, 5.0)  # a measurement that knows nothing
+    done = compare(study / "measured", [study / "right", study / "half"], **given(study))
+    assert "The measurement does not tell these apart from it by the area: half." in done.noise[0]
+
+
+def test_a_load_that_a_model_did_not_carry_is_not_compared(study: Path) -> None:
+    outcome = {"outcome": {"Load1": {"reached": 0.42}, "Load2": {"reached": 1.0}}, "parameters": {}}
+    (study / "half" / "simulation.json").write_text(json.dumps(outcome))
+    done = compare(study / "measured", [study / "right", study / "half"], **given(study))
+    assert "half reached only 42% of Load1, which is not compared." in done.notes
+    assert [a.model for a in done.totals] == ["right"]
+    assert [sorted(one.found.models) for one in done.comparisons] == [["right"], ["half", "right"]]
+
+
+def test_a_law_that_is_unstable_is_told_beside_the_rank(study: Path) -> None:
+    outcome = {
+        "outcome": {load: {"reached": 1.0, "stable_share": share} for load, share in (("Load1", 0.9), ("Load2", 1.0))}
+    }
+    (study / "half" / "simulation.json").write_text(json.dumps(outcome | {"parameters": {}}))
+    done = compare(study / "measured", [study / "right", study / "half"], **given(study))
+    told = [note for note in done.notes if "not stable (Drucker)" in note]
+    assert [note.partition(":")[0] for note in told] == ["half, Load1"]
+    assert "10.0%" in told[0]
+
+
+def test_a_load_is_looked_at_along_its_own_directions(study: Path) -> None:
+    """Of a shear along y the plate across x moves 'along', that across y goes in."""
+    own = {"Load2": ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0))}
+    compare(study / "measured", [study / "right"], **given(study), towards=own)
+    travel = {r["load"]: r for r in rows(study / "out" / "travel.csv")}
+    usual, aside = (float(travel[load]["model_along_mm"]) for load in LOADS)
+    assert usual > 0.5
+    assert aside < 0.05
+    told = json.loads((study / "out" / "comparison.json").read_text())["parameters"]
+    assert list(told["plate_axes_lps_of"]) == ["Load2"]
+    assert np.array(told["plate_axes_lps_of"]["Load2"])[:, 0] == pytest.approx([0.0, -1.0, 0.0])
+
+
+def test_a_model_that_lies_elsewhere_or_is_strange_is_refused_or_told(study: Path) -> None:
+    mesh = cube(6)
+
+    def written(name: str, points: np.ndarray, u: np.ndarray) -> Path:
+        (study / name).mkdir()
+        for load in LOADS:
+            meshio.write(
+                study / name / f"{load}.vtu", meshio.Mesh(points, [("tetra", mesh.cells)], {"displacement": u})
+            )
+        return study / name
+
+    u = sheared(0.4).displacement(mesh.points_mm)
+    off = written("off", mesh.points_mm - [6.0, 0.0, 0.0], u)  # a third of it in the bone
+    with pytest.raises(GeometryError, match=r"only \d+% of the model lies in the labelled soft tissue"):
+        compare(study / "measured", [off], **given(study))
+    assert not (study / "out").exists()
+    a_bit = written("a bit", mesh.points_mm - [2.0, 0.0, 0.0], u)
+    moving = written("moving", mesh.points_mm, u + np.array([3.0, 0.0, 0.0]))
+    swollen = written("swollen", mesh.points_mm, 0.1 * mesh.points_mm)
+    done = compare(study / "measured", [a_bit, moving, swollen], **given(study))
+    for name, words in (
+        ("a bit", "is its frame right"),
+        ("moving", "mm at the bone"),
+        ("swollen", "change their volume by 33%"),
+    ):
+        assert any(name in note and words in note for note in done.notes), (name, done.notes)
+
+
+def test_each_model_may_have_a_unit_frame_and_mesh_of_its_own(study: Path) -> None:
+    from tests.validate.test_fe_result import table
+
+    mesh = cube(6)
+    (study / "ansys").mkdir()
+    turned = 1e-3 * mesh.points_mm * [-1.0, -1.0, 1.0]
+    meshio.write(study / "ansys" / "heel.vtu", meshio.Mesh(turned, [("tetra", mesh.cells)]))
+    for load, gamma in LOADS.items():
+        u = 1e-3 * sheared(gamma).displacement(mesh.points_mm) * [-1.0, -1.0, 1.0]
+        table(study / "ansys" / f"{load}.csv", np.arange(len(turned)), u)
+    settings = study / "ansys" / "model.toml"
+    settings.write_text('mesh = "heel.vtu"\nunit = "m"\nframe = "RAS"\n')
+    done = compare(study / "measured", [study / "half", study / "ansys"], **given(study))
+    assert done.totals[0].model == "ansys"
+    assert done.totals[0].ml == pytest.approx(0.0, abs=1e-3)
+    settings.write_text('units = "m"\n')
+    with pytest.raises(InputError, match="'units' is none of mesh, unit, frame, to_image"):
+        compare(study / "measured", [study / "ansys"], **given(study))
+
+
+def test_nothing_old_stands_beside_what_is_new(study: Path) -> None:
+    compare(study / "measured", [study / "right"], **given(study))
+    (study / "out" / "notes.txt").write_text("mine")
+    compare(study / "measured" / "Load1", [study / "half"], **given(study))
+    assert {p.name for p in (study / "out").iterdir() if p.is_dir()} == {"Load1"}
+    assert (study / "out" / "notes.txt").is_file()
+    for place in (study / "measured", study / "half"):
+        with pytest.raises((InputError, OutputError), match="hoose another --out"):
+            compare(study / "measured", [study / "half"], **(given(study) | {"out": place}))
+
+
+def test_the_command_takes_one_load_and_one_file(study: Path) -> None:
+    out = study / "one"
+    argv = ["compare", study / "measured" / "Load1", study / "half" / "Load1.vtu", "--labels", study / "tissues.nii.gz"]
+    argv += ["--names", study / "tissues.csv", "--out", out, "--strains", "0.1", "0.4"]
+    ran = CliRunner().invoke(app, [str(a) for a in argv])
+    assert ran.exit_code == 0, ran.output
+    assert "Load1: area between the curves, mL, the nearest first: half" in ran.output
+    assert (out / "report.html").is_file()
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_written(study: Path) -> None:
+    right = study / "right"
+    for measured, models, error, message in (
+        (study, [right], InputError, "no results of `register`"),
+        (study / "measured", [], InputError, "No model is given"),
+        (study / "measured", [study / "nobody"], InputError, "no such model"),
+        (study / "measured", [right, right / "Load1.vtu"], InputError, "Two models are called 'right'"),
+        (study / "measured", [study / "measured"], InputError, "no file of a measured load"),
+    ):
+        with pytest.raises(error, match=message):
+            compare(measured, models, **given(study))
+    for more, error, message in (
+        ({"bones": ["calcaneus"]}, InputError, "no 'calcaneus'"),
+        ({"strains": (0.5, 0.2)}, InputError, "must rise"),
+        ({"strains": (20, 50)}, InputError, "no percent"),
+        ({"model_unit": "m"}, (GeometryError, InputError), "no body part is that large"),
+        ({"model_frame": "RAS"}, GeometryError, "the other of LPS and RAS"),
+    ):
+        with pytest.raises(error, match=message):
+            compare(study / "measured", [right], **(given(study) | more))
+    assert not list((study / "out").glob("*/*")) if (study / "out").exists() else True

@@ -1,0 +1,288 @@
+"""The methods text: figures from the records of what was done, and no paper that was not used."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import sys
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dvc
+from dvc.io.images import read as imagefile
+from dvc.registration import engines as nonrigid
+from dvc.registration.elastix.presets import load_preset
+from dvc.registration.gauss_newton import fit as gaussnewton
+from dvc.registration.gauss_newton.fit import GaussNewton
+from dvc.registration.gauss_newton.with_borders import AtBorders
+from dvc.registration.register import Settings
+from mrstrain.comparison.methods import methods
+from mrstrain.measurement.register import record_of
+from mrstrain.records.inputs import read_subject
+
+VERSIONS = {"mrstrain": "9.8.7", "itk-elastix": "0.1.2", "SimpleITK": "3.4.5", "nibabel": "5.4", "pydicom": "7.8"}
+VERSIONS |= {"pytetwild": "6.7"}
+
+
+def measured(folder: Path, load: str, align: str = "bone") -> Path:
+    place = folder / load
+    place.mkdir(parents=True)
+    stage = {"name": "heel-mr", "text": load_preset("heel-mr").text}
+    record = {"command": "register", "versions": VERSIONS, "parameters": {"align": align, "seed": 5, "stages": [stage]}}
+    (place / "provenance.json").write_text(json.dumps(record))
+    (place / "quality.json").write_text(json.dumps({"error_of_max_shear": {"source": "A study of 3 heels."}}))
+    return place
+
+
+def simulated(folder: Path, name: str, made: object = None) -> Path:
+    place = folder / name
+    place.mkdir(parents=True)
+    given = {
+        "set": name, "title": f"Set of {name}", "laws": {"fat": {"law": "Ogden, mu0 10.54 kPa"}}, "mesh_made": made,
+        "fixed": ["bone"], "taped": True, "plate": "rigid", "element": "P1: stabilised",
+        "paths": [[{"name": "Load1", "normal_n": 140.0, "shear_n": 0.0}]],
+    }  # fmt: skip
+    (place / "simulation.json").write_text(
+        json.dumps({"command": "simulate", "versions": VERSIONS, "parameters": given})
+    )
+    return place / "Load1.vtu"
+
+
+def driven(folder: Path, name: str, of: str) -> Path:
+    """A set whose outside goes where it was measured, as `drive` records it."""
+    place = folder / name
+    place.mkdir(parents=True)
+    record = {
+        "command": "drive",
+        "versions": VERSIONS,
+        "set": of,
+        "laws": {"fat": "Ogden, mu0 7 kPa"},
+        "parameters": {},
+    }
+    (place / "simulation.json").write_text(json.dumps(record))
+    return place / "Load1.vtu"
+
+
+def levelled(folder: Path, name: str, align: str) -> Path:
+    """A model that was sent through the measurement, with the registration of what it would have given."""
+    place = folder / f"{name}-levelled"
+    place.mkdir(parents=True)
+    (place / "provenance.json").write_text(json.dumps({"command": "level", "versions": VERSIONS, "parameters": {}}))
+    measured(folder / f"{name}-levelled-work" / "registered" / "Load1", "Load1", align)
+    return place / "Load1.vtu"
+
+
+def told(loads: dict[str, Path], models: dict[str, Path], error_known: bool = True) -> str:
+    return "\n".join(methods(loads, models, 1234, (0.2, 0.5), (0.2, 0.3), 0.1, error_known=error_known, version="1.0"))
+
+
+def test_directions_are_told_where_loads_do_not_share_them(tmp_path: Path) -> None:
+    place = simulated(tmp_path, "mine")
+    loads = {"Load1": measured(tmp_path / "res", "Load1")}
+    down, aside = [[0, 0, 1], [0, -1, 0], [1, 0, 0]], [[0, 1, 0], [0, 0, -1], [1, 0, 0]]
+    for other in (down, aside):
+        record = json.loads((place.parent / "simulation.json").read_text())
+        record["outcome"] = {"Load1": {"plate_axes_lps": down}, "Load2": {"plate_axes_lps": other}}
+        (place.parent / "simulation.json").write_text(json.dumps(record))
+        text = told(loads, {"mine": place})
+        said = "Load2 with the plate's outward normal along (0, 0, -1) and shear along (1, 0, 0) (LPS)"
+        assert (said in text) == (other is aside)
+
+
+def test_figures_and_papers_are_those_of_the_records(tmp_path: Path) -> None:
+    loads = {load: measured(tmp_path / "res", load) for load in ("Load1", "Load2")}
+    models = {"trebbi": simulated(tmp_path, "trebbi", {"edge_mm": 2.5, "pytetwild": "6.7"})}
+    models |= {"mine": simulated(tmp_path, "mine"), "ansys": tmp_path / "ansys" / "Load1.csv"}
+    text = told(loads, models)
+    assert text.count("registered non-rigidly") == 1  # both loads alike, in one sentence
+    for said in (
+        "Load1 and Load2: The loaded image was aligned with the unloaded one rigidly on the bone",
+        "itk-elastix 0.1.2", "mrstrain 9.8.7", "control points every 4.5 mm",
+        "1000, 1000, 1000, 500 iterations of 5000",
+        "metric AdvancedNormalizedCorrelation", "seed 5", "SimpleITK 3.4.5", "pytetwild 6.7", "edges of 2.5 mm",
+        "trebbi: Set of trebbi (fat: Ogden, mu0 10.54 kPa)", "Load1 140 N normal, 0 N shear", "ansys (csv)",
+        "1234 tetrahedra", "from 0.2 to 0.5", "tissue above 0.2 and 0.3", "A study of 3 heels.", "no error model",
+    ):  # fmt: skip
+        assert said in text, said
+    for paper in (
+        "Klein S, Staring M, Murphy",
+        "Shamonin DP",
+        "Lowekamp BC",
+        "Hu Y",
+        "Trebbi A",
+        "Dice LR",
+        "Lin LI-K",
+        "Bland JM",
+    ):
+        assert text.count(paper) == 1, paper
+
+
+def test_our_own_engine_is_told_with_its_weights(tmp_path: Path) -> None:
+    for name, bending, weight in (("a", None, "chosen for each pair by cross-validation"), ("b", 2.5, "weight 2.5/mm")):
+        place = measured(tmp_path / name, "Load1")
+        record = json.loads((place / "provenance.json").read_text())
+        record["parameters"] |= {"stages": [], "gauss_newton": asdict(GaussNewton(bending=bending))}
+        (place / "provenance.json").write_text(json.dumps(record))
+        text = told({"Load1": place}, {"ansys": tmp_path / "Load1.csv"})
+        assert "borders" not in text
+        for said in (
+            "Gauss-Newton engine of mrstrain 9.8.7",
+            "every 3.2 mm",
+            weight,
+            "300/mm3",
+            "rigid alignment by Gauss-Newton",
+            "doi:10.1023/B:VISI",
+        ):
+            assert said in text, said
+        assert "taken as it was given" not in text.split("Results of other")[0]
+
+
+def test_borders_are_told(tmp_path: Path) -> None:
+    place = measured(tmp_path, "Load1")
+    record = json.loads((place / "provenance.json").read_text())
+    record["parameters"] |= {"stages": [], "gauss_newton": asdict(GaussNewton()), "borders": asdict(AtBorders())}
+    (place / "provenance.json").write_text(json.dumps(record))
+    text = told({"Load1": place}, {"ansys": tmp_path / "Load1.csv"})
+    assert "vanishes on the borders of the label map's tissues" in text
+    assert "strain of a tissue called skin penalised (weight chosen for each pair by cross-validation)" in text
+
+
+def test_a_twin_that_judged_the_error_bars_is_told(tmp_path: Path) -> None:
+    loads = {load: measured(tmp_path, load) for load in ("Load1", "Load2")}
+    assert "twin" not in told(loads, {})
+    rows = [{"region": "fat", "factor": 1.2}]
+    for load, more in (("Load1", {"twin": rows}), ("Load2", {"twin": [], "of_twin": "There is none."})):
+        error = {"source": "A study of 3 heels."} | more
+        (loads[load] / "quality.json").write_text(json.dumps({"error_of_max_shear": error}))
+    assert "The error bars of Load1 were judged by a twin" in told(loads, {})
+    error = {"known": False, "twin": [{"region": "fat", "factor": None}]}  # a pair without error bars
+    (loads["Load1"] / "quality.json").write_text(json.dumps({"error_of_max_shear": error}))
+    assert "twin" not in told(loads, {})
+
+
+def test_driven_and_levelled_models_are_not_those_of_other_programs(tmp_path: Path) -> None:
+    loads = {"Load1": measured(tmp_path / "res", "Load1")}
+    models = {"mine-driven": driven(tmp_path, "mine-driven", "mine")}
+    models |= {"mine-levelled": levelled(tmp_path, "mine", "bone")}
+    text = told(loads, models)
+    for said in (
+        "moved by the measured displacement", "mine-driven: with mrstrain 9.8.7 (fat: Ogden, mu0 7 kPa)",
+        "mine-levelled: the model was sent through the measurement", "registered as the images were.",
+    ):  # fmt: skip
+        assert said in text, said
+    assert "other programs" not in text
+    assert "Trebbi" not in text
+    text = told(loads, {"x": driven(tmp_path, "trebbi-driven", "trebbi"), "y": levelled(tmp_path, "other", "image")})
+    assert "Published sets of laws are those that Trebbi 2023 compiled." in text
+    assert "registered as follows. The loaded image was aligned with the unloaded one rigidly on the whole" in text
+
+
+def test_the_correction_of_shading_is_told_where_it_was_done(tmp_path: Path) -> None:
+    models = {"ansys": tmp_path / "Load1.csv"}
+    text = told({"Load1": measured(tmp_path, "Load1")}, models)
+    assert "out of both images (N4, Tustison 2010, as" in text
+    assert text.count("doi:10.1109/TMI.2010.2046908") == 1
+    (tmp_path / "given").mkdir()
+    assert "Tustison" not in told({"Load1": tmp_path / "given"}, models)
+
+
+def test_what_is_not_known_is_not_claimed(tmp_path: Path) -> None:
+    (tmp_path / "Load1").mkdir()
+    text = told({"Load1": tmp_path / "Load1"}, {"ansys": tmp_path / "Load1.csv"}, error_known=False)
+    assert "Load1: the displacement was taken as it was given." in text
+    for absent in ("elastix", "SimpleITK", "fTetWild", "Hu Y", "Trebbi", "draws", "Klein"):
+        assert absent not in text, absent
+    # a set of one's own on a mesh made elsewhere: neither the published sets nor the mesher
+    text = told({"Load1": measured(tmp_path, "a", "none")}, {"mine": simulated(tmp_path, "mine")}, error_known=False)
+    assert "without rigid alignment" in text
+    assert "Hu 2020" not in text
+    assert "Trebbi" not in text
+
+
+def libraries_of(module: str, seen: set[str]) -> set[str]:
+    """Libraries that a module of ours imports, or any of ours that it imports."""
+    seen.add(module)
+    spec = find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    found = set()
+    for node in ast.walk(ast.parse(Path(spec.origin).read_text())):
+        names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        for name in names:
+            if name.split(".")[0] != "dvc":
+                found.add(name.split(".")[0])
+            elif name not in seen:
+                found |= libraries_of(name, seen)
+    return found - set(sys.stdlib_module_names)
+
+
+def with_inputs(folder: Path, *names: str) -> Path:
+    """A measurement whose record names the files that it read."""
+    place = measured(folder, "Load1")
+    record = json.loads((place / "provenance.json").read_text())
+    record["inputs"] = {"load0": [{"name": names[0]}], "loads": [{"name": name} for name in names[1:]]}
+    record["inputs"]["error_model"] = [{"name": "model.json"}]
+    (place / "provenance.json").write_text(json.dumps(record))
+    return place
+
+
+@pytest.mark.parametrize("name", ["Load0.nii.gz", "Load0.nii", "a.nrrd", "a.nhdr", "a.mha", "a.mhd", "series"])
+def test_the_libraries_told_are_those_that_read_and_write(tmp_path: Path, name: str) -> None:
+    text = told({"Load1": with_inputs(tmp_path, name, name)}, {})
+    (sentence,) = re.findall(r"Images \(.*?of the JPEG formats\)\.|Images \(.*?NIfTI files\.", text)
+    suffix = imagefile._known_suffix(name)
+    reader = "dvc.io.images.dicom" if suffix is None else imagefile._FORMATS[suffix][1].__module__
+    used = libraries_of(reader, set()) | libraries_of("dvc.io.images.write", set())
+    assert set(re.findall(r"[\w-]+(?= \d)", sentence)) == used - {"numpy"}
+    assert sentence.startswith(f"Images ({imagefile.format_of(name)}) were read, and maps (NIfTI, NRRD) written")
+    for library in used - {"numpy"}:
+        assert f"{library} {VERSIONS[library]}" in sentence
+    # N4, for whatever images
+    assert "SimpleITK" in libraries_of("dvc.images.shading", set())
+    assert "(N4, Tustison 2010, as implemented in SimpleITK 3.4.5, Lowekamp 2013)" in text
+
+
+def test_every_format_that_was_read_is_told(tmp_path: Path) -> None:
+    text = told({"Load1": with_inputs(tmp_path, "a.nii.gz", "b.mha", "c.nii.gz", "d")}, {})
+    assert "Images (DICOM, MetaImage, NIfTI) were read" in text
+    assert "pydicom 7.8" in text
+
+
+def test_formats_are_those_of_the_record_that_register_makes(tmp_path: Path) -> None:
+    grid = dvc.Grid((8, 8, 8), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    values = np.random.default_rng(1).normal(size=grid.shape)
+    half = np.zeros(grid.shape, dtype=bool)
+    half[:4] = True
+    load0, bone, labels = (tmp_path / name for name in ("Load0.nii.gz", "bone.nrrd", "labels.mha"))
+    dvc.write_image(load0, dvc.Image(grid, values))
+    dvc.write_mask(bone, dvc.Mask(grid, half))
+    dvc.write_labels(labels, dvc.LabelMap(grid, half.astype(int), {1: "fat"}))
+    subject = read_subject(load0, bone=bone, labels=labels, names=tmp_path / "labels.csv")
+    record = record_of(subject, {"loads": [load0]}, Settings.of(), {})
+    (tmp_path / "provenance.json").write_text(json.dumps(record))
+    assert "Images (MetaImage, NIfTI, NRRD) were read" in told({"Load1": tmp_path}, {})
+
+
+def test_a_levelled_model_counts_as_registered_alike_whatever_files_its_images_came_from(tmp_path: Path) -> None:
+    loads = {"Load1": with_inputs(tmp_path / "res", "series0", "series1")}
+    assert "registered as the images were." in told(loads, {"mine-levelled": levelled(tmp_path, "mine", "bone")})
+
+
+def test_what_the_engine_compares_and_holds_is_told(tmp_path: Path) -> None:
+    assert gaussnewton._LEAST_VOXELS == nonrigid._LEAST_VOXELS == 2.0
+    for align, bone in (("bone", True), ("image", False), ("none", False)):
+        place = measured(tmp_path / align, "Load1", align)
+        assert "mm (every two voxels, if that is more)" in told({"Load1": place}, {})
+        record = json.loads((place / "provenance.json").read_text())
+        record["parameters"] |= {"stages": [], "gauss_newton": asdict(GaussNewton())}
+        (place / "provenance.json").write_text(json.dumps(record))
+        text = told({"Load1": place}, {})
+        assert ("strain of the bone (1000/mm3)" in text) == bone
+        assert "3.2 mm (every two voxels, if that is more)" in text
+        assert f"all voxels of the tissue and {nonrigid._MASK_MARGIN_MM:g} mm around it" in text

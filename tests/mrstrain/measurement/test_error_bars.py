@@ -1,0 +1,276 @@
+"""Error bars are put on where the error is known, and a reason is given where it is not."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import foldnorm
+
+from dvc.deformation.strain_maps import StrainMaps
+from dvc.images.image import Grid, Image, LabelMap, Mask
+from dvc.registration.elastix.presets import load_preset
+from dvc.registration.gauss_newton.fit import Choice, GaussNewton
+from dvc.registration.gauss_newton.with_borders import AtBorders
+from dvc.registration.register import Settings
+from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, error_model_of, uncertainty_of
+from dvc.trust.twin_judgement import judged
+from dvc.trust.verdict import Verdict
+from mrstrain.measurement.error_bars import error_bars
+from mrstrain.measurement.results import with_volume
+from mrstrain.measurement.twin_check import TwinCheck
+from mrstrain.records.inputs import Subject
+
+GRID = Grid((40, 40, 40), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))
+NAMES = {1: "Calcaneus", 2: "fat", 3: "Left talus"}
+
+
+def model(preset: str = "heel-mr", voxel_mm: float = 0.8, snr: float = 25.0, text: str | None = None) -> ErrorModel:
+    rows = {POOLED: np.full((2, 1, 2), 0.03), "fat": np.full((2, 1, 2), 0.02)}
+    table = ErrorTable(np.full(3, voxel_mm), snr, np.array([0.0, 0.5]), np.zeros(1), rows, (rows,), 4.0)
+    used = load_preset("heel-mr").text if text is None else text
+    return ErrorModel(preset, hashlib.sha256(used.encode()).hexdigest(), (table,), "made up")
+
+
+def given(with_labels: bool = True, with_bone: bool = True):
+    """A block of tissue in air at SNR 25, with a bone, another bone and fat."""
+    inside = np.zeros(GRID.shape, dtype=bool)
+    inside[6:34, 6:34, 6:34] = True
+    random = np.random.default_rng(0)
+    noise = 20.0 * random.standard_normal((2, *GRID.shape))
+    image = Image(GRID, np.hypot(np.where(inside, 500.0, 0.0) + noise[0], noise[1]).astype(np.float32))
+    labels = np.where(inside, 2, 0)
+    labels[6:12, 6:34, 6:34] = 1
+    labels[28:34, 6:34, 6:34] = 3
+    bone = Mask(GRID, labels == 1) if with_bone else None
+    names = LabelMap(GRID, labels, NAMES) if with_labels else None
+    subject = Subject(image, bone, None, names, None, np.array([0.0, 0.0, -1.0]), None)
+    shear = np.where(inside, 0.1, np.nan).astype(np.float32)
+    maps = StrainMaps(GRID, inside, np.zeros((*GRID.shape, 3)), np.zeros((*GRID.shape, 6)), shear, np.ones(GRID.shape))
+    settings = Settings.of("heel-mr")
+    body = Mask(GRID, inside)
+    return SimpleNamespace(settings=settings, tissue=body, reference=image, loaded=image, choice=None), subject, maps
+
+
+def test_every_bone_is_left_out_whatever_its_name() -> None:
+    found, subject, maps = given()
+    bars = error_bars(found, subject, maps, model())
+    assert bars.uncertainty is not None
+    assert {i.region for i in bars.uncertainty.intervals} == {"fat"}
+    known = np.isfinite(bars.uncertainty.sigma)
+    assert subject.labels is not None
+    np.testing.assert_array_equal(known, subject.labels.labels == 2)
+    assert np.nanmax(np.abs(bars.uncertainty.sigma - 0.02)) < 1e-6
+
+
+def test_without_labels_all_but_bone_is_soft_tissue() -> None:
+    found, subject, maps = given(with_labels=False)
+    bars = error_bars(found, subject, maps, model())
+    assert bars.uncertainty is not None
+    assert {i.region for i in bars.uncertainty.intervals} == {POOLED}
+    assert np.nanmax(np.abs(bars.uncertainty.sigma - 0.03)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("used", "labels", "bone", "says"),
+    [
+        (model("heel-fine"), True, True, "heel-fine, and heel-mr was used"),
+        (model(voxel_mm=2.0), True, True, "too far"),
+        (model(snr=100.0), True, True, "too far"),
+        (model(text="(Edited 1)"), True, True, "other parameters"),
+        (model(), False, False, "no bone was given"),
+    ],
+)
+def test_where_the_error_is_not_known_the_reason_is_told(
+    used: ErrorModel, labels: bool, bone: bool, says: str, tmp_path: Path
+) -> None:
+    found, subject, maps = given(labels, bone)
+    bars = error_bars(found, subject, maps, used)
+    assert bars.uncertainty is None
+    assert says in bars.told
+    assert bars.as_dict() == {"known": False, "reason": bars.told}
+    bars.write(tmp_path, maps, Verdict("trust"))
+    assert not list(tmp_path.iterdir())
+    assert bars.tables() == []
+
+
+def test_a_muscle_named_after_a_bone_is_no_bone() -> None:
+    found, subject, maps = given()
+    assert subject.labels is not None
+    names = {1: "Calcaneus", 2: "Tibialis posterior", 3: "ankle fat"}
+    subject = replace(subject, labels=replace(subject.labels, names=names))
+    bars = error_bars(found, subject, maps, model())
+    assert bars.uncertainty is not None
+    assert {i.region for i in bars.uncertainty.intervals} == {"Tibialis posterior", "ankle fat"}
+
+
+def test_the_noisier_image_counts() -> None:
+    found, subject, maps = given()
+    random = np.random.default_rng(1)
+    noise = 60.0 * random.standard_normal((2, *GRID.shape))
+    found.loaded = Image(GRID, np.hypot(found.reference.values + noise[0], noise[1]).astype(np.float32))
+    assert "too far" in error_bars(found, subject, maps, model()).told
+
+
+def test_several_stages_have_no_known_error() -> None:
+    found, subject, maps = given()
+    found.settings = Settings((load_preset("heel-mr"), load_preset("heel-mr")))
+    assert "several stages" in error_bars(found, subject, maps, model()).told
+
+
+def test_a_preset_without_a_model_is_told() -> None:
+    found, subject, maps = given()
+    found.settings = Settings((replace(load_preset("heel-mr"), name="mine"),))
+    bars = error_bars(found, subject, maps, error_model_of("mine"))
+    assert "mine has not been measured" in bars.told
+
+
+def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
+    found, subject, maps = given()
+    found.settings = Settings.of("gauss-newton")
+    own = model("gauss-newton", text=found.settings.text)
+    assert error_bars(found, subject, maps, own).uncertainty is not None
+    assert "that of heel-mr" in error_bars(found, subject, maps, model()).told
+    found.choice = Choice(GaussNewton().weights, "", asked=0.01)
+    assert error_bars(found, subject, maps, own).uncertainty is not None
+    found.choice = Choice(GaussNewton().weights, "", asked=0.05)
+    assert "phantoms that keep their volume" in error_bars(found, subject, maps, own).told
+    found.settings = Settings(gauss_newton=GaussNewton(bending=2.0))
+    assert "fixed at 2/mm" in error_bars(found, subject, maps, own).told
+    found.settings, found.choice = replace(Settings.of("gauss-newton"), borders=AtBorders()), None
+    assert "gauss-newton-borders was used" in error_bars(found, subject, maps, own).told
+    with_borders = model("gauss-newton-borders", text=found.settings.text)
+    assert error_bars(found, subject, maps, with_borders).uncertainty is not None
+    unlabelled = subject.labels.labels.copy()
+    unlabelled[12:20] = 0
+    partly = replace(subject, labels=replace(subject.labels, labels=unlabelled))
+    assert "of the body has no label" in error_bars(found, partly, maps, with_borders).told
+    found.settings = replace(found.settings, align_on="image")
+    assert "with the bone held at rest" in error_bars(found, subject, maps, with_borders).told
+
+
+def twin_of(maps: StrainMaps, sd: float, bias: float = 0.03) -> TwinCheck:
+    """What comes back with an error of that bias and deviation; the measured shear is made to vary from .05 to .45."""
+    maps.max_shear[:] += np.linspace(-0.05, 0.35, GRID.shape[2], dtype=np.float32)
+    random = np.random.default_rng(4)
+    return TwinCheck((maps.max_shear + bias + sd * random.standard_normal(GRID.shape)).astype(np.float32))
+
+
+@pytest.mark.parametrize("sd", [0.019, 0.035])
+def test_error_bars_that_hold_in_the_pairs_twin_stay_and_others_are_made_wider(sd: float) -> None:
+    # the model of fat: bias and deviation .02; the twin's error has the same bias, and its own deviation
+    errors = foldnorm(0.02 / sd, scale=sd)
+    claimed = np.hypot(0.02, 0.02)
+    found, subject, maps = given()
+    bars = error_bars(found, subject, maps, model(), twin_of(maps, sd, 0.02))
+    alone = error_bars(found, subject, maps, model())
+    (row,) = bars.twin
+    assert row.region == "fat"
+    assert row.held == pytest.approx(errors.cdf(1.96 * claimed), abs=0.01)
+    assert 0.88 < row.expected < 0.93  # the fat is small: some hundred places that are 4 mm apart
+    assert row.rms_error == pytest.approx(np.hypot(0.02, sd), rel=0.05)
+    assert row.bias == pytest.approx(0.02, abs=0.002)
+    assert bars.as_dict()["twin"][0]["factor"] == row.factor
+    assert bars.tables()[1].title.startswith("The twin")
+    if sd < 0.02:
+        assert row.factor == 1.0
+        assert bars.of_twin == "they hold in the twin of this pair."
+        assert bars.uncertainty.intervals == alone.uncertainty.intervals
+        assert np.isnan(bars.model.tables[0].widening)  # as it was: of one heel
+        return
+    assert row.factor == pytest.approx(np.sqrt((errors.ppf(0.95) / 1.96) ** 2 - 0.02**2) / 0.02, rel=0.02)
+    assert bars.of_twin.startswith("made wider by the twin of this pair: fat 1.")
+    assert np.nanmax(bars.uncertainty.sigma) == pytest.approx(0.02 * row.factor, rel=1e-5)
+    for now, before in zip(bars.uncertainty.intervals, alone.uncertainty.intervals, strict=True):
+        assert now.estimate == before.estimate
+        assert now.low <= before.low
+        assert now.high >= before.high
+    # what `compare` draws truths from is as sure as the least sure tissue, and says so
+    assert bars.model.tables[0].widening == pytest.approx(row.factor)
+    assert "wider by the twin of one pair" in bars.model.source
+    # judged again, the wider error bars hold
+    again = twin_of(maps, sd, 0.02).max_shear - maps.max_shear
+    inside = np.isfinite(again)
+    assert np.mean(np.abs(again[inside]) <= 1.96 * np.hypot(0.02, 0.02 * row.factor)) == pytest.approx(0.95, abs=0.01)
+
+
+def test_a_percentile_outside_of_its_interval_makes_error_bars_wider_though_voxels_hold() -> None:
+    found, subject, maps = given()
+    # voxels are off by two deviations all alike: each is within what is claimed of it, and the median is not
+    bars = error_bars(found, subject, maps, model(), twin_of(maps, 0.0, 0.04))
+    (row,) = bars.twin
+    assert row.held == 1.0
+    assert row.factor > 1.4
+    alone = error_bars(found, subject, maps, model())
+    for now, before in zip(bars.uncertainty.intervals, alone.uncertainty.intervals, strict=True):
+        assert now.high - now.low >= before.high - before.low
+
+
+def test_voxels_that_only_the_twin_has_do_not_count() -> None:
+    found, subject, maps = given()
+    twin = twin_of(maps, 0.01, 0.02)
+    maps.max_shear[:, :, :24] = np.nan  # the loaded scan ends there: what is left is the stronger part
+    (row,) = error_bars(found, subject, maps, model(), twin).twin
+    assert row.factor == 1.0
+
+
+def test_a_model_as_it_was_made_is_seldom_doubted() -> None:
+    # registrations differ in their bias: each alone holds less or more than 95 % of its voxels
+    rows = {POOLED: np.stack([np.zeros((1, 2)), np.full((1, 2), 0.03)])}
+    biases = np.random.default_rng(7).normal(0.0, 0.02, 40)
+    runs = tuple({POOLED: np.stack([np.full((1, 2), b), np.full((1, 2), 0.022)])} for b in biases)
+    table = ErrorTable(np.full(3, 0.8), 25.0, np.array([0.0, 0.5]), np.zeros(1), rows, runs, 4.0, widening=2.0)
+    shear = np.random.default_rng(0).uniform(0.1, 0.4, (16, 16, 16)).astype(np.float32)
+    grid, near, inside = Grid((16, 16, 16), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0)), np.zeros((16, 16, 16)), shear > 0
+
+    def factor(bias: float, sd: float, seed: int) -> float:
+        again = (shear + np.random.default_rng(seed).normal(bias, sd, shear.shape)).astype(np.float32)
+        sure = uncertainty_of(again, grid, {"fat": inside}, near, table)
+        (row,) = judged(shear, again, {"fat": inside}, near, sure, grid.voxel_volume_mm3)
+        return row.factor
+
+    assert sum(factor(b, 0.022, k) > 1.0 for k, b in enumerate(biases)) <= 4
+    assert factor(0.0, 0.06, 0) > 1.4
+
+
+def test_without_an_error_model_the_twin_tells_the_least_error() -> None:
+    found, subject, maps = given()
+    bars = error_bars(found, subject, maps, None, twin_of(maps, 0.05))
+    assert bars.uncertainty is None
+    (row,) = bars.twin
+    assert (row.held, row.factor) == (None, None)
+    assert row.rms_error == pytest.approx(np.hypot(0.03, 0.05), rel=0.05)
+    (table,) = bars.tables()
+    assert table.columns == ("region", "error (rms)", "bias")
+    assert bars.of_twin.startswith("not known; the twin of this pair came back with an error (rms) of fat 0.05")
+    failed = error_bars(found, subject, maps, model(), TwinCheck(None, "The deformation folds."))
+    assert failed.twin == ()
+    assert failed.of_twin == "there is no twin of this pair. The deformation folds."
+    assert failed.uncertainty is not None
+
+
+def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:
+    allowed, kept = (Choice(GaussNewton().weights, "", asked=asked) for asked in (0.05, 0.01))
+    doubted = with_volume(Verdict("trust"), allowed)
+    assert doubted.level == "caution"
+    assert "ask for a change of volume, of 5.0 % or more" in doubted.reasons[0]
+    assert with_volume(Verdict("trust"), kept).level == "trust"
+    assert with_volume(Verdict("caution", ("Less alike.",)), allowed).level == "distrust"
+    folded = with_volume(Verdict("distrust", ("It folds.",)), allowed)
+    assert folded.level == "distrust"
+    assert folded.reasons == ("It folds.", doubted.reasons[0])
+
+
+@pytest.mark.parametrize("name", ["gauss-newton", "gauss-newton-borders", "heel-mr"])
+def test_our_own_engine_and_the_preset_for_heels_come_with_their_error(name: str) -> None:
+    stored = error_model_of(name)
+    assert stored is not None
+    assert stored.parameters_sha256 == hashlib.sha256(Settings.of(name).text.encode()).hexdigest()
+    table = stored.table_for(np.full(3, 0.8), 25.0)
+    bias, sd = table.expected("fat", np.array([0.02, 0.3]), np.array([6.0, 0.5], dtype=np.float32))
+    assert bias[0] > 0.002  # noise lifts small shears
+    assert sd[1] > sd[0] > 0.002

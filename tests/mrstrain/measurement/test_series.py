@@ -1,0 +1,184 @@
+"""Several loads in one call, chained or at once, one of them failing: none disturbs another."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.deformation.bspline import BSpline
+from dvc.errors import InputError, OutputError, RegistrationError
+from dvc.images.image import Image, Mask
+from dvc.io.images.read import read_image
+from dvc.io.images.write import write_image, write_labels, write_mask
+from dvc.io.transforms.elastix_text import parse_parameters
+from dvc.registration.align import Alignment
+from dvc.registration.elastix.presets import Preset
+from dvc.registration.gauss_newton.fit import control_grid, spline_through
+from dvc.registration.register import Registration, Settings
+from dvc.registration.register import register as register_pair
+from dvc.report.page import Section
+from dvc.trust.verdict import Verdict
+from dvc.worker import Worker
+from mrstrain.measurement.register import Series, register
+from mrstrain.measurement.results import Case
+from phantoms.anatomy import Heel
+from phantoms.heel import pressed, scan
+from tests.quick import QUICK
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory, tiny_pair) -> Path:
+    """An unloaded heel and five others in its frame: two loads, one of turned contrast, and a repeat scan."""
+    folder = tmp_path_factory.mktemp("series")
+    heel, foot = Heel(3), tiny_pair.foot_motion
+    less = scan(heel, tiny_pair.loaded.grid, pressed(heel, 0.3), foot, snr=25.0, number=5)
+    turned = replace(less, values=less.values.max() - less.values)
+    back = foot.inverse()
+    for name, image in (("Load1", tiny_pair.loaded), ("Load2", less), ("Turned", turned), ("again", tiny_pair.repeat)):
+        grid = image.grid.moved_by(back.rotation, back.translation_mm)
+        write_image(folder / f"{name}.nii.gz", Image(grid, image.values))
+    write_image(folder / "Load0.nii.gz", tiny_pair.reference)
+    write_mask(folder / "bone.nii.gz", tiny_pair.bone)
+    write_labels(folder / "tissues.nrrd", tiny_pair.labels)
+    return folder
+
+
+@dataclass
+class Spy:
+    """In the place of the registration of a pair: keeps what each was started from, and fails on turned contrast."""
+
+    scans: Path
+    spline: BSpline
+    asked: list[tuple[str, BSpline | None]]
+    bones: list[Mask | None]
+    found: dict[str, BSpline]
+
+    def register(self, reference, loaded, *, start, settings, bone, tissue, **_) -> Registration:
+        name = next(
+            path.name.removesuffix(".nii.gz")
+            for path in self.scans.glob("*.nii.gz")
+            if path.name != "bone.nii.gz" and np.array_equal(read_image(path).values, loaded.values)
+        )
+        self.asked.append((name, start))
+        self.bones.append(bone)
+        if name == "Turned":
+            raise RegistrationError("turned")
+        found = self.found[name] = replace(self.spline)
+        alignment = Alignment(np.nan, "bone", 0.5, 0.9, 0.01, np.zeros(3))  # type: ignore[arg-type]
+        return Registration(reference, loaded, tissue, bone, alignment, found, settings, 1.0)
+
+
+@pytest.fixture
+def spy(monkeypatch, scans, tiny_pair) -> Spy:
+    control = control_grid(tiny_pair.reference.grid, np.full(3, 8.0))
+    one = Spy(scans, BSpline(control, spline_through(tiny_pair.deformation, control)), [], [], {})
+    monkeypatch.setattr("mrstrain.measurement.register.register_pair", one.register)
+
+    def written(_folder: Path, name: str, *_: object, **__: object) -> Case:
+        return Case(name, Section(name, Verdict("trust")), Verdict("trust"), {}, None)
+
+    monkeypatch.setattr("mrstrain.measurement.register.write_case", written)
+    return one
+
+
+@pytest.mark.parametrize("chain", [True, False])
+def test_each_load_of_a_chain_starts_from_the_last_good_one(spy, scans, tmp_path, chain):
+    loads = [scans / f"{name}.nii.gz" for name in ("Load1", "Turned", "Load2")]
+    series = register(
+        scans / "Load0.nii.gz", loads, out=tmp_path, bone=scans / "bone.nii.gz", repeat=scans / "again.nii.gz",
+        chain=chain, workers=1,
+    )  # fmt: skip
+    assert series.failures == {"Turned": "turned"}
+    assert [name for name, _ in spy.asked] == ["again", "Load1", "Turned", "Load2"]
+    begun_at = dict(spy.asked)
+    assert begun_at["again"] is None  # unloaded: it is far from every load
+    assert begun_at["Load1"] is None
+    assert begun_at["Turned"] is (spy.found["Load1"] if chain else None)
+    assert begun_at["Load2"] is (spy.found["Load1"] if chain else None)
+
+
+def test_the_bone_may_be_a_label_of_the_map(spy, scans, tmp_path, tiny_pair):
+    given = {"labels": scans / "tissues.nrrd", "names": scans / "tissues.csv", "out": tmp_path / "out"}
+    register(scans / "Load0.nii.gz", [scans / "Load1.nii.gz"], bone_label="bone", **given)
+    (bone,) = spy.bones
+    np.testing.assert_array_equal(bone.inside, tiny_pair.bone.inside)
+    with pytest.raises(InputError, match="calcaneum"):
+        register(scans / "Load0.nii.gz", [scans / "Load1.nii.gz"], bone_label="calcaneum", **given)
+    with pytest.raises(InputError, match="once"):
+        register(
+            scans / "Load0.nii.gz", [scans / "Load1.nii.gz"], bone=scans / "bone.nii.gz", bone_label="bone", **given
+        )
+
+
+@pytest.mark.parametrize(("load0", "load"), [("Load0", "copy"), ("Load1", "copy"), ("Load2", "Load0")])
+def test_row_8_one_image_given_twice_is_refused_before_anything_is_made(spy, scans, tmp_path, load0, load):
+    """The copy is of Load0 or of another load; or a load is the unloaded image itself."""
+    shutil.copy(scans / f"{'Load0' if load0 == 'Load0' else 'Load1'}.nii.gz", tmp_path / "copy.nii.gz")
+    second = tmp_path / "copy.nii.gz" if load == "copy" else scans / f"{load}.nii.gz"
+    loads = [scans / "Load1.nii.gz", scans / "Load2.nii.gz", second]
+    with pytest.raises(InputError, match=rf"{load}\.nii\.gz are the same image: every voxel is equal"):
+        register(scans / "Load0.nii.gz", loads, out=tmp_path / "out", bone=scans / "bone.nii.gz")
+    assert not (tmp_path / "out").exists()
+    assert not spy.asked
+
+
+def test_row_17_a_disk_too_small_for_all_loads_is_told_first(spy, scans, tmp_path, monkeypatch):
+    """77,000 voxels at 30 bytes: 2.3 MB for each image."""
+    arguments = {"out": tmp_path / "new" / "out", "bone": scans / "bone.nii.gz"}
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 3 * 10**6))
+    both = [scans / "Load1.nii.gz", scans / "Load2.nii.gz"]
+    with pytest.raises(OutputError, match="the results of 2 images need about 5 MB and the disk has 3 MB left"):
+        register(scans / "Load0.nii.gz", both, **arguments)
+    assert not (tmp_path / "new").exists()
+    assert register(scans / "Load0.nii.gz", both[:1], **arguments).cases
+
+
+def test_loads_at_once_are_those_one_after_the_other_bit_for_bit(scans, tmp_path):
+    """Two loads and a repeat scan, a failing load beside; two workers and one, on equal threads."""
+
+    def results(workers: int) -> tuple[Series, dict[str, bytes], dict[str, object]]:
+        out = tmp_path / str(workers)
+        series = register(
+            scans / "Load0.nii.gz",
+            [scans / f"{name}.nii.gz" for name in ("Turned", "Load1", "Load2")],
+            out=out,
+            repeat=scans / "again.nii.gz",
+            align="none",
+            bending=4.0,
+            workers=workers,
+            threads=1,
+        )
+        quality = {c.name: json.loads((out / c.name / "quality.json").read_text()) for c in series.cases}
+        for told in quality.values():
+            del told["alignment"]["seconds"]
+        return series, {c.name: (out / c.name / "displacement.nrrd").read_bytes() for c in series.cases}, quality
+
+    series, fields, quality = results(2)
+    again, same_fields, same_quality = results(1)
+    for one in (series, again):
+        assert list(one.failures) == ["Turned"]
+        assert "below zero" in one.failures["Turned"]
+        assert [case.name for case in one.cases] == ["Load1", "Load2", "repeat"]
+    assert fields == same_fields
+    assert len(set(fields.values())) == 3
+    assert quality == same_quality
+    floors = [quality[name]["noise_floor"] for name in ("Load1", "Load2", "repeat")]
+    assert floors[0] == floors[1] == floors[2] is not None  # the repeat scan's, whichever was finished first
+
+
+def test_row_26_two_threads_give_the_same_bits_again(tiny_pair):
+    settings = Settings((Preset("quick", QUICK, parse_parameters(QUICK)),), threads=2)
+    with Worker(threads=2) as worker:
+        one, two = (
+            register_pair(tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.bone, settings=settings, worker=worker)
+            for _ in range(2)
+        )
+    np.testing.assert_array_equal(one.bspline.coefficients_mm, two.bspline.coefficients_mm)
+    np.testing.assert_array_equal(one.alignment.motion.rotation, two.alignment.motion.rotation)
+    np.testing.assert_array_equal(one.alignment.motion.translation_mm, two.alignment.motion.translation_mm)
+    assert np.abs(one.bspline.coefficients_mm).max() > 0.5

@@ -1,0 +1,103 @@
+"""Progress in a pipe: lines now and then, with the time left; and in a terminal: what is under way."""
+
+from __future__ import annotations
+
+import io
+import re
+import time
+
+import pytest
+from rich.console import Console
+
+from mrstrain.records import progress
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time in seconds, to be set."""
+    now = [1000.0]
+    monkeypatch.setattr("mrstrain.records.progress.time.monotonic", lambda: now[0])
+    return now
+
+
+def test_lines_come_now_and_then_with_the_time_left(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.live() as told:
+        for second, fraction in ((0, 0.0), (5, 0.1), (14, 0.2), (20, 0.25), (30, 0.3), (36, 0.6), (60, 1.0), (61, 1.0)):
+            clock[0] = 1000.0 + second
+            told("Load1", "registering", fraction)
+    lines = capsys.readouterr()
+    assert lines.out == ""
+    assert lines.err.splitlines() == [
+        "Load1: registering 0 % after 0 s",
+        "Load1: registering 25 % after 20 s, 60 s left",
+        "Load1: registering 60 % after 36 s, 24 s left",
+        "Load1: registering 100 % after 60 s",
+    ]
+
+
+def test_cases_and_stages_have_clocks_of_their_own(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.live() as told:
+        told("Load1", "aligning", 0.0)
+        clock[0] += 40.0
+        told("Load1", "registering", 0.0)
+        told("Load2", "aligning", 0.5)
+        clock[0] += 20.0
+        told("Load1", "registering", 0.4)
+    assert capsys.readouterr().err.splitlines() == [
+        "Load1: aligning 0 % after 0 s",
+        "Load1: registering 0 % after 0 s",
+        "Load2: aligning 50 % after 0 s, 0 s left",
+        "Load1: registering 40 % after 20 s, 30 s left",
+    ]
+
+
+def test_of_many_stages_a_pipe_gets_the_line_of_all_alone(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with progress.live(of_all=True) as told:
+        for second in range(121):  # two minutes of a stage that tells every second
+            clock[0] = 1000.0 + second
+            told("Ada: register Load1", "aligning" if second < 30 else "registering", second / 200)
+        told("Ada: register Load1", "ended", 1.0)
+        told("all", "40 stages", 0.5)
+        for share in (0.6, 0.7, 0.8):  # there already, all at once
+            told("all", "40 stages", share)
+        clock[0] = 1180.0
+        told("Ben: mesh", "meshing", 0.5)
+        told("Ben: mesh", "meshing", 0.6)
+        told("all", "40 stages", 1.0)
+    lines = capsys.readouterr()
+    assert lines.out == ""
+    assert lines.err.splitlines() == [
+        "all: begun 0 % after 60 s",
+        "all: begun 0 % after 120 s",
+        "all: 40 stages 80 % after 180 s, 45 s left",
+        "all: 40 stages 100 % after 180 s",
+    ]
+
+
+def screen(written: str, lines: int) -> list[str]:
+    """What a terminal of some lines shows at last: the text of the last picture drawn, without its codes."""
+    last = re.split(r"\x1b\[1A\x1b\[2K(?!\x1b\[1A)|\x1b\[2K", written)[-1]
+    shown = [line.strip() for line in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", last).splitlines()]
+    return [line for line in shown if line][-lines:]
+
+
+def test_thirty_ended_stages_do_not_push_the_running_one_off_the_screen() -> None:
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=True, width=100, height=24)
+    with progress.live(of_all=True, console=console) as told:
+        time.sleep(0.3)
+        begun = screen(file.getvalue(), 24)
+        assert len(begun) == 1
+        assert begun[0].startswith("all")
+        for number in range(30):
+            told(f"simulate set-{number}", "Load1", 0.5)
+            told(f"simulate set-{number}", "Load1", 1.0)
+            told("all", "40 stages", (number + 1) / 40)
+        told("register Load4", "registering", 0.25)
+        time.sleep(0.5)  # drawn ten times a second
+        shown = screen(file.getvalue(), 24)
+    assert [line.split("%")[0].split()[0] for line in shown] == ["all:", "register"]
+    assert "75 %" in shown[0]
+    assert "25 %" in shown[1]

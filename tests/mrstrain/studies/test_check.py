@@ -1,0 +1,350 @@
+"""`check`: what `simulate` would refuse later is told now, and what a run takes grows with what it is made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.errors import InputError, RegistrationError
+from dvc.images.image import Grid, Image, LabelMap
+from dvc.io.images.read import read_image
+from dvc.io.images.write import write_image, write_labels
+from dvc.mesh import TetMesh
+from fe.mesh_file import write_tet_mesh
+from mrstrain.studies import costs, stages
+from mrstrain.studies.check import check, wrong_with
+from mrstrain.studies.file import read_study
+from mrstrain.studies.plan import Stage, plan
+from mrstrain.studies.run import forecast, run
+from tests.fe.test_simulate import dome
+
+GRID = Grid((16, 16, 16), (2.0, 2.0, 2.0), (-6.0, -6.0, -6.0))  # around the dome
+STUDY = """
+[study]
+name = "Heel"
+[images]
+load0 = "Load0.nii.gz"
+labels = "tissues.nii.gz"
+names = "tissues.csv"
+[loads.Load1]
+image = "Load1.nii.gz"
+normal_n = 15.0
+shear_n = 4.0
+[plate]
+normal = [-1.0, 0.0, 0.0]
+[registration]
+[mesh]
+[models]
+sets = ["mine.toml", "friedman"]
+"""
+MINE = '[mine]\n[mine.fat]\nlaw = "neo-Hooke"\nmu_kpa = 10.0\nnu = 0.49\n'
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """Two images of noise, a label map of bone, fat and tendon, and a set that has a law for fat alone."""
+    rng = np.random.default_rng(1)
+    for name in ("Load0", "Load1"):
+        write_image(tmp_path / f"{name}.nii.gz", Image(GRID, rng.uniform(0.0, 100.0, GRID.shape)))
+    values = np.ones(GRID.shape, dtype=np.int64)
+    values[:4], values[4:6] = 2, 3
+    write_labels(tmp_path / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 3: "tendon", 9: "skin"}))
+    (tmp_path / "mine.toml").write_text(MINE)
+    (tmp_path / "study.toml").write_text(STUDY)
+    return tmp_path
+
+
+def wrong(folder: Path, *changes: tuple[str, str]) -> str:
+    text = STUDY
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "study.toml").write_text(text)
+    return "\n".join(check(folder).wrong)
+
+
+def test_a_tissue_without_a_law_is_told_and_one_that_takes_anothers_is_not(study):
+    # tendon takes fat's; the table names a skin that no voxel has, so no cell will need its law
+    assert wrong(study) == ""
+    values = np.full(GRID.shape, 9)
+    values[:8], values[:4] = 1, 2
+    write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 9: "skin"}))
+    assert wrong(study).startswith("The set mine has no law for the region 'skin'")
+    assert wrong(study, ('"mine.toml", ', "")) == ""
+
+
+def test_a_bone_that_would_be_meshed_as_tissue_is_told(study):
+    def told() -> list[str]:
+        return [note for note in check(study).notes if note.startswith("CARE: talus")]
+
+    assert told() == []
+    values = np.ones(GRID.shape, dtype=np.int64)
+    values[:4], values[4:6] = 2, 3
+    write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 3: "talus"}))
+    assert told() == [
+        "CARE: talus will be meshed as soft tissue, and is called as a bone is: [mesh] bones leaves it out."
+    ]
+    (study / "study.toml").write_text(STUDY.replace("[mesh]", '[mesh]\nbones = ["bone", "talus"]'))
+    assert told() == []
+
+
+def test_a_plate_without_friction_carries_no_shear(study):
+    write_tet_mesh(study / "dome.vtu", dome((3, 4, 4)), {})
+    for mesh in ("[mesh]", '[mesh]\nfile = "dome.vtu"'):
+        told = wrong(
+            study, ("[registration]", "taped = false\n[registration]"), ("[mesh]", mesh), ('"mine.toml", ', "")
+        )
+        assert told.startswith("Load1: a plate without friction carries no shear")
+        assert told.count("\n") == 0
+
+
+def test_directions_of_one_load_are_looked_at_like_those_of_the_plate(study):
+    of_load = ("shear_n = 4.0", "shear_n = 4.0\nshear_direction = [2.0, 0.0, 0.0]")
+    assert "shear" in wrong(study, of_load)
+    assert wrong(study, (of_load[0], of_load[1].replace("2.0, 0.0, 0.0", "0.0, 2.0, 0.0"))) == ""
+
+
+def test_a_label_map_to_mesh_that_lies_elsewhere_and_one_image_for_two_loads_are_told(study):
+    far = Grid(GRID.shape, GRID.spacing_mm, GRID.origin_mm + np.array([500.0, 0.0, 0.0]))
+    values = np.ones(GRID.shape, dtype=np.int64)
+    values[:4] = 2
+    write_labels(study / "far.nii.gz", LabelMap(far, values, {1: "fat", 2: "bone"}))
+    there = ("[mesh]", '[mesh]\nlabels = "far.nii.gz"\nnames = "tissues.csv"')
+    assert "only 0% of what it labels lies in the unloaded image" in wrong(study, there)
+    twice = ("[plate]", '[loads.Load2]\nimage = "Load1.nii.gz"\nnormal_n = 2.0\n[plate]')
+    assert wrong(study, twice) == "Load2 is the image of Load1: every voxel is equal."
+    forceless = (twice[0], twice[1].replace("normal_n = 2.0\n", ""))
+    wrong(study, forceless)
+    assert "Load2: no force, so measured and not simulated." in check(study).notes
+
+
+def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
+    made = dome((3, 4, 4))
+    file, friedman = ("[mesh]", '[mesh]\nfile = "dome.vtu"'), ('"mine.toml", ', "")
+    write_tet_mesh(study / "dome.vtu", made, {})
+    assert wrong(study, file, friedman) == ""
+    assert "mine has no law for the region 'skin'" in wrong(study, file)
+    assert "no facets 'cut'" in wrong(study, file, friedman, ("sets", 'fixed = ["bone", "cut"]\nsets'))
+    assert wrong(study, file, friedman, ("sets", 'fixed = ["Bone"]\nsets')) == ""  # case does not count
+    assert "nothing to touch" in wrong(study, file, friedman, ("sets", 'fixed = ["skin"]\nsets'))
+    far = TetMesh(made.points_mm + 400.0, made.cells, made.regions, made.facets)
+    write_tet_mesh(study / "dome.vtu", far, {})
+    assert "dome.vtu does not lie in the image" in wrong(study, file, friedman)
+
+
+def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(study, monkeypatch):
+    tissues = LabelMap(GRID, np.ones(GRID.shape, dtype=np.int64), {1: "fat"})
+    write_labels(study / "tissues.nii.gz", tissues)
+    align, measured = ("[registration]", '[registration]\nalign = "image"'), ('"mine.toml", "friedman"', "")
+    assert "no region 'bone'" in wrong(study, measured)
+    assert "no 'bone'" in wrong(study, align)  # a comparison needs one
+    assert "no region 'sacrum'" in wrong(study, align, measured, ("labels =", 'bone = "sacrum"\nlabels ='))
+    assert wrong(study, align, measured) == ""
+    (stage,) = plan(read_study(study))
+    asked = {}
+
+    def never(reference, loaded, *, bone, settings, **_):
+        asked.update(bone=bone, on=settings.align_on)
+        raise RegistrationError("enough")
+
+    monkeypatch.setattr("mrstrain.measurement.register_one.register_pair", never)
+    body = np.zeros(GRID.shape, dtype=bool)
+    body[2:-2, 2:-2, 2:-2] = True
+    monkeypatch.setattr("mrstrain.measurement.register_one.tissue_mask", lambda _: body)
+    with pytest.raises(RegistrationError, match="enough"):
+        stages.register(lambda *_: None, **stage.arguments, repeat=[])
+    assert asked == {"bone": None, "on": "image"}
+    (study / "study.toml").write_text(
+        STUDY.replace(*align).replace('sets = ["mine.toml", "friedman"]', 'sets = ["friedman"]\nlevel = true')
+    )
+    with pytest.raises(InputError, match="level = true needs a bone"):
+        plan(read_study(study))
+
+
+def test_larger_images_and_meshes_take_longer_and_more_memory(study):
+    (study / "study.toml").write_text(STUDY.replace("[registration]", "[registration]\nborders = false"))
+    told = read_study(study)
+    by_kind = {stage.kind: stage for stage in plan(told)}
+    small, large = 126.0 * 140 * 132, 256.0**3
+    registering, simulating = by_kind["register"], by_kind["simulate"]
+    assert costs.gib_of(registering, told, small, 0.0) == pytest.approx(
+        1.06, abs=0.05
+    )  # measured: .95 for 2.1 million, 2.08 for 7.1
+    assert costs.gib_of(registering, told, large, 0.0) == pytest.approx(3.5, abs=0.1)
+    assert costs.gib_of(registering, told, 384.0**3, 0.0) == pytest.approx(10.6, abs=0.5)
+    assert costs.seconds_of(registering, told, 128.0**3, 0.0) == pytest.approx(76.0, rel=0.3)  # as measured
+    assert costs.seconds_of(registering, told, large, 0.0) == pytest.approx(215.0, rel=0.1)
+    assert costs.seconds_of(registering, told, 384.0**3, 0.0) == pytest.approx(640.0, rel=0.1)
+    for text, slower in ((STUDY, 2.5), (STUDY.replace("[registration]", '[registration]\npreset = "heel-mr"'), 1.0)):
+        (study / "study.toml").write_text(text)
+        usual = read_study(study)
+        seconds, gib = (of(registering, usual, small, 0.0) for of in (costs.seconds_of, costs.gib_of))
+        assert seconds == pytest.approx(slower * 16.3 + 43.1, rel=0.05)
+        assert gib == pytest.approx(1.29 if slower > 1.0 else 1.81, abs=0.05)
+    assert costs.gib_of(simulating, told, 0.0, 79e3) == pytest.approx(1.2)
+    assert costs.gib_of(simulating, told, 0.0, 8 * 79e3) == pytest.approx(8.2)
+    assert costs.seconds_of(simulating, told, 0.0, 8 * 79e3) > 8 * costs.seconds_of(simulating, told, 0.0, 79e3)
+    (study / "study.toml").write_text(STUDY.replace("[models]", '[models]\nelement = "P2"'))
+    exact = read_study(study)
+    assert costs.seconds_of(simulating, exact, 0.0, 6e4) == pytest.approx(
+        20.0 * costs.seconds_of(simulating, told, 0.0, 6e4)
+    )
+    assert costs.gib_of(simulating, exact, 0.0, 6e4) > 2.0 * costs.gib_of(simulating, told, 0.0, 6e4)
+    (study / "study.toml").write_text(STUDY.replace("[models]", "[models]\nlimit_minutes = 0.5"))
+    limited = read_study(study)
+    (simulating, *_) = (stage for stage in plan(limited) if stage.kind == "simulate")
+    assert costs.seconds_of(simulating, limited, 0.0, 6e4) == 30.0  # one load, one path
+
+
+def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, monkeypatch):
+    (study / "study.toml").write_text(STUDY.replace("[registration]", "[registration]\nborders = false"))
+    told = read_study(study)
+    load = next(stage for stage in plan(told) if stage.kind == "register")
+    left = [replace(load, name=f"register {k}") for k in range(4)]
+
+    def care(gib: float, workers: int = 3) -> list[str]:
+        monkeypatch.setattr(costs, "usable_memory_bytes", lambda: int(gib * 1024**3))
+        return [line for line in costs.costs(told, left, left, 256.0**3, 0.0, workers) if line.startswith("CARE")]
+
+    assert care(12.0) == []  # three of 3.9 GiB
+    assert care(8.0) == ["CARE: this machine has 8.0 GiB of memory; run with --workers 2."]
+    assert care(8.0, workers=2) == []
+    assert "crop the images" in care(3.0)[0]
+
+
+def test_what_is_fixed_beside_the_bone_has_to_be_there_and_decides_what_is_done_anew(study):
+    friedman = ('"mine.toml", ', "")
+    assert "beside the bone's surface the cut may be fixed" in wrong(
+        study, friedman, ("sets", 'fixed = ["skin"]\nsets')
+    )
+    assert "needs a tissue called skin" in wrong(study, friedman, ("sets", 'fixed = ["Cut"]\nsets'))
+
+    def held(fixed: str) -> object:
+        wrong(study, friedman, ("sets", f"{fixed}sets"))
+        return next(stage.arguments["fixed"] for stage in plan(read_study(study)) if stage.kind == "simulate")
+
+    assert held("") == held('fixed = ["bone"]\n') == ("bone",)
+    assert held('fixed = ["cut"]\n') == ("bone", "cut")
+
+
+def test_a_run_refuses_before_it_begins_what_all_of_it_needs(study, monkeypatch):
+    def never(*_, **__):
+        raise AssertionError("a cluster was started")
+
+    monkeypatch.setattr("mrstrain.studies.cluster.cluster", never)
+    for change, told in (
+        (("labels =", 'bone = "calcaneuz"\nlabels ='), "no region 'calcaneuz'"),
+        (("[mesh]", "[mesh]\nedge_mm = 0.02"), "half a voxel"),
+        (("[mesh]", '[mesh]\nfiner = { region = "skni", edge_mm = 1.0 }'), "no region 'skni'"),
+        (("sets =", 'fixed = ["skin"]\nsets ='), "the cut may be fixed"),
+    ):
+        assert told in wrong(study, change)
+        for begin in (run, forecast):
+            with pytest.raises(InputError, match=f"(?s)cannot be run as it is.*Heel: .*{told}"):
+                begin(study)
+        if "bone =" not in change[1]:
+            assert forecast(study, only=("register",))["register Load1"] == "run"
+    assert not (study / "results").exists()
+    (study / "study.toml").write_text(STUDY.replace("labels =", 'bone = "calcaneuz"\nlabels ='))
+    assert forecast(study, only=("mesh", "simulate"))["simulate friedman"] == "run"
+
+
+def test_stages_are_refused_by_what_they_need_and_not_by_what_others_do(study):
+    def refused(*only: str) -> str:
+        try:
+            what = forecast(study, only=only)
+        except InputError as wrong:
+            return str(wrong)
+        assert "run" in what.values()
+        return ""
+
+    values = np.full(GRID.shape, 9)
+    values[:8], values[:4] = 1, 2
+    write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 9: "skin"}))
+    assert "mine has no law for the region 'skin'" in refused("mesh", "simulate mine")
+    assert refused("mesh") == refused("register") == refused("mesh", "simulate friedman") == ""
+    second = STUDY.replace(
+        "[plate]", '[loads.Load2]\nimage = "Load1.nii.gz"\nnormal_n = 2.0\nshear_direction = [2.0, 0.0, 0.0]\n[plate]'
+    )
+    (study / "study.toml").write_text(second)
+    assert refused("register Load1") == refused("mesh") == ""
+    assert "shear" in refused("register Load2")
+    (study / "study.toml").write_text(STUDY.replace("[registration]", "taped = false\n[registration]"))
+    assert "a plate without friction" in refused("mesh", "simulate friedman")
+    assert refused("mesh") == ""
+
+
+@pytest.mark.parametrize("name", ["Load0", "tissues"])
+def test_an_image_that_all_registrations_read_is_refused_where_it_is_damaged(study, name):
+    file = study / f"{name}.nii.gz"
+    file.write_bytes(file.read_bytes()[:-99])
+    with pytest.raises(InputError, match=f"(?s)cannot be run as it is.*{name}"):
+        forecast(study, only=("register",))
+    if name == "Load0":
+        assert forecast(study, only=("mesh",))["mesh"] == "run"
+
+
+def test_what_is_meshed_is_looked_at_as_it_is(study):
+    """Labels in voxels of 1 mm are meshed at .6 mm; brought to the image's 2 mm for all else."""
+    fine = Grid((32, 32, 32), (1.0, 1.0, 1.0), (-6.5, -6.5, -6.5))
+    values = np.ones(fine.shape, dtype=np.int64)
+    values[:8] = 2
+    write_labels(study / "tissues.nii.gz", LabelMap(fine, values, {1: "fat", 2: "bone"}))
+    assert wrong(study, ("[mesh]", "[mesh]\nedge_mm = 0.6")) == ""
+    assert "half a voxel" in wrong(study, ("[mesh]", "[mesh]\nedge_mm = 0.4"))
+
+
+def test_a_damaged_loaded_image_is_left_to_its_stage(study):
+    (study / "Load1.nii.gz").write_bytes((study / "Load1.nii.gz").read_bytes()[:-99])
+    assert "Load1.nii.gz" in "".join(check(study).wrong)
+    told = read_study(study)
+    assert wrong_with(told, plan(told)) == ()
+
+
+@pytest.mark.parametrize(("given", "told"), [("[0.5, 0.2]", "must rise"), ("[20.0, 50.0]", "no percent")])
+def test_a_range_of_strain_that_no_comparison_takes_is_refused_with_the_study_file(study, given, told):
+    (study / "study.toml").write_text(STUDY + f"[compare]\nstrains = {given}\n")
+    with pytest.raises(InputError, match=rf"\[compare\] 'strains': .*{told}"):
+        read_study(study)
+
+
+def test_gaps_are_left_out_where_the_study_says_so(study):
+    image = read_image(study / "Load1.nii.gz")
+    values = image.values.copy()
+    values[3, 3, 3] = np.nan
+    write_image(study / "Load1.nii.gz", Image(GRID, values))
+    assert "1 of 4096 voxels are NaN" in wrong(study)
+    masked = ("labels =", "allow_missing = true\nlabels =")
+    assert wrong(study, masked) == ""
+    (registered, *_) = plan(read_study(study))
+    assert registered.arguments["allow_missing"]
+    level = ("[models]", "[models]\nlevel = true")
+    assert wrong(study, masked, level) == ""  # which reads the unloaded image alone
+    write_image(study / "Load0.nii.gz", Image(GRID, values[::-1]))
+    assert "level = true needs an unloaded image without" in wrong(study, masked, level)
+    with pytest.raises(InputError, match="level = true"):
+        forecast(study)
+    assert forecast(study, only=("register",))["register Load1"] == "run"
+
+
+def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
+    (study / "study.toml").write_text(STUDY)
+    told = read_study(study)
+    first = next(stage for stage in plan(told) if stage.kind == "register")
+    row = [first]
+    for k in range(3):
+        row.append(replace(first, name=f"register {k}", after=(row[-1].name,)))
+    apart = [replace(first, name=f"register {k}") for k in range(4)]
+    one = costs.seconds_of(first, told, 1e6, 0.0)
+
+    def minutes(stages: list[Stage]) -> float:
+        return float(costs.costs(told, stages, stages, 1e6, 0.0, 8)[0].split("about ")[1].split()[0])
+
+    assert minutes(apart) == pytest.approx(one / 60.0, abs=0.5)
+    assert minutes(row) == pytest.approx(4 * one / 60.0, abs=0.5)
+    levelled = replace(first, name="level trebbi Load1")
+    (study / "study.toml").write_text(STUDY + '[loads.Load2]\nimage = "Load1.nii.gz"\n')
+    assert costs.disk_bytes(levelled, read_study(study), 1e6) == costs.disk_bytes(levelled, told, 1e6)

@@ -1,0 +1,151 @@
+"""The demonstration's study file, in both sizes, and one load of it on coarse voxels; `make demo` runs it whole."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import partial
+from importlib import import_module
+
+import pytest
+
+from dvc.errors import OutputError
+from dvc.io.images.labels import read_labels
+from dvc.report.page import Section
+from dvc.trust.verdict import Verdict
+from mrstrain.models.loads import LOADS
+from mrstrain.studies.demo import _make, _reached, _told
+from mrstrain.studies.file import read_study
+from mrstrain.studies.ledger import Record
+from mrstrain.studies.pipeline import Outcome
+from mrstrain.studies.plan import plan
+from mrstrain.studies.run import Ran, run
+from mrstrain.studies.stages import Given
+from mrstrain.studies.true_error import read_errors, write_errors
+from mrstrain.truth.phantom import phantom
+from phantoms.tissue_error import TissueError
+
+demonstration = import_module("mrstrain.studies.demo")  # the package has a function of that name
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "phantom.json").write_text(json.dumps({"parameters": {"seed": 1}}))  # as if the images were there
+    return tmp_path
+
+
+def test_three_sets_on_a_coarser_mesh(folder):
+    _make(folder, 1, False, None)
+    study = read_study(folder)
+    names = [stage.name for stage in plan(study)]
+    assert names[:6] == ["register repeat", *(f"register {x.name}" for x in LOADS), "mesh"]
+    assert [n.split()[0] for n in names[6:]] == ["simulate"] * 3 + ["compare"]
+    for load in LOADS:
+        told = study.loads[load.name]
+        assert (told.normal_n, told.shear_n) == (load.normal_n, load.shear_n or 0.0)
+    labels = read_labels(study.path(str(study.mesh.labels)), study.path(str(study.mesh.names)))
+    assert labels.grid.spacing_mm[0] > 1.0
+
+
+def test_the_published_size_has_all_seven_sets(folder):
+    _make(folder, 1, True, None)
+    study = read_study(folder)
+    assert len(study.models.sets) == 7
+    assert study.mesh.edge_mm < 3.0
+
+
+def test_another_phantom_in_the_folder_is_refused(folder):
+    with pytest.raises(OutputError, match="seed 1"):
+        _make(folder, 2, False, None)
+
+
+def test_a_study_of_ones_own_is_not_touched(tmp_path):
+    (tmp_path / "study.toml").write_text("mine")
+    with pytest.raises(OutputError, match="would replace"):
+        _make(tmp_path, 1, False, None)
+    assert (tmp_path / "study.toml").read_text() == "mine"
+
+
+def test_changes_to_its_study_file_are_kept(folder):
+    _make(folder, 1, False, None)
+    changed = (folder / "study.toml").read_text().replace('"luboz", ', "")
+    (folder / "study.toml").write_text(changed)
+    _make(folder, 1, False, None)
+    assert (folder / "study.toml").read_text() == changed
+
+
+def test_it_ends_with_five_lines_and_the_reports_path(folder):
+    _make(folder, 1, False, None)
+    study = read_study(folder)
+
+    def ended(stage: str, *lines: str, verdict: str | None = None, complete: bool = True) -> Outcome:
+        sections = () if verdict is None else (Section(stage, verdict=Verdict(verdict, ("why",))),)
+        given = Given(lines, sections, complete=complete)
+        return Outcome(stage, Record(stage=stage, key="", made_utc="", seconds=1.0, files={}, given=given))
+
+    outcomes = {
+        f"register {load.name}": ended(f"register {load.name}", verdict="caution" if load.name == "Load3" else "trust")
+        for load in LOADS
+    }
+    outcomes["compare"] = ended(
+        "compare", "Load1: trebbi 1.0", "All loads: trebbi 2.5", "Nearest over all loads: trebbi."
+    )
+    errors = {x.name: (TissueError("fat", 9, 0.1, 0.44, 0.0221, 0.0, 0.1, 0.1, 0.2, 0),) for x in LOADS}
+    lines = _told(errors, Ran(study, outcomes))
+    assert len(lines) == 5
+    assert "Load1 trust" in lines[0]
+    assert "Load3 use with care" in lines[0]
+    assert "Load4 0.022 of 0.44" in lines[1]
+    assert lines[2:4] == ["All loads: trebbi 2.5", "Nearest over all loads: trebbi."]
+    assert lines[4] == f"Report: {folder / 'results' / 'report.html'}"
+    outcomes["simulate luboz"] = ended("simulate luboz", "luboz, Load1: ONLY 75% of the load", complete=False)
+    lines = _told(errors, Ran(study, outcomes))
+    assert lines[4] == "simulate luboz: in part. luboz, Load1: ONLY 75% of the load"
+    assert lines[5].startswith("Report: ")
+
+
+def test_a_model_that_its_limit_of_time_ended_is_no_failure_of_the_demonstration():
+    def reached(*, timed_out: bool, reason: str = "", there: bool = True) -> bool:
+        given = Given((), complete=False, timed_out=timed_out)
+        record = Record(stage="simulate friedman", key="", made_utc="", seconds=1.0, files={}, given=given)
+        return _reached(Outcome("simulate friedman", record if there else None, reason))
+
+    assert reached(timed_out=True)
+    assert not reached(timed_out=False)
+    assert not reached(timed_out=True, reason="Made from other inputs than the study names now.")
+    assert not reached(timed_out=True, there=False)
+
+
+def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_truth(tmp_path, monkeypatch):
+    """Load2 alone, voxels of 2 mm, and nothing but its registration."""
+    (load2,) = (load for load in LOADS if load.name == "Load2")
+    monkeypatch.setattr(demonstration, "LOADS", [load2])
+    monkeypatch.setattr(demonstration, "phantom", partial(phantom, spacing_mm=2.0, loads=["Load2"]))
+    monkeypatch.setattr(demonstration, "run", partial(run, only=["register Load2"]))
+    shown = demonstration.demo(tmp_path / "demo", seed=3)
+    assert not shown.complete  # the rest has no result
+    assert shown.lines[0].startswith("Verdicts on the registrations: Load2 ")
+    error, true = (float(word) for word in re.search(r"Load2 ([\d.]+) of ([\d.]+)", shown.lines[1]).groups())
+    assert 0.0 < error < 0.5 * true
+    report = tmp_path / "demo" / "results" / "report.html"
+    assert shown.lines[-1] == f"Report: {report}"
+    assert "Error against the truth" in report.read_text()
+    before = (tmp_path / "demo" / "error.csv").read_bytes()
+    assert demonstration.demo(tmp_path / "demo", seed=3).lines == shown.lines  # nothing is done again
+    assert (tmp_path / "demo" / "error.csv").read_bytes() == before
+
+
+def test_errors_are_read_again_while_their_registrations_are_the_same(tmp_path):
+    def outcomes(made_utc: str) -> dict[str, Outcome]:
+        record = Record(stage="register Load1", key="", made_utc=made_utc, seconds=1.0, files={}, given=Given(()))
+        return {"register Load1": Outcome("register Load1", record)}
+
+    errors = {
+        "Load1": tuple(TissueError(name, 12345, 0.1, 0.4, 1 / 3, -0.01, 0.05, 0.1, 0.2, 1) for name in ("fat", "a, b"))
+    }
+    write_errors(tmp_path / "error.csv", errors, outcomes("then"))
+    assert read_errors(tmp_path / "error.csv", outcomes("then")) == errors
+    assert read_errors(tmp_path / "error.csv", outcomes("since")) == {}
+    assert read_errors(tmp_path / "none.csv", outcomes("then")) == {}
+    (tmp_path / "own.csv").write_text("a,b\n1,2\n")
+    assert read_errors(tmp_path / "own.csv", outcomes("then")) == {}

@@ -1,0 +1,231 @@
+"""The study file: what is read from it, and everything that is refused, at once and with the nearest known key."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dvc.errors import InputError
+from mrstrain.studies.file import _fields_at, read_study
+from mrstrain.studies.ledger import Ledger
+from mrstrain.studies.plan import plan
+
+WHOLE = """
+[study]
+name = "Heel"
+[images]
+load0 = "Load0.nii.gz"
+labels = "tissues.nii.gz"
+[loads.Load1]
+image = "Load1.nii.gz"
+normal_n = 140
+[loads.Load2]
+image = "Load2.nii.gz"
+normal_n = 15.0
+shear_n = 45.0
+[models]
+sets = ["trebbi", "luboz"]
+results = ["ansys"]
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    (folder / "study.toml").write_text(text)
+    return folder
+
+
+def test_values_and_paths_start_from_the_file(tmp_path):
+    study = read_study(written(tmp_path, WHOLE))
+    assert study.loads["Load1"].normal_n == 140.0
+    assert study.path(study.images.load0) == tmp_path / "Load0.nii.gz"
+    assert study.out == tmp_path / "results"
+    assert study.plate.normal == (0.0, 0.0, -1.0)
+    assert read_study(tmp_path / "study.toml") == study
+
+
+def test_everything_wrong_is_told_at_once_with_the_nearest_key(tmp_path):
+    text = WHOLE.replace("normal_n = 140", "norml_n = 140").replace('name = "Heel"', 'nam = "Heel"')
+    text = text.replace("shear_n = 45.0", 'shear_n = "45"') + "[mesh]\nedge = 2.0\n[meshing]\n"
+    with pytest.raises(InputError) as told:
+        read_study(written(tmp_path, text))
+    for sentence in (
+        "[study] 'name' is missing",
+        "[study] 'nam' is no key here; did you mean 'name'?",
+        "[loads.Load1] 'norml_n' is no key here; did you mean 'normal_n'?",
+        "[loads.Load2] 'shear_n'",
+        "[mesh] 'edge' is no key here; did you mean 'edge_mm'?",
+        "'meshing' is no key here; did you mean 'mesh'?",
+    ):
+        assert sentence in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("normal_n = 140", "normal_n = true", "normal_n"),
+        ("normal_n = 140", "normal_n = -5.0", "greater than 0"),
+        ("normal_n = 140", "normal_n = nan", "normal_n"),
+        ("[loads.Load1]", '[loads."../Load1"]', "folder"),
+        ("[loads.Load1]", '[loads."repeat"]', "repeat scan"),
+        ('sets = ["trebbi", "luboz"]', 'sets = ["trebbi", "trebbi"]', "only once"),
+        ('name = "Heel"', 'name = "Heel"\nout = "../elsewhere"', "below the study's own folder"),
+        ('name = "Heel"', 'name = "Heel"\nout = "/tmp/elsewhere"', "below the study's own folder"),
+        ('name = "Heel"', 'name = "Heel"\nout = "."', "below the study's own folder"),
+        ('name = "Heel"', 'name = "Heel"\nseed = 0', "seed"),
+        ("[study]", "[study", "no TOML"),
+        ("[study]", 'place = "/tmp"\n[study]', "'place' is no key"),
+    ],
+)
+def test_refused(tmp_path, old, new, words):
+    assert old in WHOLE
+    with pytest.raises(InputError, match=words):
+        read_study(written(tmp_path, WHOLE.replace(old, new)))
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(InputError, match="mrstrain init"):
+        read_study(tmp_path)
+
+
+def test_the_plan_names_every_stage_behind_what_it_waits_for(tmp_path):
+    text = WHOLE.replace('labels = "', 'repeat = "again.nii.gz"\nlabels = "') + "level = true\ndrive = true\n"
+    stages = plan(read_study(written(tmp_path, text)))
+    names = [stage.name for stage in stages]
+    assert names == [
+        "register repeat", "register Load1", "register Load2", "mesh",
+        "simulate trebbi", "drive trebbi", "level trebbi Load1", "level trebbi Load2",
+        "simulate luboz", "drive luboz", "level luboz Load1", "level luboz Load2", "compare",
+    ]  # fmt: skip
+    for at, stage in enumerate(stages):
+        assert set(stage.before) <= set(names[:at])
+    by_name = dict(zip(names, stages, strict=True))
+    assert by_name["register Load2"].before == ("register repeat",)
+    assert by_name["level trebbi Load1"].before == ("simulate trebbi",)
+    assert tmp_path / "ansys" in by_name["compare"].files
+
+
+def test_chained_loads_wait_for_one_another(tmp_path):
+    stages = plan(read_study(written(tmp_path, WHOLE + "[registration]\nchain = true\n")))
+    assert next(s for s in stages if s.name == "register Load2").before == ("register Load1",)
+
+
+def test_a_simulated_load_needs_its_force(tmp_path):
+    text = WHOLE.replace("normal_n = 15.0\n", "")
+    with pytest.raises(InputError, match=r"loads.Load2\] normal_n is missing"):
+        plan(read_study(written(tmp_path, text)))
+    alone = text.replace("shear_n = 45.0\n", "") + "level = true\n"
+    stages = {stage.name: stage for stage in plan(read_study(written(tmp_path, alone)))}
+    assert [load["name"] for load in stages["simulate trebbi"].arguments["loads"]] == ["Load1"]
+    assert {name for name in stages if name.startswith("level trebbi")} == {"level trebbi Load1"}
+    assert "register Load2" in stages  # measured all the same
+    with pytest.raises(InputError, match=r"loads.Load1\] normal_n is missing: no load has a force"):
+        plan(read_study(written(tmp_path, alone.replace("normal_n = 140\n", ""))))
+    measured = text.replace('sets = ["trebbi", "luboz"]', "sets = []")
+    assert [s.kind for s in plan(read_study(written(tmp_path, measured)))] == ["register", "register", "compare"]
+
+
+def test_a_load_has_the_plates_directions_or_its_own(tmp_path):
+    text = WHOLE.replace("shear_n = 45.0", "shear_n = 45.0\nshear_direction = [1.0, 0.0, 0.0]")
+    (found,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "simulate trebbi")
+    assert found.arguments["towards"] == {"Load2": ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0))}
+    measured = {s.name: s.arguments["shear_direction"] for s in plan(read_study(tmp_path)) if s.kind == "register"}
+    assert measured == {"register Load1": (0.0, -1.0, 0.0), "register Load2": (1.0, 0.0, 0.0)}
+    (found,) = (s for s in plan(read_study(written(tmp_path, WHOLE))) if s.name == "simulate trebbi")
+    assert found.arguments["towards"] == {}
+
+
+def test_weights_of_the_engine_and_the_plates_pivot_reach_their_stages(tmp_path):
+    text = WHOLE + "[registration]\nvolume = 3.0\n[plate]\npivot_mm = [1.0, 2.0, 3.0]\n"
+    stages = {stage.name: stage.arguments for stage in plan(read_study(written(tmp_path, text)))}
+    assert stages["register Load1"]["volume"] == 3.0
+    assert "bending" not in stages["register Load1"]
+    assert stages["simulate trebbi"]["pivot_mm"] == (1.0, 2.0, 3.0)
+
+
+def test_a_simulation_may_have_a_limit_of_time(tmp_path):
+    for text, limit in ((WHOLE + "limit_minutes = 2.5\n", 150.0), (WHOLE, None)):
+        (simulated,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "simulate trebbi")
+        assert simulated.arguments["limit_s"] == limit
+
+
+def test_the_page_on_studies_names_every_key_and_no_other():
+    page = (Path(__file__).parents[3] / "docs" / "study.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `\[(\w+)(?:\.NAME)?\]` \|(.*)\|$", page, re.MULTILINE)
+    assert {table for table, _ in rows} == set(_fields_at([]))
+    for table, keys in rows:
+        known = set(_fields_at([table, "NAME"] if table == "loads" else [table]))
+        assert set(re.findall(r"`(\w+)`", keys)) == known, table
+
+
+def test_two_models_of_one_name_are_refused(tmp_path):
+    with pytest.raises(InputError, match="rename the folder"):
+        plan(read_study(written(tmp_path, WHOLE.replace('["ansys"]', '["other/trebbi"]'))))
+
+
+def test_a_set_whose_name_is_no_folder_is_refused(tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        '["../.."]\ntitle = "x"\nsource = "x"\n["../..".all]\nlaw = "neo-Hooke"\nmu_kpa = 10.0\nnu = 0.49\n'
+    )
+    with pytest.raises(InputError, match="folder"):
+        plan(read_study(written(tmp_path, WHOLE.replace('"luboz"', '"mine.toml"'))))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"tissues.nii.gz"', '"results/tissues.nii.gz"'),
+        ('results = ["ansys"]', 'results = ["results/models/ansys"]'),
+        ('name = "Heel"', 'name = "Heel"\nout = "ansys/here"'),
+    ],
+)
+def test_inputs_and_results_do_not_lie_in_one_another(tmp_path, old, new):
+    assert old in WHOLE
+    with pytest.raises(InputError, match="is an input and lies in the folder of the results"):
+        plan(read_study(written(tmp_path, WHOLE.replace(old, new))))
+
+
+def test_a_model_is_levelled_by_the_preset_that_measured(tmp_path):
+    text = WHOLE + 'level = true\n[registration]\nparameters = ["mine.txt"]\n'
+    (stage,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "level trebbi Load1")
+    assert stage.arguments["parameters"] == [str(tmp_path / "mine.txt")]
+    assert tmp_path / "mine.txt" in stage.files
+
+
+def test_borders_are_asked_of_measurement_and_levelling_and_their_results_are_others(tmp_path):
+    text = WHOLE + "level = true\n[registration]\n"
+    keys: dict[str, list[str]] = {}
+    for borders in ("false", "true"):
+        for stage in plan(read_study(written(tmp_path, text + f"borders = {borders}\n"))):
+            if stage.kind in {"register", "level"}:
+                assert stage.arguments["borders"] is (borders == "true")
+                alone = replace(stage, files=())
+                ledger = Ledger(tmp_path / "results", tmp_path)
+                key = ledger.key(alone, ledger.made_from(alone, stage.arguments), {})
+                keys.setdefault(stage.name, []).append(key)
+    assert len(keys) > 2
+    assert all(plain != with_borders for plain, with_borders in keys.values())
+
+
+def test_files_that_inputs_name_are_inputs_too(tmp_path):
+    (tmp_path / "ansys").mkdir()
+    (tmp_path / "heel.cdb").write_text("x")
+    (tmp_path / "ansys" / "model.toml").write_text('mesh = "../heel.cdb"\n')
+    (tmp_path / "own.vtu").write_text("x")
+    (tmp_path / "own.json").write_text("{}")
+    stages = plan(read_study(written(tmp_path, WHOLE + '[mesh]\nfile = "own.vtu"\n')))
+    files = {stage.name: [path.resolve() for path in stage.files] for stage in stages}
+    assert tmp_path / "heel.cdb" in files["compare"]
+    assert tmp_path / "own.json" in files["simulate trebbi"]
+
+
+def test_unit_and_frame_are_those_of_a_mesh_made_elsewhere(tmp_path):
+    (tmp_path / "own.vtu").write_text("x")
+    of_file = WHOLE + '[mesh]\nfile = "own.vtu"\nunit = "m"\nframe = "RAS"\n'
+    simulated = [stage for stage in plan(read_study(written(tmp_path, of_file))) if stage.kind == "simulate"]
+    assert {(stage.arguments["mesh_unit"], stage.arguments["mesh_frame"]) for stage in simulated} == {("m", "RAS")}
+    for key in ('unit = "m"', 'frame = "RAS"'):
+        with pytest.raises(InputError, match="no 'file' names one"):
+            read_study(written(tmp_path, WHOLE + f"[mesh]\n{key}\n"))

@@ -1,0 +1,116 @@
+"""`init`: what it finds, what it passes over and says so, and every key of a study file in what it writes."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from dvc.errors import InputError
+from mrstrain.studies.file import Load, Study, read_study
+from mrstrain.studies.init import init
+
+
+def folder_of(place: Path, *names: str) -> Path:
+    for name in names:
+        (place / name).write_bytes(b"")
+    return place
+
+
+def test_what_has_no_role_is_told_and_stands_in_the_study_file(tmp_path):
+    folder_of(
+        tmp_path, "Load0.nii.gz", "Load1.nii.gz", "Load1.nrrd", "Load1-again.nii.gz", "T1 <scout>.nii.gz",
+        "labels.nii.gz", "tissues.nii.gz", "calcaneus.nii.gz", "other-bone.nii.gz",
+    )  # fmt: skip
+    begun = init(tmp_path, name='S07 "left" \U0001f9b6')
+    told, text = "\n".join(begun.summary()), begun.path.read_text()
+    study = read_study(tmp_path)
+    assert study.study.name == 'S07 "left" \U0001f9b6'
+    assert (study.images.labels, study.images.bone_mask) == ("labels.nii.gz", "calcaneus.nii.gz")
+    assert study.loads["Load1"].image == "Load1.nii.gz"
+    for name, why in (
+        ("tissues.nii.gz", "since labels.nii.gz is taken for the label map"),
+        ("other-bone.nii.gz", "since calcaneus.nii.gz is taken for the bone"),
+        ("Load1.nrrd", "since Load1.nii.gz is taken for the load of that name"),
+        ("Load1-again.nii.gz", "whose name tells no role"),
+        ("T1 <scout>.nii.gz", "whose name tells no role"),
+    ):
+        assert f"NOT USED: {name}, {why}" in told
+        assert f'# NOT USED: "{name.split("<", maxsplit=1)[0]}' in text
+        assert why in text
+    assert told.count("NOT USED") == text.count("NOT USED") == 5
+
+
+def test_two_unloaded_images_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"both Load0\.nii\.gz and unloaded\.nii\.gz"):
+        init(folder_of(tmp_path, "Load0.nii.gz", "unloaded.nii.gz"))
+
+
+def tables_of(text: str) -> dict[str, dict[str, str]]:
+    """Every line ``key = value`` of a study file by its table, those that are commented out among them."""
+    tables: dict[str, dict[str, str]] = {}
+    for line in text.splitlines():
+        if head := re.match(r"(?:# )?\[(\w+)[\].]", line):
+            at = tables.setdefault(head[1], {})
+        elif given := re.match(r"(?:# )?(\w+) = (.+)", line):
+            at.setdefault(given[1], line.removeprefix("# "))
+    return tables
+
+
+@pytest.mark.parametrize("names", [(), ("Load0.nii.gz", "Load1.nii.gz", "tissues.nii.gz", "to_mesh-labels.nii.gz")])
+def test_every_key_of_a_study_file_stands_in_it_with_its_default(tmp_path, names):
+    tables = tables_of(init(folder_of(tmp_path, *names)).path.read_text())
+    parts = {name: one.annotation for name, one in Study.model_fields.items() if name != "place"}
+    parts["loads"] = Load
+    assert set(tables) == set(parts)
+    for table, model in parts.items():
+        assert isinstance(model, type)
+        assert issubclass(model, BaseModel)
+        assert set(tables[table]) == set(model.model_fields), table
+        for key, line in tables[table].items():
+            (value,) = tomllib.loads(line).values()  # each is TOML once the # is taken away
+            default = model.model_fields[key].get_default()
+            if not model.model_fields[key].is_required() and default not in (None, ()):
+                assert (tuple(value) if isinstance(value, list) else value) == default, key
+
+
+def test_init_of_an_empty_folder_says_what_is_missing(tmp_path):
+    told = "\n".join(init(tmp_path).summary())
+    assert "Load0: NOT FOUND" in told
+    with pytest.raises(InputError, match=r"\[images\] 'load0' is missing"):
+        read_study(tmp_path)
+    assert "Put in what was not found, and the forces" in told
+
+
+def test_dicom_folders_are_found_whatever_their_files_are_called(tmp_path):
+    for folder, name in (("Load0", "IM0001"), ("Load1", "I1.IMA"), ("Load2", "A.DCM"), ("Load3", "notes.txt")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / name).write_bytes(bytes(128) + b"DICM" if folder in ("Load0", "Load1") else b"x")
+    begun = init(tmp_path)
+    assert begun.found.load0 == "Load0"
+    assert begun.found.loads == {"Load1": "Load1", "Load2": "Load2"}
+    assert "NOT USED: Load3, a folder without a DICOM image in it" in begun.summary()
+    assert "Put in what was not found" in begun.summary()[-1]  # the label map
+    (tmp_path / "study.toml").unlink()
+    (tmp_path / "tissues.nii.gz").touch()
+    assert "Put the forces in" in init(tmp_path).summary()[-1]
+
+
+def test_a_dicom_folder_may_hold_many_other_files(tmp_path):
+    (tmp_path / "Load0").mkdir()
+    for name in (*(f"A{n:02d}.bmp" for n in range(25)), "I1.dcm"):
+        (tmp_path / "Load0" / name).write_bytes(b"x")
+    assert init(tmp_path).found.load0 == "Load0"
+
+
+def test_enhanced_dicom_files_are_found_and_single_slices_left_alone(tmp_path, monkeypatch):
+    for name in ("Load0.dcm", "Load1.DCM", "load2_slice1.dcm", "load2_slice2.dcm", "notes.dcm"):
+        (tmp_path / name).write_bytes(bytes(128) + b"DICM")  # no image at all
+    assert init(tmp_path).found.load0 is None
+    (tmp_path / "study.toml").unlink()
+    monkeypatch.setattr("mrstrain.studies.init.is_multiframe", lambda path: path.stem in ("Load0", "Load1"))
+    found = init(tmp_path).found
+    assert (found.load0, found.loads, found.passed_over) == ("Load0.dcm", {"Load1": "Load1.DCM"}, {})

@@ -1,0 +1,199 @@
+"""A study's report: whose verdict stands at its head, what is lacking, how it was measured, and a phantom's error."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from dvc.errors import MrstrainError, ParameterError
+from dvc.report.page import Section
+from dvc.trust.verdict import Verdict
+from mrstrain.cli.app import app
+from mrstrain.studies.file import Study, read_study
+from mrstrain.studies.ledger import Ledger, Record
+from mrstrain.studies.page import write_run_report
+from mrstrain.studies.pipeline import Outcome
+from mrstrain.studies.plan import plan
+from mrstrain.studies.run import Ran, report, run
+from mrstrain.studies.stages import Given
+from mrstrain.studies.true_error import TABLE, write_errors
+from phantoms.tissue_error import TissueError
+from tests.mrstrain.comparison.test_methods import measured
+
+STUDY = """
+[study]
+name = "Heel"
+[images]
+load0 = "Load0.nii.gz"
+labels = "tissues.nii.gz"
+[loads.Load1]
+image = "Load1.nii.gz"
+normal_n = 140
+[loads.Load2]
+image = "Load2.nii.gz"
+normal_n = 15
+[models]
+sets = ["trebbi"]
+"""
+SOUND = Given((), (Section("Load1", Verdict("trust")),))
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Study:
+    (tmp_path / "study.toml").write_text(STUDY)
+    for name in ("Load0", "Load1", "Load2", "tissues"):
+        (tmp_path / f"{name}.nii.gz").write_bytes(name.encode())
+    return read_study(tmp_path)
+
+
+def record(stage: str, given: Given, made: str = "2026-01-01T00:00:00Z") -> Record:
+    return Record(stage=stage, key="", made_utc=made, seconds=1.0, files={}, given=given)
+
+
+def ended(study: Study, **given: Given | str) -> dict[str, Outcome]:
+    """Outcomes of all stages: records where something is given, reasons where a sentence is, else not asked for."""
+    outcomes = {}
+    for stage in plan(study):
+        one = given.get(stage.name.replace(" ", "_"))
+        if isinstance(one, Given):
+            outcomes[stage.name] = Outcome(stage.name, record(stage.name, one))
+        else:
+            outcomes[stage.name] = Outcome(stage.name, None, one or "Not run: nobody asked.", asked=one is not None)
+    return outcomes
+
+
+def page_of(study: Study, outcomes: dict[str, Outcome]) -> str:
+    study.out.mkdir(exist_ok=True)
+    write_run_report(study.out / "report.html", study, outcomes)
+    return (study.out / "report.html").read_text()
+
+
+def head(page: str) -> str:
+    """What stands between title and table of contents, as text."""
+    return " ".join(re.sub(r"<[^>]+>", " ", page.split("<h1>")[1].split("<h2>", maxsplit=1)[0]).split())
+
+
+def test_what_was_not_asked_for_or_failed_is_no_verdict_on_the_registrations(study: Study) -> None:
+    sound = {"register_Load1": SOUND, "register_Load2": SOUND}
+    only = ended(study, **sound)
+    told = head(page_of(study, only))
+    assert told.startswith("Heel Trust The measurement: 2 images are registered soundly. Not asked for")
+    assert told.endswith("without a result: mesh, simulate trebbi, compare.")
+    assert Ran(study, only).complete
+    assert "Not asked for, and without a result: mesh, simulate trebbi, compare." in Ran(study, only).summary()
+
+    broken = ended(study, **sound, mesh="It broke.\nTraceback", simulate_trebbi="Not run: mesh has no result.")
+    told = head(page_of(study, broken))
+    assert "Do not trust" not in told
+    assert "Not whole: mesh failed (It broke); simulate trebbi not run (mesh has no result)." in told
+    assert "Traceback" not in told
+    assert not Ran(study, broken).complete
+
+    part = ended(study, **sound, mesh=SOUND, simulate_trebbi=Given((), complete=False))
+    assert "Not whole: simulate trebbi in part." in head(page_of(study, part))
+    assert not Ran(study, part).complete
+
+
+def test_a_registration_that_is_not_to_be_trusted_heads_the_report(study: Study) -> None:
+    folded = Given((), (Section("Load2", Verdict("distrust", ("It folds.",))),))
+    told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=folded)))
+    assert told.startswith("Heel Do not trust It folds.")
+    # a comparison made of it before is not what is there now
+    compared = Given((), (Section("Models", Verdict("distrust", ("It folds.",))),))
+    told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=SOUND, compare=compared)))
+    assert told.startswith("Heel Trust")
+    placed = Given((), (Section("Models", Verdict("caution", ("In metres?",))),))
+    told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=SOUND, compare=placed)))
+    assert told.startswith("Heel Use with care In metres?")
+
+
+def test_without_a_verdict_nothing_is_claimed(study: Study) -> None:
+    told = head(page_of(study, ended(study, register_Load1="The bone was not found.", register_Load2="Nor here.")))
+    assert told.startswith(
+        "Heel Not whole: register Load1 failed (The bone was not found); register Load2 failed (Nor here)."
+    )
+
+
+def test_registrations_alone_have_a_methods_text(study: Study) -> None:
+    outcomes = ended(study, register_Load1=SOUND)
+    measured(study.out / "registration", "Load1")
+    page = page_of(study, outcomes)
+    assert "Methods, to be pasted" in page
+    assert "Load1: The loaded image was aligned with the unloaded one rigidly on the bone" in page
+    assert "A study of 3 heels." in page
+    assert "Tustison NJ" in page
+    assert "Models and measurement" not in page
+    closing = (Section("Methods, to be pasted", paragraphs=("All of it.",)),)
+    page = page_of(study, ended(study, register_Load1=SOUND, compare=Given((), (), closing)))
+    assert page.count("Methods, to be pasted") == 1  # that of the comparison tells the registrations too
+
+
+def test_the_error_of_a_phantom_stays_in_the_report_as_long_as_its_registration_does(study: Study) -> None:
+    assert "Error against the truth" not in page_of(study, ended(study, register_Load1=SOUND))
+    ledger = Ledger(study.out, study.place)
+    stages = {stage.name: stage for stage in plan(study)}
+    for load in ("Load1", "Load2"):
+        ledger.keep(stages[f"register {load}"], "", {}, SOUND, 1.0)
+    errors = [TissueError("fat", 10, 0.1, 0.2, 0.0123, 0.002, 0.03, 0.04, 0.05, 0)]
+    write_errors(
+        study.place / TABLE, {"Load1": errors, "Load2": [replace(errors[0], shear_rmse=0.0456)]}, report(study).outcomes
+    )
+    report(study)  # what `run --report-only` does
+    page = (study.out / "report.html").read_text()
+    assert "Error against the truth" in page
+    assert "0.0123" in page
+    assert "0.0456" in page
+    ledger.keep(stages["register Load2"], "", {}, SOUND, 1.0)  # made anew: the error of what was before is no longer so
+    report(study)
+    page = (study.out / "report.html").read_text()
+    assert "0.0123" in page
+    assert "0.0456" not in page
+    assert "Registered anew since, and not known: Load2" in page
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--report-only", "--force", "mesh"], "--force"),
+        (["--report-only", "--only", "mesh"], "--only"),
+        (["--report-only", "--dry-run"], "--dry-run"),
+        (["--report-only", "--workers", "2"], "--workers"),
+        (["--dry-run", "--scheduler", "tcp://node1:8786"], "--scheduler"),
+        (["--scheduler", "tcp://node1:8786", "--workers", "4"], "--workers 4"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(study: Study, options: list[str], named: str) -> None:
+    told = CliRunner().invoke(app, ["run", str(study.place), *options])
+    assert isinstance(told.exception, ParameterError)
+    assert named in str(told.exception)
+    assert not study.out.exists()
+
+
+def test_a_cohort_refuses_them_too(study: Study, tmp_path: Path) -> None:
+    told = CliRunner().invoke(
+        app, ["cohort", str(study.place), "--out", str(tmp_path / "all"), "--scheduler", "tcp://n:1", "--workers", "4"]
+    )
+    assert isinstance(told.exception, ParameterError)
+
+
+def test_only_what_was_asked_for_decides_the_exit(study: Study) -> None:
+    stages = {stage.name: stage for stage in plan(study)}
+    ledger = Ledger(study.out, study.place)
+    for load in ("Load1", "Load2"):
+        stage = stages[f"register {load}"]
+        arguments = stage.arguments | {"repeat": []} if stage.perhaps else stage.arguments
+        arguments = arguments | {name: [] for name in stage.perhaps}
+        made_from = ledger.made_from(stage, arguments)
+        ledger.keep(stage, ledger.key(stage, made_from, {}), made_from, SOUND, 1.0)
+    told = CliRunner().invoke(app, ["run", str(study.place), "--only", "register"])
+    assert told.exit_code == 0, told.output
+    assert "Not asked for, and without a result: mesh, simulate trebbi, compare." in told.output
+    assert run(study, only=["register"]).complete
+    with pytest.raises(MrstrainError):
+        run(study, only=["registr"])
+    assert json.loads((study.out / "provenance.json").read_text())["command"] == "run"

@@ -1,0 +1,387 @@
+"""What is run, what is not run again, and what a failure leaves standing; with stages that only write a file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from dvc.errors import InputError
+from dvc.software import distribution_versions, software_key
+from mrstrain.records.provenance import without_folders
+from mrstrain.studies.cluster import _refuse_unfit
+from mrstrain.studies.ledger import Ledger
+from mrstrain.studies.pipeline import Pipeline, run_all
+from mrstrain.studies.plan import Stage
+from mrstrain.studies.run import refuse_unknown
+from mrstrain.studies.stages import Given
+
+
+class Here:
+    """A cluster that runs stages at once: each writes down what it reads."""
+
+    def __init__(self, failing: tuple[str, ...] = ()) -> None:
+        self.failing, self.ran, self._ended = failing, [], []
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._ended)
+
+    def begin(self, name: str, function: str, arguments: dict, lock: Path) -> None:
+        self.ran.append(name)
+        out = Path(arguments["out"])
+        if name in self.failing:
+            out.write_text("half")
+            self._ended.append((name, "It broke.", 1.0))
+            return
+        read = [Path(p).read_text() for p in [*arguments["reads"], *arguments.get("parts", [])]]
+        out.write_text(json.dumps([name, arguments["number"], *read]))
+        self._ended.append((name, Given((f"{name} done",)), 1.0))
+
+    def next(self) -> tuple[str, Given | str, float]:
+        return self._ended.pop(0)
+
+
+def stages_in(folder: Path, number: int = 1) -> list[Stage]:
+    """Two measurements, a mesh and two models on it, and their comparison."""
+    out = folder / "results"
+
+    def stage(name: str, reads: tuple[str, ...], made: tuple[str, ...] = (), some: dict | None = None) -> Stage:
+        given = [str(folder / r) for r in reads] + [str(out / m) for m in made]
+        place = out / name.replace(" ", "_")
+        arguments = {"out": str(place), "reads": given, "number": number if name == "mesh" else 0}
+        waits = tuple(m.replace("_", " ") for m in made)
+        return Stage(name, arguments, tuple(folder / r for r in reads), (place,), waits, some or {})
+
+    parts = {f"{kind} {n}": str(out / f"{kind}_{n}") for kind in ("register", "simulate") for n in "ab"}
+    return [
+        stage("register a", ("a.txt",)),
+        stage("register b", ("b.txt",)),
+        stage("mesh", ("labels.txt",)),
+        stage("simulate a", (), ("mesh",)),
+        stage("simulate b", (), ("mesh",)),
+        stage("compare", ("labels.txt",), (), {"parts": parts}),
+    ]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "results").mkdir()
+    for name in ("a", "b", "labels"):
+        (tmp_path / f"{name}.txt").write_text(name)
+    return tmp_path
+
+
+def ran(folder: Path, number: int = 1, failing: tuple[str, ...] = (), **how):
+    """Run the stages; give what was run, and the outcomes."""
+    cluster, asked = Here(failing), []
+
+    @contextmanager
+    def pool():
+        asked.append(1)
+        yield cluster
+
+    told: list[str] = []
+    pipeline = Pipeline(stages_in(folder, number), Ledger(folder / "results", folder), **how)
+    run_all({"": pipeline}, pool, {"": told.append})
+    outcomes = pipeline.outcomes
+    assert len(asked) == bool(cluster.ran)  # no workers are started for nothing
+    return cluster.ran, outcomes, told
+
+
+ALL = ["register a", "register b", "mesh", "simulate a", "simulate b", "compare"]
+
+
+def test_finished_work_is_not_done_again(folder):
+    first, outcomes, told = ran(folder)
+    assert first == ALL
+    assert all(o.words == "done" for o in outcomes.values())
+    assert "compare: done after 1 s" in told
+    assert "    compare done" in told
+    again, outcomes, _ = ran(folder)
+    assert again == []
+    assert all(o.words == "there already" for o in outcomes.values())
+
+
+def test_changed_content_of_the_same_size_is_done_again_and_what_builds_on_it(folder):
+    ran(folder)
+    (folder / "a.txt").write_text("z")
+    assert ran(folder)[0] == ["register a", "compare"]
+    assert '"z"' in (folder / "results" / "compare").read_text().replace("\\", "")
+
+
+def test_a_new_number_is_done_again_and_what_builds_on_it(folder):
+    ran(folder)
+    assert ran(folder, number=2)[0] == ["mesh", "simulate a", "simulate b", "compare"]
+
+
+def test_a_result_that_was_lost_is_made_again(folder):
+    ran(folder)
+    (folder / "results" / "simulate_b").unlink()
+    assert ran(folder)[0] == ["simulate b", "compare"]
+    (folder / "results" / "register_a").write_text("cut")
+    assert ran(folder)[0] == ["register a", "compare"]
+
+
+def test_a_failure_is_named_and_the_others_finish(folder):
+    first, outcomes, told = ran(folder, failing=("register b", "simulate a"))
+    assert first == ALL
+    assert outcomes["register b"].words == "FAILED"
+    assert outcomes["register b"].reason == "It broke."
+    assert outcomes["compare"].record is not None
+    assert "register b" not in (folder / "results" / "compare").read_text()
+    assert not (folder / "results" / "register_b").exists()  # a half result is none
+    assert "register b: FAILED after 1 s. It broke." in told
+    assert ran(folder)[0] == ["register b", "simulate a", "compare"]
+
+
+def test_what_cannot_do_without_a_failed_one_is_not_run(folder):
+    first, outcomes, _ = ran(folder, failing=("mesh",))
+    assert "simulate a" not in first
+    assert outcomes["simulate a"].words == "not run"
+    assert outcomes["simulate a"].reason == "Not run: mesh has no result."
+    _, outcomes, _ = ran(folder, failing=("mesh", "register a", "register b"), force=("register",))
+    assert outcomes["compare"].words == "not run"
+    assert (folder / "results" / "compare").exists()  # nothing that was finished is lost
+    assert ran(folder)[0] == ["register a", "register b", "mesh", "simulate a", "simulate b", "compare"]
+
+
+def test_a_result_of_other_inputs_does_not_outlive_a_failure(folder):
+    ran(folder)
+    (folder / "a.txt").write_text("z")
+    _, outcomes, _ = ran(folder, failing=("register a",))
+    assert outcomes["register a"].record is None
+    assert not (folder / "results" / "register_a").exists()
+    assert '"a"' not in (folder / "results" / "compare").read_text().replace("\\", "")
+
+
+def test_only_and_force(folder):
+    first, outcomes, _ = ran(folder, only=("register",))
+    assert first == ["register a", "register b"]
+    assert outcomes["mesh"].words == "not run"
+    ran(folder)
+    assert ran(folder, force=("simulate b",))[0] == ["simulate b", "compare"]
+    assert ran(folder, force=("register",))[0] == ["register a", "register b", "compare"]
+    (folder / "a.txt").write_text("z")
+    first, outcomes, _ = ran(folder, only=("mesh", "simulate", "compare"))
+    assert first == []
+    assert outcomes["register a"].reason.startswith("Made from other inputs")
+    assert outcomes["compare"].words == "OUT OF DATE"  # what builds on it is no newer
+    assert outcomes["compare"].reason == "Built on register a, out of date."
+    assert [name for name, one in outcomes.items() if not one.asked] == ["register a", "register b"]
+    assert [name for name, one in outcomes.items() if not one.whole] == ["register a", "compare"]
+    first, outcomes, _ = ran(folder, only=("compare",), force=("compare",))
+    assert first == ["compare"]
+    assert not outcomes["compare"].whole
+    assert all(one.whole for one in ran(folder)[1].values())
+
+
+@pytest.mark.parametrize(
+    ("only", "force", "says"),
+    [
+        (("registr",), (), "No stage is called 'registr'. There are: register a"),
+        (("register",), ("mesh",), "--force mesh makes nothing anew: --only register leaves it out"),
+        (("register a",), ("register b",), "--force register b makes nothing"),
+    ],
+)
+def test_what_no_stage_answers_to_is_refused(folder, only, force, says):
+    with pytest.raises(InputError, match=says):
+        refuse_unknown(stages_in(folder), only, force)
+    for fine in (((), force), (("register",), ("register a",)), (("register b",), ("register",))):
+        refuse_unknown(stages_in(folder), *fine)
+
+
+@dataclass
+class Workers:
+    """A client of one worker that gives a certain answer."""
+
+    answer: tuple[str, bool, bool] | None
+    threads: int = 1
+
+    def run(self, *_: object) -> dict[str, tuple[str, bool, bool]]:
+        if self.answer is None:
+            raise ModuleNotFoundError("No module named 'mrstrain'")
+        return {"tcp://far:1": self.answer}
+
+    def nthreads(self) -> dict[str, int]:
+        return {"tcp://far:1": self.threads}
+
+
+HERE, NUMPY = software_key("mrstrain"), f"numpy {distribution_versions()['numpy']}"
+
+
+@pytest.mark.parametrize(
+    ("workers", "says"),
+    [
+        (Workers(None), "have no mrstrain"),
+        (Workers(("0.1.0, code abc", False, True)), "has 0.1.0, code abc; here is mrstrain "),  # as earlier ones answer
+        (Workers((HERE.replace(NUMPY, "numpy 1.0"), False, True)), f"has numpy 1.0; here is {NUMPY}: start"),
+        (Workers((HERE, False, False)), "does not see"),
+        (Workers((HERE, False, True), threads=4), "runs 4 stages at once"),
+        (Workers((HERE, True, True)), "may not start processes"),
+    ],
+)
+def test_workers_that_would_not_do_are_refused_by_what_they_lack(tmp_path, workers, says):
+    with pytest.raises(InputError, match=says):
+        _refuse_unfit(workers, "tcp://far:0", [tmp_path])
+    assert not list(tmp_path.iterdir())
+    _refuse_unfit(Workers((HERE, False, True)), "tcp://far:0", [tmp_path])
+
+
+@pytest.mark.parametrize("name", ["study", "Müller Ö 'x'"])
+def test_a_moved_study_stays_finished(folder, tmp_path_factory, name):
+    named = folder.with_name(name)
+    folder.rename(named)
+    ran(named)
+    for record in (named / "results" / ".study").glob("*.json"):
+        assert str(named) not in repr(json.loads(record.read_text())["made_from"])
+    moved = tmp_path_factory.mktemp("elsewhere") / "moved"
+    named.rename(moved)
+    assert ran(moved)[0] == []
+
+
+def test_records_name_no_folders_outside_the_study(tmp_path):
+    home = tmp_path / "Müller"
+    given = {
+        "in": str(home / "a" / "Load0.nii.gz"), "up": str(home / ".." / "Doe_Jane" / "x.nii"), "n": 1.5,
+        "far": [str(tmp_path / "Doe_Jane" / "y.csv"), "../Doe_Jane/z.toml", "b/w.toml", "trebbi", ""], "none": None,
+        "dicom": [str(tmp_path / "Doe_John"), "../Doe_John"],
+    }  # fmt: skip
+    (tmp_path / "Doe_John").mkdir()
+    assert without_folders(given, home) == {
+        "in": "a/Load0.nii.gz", "up": "x.nii", "n": 1.5,
+        "far": ["y.csv", "z.toml", "b/w.toml", "trebbi", ""], "none": None, "dicom": ["a folder", "a folder"],
+    }  # fmt: skip
+
+
+def test_what_is_told_of_a_failure_names_no_folders_outside_the_study(tmp_path):
+    home = tmp_path / "study"
+    far, up = tmp_path / "Doe_Jane" / "x.nii", home / ".." / "Doe_John" / "y.nii"
+    stage = Stage("register a", {}, (far, up, home / "z.nii"), (home / "results" / "a",))
+    text = f"{far}: no image. {up}, in {tmp_path / 'Doe_John'}: none. {home / 'z.nii'}: none."
+    told = Ledger(home / "results", home).impersonal(text, stage)
+    assert told == "x.nii: no image. y.nii, in a folder: none. z.nii: none."
+
+
+def test_what_is_told_of_a_failure_names_no_folders_one_within_another(tmp_path):
+    home, dicom = tmp_path / "Doe_Jane", tmp_path / "Doe_Jim" / "DICOM"
+    dicom.mkdir(parents=True)
+    files = (home / ".." / "p.txt", tmp_path / "q.txt", dicom, tmp_path / "Doe_Jim" / "r.nii", home / "z.nii")
+    text = f"{home / 'z.nii'}, {files[0]}, {files[1]}, {dicom / 'IM1'}, {dicom}, {files[3]}: none."
+    for given in (files, files[::-1]):
+        stage = Stage("register a", {}, given, (home / "results" / "a",))
+        told = Ledger(home / "results", home).impersonal(text, stage)
+        assert told == "z.nii, p.txt, q.txt, IM1, a folder, r.nii: none."
+
+
+def test_the_forecast_knows_what_cannot_be_run(folder):
+    def told(only: tuple[str, ...]) -> dict[str, str]:
+        return Pipeline(stages_in(folder), Ledger(folder / "results", folder), only=only).forecast()
+
+    assert told(("simulate",))["simulate a"] == "cannot be run: mesh has no result."
+    assert told(("compare",))["compare"].startswith("cannot be run: none of register a")
+    assert told(("mesh", "simulate"))["simulate a"] == "run"
+    assert told(("register", "compare"))["compare"] == "run"
+    ran(folder, failing=("mesh",))
+    assert told(("compare",))["compare"] == "done already"  # of the measurements alone, as a run takes it
+    ran(folder)
+    assert set(told(("compare",)).values()) == {"left out", "done already"}
+    (folder / "results" / ".study" / "mesh.json").unlink()
+    assert told(("simulate",))["simulate a"] == "cannot be run: mesh has no result."
+    assert told(("compare",))["compare"] == "run"  # models that a mesh is lost of are no result any more
+    assert "compare" in ran(folder, only=("compare",))[0]
+
+
+def test_the_forecast_is_what_is_run(folder):
+    def forecast(number: int = 1, **how) -> list[str]:
+        told = Pipeline(stages_in(folder, number), Ledger(folder / "results", folder), **how).forecast()
+        return [name for name, what in told.items() if what == "run"]
+
+    assert forecast() == ALL
+    assert not (folder / "results" / "mesh").exists()
+    ran(folder)
+    assert forecast() == []
+    assert forecast(force=("simulate b",)) == ["simulate b", "compare"]
+    (folder / "b.txt").write_text("y")
+    assert forecast() == ["register b", "compare"] == ran(folder)[0]
+    assert forecast(number=3) == ran(folder, number=3)[0]
+
+
+def test_what_may_be_lacking_is_gone_without(folder):
+    def planned() -> list[Stage]:
+        plain, *others = stages_in(folder)
+        out = str(folder / "results" / "register_b")
+        return [
+            *others,
+            Stage(plain.name, plain.arguments, plain.files, plain.gives, (), {}, {"parts": {"register b": out}}),
+        ]
+
+    def run(failing: tuple[str, ...]) -> tuple[list[str], dict]:
+        cluster = Here(failing)
+        pipeline = Pipeline(planned(), Ledger(folder / "results", folder))
+        run_all({"": pipeline}, lambda: nullcontext(cluster), {"": lambda _: None})
+        return cluster.ran, pipeline.outcomes
+
+    first, outcomes = run(("register b",))
+    assert outcomes["register a"].words == "done"
+    assert first.index("register b") < first.index("register a")
+    assert run(())[0] == ["register b", "register a", "compare"]  # and made anew when it is there
+
+
+def test_a_result_that_may_come_out_better_is_run_again(folder):
+    class Halting(Here):
+        def next(self) -> tuple[str, Given | str, float]:
+            name, given, seconds = super().next()
+            again = name == "simulate a" and isinstance(given, Given)
+            return name, replace(given, complete=False, retry=True) if again else given, seconds
+
+    def run(cluster: Here) -> list[str]:
+        run_all(
+            {"": Pipeline(stages_in(folder), Ledger(folder / "results", folder))},
+            lambda: nullcontext(cluster),
+            {"": lambda _: None},
+        )
+        return cluster.ran
+
+    assert run(Halting()) == ALL
+    assert run(Here()) == ["simulate a", "compare"]
+    assert run(Here()) == []
+
+
+def test_an_input_that_vanishes_fails_its_stage_alone(folder):
+    (folder / "a.txt").unlink()
+    first, outcomes, _ = ran(folder)
+    assert outcomes["register a"].words == "FAILED"
+    assert "a.txt" in outcomes["register a"].reason
+    assert first == ALL[1:]
+
+
+def test_taken_as_they_are_stale_results_are_called_so_and_reasons_are_kept(folder):
+    ran(folder, failing=("register b",))
+    (folder / "a.txt").write_text("z")
+    pipeline = Pipeline(stages_in(folder), Ledger(folder / "results", folder), only=("nothing",))
+    assert pipeline.settle() == []
+    assert pipeline.outcomes["register a"].words == "OUT OF DATE"
+    assert not pipeline.outcomes["register a"].whole
+    assert pipeline.outcomes["register b"].reason == "It broke."
+    assert pipeline.outcomes["mesh"].whole
+
+
+def test_what_other_code_made_is_made_anew(folder, monkeypatch):
+    ran(folder)
+    assert ran(folder)[0] == []
+    monkeypatch.setattr("mrstrain.studies.ledger.software_key", lambda _: "other")
+    assert ran(folder)[0] == ALL
+    assert ran(folder)[0] == []
+
+
+def test_a_record_tells_what_it_was_made_from(folder):
+    _, outcomes, _ = ran(folder)
+    record = outcomes["mesh"].record
+    assert record.made_from["files"] == [["labels.txt", hashlib.sha256(b"labels").hexdigest()]]
+    assert record.made_from["arguments"]["number"] == 1
+    assert str(folder) not in json.dumps(record.made_from)

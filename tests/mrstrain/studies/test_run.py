@@ -1,0 +1,392 @@
+"""A study from its file to its report: run, run again, changed, broken, killed, shared out over a cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from filelock import FileLock
+
+from dvc.errors import InputError, OutputError
+from dvc.images.image import Grid, LabelMap
+from dvc.io.images.read import read_image
+from dvc.io.images.write import write_image, write_labels
+from mrstrain.studies.check import check
+from mrstrain.studies.cohort import cohort
+from mrstrain.studies.file import read_study
+from mrstrain.studies.init import init
+from mrstrain.studies.run import forecast, report, run, run_studies
+from tests.processes import cluster_of_two, under_way, wait_for
+from tests.quick import QUICK
+
+pytestmark = pytest.mark.slow
+
+STUDY = """
+[study]
+name = "Heel <b>3</b>"
+[images]
+load0 = "Load0.nii.gz"
+labels = "tissues.nii.gz"
+names = "tissues.csv"
+repeat = "Load0-again.nii.gz"
+[loads.Load1]
+image = "Load1.nii.gz"
+normal_n = 8.0
+[loads.Load2]
+image = "Load2.nii.gz"
+normal_n = 2.0
+[registration]
+parameters = ["quick.txt"]
+[mesh]
+edge_mm = 9.0
+labels = "to_mesh.nii.gz"
+names = "to_mesh.csv"
+[models]
+sets = ["akrami"]
+"""
+STAGES = ["register repeat", "register Load1", "register Load2", "mesh", "simulate akrami", "compare"]
+
+
+def coarse(labels: LabelMap) -> LabelMap:
+    """Bone and soft tissue at twice the voxel: a mesh of few cells."""
+    grid = labels.grid
+    bones = [n for n, name in labels.names.items() if name in ("bone", "ankle")]
+    values = labels.labels[::2, ::2, ::2]
+    both = np.where(np.isin(values, bones), 1, np.where(values > 0, 2, 0))
+    return LabelMap(
+        Grid(both.shape, 2.0 * grid.spacing_mm, grid.origin_mm, grid.direction), both, {1: "bone", 2: "fat"}
+    )
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory, small_pair) -> Path:
+    """A heel at 1.6 mm; the repeat scan serves for Load2 too, with one voxel changed: no image is given twice."""
+    folder = tmp_path_factory.mktemp("images")
+    write_image(folder / "Load0.nii.gz", small_pair.reference)
+    write_image(folder / "Load1.nii.gz", small_pair.loaded)
+    values = small_pair.repeat.values.copy()
+    values[0, 0, 0] += 1.0
+    write_image(folder / "Load2.nii.gz", type(small_pair.repeat)(small_pair.repeat.grid, values))
+    write_image(folder / "Load0-again.nii.gz", small_pair.repeat)
+    write_labels(folder / "tissues.nii.gz", small_pair.labels)
+    write_labels(folder / "to_mesh.nii.gz", coarse(small_pair.labels))
+    (folder / "quick.txt").write_text(QUICK)
+    (folder / "study.toml").write_text(STUDY)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(images, tmp_path_factory):
+    """The study, run in a process of its own on two workers."""
+    folder = tmp_path_factory.mktemp("done") / "study"
+    shutil.copytree(images, folder)
+    told = subprocess.run(
+        [sys.executable, "-m", "mrstrain", "run", str(folder)], capture_output=True, text=True, check=False
+    )
+    assert told.returncode == 0, told.stderr
+    return folder, told
+
+
+def shear_of(folder: Path, load: str) -> np.ndarray:
+    return read_image(folder / "results" / "registration" / load / "max_shear.nii.gz", allow_missing=True).values
+
+
+def areas(study: Path) -> list[float]:
+    with (study / "results" / "comparison" / "areas.csv").open() as file:
+        return [float(row["ml"]) for row in csv.DictReader(file)]
+
+
+def test_every_result_is_there_and_the_report_tells_it(done):
+    folder, told = done
+    out = folder / "results"
+    for name in (
+        "registration/Load1/displacement.nii.gz",
+        "registration/repeat/quality.json",
+        "mesh/mesh.vtu",
+        "models/akrami/Load1.vtu",
+        "models/akrami/Load2.vtu",
+        "comparison/areas.csv",
+        "provenance.json",
+    ):
+        assert (out / name).is_file(), name
+    page = (out / "report.html").read_text()
+    assert "Heel &lt;b&gt;3&lt;/b&gt;" in page
+    assert "<b>3</b>" not in page
+    assert "Registration of Load1" in page
+    assert "Area between the volume-strain curves" in page
+    assert "how each stage ended" in page.lower()
+    assert f"Report: {out / 'report.html'}" in told.stdout
+    assert "akrami" in told.stdout
+    assert "register Load1" not in told.stderr  # quiet in a pipe: that is in the log
+    assert "all: 6 stages 100 %" in told.stderr
+    log = (out / "study.log").read_text()
+    assert all(f"{stage}: done after" in log for stage in STAGES)
+    record = json.loads((out / "provenance.json").read_text())
+    assert {f["name"] for f in record["inputs"]["inputs"]} >= {"Load0.nii.gz", "tissues.nii.gz", "quick.txt"}
+
+
+def test_run_again_does_nothing_in_under_ten_seconds(done):
+    folder, _ = done
+    before = (folder / "results" / "mesh" / "mesh.vtu").stat().st_mtime_ns
+    assert set(forecast(folder).values()) == {"done already"}
+    began = time.monotonic()
+    outcomes = run(folder).outcomes
+    assert time.monotonic() - began < 10.0
+    assert all(o.again for o in outcomes.values())
+    assert (folder / "results" / "mesh" / "mesh.vtu").stat().st_mtime_ns == before
+
+
+def test_a_disk_with_too_little_room_is_refused_before_anything_is_made(done, images, tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5 * 10**7))
+    shutil.copytree(images, tmp_path / "study")
+    said = r"the results of 6 stages need about (\d+) MB and the disk has 50 MB left"
+    with pytest.raises(OutputError, match=said) as refused:
+        run(tmp_path / "study")
+    assert not (tmp_path / "study" / "results" / "registration").exists()
+    one = 10**6 * int(re.search(said, str(refused.value))[1])
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 3 * one // 2))
+    shutil.copytree(images, tmp_path / "other")
+    with pytest.raises(OutputError, match="the results of 12 stages need"):  # room for one of two
+        run_studies([read_study(tmp_path / name) for name in ("study", "other")])
+    assert run(done[0]).complete  # where all is there already, none is needed
+
+
+def test_the_report_alone(done):
+    folder, _ = done
+    first = (folder / "results" / "report.html").read_text()
+    (folder / "results" / "report.html").unlink()
+    report(folder)
+    again = (folder / "results" / "report.html").read_text()
+    assert "Registration of Load2" in again
+    assert abs(len(again) - len(first)) < 2000  # but for times and "there already"
+
+
+def test_only_what_changed_is_done_anew(done, tmp_path):
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(folder, study)
+    (study / "study.toml").write_text(STUDY.replace("normal_n = 8.0", "normal_n = 6.0"))
+    told = forecast(study)
+    assert [name for name, what in told.items() if what == "run"] == ["simulate akrami", "compare"]
+    image = read_image(study / "Load2.nii.gz")
+    values = image.values.copy()
+    values[0, 0, 0] += 1.0
+    write_image(study / "Load2.nii.gz", type(image)(image.grid, values))  # the same shape, and nearly the same size
+    assert [name for name, what in forecast(study).items() if what == "run"] == [
+        "register Load2", "simulate akrami", "compare",
+    ]  # fmt: skip
+
+
+def test_a_broken_image_leaves_the_others_to_finish_and_is_named(done, tmp_path):
+    folder, _ = done
+    study = tmp_path / "Doe_Jane" / "heel"
+    shutil.copytree(folder, study)
+    whole = (study / "Load2.nii.gz").read_bytes()
+    (study / "Load2.nii.gz").write_bytes(whole[: len(whole) // 2])
+    ran = subprocess.run(
+        [sys.executable, "-m", "mrstrain", "run", str(study)], capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 1
+    assert "register Load2: FAILED" in ran.stdout
+    out = study / "results"
+    assert not (out / "registration" / "Load2").exists()  # that of the whole image is no result of this one
+    with (out / "comparison" / "areas.csv").open() as file:
+        assert "Load2" not in {row["load"] for row in csv.DictReader(file)}
+    page = (out / "report.html").read_text()
+    assert "register Load2 failed" in page
+    for file in (out / "report.html", out / "study.log", out / "provenance.json", *(out / ".study").glob("*.*")):
+        assert "Doe_Jane" not in file.read_text(), file
+
+
+def test_two_runs_in_one_folder(done):
+    folder, _ = done
+    with FileLock(folder / "results" / ".study" / "lock"), pytest.raises(OutputError, match="another run"):
+        run(folder)
+
+
+def test_killed_and_run_again_gives_the_same(done, images, tmp_path):
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    command = [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--workers", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    records = study / "results" / ".study"
+    wait_for(lambda: under_way(records, "register Load1"), process)
+    assert (records / "register repeat.json").is_file()
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (records / "register Load1.json").exists()  # it was lost half-way
+    assert not (study / "results" / "registration" / "Load2").exists()
+    kept = (records / "register repeat.json").read_bytes()
+    assert set(forecast(study, only=["register"]).values()) == {"done already", "run", "left out"}
+    run(study, only=["register"])
+    assert (records / "register repeat.json").read_bytes() == kept  # not done twice
+    for load in ("Load1", "Load2"):
+        assert np.array_equal(shear_of(study, load), shear_of(folder, load), equal_nan=True)
+
+
+@pytest.mark.parametrize("stage", ["mesh", "simulate akrami", "compare"])
+def test_killed_in_any_stage_and_run_again(done, tmp_path, stage):
+    """Made anew and killed half-way, a stage has no result; the next run makes it, and what builds on it alone."""
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(folder, study)
+    records, left = study / "results" / ".study", STAGES[STAGES.index(stage) :]
+    kept = {name: (records / f"{name}.json").read_bytes() for name in STAGES if name not in left}
+    command = [sys.executable, "-m", "mrstrain", "run", str(study), "--force", stage, "--workers", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_for(lambda: under_way(records, stage), process)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (records / f"{stage}.json").exists()
+    told = forecast(study)
+    assert [name for name in STAGES if told[name] == "run"] == left
+    of_all: list[float] = []
+    again = run(study, progress=lambda case, _, fraction: of_all.append(fraction) if case == "all" else None)
+    assert again.complete
+    assert [name for name in STAGES if not again.outcomes[name].again] == left
+    assert {name: (records / f"{name}.json").read_bytes() for name in kept} == kept
+    assert len(of_all) == len(left) + 1  # of what is left to do, each by its time, and the end
+    assert sorted(of_all) == of_all
+    assert of_all[0] > 0.0
+    assert of_all[-1] == 1.0
+    # A mesh made anew is another; states found on the same are the same to the solver's tolerance.
+    assert areas(study) == pytest.approx(areas(folder), rel=0.2 if stage == "mesh" else 1e-4)
+
+
+def test_a_registration_whose_process_is_killed_fails_alone_and_is_named(done, images, tmp_path):
+    """As the system does where memory runs out."""
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    command = [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--workers", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    records = study / "results" / ".study"
+
+    def registering() -> list[psutil.Process]:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            below = psutil.Process(process.pid).children(recursive=True)
+            return [one for one in below if any("popen_loky" in word for word in one.cmdline())]
+        return []
+
+    wait_for(lambda: under_way(records, "register Load1") and registering() != [], process)
+    registering()[-1].kill()
+    told, _ = process.communicate(timeout=400)
+    assert process.returncode == 1
+    assert "register Load1: FAILED" in told
+    assert "died (exit code SIGKILL(-9))" in told
+    assert not (study / "results" / "registration" / "Load1").exists()
+    assert np.array_equal(shear_of(study, "Load2"), shear_of(folder, "Load2"), equal_nan=True)  # the others finish
+    assert "register Load1 failed" in (study / "results" / "report.html").read_text()
+    assert forecast(study, only=["register"])["register Load1"] == "run"
+
+
+def test_a_cluster_whose_worker_is_killed_loses_nothing(done, images, tmp_path):
+    folder, _ = done
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    with cluster_of_two(tmp_path) as (address, workers):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--scheduler", address],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        records = study / "results" / ".study"
+        wait_for(lambda: all(under_way(records, f"register {load}") for load in ("Load1", "Load2")), process)
+        workers[0].kill()  # each of the two has one
+        workers[0].wait()
+        assert not all((records / f"register {load}.json").exists() for load in ("Load1", "Load2"))
+        assert process.wait(timeout=400) == 0  # what was not asked for is no failure
+        for load in ("Load1", "Load2"):
+            assert np.array_equal(shear_of(study, load), shear_of(folder, load), equal_nan=True)
+        rest = run(study, scheduler=address)  # what builds on them, by the worker that is left
+        assert rest.complete
+        assert [name for name in STAGES if not rest.outcomes[name].again] == ["mesh", "simulate akrami", "compare"]
+        assert areas(study) == pytest.approx(areas(folder), rel=0.2)  # on a mesh of its own
+        outcomes = (study / "results" / "study.log").read_text()
+        assert "FAILED" not in outcomes
+
+
+def test_a_scheduler_that_is_not_there(images, tmp_path):
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    with pytest.raises(InputError, match="No Dask scheduler"):
+        run(study, scheduler="tcp://127.0.0.1:1")
+
+
+def test_check_tells_all_that_is_wrong_at_once(done, images, tmp_path):
+    fine = check(images)
+    assert fine.wrong == ()
+    assert any(f"To do: {len(STAGES)} of {len(STAGES)} stages" in note for note in fine.notes)
+    assert "Everything is done already" in check(done[0]).notes[-1]
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    shutil.copy(study / "Load0.nii.gz", study / "Load1.nii.gz")
+    (study / "Load2.nii.gz").unlink()
+    text = STUDY.replace('names = "tissues.csv"', 'names = "tissues.csv"\nbone = "heelbone"')
+    (study / "study.toml").write_text(text.replace('"akrami"', '"akramy"'))
+    wrong = "\n".join(check(study).wrong)
+    for words in ("Load1 is the unloaded image", "Load2.nii.gz", "heelbone", "akramy"):
+        assert words in wrong, words
+
+
+def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    with pytest.raises(OutputError, match="already"):
+        init(study)
+    (study / "study.toml").unlink()
+    (study / "ansys").mkdir()
+    (study / "ansys" / "Load1.vtu").write_text("")
+    init(study)
+    told = read_study(study)
+    assert told.images.load0 == "Load0.nii.gz"
+    assert told.images.repeat == "Load0-again.nii.gz"
+    assert (told.images.labels, told.images.names) == ("tissues.nii.gz", "tissues.csv")
+    assert list(told.loads) == ["Load1", "Load2"]
+    assert told.loads["Load1"].normal_n is None  # forces are never guessed
+    assert any("normal_n is missing" in one for one in check(study).wrong)
+    assert told.models.results == ("ansys",)
+    assert len(told.models.sets) == 6
+    assert "friedman" not in told.models.sets
+
+
+def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path):
+    folder, _ = done
+    places = []
+    for name in ("Ada", "Ben"):
+        places.append(tmp_path / name)
+        shutil.copytree(folder, places[-1])
+        (places[-1] / "study.toml").write_text(STUDY.replace("Heel <b>3</b>", name))
+    told = cohort(places, out=tmp_path / "cohort")
+    assert all(o.again for one in told.ran for o in one.outcomes.values())
+    (first,) = told.ranking
+    assert (first.model, first.subjects, first.nearest_in) == ("akrami", 2, 2)
+    with (folder / "results" / "comparison" / "areas.csv").open() as file:
+        shares = [float(r["share"]) for r in csv.DictReader(file) if r["load"] == "all loads"]
+    assert first.mean == pytest.approx(shares[0], rel=1e-5)
+    assert first.high - first.low == pytest.approx(0.0, abs=1e-12)  # one subject twice
+    with (tmp_path / "cohort" / "cohort.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {r["subject"] for r in rows} == {"Ada", "Ben"}
+    assert not any("not to be trusted" in note for note in told.notes)
+    page = (tmp_path / "cohort" / "report.html").read_text()
+    assert "Ada" in page
+    assert "Ben" in page
+    ledger = places[1] / "results" / ".study" / "register Load1.json"
+    ledger.write_text(re.sub(r'"level":"(trust|caution)"', '"level":"distrust"', ledger.read_text()))
+    doubtful = [note for note in cohort(places, out=tmp_path / "cohort").notes if "not to be trusted" in note]
+    assert [note.split(",")[0] for note in doubtful] == ["Ben: the registration of Load1 is not to be trusted"]
+    with pytest.raises(InputError, match="name of its own"):
+        cohort([places[0], places[0]], out=tmp_path / "cohort")

@@ -1,0 +1,177 @@
+"""A made loaded image shows the deformation it was made with, and its noise stays where it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+from typer.testing import CliRunner
+
+from dvc.deformation.bspline import BSpline
+from dvc.deformation.protocol import Affine, Composed, RigidMotion, SampledDisplacement, Within
+from dvc.deformation.strain import StrainField
+from dvc.errors import InputError
+from dvc.images.image import Grid, Image, Mask
+from dvc.images.noise import noise_sd, signal_to_noise
+from dvc.io.images.read import read_image
+from dvc.io.images.write import write_image, write_mask, write_vectors
+from dvc.io.transforms.read import read_transform
+from dvc.io.transforms.write import write_elastix_transform
+from mrstrain.cli.app import app
+from phantoms.heel import drawn_motion, heel_grid, labels_of, scan, under_load
+from phantoms.motions import ShearWave
+from phantoms.twin import found_back, loaded_twin
+
+SPACING = 1.6
+
+
+@pytest.fixture(scope="module")
+def unloaded(heel) -> tuple[Image, Mask]:
+    grid = heel_grid(SPACING)
+    return scan(heel, grid, snr=25.0, number=0), Mask(grid, labels_of(heel, grid).labels > 0)
+
+
+def test_noise_is_found_in_air_and_without_air(unloaded: tuple[Image, Mask]) -> None:
+    image, body = unloaded
+    assert noise_sd(image, body) == pytest.approx(27.0, rel=0.03)
+    assert signal_to_noise(image, body) == pytest.approx(25.0, rel=0.1)
+    silent = Image(image.grid, np.where(body.inside, image.values, 0.0).astype(np.float32))
+    assert 20.0 < noise_sd(silent, body) < 80.0  # texture counts as noise there, and more so in large voxels
+
+
+def test_noise_alone_is_measured_in_tissue_too() -> None:
+    """Even signal of 500, noise of 20, air set to zero: the second estimate."""
+    grid = Grid((40, 40, 40), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    inside = np.zeros(grid.shape, dtype=bool)
+    inside[8:32, 8:32, 8:32] = True
+    values = np.where(inside, 500.0 + 20.0 * np.random.default_rng(0).standard_normal(grid.shape), 0.0)
+    assert noise_sd(Image(grid, values.astype(np.float32)), Mask(grid, inside)) == pytest.approx(20.0, rel=0.05)
+
+
+def test_points_are_found_back_through_a_sampled_field() -> None:
+    """Of a displacement image there is no closed inverse; Newton's finds it to 1e-6 mm, or says that there is none."""
+    wave = ShearWave(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), 25.0, 0.5)
+    foot = drawn_motion(3, 1)
+    grid = Grid((30, 30, 30), (2.0, 2.0, 2.0), (-29.0, -29.0, -29.0))
+    X = grid.points().reshape(-1, 3)
+    field = SampledDisplacement(grid, Composed([wave, foot]).displacement(X).reshape(*grid.shape, 3))
+    points = np.random.default_rng(0).uniform(-18.0, 18.0, (500, 3))
+    x = points + field.displacement(points)
+    np.testing.assert_allclose(found_back(field, x, foot.inverse().apply(x)), points, atol=1e-6)
+    assert np.isnan(found_back(field, np.array([[200.0, 0.0, 0.0]]), np.zeros((1, 3)))).all()
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_twin_shows_the_motion(unloaded: tuple[Image, Mask], heel, exact: bool) -> None:
+    """Against a scan of the same heel after the same motion: alike where tissue is, unlike without the motion."""
+    image, body = unloaded
+    motion, foot = under_load(heel, "Load1"), drawn_motion(2, 1)
+    whole = Composed([motion, foot])
+    if exact:
+        made = loaded_twin(image, body, whole, near=foot, seed=5)
+    else:
+        u = whole.displacement(image.grid.points().reshape(-1, 3)).reshape(*image.grid.shape, 3)
+        made = loaded_twin(image, body, Within(SampledDisplacement(image.grid, u), body), near=foot, seed=5)
+    real = scan(heel, image.grid, motion, foot, snr=None, number=7)
+    inside = real.values > 200.0
+
+    def alike(values: np.ndarray) -> float:
+        return float(np.corrcoef(values[inside], real.values[inside])[0, 1])
+
+    assert made.shown > 0.9
+    assert made.noise_sd == pytest.approx(27.0, rel=0.05)
+    assert alike(made.image.values) > 0.8
+    assert alike(image.values) < 0.65
+    air = ~inside
+    air[:, :, 4:] = False
+    assert made.image.values[air].mean() == pytest.approx(made.noise_sd * np.sqrt(np.pi / 2), rel=0.05)
+
+
+def test_noise_does_not_move_with_the_tissue(unloaded: tuple[Image, Mask], heel) -> None:
+    """Of the unloaded image's noise less than half its amplitude is in the twin; carried as it is, all would be."""
+    image, body = unloaded
+    clean = scan(heel, image.grid, snr=None, number=0)
+    noise = (image.values - clean.values)[body.inside]
+    still = Affine(np.eye(3), np.zeros(3))
+    made = loaded_twin(image, body, still, seed=5, shading=False)
+    left = (made.image.values - clean.values)[body.inside]
+    assert (noise @ left) / (noise @ noise) < 0.5
+    assert left.std() < 3.0 * noise.std()
+
+
+def test_a_transform_as_register_writes_it_will_do(unloaded: tuple[Image, Mask], tmp_path: Path) -> None:
+    """A B-spline and a rigid motion: a composition, of which one part has no closed inverse."""
+    image, body = unloaded
+    control = Grid((16, 17, 17), (8.0, 8.0, 8.0), image.grid.centre_mm - 64.0)
+    bspline = BSpline(control, np.random.default_rng(0).normal(scale=0.8, size=(3, *control.shape)))
+    foot = drawn_motion(2, 1)
+    path = write_elastix_transform(tmp_path, bspline, foot, image.grid)[-1]
+    made = loaded_twin(image, body, read_transform(path), near=foot, seed=1)
+    assert made.shown > 0.9
+    points = body.points()[::97]
+    moved = points + read_transform(path).displacement(points)
+    at = np.rint(image.grid.indices_of(moved)).astype(int)
+    inside = ((at >= 0) & (at < np.array(image.grid.shape))).all(axis=1)
+    there = made.image.values[tuple(at[inside].T)]
+    here = image.values[tuple(np.rint(image.grid.indices_of(points[inside])).astype(int).T)]
+    assert np.corrcoef(there, here)[0, 1] > 0.8
+
+
+def test_the_skin_keeps_its_partial_volume(unloaded: tuple[Image, Mask]) -> None:
+    """At rest the twin's rim, air included, is that of the unloaded scan; cut at the mask it would be dark outside."""
+    image, body = unloaded
+    made = loaded_twin(image, body, Affine(np.eye(3), np.zeros(3)), seed=5, shading=False)
+    rim = binary_dilation(body.inside) & ~body.inside
+    assert image.values[rim].mean() > 2.0 * made.noise_sd
+    assert made.image.values[rim].mean() == pytest.approx(image.values[rim].mean(), rel=0.25)
+
+
+def test_what_no_image_can_show_is_refused(unloaded: tuple[Image, Mask]) -> None:
+    image, body = unloaded
+    with pytest.raises(InputError, match="folds"):
+        loaded_twin(image, body, Affine(np.diag([-1.0, 1.0, 1.0]), np.zeros(3)), seed=1)
+    with pytest.raises(InputError, match="field of view"):
+        loaded_twin(image, body, RigidMotion(np.eye(3), np.array([90.0, 0.0, 0.0])), seed=1)
+    other = Mask(Grid(body.grid.shape, body.grid.spacing_mm, body.grid.origin_mm + 1.0), body.inside)
+    with pytest.raises(InputError, match="not on the unloaded image"):
+        loaded_twin(image, other, RigidMotion.identity(), seed=1)
+    part = np.zeros(body.grid.shape, dtype=bool)
+    part[:20] = True
+    few = Within(Affine(np.eye(3), np.zeros(3)), Mask(body.grid, part))
+    with pytest.raises(InputError, match=r"half|defined"):
+        loaded_twin(image, body, few, seed=1)
+
+
+def test_command_writes_the_twin_and_its_truth(unloaded: tuple[Image, Mask], heel, tmp_path: Path) -> None:
+    image, _ = unloaded
+    write_image(tmp_path / "Load0.nii.gz", image)
+    bone = labels_of(heel, image.grid).region("bone")
+    write_mask(tmp_path / "bone.nii.gz", bone)
+    motion, foot = under_load(heel, "Load4"), drawn_motion(2, 1)
+    u = Composed([motion, foot]).displacement(image.grid.points().reshape(-1, 3)).reshape(*image.grid.shape, 3)
+    write_vectors(tmp_path / "u.nii.gz", image.grid, u.astype(np.float32), ("x", "y", "z"), "u", "LPS", unit="mm")
+    given = ["twin", str(tmp_path / "Load0.nii.gz"), str(tmp_path / "u.nii.gz"), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, [*given, "--bone", str(tmp_path / "bone.nii.gz")])
+    assert result.exit_code == 0, result.output
+    assert "mrstrain register" in result.output
+    assert read_image(tmp_path / "out" / "twin.nii.gz").grid.same_as(image.grid)
+    found = read_image(tmp_path / "out" / "truth" / "twin" / "max_shear.nii.gz", allow_missing=True).values
+    fat = labels_of(heel, image.grid).region("fat").inside & np.isfinite(found)
+    true = StrainField.from_gradient(motion.evaluate(image.grid.points(fat))[1]).max_shear
+    # a displacement sampled every 1.6 mm blurs the jumps of the strain
+    assert np.median(np.abs(found[fat] - true)) < 0.01
+    assert (tmp_path / "out" / "truth" / "twin" / "displacement.nii.gz").exists()
+
+
+def test_where_the_unloaded_image_did_not_look_the_twin_has_no_value(unloaded: tuple[Image, Mask]) -> None:
+    image, body = unloaded
+    foot = RigidMotion(np.eye(3), np.array([0.0, 0.0, -3.0 * SPACING]))  # the leg's end comes into view
+    given = {"near": foot, "seed": 1, "onto": image.grid}
+    missing = ~np.isfinite(loaded_twin(image, body, foot, beyond_missing=True, **given).image.values)
+    assert missing[..., -3:].all()
+    assert not missing[..., :-3].any()
+    assert np.isfinite(loaded_twin(image, body, foot, **given).image.values).all()
+    noisier = loaded_twin(image, body, foot, noisier=2.0, **given)
+    assert noisier.noise_sd == pytest.approx(2.0 * noise_sd(image, body), rel=1e-3)

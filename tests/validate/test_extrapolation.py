@@ -1,0 +1,126 @@
+"""A model carried on over an image, and sent through the measurement."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+
+from dvc.deformation.nodal import OnMesh
+from dvc.deformation.protocol import evaluate_on_grid
+from dvc.errors import InputError, RegistrationError
+from dvc.images.image import Grid, Mask
+from dvc.io.images.write import write_image, write_mask
+from dvc.mesh import TetMesh
+from dvc.registration.elastix.presets import load_preset
+from dvc.registration.gauss_newton.fit import USUAL_VOLUME
+from mrstrain.comparison.level import level
+from phantoms.heel import heel_grid, labels_of, scan
+from tests.blocks import block
+from tests.validate.test_comparison import cube, error_table, labels, sheared
+from tests.validate.test_measured_boundary import SHEAR, slab
+from validate.comparison import compare
+from validate.extrapolation import LEVELLED, carried_on
+from validate.fe_result import FeResult, read_result
+from validate.mapping import ALL
+
+
+def test_a_model_is_itself_in_its_mesh_at_rest_in_bone_and_smooth_between() -> None:
+    grid = Grid((40, 40, 40), np.ones(3), np.full(3, -9.5), np.eye(3))
+    mesh = slab()  # from 0 to 20 mm
+    x = grid.points().reshape(*grid.shape, 3)
+    bone = x[..., 0] < 0.0
+    field = carried_on(OnMesh(mesh, SHEAR.displacement(mesh.points_mm)), grid, bone)
+    inside = ((x > 0.0) & (x < 20.0)).all(axis=-1)
+    u, H = (v.reshape(*grid.shape, *v.shape[1:]) for v in evaluate_on_grid(field, grid))
+    assert np.abs(u - SHEAR.displacement(x.reshape(-1, 3)).reshape(u.shape))[inside].max() < 1e-9
+    assert np.abs(u[bone & ~inside]).max() < 1e-9
+    assert np.isfinite(u).all()
+    assert np.linalg.det(H + np.eye(3)).min() > 0.1
+    steps = np.abs(np.diff(u, axis=1)).max()
+    assert steps < 2.5  # mm from voxel to voxel, where 6 mm of the model ends
+    with pytest.raises(InputError, match="No voxel"):
+        carried_on(
+            OnMesh(mesh, np.zeros_like(mesh.points_mm)),
+            Grid((5, 5, 5), np.ones(3), np.full(3, 90.0)),
+            np.zeros((5, 5, 5), dtype=bool),
+        )
+
+
+def test_a_model_that_is_nearly_flat_is_smoothed_until_an_image_can_show_it() -> None:
+    grid = Grid((40, 40, 40), np.ones(3), np.full(3, -9.5), np.eye(3))
+    mesh = slab(10)
+    u = np.zeros_like(mesh.points_mm)
+    u[:, 0] = np.where(mesh.points_mm[:, 0] > 10.5, -1.9, 0.0)  # one layer of 2 mm is pressed to a twentieth
+    field = carried_on(OnMesh(mesh, u), grid, np.zeros(grid.shape, dtype=bool))
+    _, H = evaluate_on_grid(field, grid)
+    assert np.linalg.det(H + np.eye(3)).min() > 0.0
+
+
+def test_levelled_models_are_judged_as_found() -> None:
+    mesh = cube(6)
+
+    def of(name: str, gamma: float) -> FeResult:
+        return FeResult(name, Path(), OnMesh(mesh, sheared(gamma).displacement(mesh.points_mm)))
+
+    one = compare(
+        "Load1", sheared(0.8), [of("a", 0.6), of("b", 0.5), of("a" + LEVELLED, 0.8)], labels(), bones=["bone"],
+        normal=np.array([1.0, 0.0, 0.0]), table=error_table(0.05, 0.01),
+    )  # fmt: skip
+    assert [a.model for a in one.ranked()] == ["a", "b"]
+    area = {a.model: a for a in one.areas if a.tissue == ALL}
+    assert area["a" + LEVELLED].ml == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(area["a" + LEVELLED].estimate_ml)
+
+
+def test_what_comes_back_is_the_model_as_the_measurement_shows_it(
+    tmp_path: Path, heel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid = heel_grid(1.6)
+    tissues = labels_of(heel, grid)
+    write_image(tmp_path / "Load0.nii.gz", scan(heel, grid, snr=25.0, number=0))
+    bone = next(n for n, name in tissues.names.items() if name == "bone")
+    write_mask(tmp_path / "bone.nii.gz", Mask(grid, tissues.labels == bone))
+    fat = next(n for n, name in tissues.names.items() if name == "fat")
+    centre = np.median(grid.points(tissues.labels == fat), axis=0)
+    made = block((10, 10, 10), (30.0, 30.0, 30.0))
+    mesh = TetMesh(made.points_mm + centre - 15.0, made.cells, {"fat": np.arange(len(made.cells))})
+    bump = np.prod(np.sin(np.pi * made.points_mm / 30.0), axis=1)
+    u = bump[:, None] * np.array([0.0, 3.0, 0.0])
+    (tmp_path / "model").mkdir()
+    meshio.write(
+        tmp_path / "model" / "Load1.vtu", meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"displacement": u})
+    )
+    (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
+    # The model moves bone and changes volume, which our own engine would not let it do.
+    done = level(
+        tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "out", bone=tmp_path / "bone.nii.gz",
+        parameters=[tmp_path / "mine.txt"],
+    )  # fmt: skip
+    assert done.folder.name == "model" + LEVELLED
+    back = read_result("levelled", done.folder / "Load1.vtu")
+    body = tissues.labels[tuple(np.rint(grid.indices_of(mesh.points_mm)).astype(int).T)] > 0
+    moved = np.linalg.norm(u, axis=1) > 1.0
+    apart = np.linalg.norm(back.deformation.u_mm - u, axis=1)[body]
+    assert np.median(apart) < 0.5  # voxels of 1.6 mm
+    assert np.corrcoef(back.deformation.u_mm[body & moved, 1], u[body & moved, 1])[0, 1] > 0.8
+    for wrong, message in (
+        (tmp_path / "model" / "Load1.vtu", "no folder"),
+        (tmp_path / "out", "file of a measured load|No (load|model)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            level(tmp_path / "Load0.nii.gz", wrong, out=tmp_path / "two", bone=tmp_path / "bone.nii.gz")
+
+    def fails(*_: object, **given: object) -> None:
+        # Beyond its mesh the model changes tissue's volume as no tissue does: that is not to be followed.
+        assert given["volume"] == USUAL_VOLUME
+        raise RegistrationError("No load could be registered. Load1: folded")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("mrstrain.comparison.level.register", fails)
+        with pytest.raises(RegistrationError, match=r"Load1 was not registered: .* folded"):
+            level(tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "two", bone=tmp_path / "bone.nii.gz")
+    with pytest.raises(InputError, match="needs the bone"):
+        level(tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "two")

@@ -1,0 +1,91 @@
+"""Slips of a model's displacement that would pass in silence are named, and right models are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import permutations, product
+
+import numpy as np
+import pytest
+
+from dvc.errors import ExtentError, GeometryError
+from dvc.images.image import Grid
+from mrstrain.comparison.model_files import ModelFile, Reading
+from tests.validate.test_comparison import SIDE, cube, labels, result, sheared
+from tests.validate.test_fe_result import written
+from validate.mapping import Field, Mapped, mapped
+from validate.misfit import displacement_slip, misfits
+
+
+def pressed() -> Mapped:
+    """A block pressed by 0.4 mm along x and sheared by 0.25 mm along y; its cells hardly change their volume."""
+    found = mapped(cube(), labels(), ["bone"], sheared(0.0), {})
+    x, y, z = (found.points_mm / SIDE).T
+    u = np.stack([-0.4 * x, 0.25 * x + 0.1 * y * x, 0.12 * (z - 0.4) * x], axis=1)
+    return replace(found, measured=moved(found, u))
+
+
+def moved(found: Mapped, u: np.ndarray) -> Field:
+    return Field(u, found.measured.max_shear, found.measured.jacobian)
+
+
+def told(found: Mapped, u: np.ndarray) -> str:
+    return displacement_slip(replace(found, models={"model": moved(found, u)}), "model")
+
+
+def test_a_slip_of_axes_frame_or_unit_is_named_under_a_small_load() -> None:
+    found = pressed()
+    right, weight = found.measured.u_mm, found.volumes_ml / found.volumes_ml.sum()
+    rough = right + 0.05 * np.random.default_rng(0).standard_normal(right.shape)
+    assert told(found, rough) == ""
+    named = 0
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            slipped = rough[:, order] * signs
+            words = told(found, slipped)
+            cosine = (
+                weight
+                @ (slipped * right).sum(axis=1)
+                / np.sqrt((weight @ (slipped**2).sum(axis=1)) * (weight @ (right**2).sum(axis=1)))
+            )
+            if cosine < 0.45:
+                # taken as it says, the displacement is the measured one again
+                axes = words.split("taken as ")[1].split(" (")[0].split()
+                undone = np.stack([(-1) ** a.startswith("-") * slipped[:, "xyz".index(a[-1])] for a in axes], axis=1)
+                assert np.sqrt(weight @ ((undone - right) ** 2).sum(axis=1)) < 0.13, (order, signs, words)
+                named += 1
+            elif cosine > 0.6:
+                assert words == "", (order, signs, words)
+    assert named > 30
+    assert "taken as -x -y z (the other of LPS and RAS)" in told(found, rough * [-1.0, -1.0, 1.0])
+    assert told(found, 1e-3 * rough).endswith("times as large as the measured one: is it in metres?")
+    assert told(found, 1e3 * rough).endswith("is it 1000 times too large?")
+    both = told(found, 1e-3 * rough[:, [1, 0, 2]])
+    assert "taken as y x z" in both
+    assert "in metres" in both
+
+
+@pytest.mark.parametrize("factor", [0.15, 0.5, 2.0, 9.0])
+def test_a_model_that_is_too_stiff_too_soft_or_wrong_is_no_slip(factor: float) -> None:
+    found = pressed()
+    right = found.measured.u_mm
+    swung = right[:, [1, 0, 2]] * [1.0, 1.0, 0.0] * 0.6 + right * 0.8  # cosine of about 0.5 with the measured one
+    for u in (right, right * [1.0, 0.3, 0.3], right * [0.5, 1.5, 1.0], swung):
+        assert told(found, factor * u) == ""
+    assert told(found, np.zeros_like(right)) == ""
+
+
+def test_refusals_show_both_boxes(tmp_path) -> None:
+    mesh = cube(6)
+    aside = replace(result("aside", mesh, sheared(0.1)))
+    moved_away = type(mesh)(mesh.points_mm - [9.0, 0.0, 0.0], mesh.cells)
+    off = replace(aside, deformation=type(aside.deformation)(moved_away, aside.deformation.u_mm))
+    with pytest.raises(GeometryError, match=r"Model: -9 to 11 x 0 to 20 .*soft tissue: 0.5 to 24 x -3.5 to 24"):
+        misfits(off, labels(), ["bone"])
+    file = ModelFile("heel", written(tmp_path, "vtu")["path"], Reading(unit="m"))
+    grid = Grid((40, 40, 40), np.ones(3), np.array([-10.0, -35.0, 25.0]), np.eye(3))
+    with pytest.raises(
+        ExtentError, match=r"no body part is that large.*spans 5000 to 15000 .*image: -10 to 30"
+    ) as told:
+        file.read(grid)
+    assert str(file.path) in str(told.value)

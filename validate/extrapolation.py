@@ -1,0 +1,85 @@
+"""A model's deformation carried on over a whole image, so that it can be measured as the tissue was.
+
+A measurement smooths and a model does not. Levelling sends the model through the measurement: its deformation moves
+the unloaded image, noise is drawn anew, and the pair is registered as the scans were. What comes back is what the
+measurement would have made of a foot that moved as the model says.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.deformation.nodal import OnMesh
+from dvc.deformation.protocol import SampledDisplacement, evaluate_on_grid
+from dvc.errors import InputError
+from dvc.images.image import Grid
+
+LEVELLED = "-levelled"
+"""Ending of the name of a model that was sent through the measurement."""
+
+_SMOOTH_MM, _ROUNDS = 2.0, 40
+_MENDING, _LEAST_VOLUME = 12, 0.1
+
+
+def carried_on(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacement:
+    """A model's displacement at every voxel of a grid: its own in its mesh, zero in bone, else carried on smoothly.
+
+    Parameters
+    ----------
+    model : OnMesh
+    grid : Grid
+        Of the unloaded image.
+    bone : (ni, nj, nk) bool
+
+    Raises
+    ------
+    InputError
+        If no voxel lies in the mesh.
+    """
+    low, high = model.mesh.bounds_mm
+    at = grid.indices_of(
+        np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    )
+    first = np.clip(np.floor(at.min(axis=0)).astype(int), 0, grid.shape)
+    last = np.clip(np.ceil(at.max(axis=0)).astype(int) + 1, 0, grid.shape)
+    box = np.zeros(grid.shape, dtype=bool)
+    box[first[0] : last[0], first[1] : last[1], first[2] : last[2]] = True
+    u = np.full((*grid.shape, 3), np.nan)
+    u[box] = evaluate_on_grid(model, grid, box)[0]
+    inside = np.isfinite(u).all(axis=-1)
+    if not inside.any():
+        raise InputError("No voxel of the image lies in the model's mesh.")
+    u[bone & ~inside] = 0.0
+    known = inside | bone
+    nearest = distance_transform_edt(~known, sampling=grid.spacing_mm, return_distances=False, return_indices=True)
+    whole: FloatArray = u[tuple(nearest)]
+    width = _SMOOTH_MM / grid.spacing_mm
+    for axis in range(3):
+        part = whole[..., axis]
+        for _ in range(_ROUNDS):
+            part = np.where(known, u[..., axis], gaussian_filter(part, width, mode="nearest"))
+        whole[..., axis] = part
+    return _unfolded(grid, whole)
+
+
+def _unfolded(grid: Grid, u: FloatArray) -> SampledDisplacement:
+    """The displacement, smoothed around the voxels at which its spline folds, in some rounds.
+
+    A model is linear in each cell, and where one is nearly flat the spline through voxels overshoots.
+    """
+    width = _SMOOTH_MM / grid.spacing_mm
+    for _ in range(_MENDING):
+        field = SampledDisplacement(grid, u)
+        inner = np.zeros(grid.shape, dtype=bool)
+        inner[1:-1, 1:-1, 1:-1] = True
+        _, H = evaluate_on_grid(field, grid, inner)
+        folded = np.zeros(grid.shape, dtype=bool)
+        folded[inner] = np.linalg.det(H + np.eye(3)) < _LEAST_VOLUME
+        if not folded.any():
+            break
+        weight = np.clip(gaussian_filter(folded.astype(np.float64), width) * 8.0 * np.pi**1.5 * width.prod(), 0.0, 1.0)
+        smooth = np.stack([gaussian_filter(u[..., axis], width, mode="nearest") for axis in range(3)], axis=-1)
+        u = u + weight[..., None] * (smooth - u)
+    return field

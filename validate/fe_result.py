@@ -1,0 +1,231 @@
+"""What a finite-element code computed, as a `Deformation`: whatever the code, its unit and its frame.
+
+A result is one file with mesh and displacement (VTU, VTK, Gmsh, CalculiX .frd, FEBio .xplt), or a mesh (also Abaqus
+.inp, ANSYS .cdb) and a table of its nodes' displacements (.csv: node number, and three components).
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.deformation.nodal import OnMesh
+from dvc.deformation.protocol import Affine
+from dvc.errors import GeometryError, InputError
+from dvc.images.image import Grid
+from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS, MeshFile, read_mesh
+from dvc.mesh import TetMesh, box_told
+from validate.tetrahedra import linear_tetrahedra
+
+_NAMES = ("displacement_mm", "displacement", "displacements", "disp", "u")
+_NODE_COLUMNS = ("node", "node label", "node number", "node_id", "nodeid", "id")
+_COMPONENTS = (
+    ("ux_mm", "uy_mm", "uz_mm"),
+    ("ux", "uy", "uz"), ("u1", "u2", "u3"), ("u-u1", "u-u2", "u-u3"),
+    ("u_x", "u_y", "u_z"), ("u.x", "u.y", "u.z"), ("u.u1", "u.u2", "u.u3"), ("disp_x", "disp_y", "disp_z"),
+    ("dx", "dy", "dz"),
+)  # fmt: skip
+_SCALES = {1.0: "this unit", 1e3: "metres (--model-unit m)"}
+_TURNS = {(1.0, 1.0, 1.0): "this frame", (-1.0, -1.0, 1.0): "the other of LPS and RAS (--model-frame)"}
+_INSIDE = 0.5  # share of a mesh's nodes that has to lie in the image
+_MOST_MM = 200.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeResult:
+    """A model's answer to one load.
+
+    Attributes
+    ----------
+    name : str
+        Of the model.
+    path : Path
+    deformation : OnMesh
+        On linear tetrahedra, reference configuration, LPS mm of the image.
+    """
+
+    name: str
+    path: Path
+    deformation: OnMesh
+
+    @property
+    def mesh(self) -> TetMesh:
+        """Where it is defined."""
+        return self.deformation.mesh
+
+
+def read_result(
+    name: str,
+    path: Path | str,
+    *,
+    mesh: Path | str | None = None,
+    unit: str = "mm",
+    frame: str = "LPS",
+    to_image: FloatArray | None = None,
+) -> FeResult:
+    """Read a result of any code.
+
+    Parameters
+    ----------
+    name : str
+        What the model is called in tables.
+    path : path
+        With mesh and displacement, or a table of displacements of the nodes of ``mesh``.
+    mesh : path, optional
+        For a table: the mesh it belongs to.
+    unit : {"mm", "m"}
+        Of coordinates and displacements.
+    frame : {"LPS", "RAS"}
+        Of coordinates and displacements.
+    to_image : (4, 4), optional
+        Rigid map of the model's own frame to the image's, LPS mm, after unit and frame; displacements turn with it.
+
+    Raises
+    ------
+    InputError
+        If there is no displacement, a node has none, or it is none of a body part.
+    ImageFileError, GeometryError
+        As `dvc.io.meshes.read.read_mesh`.
+    """
+    place = Path(path)
+    if place.suffix.lower() == ".csv":
+        if mesh is None:
+            raise InputError(
+                f"{place}: a table of displacements needs the mesh that its nodes belong to (--model-mesh)."
+            )
+        source = read_mesh(mesh, unit=unit, frame=frame)
+        values = _from_table(place, source)
+    else:
+        source = read_mesh(place, unit=unit, frame=frame)
+        values = _beside_mesh(place, source)
+    u = values * MM_PER_UNIT[unit] * TO_LPS[frame]
+    tets, carry = linear_tetrahedra(source)
+    names = _names_of_regions(place)
+    regions = {names.get(region, region): cells for region, cells in tets.regions.items()}
+    tets = TetMesh(tets.points_mm, tets.cells, regions, tets.facets, tets.node_ids)
+    used = np.unique(carry.indices)
+    missing = ~np.isfinite(u[used]).all(axis=1)
+    if missing.any():
+        first = source.node_ids[used[int(np.argmax(missing))]]
+        raise InputError(
+            f"{place}: {np.count_nonzero(missing)} of {len(missing)} nodes have no displacement, first node {first}. "
+            "Export all nodes of the tissue."
+        )
+    moved = np.asarray(carry @ np.nan_to_num(u))
+    if to_image is not None:
+        rigid = _rigid(to_image)
+        tets = TetMesh(rigid.apply(tets.points_mm), tets.cells, tets.regions, tets.facets, tets.node_ids)
+        moved = moved @ rigid.matrix.T
+    largest = float(np.linalg.norm(moved, axis=1).max())
+    if not 0.0 < largest < _MOST_MM:
+        raise InputError(
+            f"{place}: the largest displacement is {largest:.3g} mm, which is none of tissue under a plate. Is the "
+            "unit right, and the load step the last one?"
+        )
+    return FeResult(name, place, OnMesh(tets, moved))
+
+
+def _names_of_regions(place: Path) -> dict[str, str]:
+    """Names of the numbers in the array ``region``, where a simulation or a mesh of ours tells them."""
+    tables = ((place.with_name("simulation.json"), "region_numbers_in_vtu"), (place.with_suffix(".json"), "regions"))
+    for file, key in tables:
+        try:
+            told = json.loads(file.read_text(encoding="utf-8"))
+            table = told.get(key) or told.get("parameters", {}).get(key)
+            if table:
+                return {f"region {number}": str(name) for number, name in table.items()}
+        except (OSError, ValueError, AttributeError):
+            continue
+    return {}
+
+
+def _rigid(matrix: FloatArray) -> Affine:
+    given = np.asarray(matrix, dtype=np.float64)
+    turn = given[:3, :3] if given.shape == (4, 4) else np.zeros((3, 3))
+    proper = np.abs(turn.T @ turn - np.eye(3)).max() < 1e-4 and np.linalg.det(turn) > 0.0
+    if not (proper and np.allclose(given[3], [0.0, 0.0, 0.0, 1.0])):
+        raise InputError("The map to the image must be a 4 x 4 matrix of a rotation and a translation in mm.")
+    return Affine(turn, given[:3, 3])
+
+
+def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
+    """Displacement (n, 3) in the file's own unit and frame."""
+    if place.suffix.lower() in (".inp", ".cdb"):
+        raise InputError(f"{place} holds a mesh and no result; give the table of its nodal displacements (.csv).")
+    if place.suffix.lower() == ".frd" and not source.at_nodes:
+        raise InputError(f"{place} has no displacements: write them with *NODE FILE, U.")
+    if place.suffix.lower() == ".msh" and (np.diff(source.node_ids) <= 0).any():
+        raise InputError(
+            f"{place}: its nodes do not stand in the order of their numbers, so that displacements may "
+            "belong to others. Write it as VTU."
+        )
+    known = {name.casefold(): name for name in source.at_nodes}
+    for wanted in _NAMES:
+        if wanted in known:
+            values = source.at_nodes[known[wanted]]
+            if values.shape != source.points_mm.shape:
+                raise InputError(f"{place}: its array '{known[wanted]}' has shape {values.shape}, not three per node.")
+            return values
+    raise InputError(
+        f"{place} has no displacement at its nodes; its arrays are {', '.join(source.at_nodes) or 'none'}. Call it "
+        f"{_NAMES[1]!r}, in the unit of the coordinates."
+    )
+
+
+def _from_table(place: Path, source: MeshFile) -> FloatArray:
+    try:
+        with place.open(newline="", encoding="utf-8-sig") as file:
+            head, *rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)] or [[]]
+    except (OSError, ValueError) as error:
+        raise InputError(f"{place}: no readable table ({error}).") from error
+    named = [cell.strip(" '\"").casefold() for cell in head]
+    node = next((n for n in _NODE_COLUMNS if n in named), None)
+    parts = next((c for c in _COMPONENTS if set(c) <= set(named)), None)
+    if node is None or parts is None:
+        raise InputError(
+            f"{place}: a table of displacements has a column 'node' and three such as ux, uy, uz, with commas "
+            f"between; it has {', '.join(head)}."
+        )
+    columns = [named.index(node), *(named.index(c) for c in parts)]
+    try:
+        numbers = np.array([[float(row[c]) for c in columns] for row in rows])
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{place}: a row is no node and three numbers ({error}).") from error
+    index = {int(n): i for i, n in enumerate(source.node_ids)}
+    ids = numbers[:, 0].astype(np.int64)
+    unknown = [int(n) for n in ids if int(n) not in index]
+    if unknown or len(np.unique(ids)) < len(ids):
+        what = f"node {unknown[0]}, which {source.path.name} does not have" if unknown else "a node twice"
+        raise InputError(f"{place} has {what}: table and mesh do not belong together.")
+    u = np.full((len(source.node_ids), 3), np.nan)
+    u[[index[int(n)] for n in ids]] = numbers[:, 1:]
+    return u
+
+
+def check_overlap(path: Path, mesh: TetMesh, grid: Grid) -> None:
+    """Refuse a mesh that does not lie in the image.
+
+    Raises
+    ------
+    GeometryError
+        With both boxes, and with what would bring the model there, if a unit or a frame does.
+    """
+    points = mesh.points_mm
+    if np.mean(grid.contains(points)) >= _INSIDE:
+        return
+    fitting = []
+    for (scale, size), (signs, turned) in product(_SCALES.items(), _TURNS.items()):
+        if np.mean(grid.contains(points * scale * np.array(signs))) >= _INSIDE:
+            fitting.append(f"{size} and {turned}")
+    low, high = grid.bounds_mm()
+    raise GeometryError(
+        f"{path} does not lie in the image. Model: {box_told(points.min(axis=0), points.max(axis=0))}; image: "
+        f"{box_told(low, high)} (LPS mm). "
+        + (f"It would with {fitting[0]}." if fitting else "Give the map to the image's frame (--to-image).")
+    )

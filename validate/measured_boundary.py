@@ -1,0 +1,197 @@
+"""Materials judged apart from the plate: the measured displacement on a model's outside drives the model.
+
+Bone stays where it is; every other node on the outside goes where the measurement puts it. What the inside then does
+depends on the laws alone, not on how plate, contact and friction were idealised.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dvc.arrays import FloatArray, IntArray
+from dvc.atomic_files import write_whole
+from dvc.deformation.protocol import Deformation
+from dvc.errors import InputError, MrstrainError
+from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
+from dvc.mesh import TetMesh, outer_faces
+from fe.assembly import Assembler
+from fe.elements import element
+from fe.linear import Solver
+from fe.materials import Material
+from fe.model import Model
+from fe.newton import Tolerance, equilibrium
+from fe.simulate import LoadStep, State, check_laws
+from fe.surface_sets import BONE
+from validate.mapping import filled_from_nearest
+
+_FIRST_STEP, _LEAST_STEP = 0.25, 1.0 / 64.0
+_GROWTH, _SHRINK = 1.7, 0.4
+_FAR_MM, _FEW = 3.0, 0.01
+_NO_EQUATION = np.empty(0, dtype=np.int64)
+
+
+def outside(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
+    """Nodes (k,) on the outside of a mesh, and their measured displacement (k, 3), LPS mm.
+
+    Nodes of the facets "bone" stay. A node at which the measurement is not defined (the outermost half voxel) goes with
+    the nearest node of the mesh at which it is.
+
+    Raises
+    ------
+    InputError
+        If over a hundredth of the nodes lie further than 3 mm from any that is measured.
+    """
+    nodes = np.unique(outer_faces(mesh.cells))
+    u = _everywhere(mesh, measured)[nodes]
+    if BONE in mesh.facets:
+        u[np.isin(nodes, mesh.facets[BONE])] = 0.0
+    return nodes, u
+
+
+def _everywhere(mesh: TetMesh, measured: Deformation) -> FloatArray:
+    u = measured.displacement(mesh.points_mm)
+    known = np.isfinite(u).all(axis=1)
+    if not known.any():
+        raise InputError("The measurement is defined at no node of the mesh. Do they share a frame?")
+    distance, _ = cKDTree(mesh.points_mm[known]).query(mesh.points_mm[~known])
+    if np.count_nonzero(distance > _FAR_MM) > _FEW * len(u):
+        raise InputError(
+            f"{np.count_nonzero(distance > _FAR_MM)} of {len(u)} nodes lie over {_FAR_MM:g} mm from any at which the "
+            "measurement is defined; it does not cover the model."
+        )
+    return filled_from_nearest(u, mesh.points_mm)
+
+
+def driven(
+    mesh: TetMesh,
+    laws: Mapping[str, Material],
+    measured: Deformation,
+    load: str,
+    *,
+    threads: int = 1,
+    tell: Callable[[str], None] = lambda _: None,
+) -> State:
+    """The state of a mesh whose outside goes where a measurement puts it.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+        Every cell in one region; facets "bone" do not move.
+    laws : mapping of region to Material
+    measured : Deformation
+        Of tissue relative to its bone, reference configuration, LPS mm.
+    load : str
+        Name of the load.
+    threads : int
+        Of the linear algebra.
+    tell : callable
+        Gets a line for each step.
+
+    Returns
+    -------
+    State
+        Without a plate; ``reached`` below 1 where the last steps found no balance.
+
+    Raises
+    ------
+    InputError
+        As `outside`, or if a cell has not one law.
+    """
+    check_laws(mesh, laws)
+    began = time.monotonic()
+    nodes, u = outside(mesh, measured)
+    guess = _everywhere(mesh, measured)
+    guess[nodes] = u
+    model = Model.of(mesh, laws, element("P1"))
+    assembler = Assembler(model, (3 * nodes[:, None] + np.arange(3)).ravel(), {})
+    solver = Solver(assembler.indptr, assembler.indices, threads=threads)
+    state = np.zeros(model.unknowns)
+    count = 3 * len(mesh.points_mm)
+    done, step, iterations = 0.0, _FIRST_STEP, 0
+    try:
+        while done < 1.0 and step > _LEAST_STEP:
+            share = min(1.0, done + step)
+            tried = state.copy()
+            tried[:count] += (share - done) * guess.ravel()
+            found = equilibrium(
+                assembler, solver, tried, np.zeros(assembler.size), _NO_EQUATION, np.empty(0), Tolerance(), told=tell
+            )
+            if found is None:
+                step *= _SHRINK
+                continue
+            state, done, step = found.state, share, step * _GROWTH
+            iterations += found.iterations
+            tell(f"{done:.0%} of the way")
+    finally:
+        solver.close()
+    if done == 0.0:
+        raise MrstrainError(f"{load}: the model finds no balance with its outside where it was measured.")
+    return State(
+        load=LoadStep(load, float("nan")),
+        reached=done,
+        u_mm=state[:count].reshape(-1, 3),
+        pressure_mpa=model.pressures(state),
+        gradients=model.gradients(state),
+        on_plate=_NO_EQUATION,
+        curve=(),
+        iterations=iterations,
+        seconds=time.monotonic() - began,
+    )
+
+
+def write_boundary(
+    stem: Path, mesh: TetMesh, nodes: IntArray, u_mm: FloatArray, *, unit: str = "mm", frame: str = "LPS"
+) -> list[Path]:
+    """Write displacements (k, 3) LPS mm of a mesh's nodes as boundary conditions, in its file's own unit and frame.
+
+    Nodes have the mesh's own numbers; those of a file that gives none are counted from 1, as in `fe.decks`.
+
+    ``.inp`` for Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D), ``.feb`` for FEBio 4, to be merged.
+    """
+    numbers = mesh.node_ids[nodes] + (1 if mesh.node_ids.min() == 0 else 0)
+    u = u_mm / MM_PER_UNIT[unit] * TO_LPS[frame]
+    about = f"displacements in {unit}, {frame}, of nodes by their numbers in the mesh"
+    written = {".inp": _abaqus(numbers, u), ".mac": _ansys(numbers, u), ".feb": _febio(numbers, u)}
+    told = {".inp": f"** {about}; into a *STEP", ".mac": f"! {about}", ".feb": f"<!-- {about} -->"}
+    paths = []
+    for ending, lines in written.items():
+        paths.append(stem.with_name(stem.name + ending))
+        first, *others = lines
+        written_lines = [first, told[ending], *others] if ending == ".feb" else [told[ending], first, *others]
+        write_whole(paths[-1], "\n".join(written_lines) + "\n")
+    return paths
+
+
+def _abaqus(numbers: IntArray, u: FloatArray) -> Iterator[str]:
+    yield "*BOUNDARY"
+    for number, row in zip(numbers, u, strict=True):
+        for axis in range(3):
+            yield f"{number}, {axis + 1}, {axis + 1}, {row[axis]:.9g}"
+
+
+def _ansys(numbers: IntArray, u: FloatArray) -> Iterator[str]:
+    for number, row in zip(numbers, u, strict=True):
+        for name, value in zip(("UX", "UY", "UZ"), row, strict=True):
+            yield f"D,{number},{name},{value:.9g}"
+
+
+def _febio(numbers: IntArray, u: FloatArray) -> Iterator[str]:
+    yield '<?xml version="1.0" encoding="ISO-8859-1"?>'
+    yield "<!-- to be merged into a model whose load controller 1 rises from 0 to 1 -->"
+    yield '<febio_spec version="4.0">'
+    yield f'<Mesh><NodeSet name="outside">{",".join(map(str, numbers))}</NodeSet></Mesh>'
+    yield "<MeshData>"
+    for axis, name in enumerate("xyz"):
+        yield f'<NodeData name="u{name}" node_set="outside">'
+        yield from (f'<node lid="{n}">{value:.9g}</node>' for n, value in enumerate(u[:, axis], start=1))
+        yield "</NodeData>"
+    yield "</MeshData><Boundary>"
+    for name in "xyz":
+        yield f'<bc name="outside_{name}" node_set="outside" type="prescribed displacement"><dof>{name}</dof>'
+        yield f'<value lc="1" type="map">u{name}</value><relative>0</relative></bc>'
+    yield "</Boundary></febio_spec>"

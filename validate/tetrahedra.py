@@ -1,0 +1,247 @@
+"""Cells of any kind as linear tetrahedra: what one evaluator of deformations needs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+
+import numpy as np
+from scipy import sparse
+
+from dvc.arrays import FloatArray, IntArray
+from dvc.errors import GeometryError
+from dvc.io.meshes.read import CellBlock, MeshFile
+from dvc.mesh import TetMesh
+from validate.cell_shapes import SHAPES, Shape
+
+_log = logging.getLogger("validate.tetrahedra")
+
+# A ten-node tetrahedron: four corners, and the octahedron between them around one of its diagonals.
+_TETRA10 = np.array(
+    [(0, 4, 6, 7), (4, 1, 5, 8), (6, 5, 2, 9), (7, 8, 9, 3), (6, 8, 4, 5), (6, 8, 5, 9), (6, 8, 9, 7), (6, 8, 7, 4)]
+)
+# Numbers of nodes of the quadratic cells that are taken whole.
+_SIZES = {"tetra": (10,), "hexahedron": (20, 27), "wedge": (15, 18), "pyramid": (13, 14)}
+_FLAT = 1e-9
+
+_Faces = list[tuple[IntArray, IntArray]]  # corners (m, c) of faces of cells, and the triangles (m, k, 3) they became
+
+
+def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
+    """A mesh file's volume cells as linear tetrahedra, and a matrix that carries nodal values to its nodes.
+
+    A quadratic tetrahedron becomes eight, through the middles of its edges. Hexahedra, wedges and pyramids are cut from
+    their middle, and so that neighbours fit: linear ones with the mean of the corners as middle, and faces along the
+    diagonal from their lowest node; quadratic ones through all their nodes, and those that the middles of quadrangles
+    and of the cell lack by the element's own interpolation, into tetrahedra of half the cell's size. Kinds with nodes
+    in some of these places only are taken by their corners, which is said in the log (``validate.tetrahedra``). Regions
+    and named surfaces are kept.
+
+    Returns
+    -------
+    tets : TetMesh
+    carry : (nodes of tets, nodes of the file)
+
+    Raises
+    ------
+    GeometryError
+        If a cell is folded.
+    """
+    nodes = _Nodes(mesh.points_mm)
+    cells: list[IntArray] = []
+    parents: list[IntArray] = []
+    faces: _Faces = []
+    at = 0
+    for block in mesh.blocks:
+        numbers = at + np.arange(len(block.nodes))
+        at += len(block.nodes)
+        if block.shape not in SHAPES:
+            continue
+        whole = block.nodes.shape[1] in _SIZES[block.shape]
+        if not whole and block.kind != block.shape:
+            _log.warning("Of cells of kind %s only the corner nodes are used.", block.kind)
+        if block.shape == "tetra":
+            children = _tetrahedra(block)
+            cells.append(children.reshape(-1, 4))
+            parents.append(np.repeat(numbers, children.shape[1]))
+            faces += _quadratic_faces(block.nodes, SHAPES["tetra"]) if whole else _linear_faces(block)
+            continue
+        made, middle = _quadratic(block, nodes) if whole else _linear(block, nodes)
+        faces += made
+        triangles = np.concatenate([found.reshape(-1, 3) for _, found in made])
+        of = np.concatenate([np.repeat(np.arange(len(found)), found.shape[1]) for _, found in made])
+        cells.append(_outward(nodes.points, triangles, middle, of, block))
+        parents.append(numbers[of])
+    every, parent = np.concatenate(cells), np.concatenate(parents)
+    order = np.argsort(parent, kind="stable")
+    starts = np.searchsorted(parent[order], np.arange(mesh.cell_count + 1))
+    regions = {}
+    for name, index in mesh.regions.items():
+        members = [order[starts[c] : starts[c + 1]] for c in index]
+        if sum(map(len, members)):
+            regions[name] = np.concatenate(members)
+    facets = {
+        name: found
+        for name, corners in _surfaces(mesh)
+        if len(found := _on_surface(corners, faces, len(mesh.points_mm)))
+    }
+    made_of = TetMesh(nodes.points, every, regions, facets, np.arange(len(nodes.points)))
+    return made_of, nodes.carry[made_of.node_ids]
+
+
+class _Nodes:
+    """A file's nodes, and new ones between them."""
+
+    def __init__(self, points: FloatArray) -> None:
+        self._points, self._known = [points], len(points)
+        self._first = len(points)
+        self._weights = [sparse.identity(len(points), format="csr")]
+
+    def add(self, between: IntArray, shares: FloatArray) -> IntArray:
+        """New nodes (m,) between the file's own (m, k), by shares (k,)."""
+        count = len(between)
+        row = np.repeat(np.arange(count), between.shape[1])
+        share = sparse.csr_matrix((np.tile(shares, count), (row, between.ravel())), shape=(count, self._first))
+        self._weights.append(share)
+        self._points.append(np.asarray(share @ self._points[0]))
+        self._known += count
+        return np.arange(self._known - count, self._known)
+
+    @property
+    def points(self) -> FloatArray:
+        """All nodes, (n, 3) LPS mm."""
+        return np.concatenate(self._points)
+
+    @property
+    def carry(self) -> sparse.csr_matrix:
+        """Weights of the file's nodes in each, (n, nodes of the file)."""
+        return sparse.vstack(self._weights, format="csr")
+
+
+def _tetrahedra(block: CellBlock) -> IntArray:
+    """Children (m, c, 4) of linear or quadratic tetrahedra, the same way round as their parents."""
+    if block.kind != "tetra10":
+        return block.corners[:, None]
+    reference = SHAPES["tetra"].nodes[_TETRA10]
+    flip = np.linalg.det(reference[:, 1:] - reference[:, :1]) < 0.0
+    ordered = np.where(flip[:, None], _TETRA10[:, [0, 1, 3, 2]], _TETRA10)
+    return block.nodes[:, ordered]
+
+
+def _linear(block: CellBlock, nodes: _Nodes) -> tuple[_Faces, IntArray]:
+    """Faces of linear cells as triangles, and the cells' middles (m,)."""
+    count = block.corners.shape[1]
+    return _linear_faces(block), nodes.add(block.corners, np.full(count, 1.0 / count))
+
+
+def _linear_faces(block: CellBlock) -> _Faces:
+    """Faces as triangles, quadrangles cut from their lowest node."""
+    found: _Faces = []
+    for face in SHAPES[block.shape].faces:
+        corners = block.corners[:, list(face)]
+        if len(face) == 3:
+            found.append((corners, corners[:, None]))
+        else:
+            turned = np.take_along_axis(corners, (np.argmin(corners, axis=1)[:, None] + np.arange(4)) % 4, axis=1)
+            found.append((corners, turned[:, np.array([(0, 1, 2), (0, 2, 3)])]))
+    return found
+
+
+def _quadratic(block: CellBlock, nodes: _Nodes) -> tuple[_Faces, IntArray]:
+    """Faces of quadratic cells as triangles of half their size, and the cells' middles (m,)."""
+    shape = SHAPES[block.shape]
+    own, edged = block.nodes, shape.edged
+    if own.shape[1] == edged:
+        # the middle of a quadrangle is one node for both its cells
+        rims, shares = zip(*(shape.in_face(face) for face in shape.quadrangles), strict=True)
+        rim = np.concatenate([own[:, list(r)] for r in rims])
+        _, first, which = np.unique(np.sort(rim[:, ::2], axis=1), axis=0, return_index=True, return_inverse=True)
+        middles = nodes.add(rim[first], shares[0])[which.ravel()].reshape(len(rims), -1).T
+        own = np.concatenate([own, middles], axis=1)
+    if block.kind == "hexahedron27":
+        return _quadratic_faces(own, shape), own[:, 26]
+    return _quadratic_faces(own, shape), nodes.add(own[:, :edged], shape.in_body())
+
+
+def _quadratic_faces(own: IntArray, shape: Shape) -> _Faces:
+    return [(own[:, list(face)], own[:, shape.halved(face)]) for face in shape.faces]
+
+
+def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: IntArray, block: CellBlock) -> IntArray:
+    """Tetrahedra (k, 4) of positive volume over triangles (k, 3) around the middles (m,) of the cells (k,) they are of.
+
+    Every triangle's normal has to point away from the middle once the faces are followed consistently; a cell where one
+    does not is folded. It is found by the volumes: those of a sound cell add up to that of its faces' divergence.
+    """
+    tets = np.concatenate([triangles, middle[cell][:, None]], axis=1)
+    corner = points[tets]
+    volume = np.linalg.det(corner[:, 1:] - corner[:, :1])
+    signed = volume * _turning(triangles, cell)
+    size = np.bincount(cell, np.abs(volume))
+    folded = np.abs(np.bincount(cell, signed)) < (1.0 - _FLAT) * size
+    folded |= np.bincount(cell, np.abs(volume) <= _FLAT * size[cell]) > 0
+    if folded.any():
+        raise GeometryError(
+            f"{np.count_nonzero(folded)} {block.kind} cells are folded or flat, first that with nodes "
+            f"{block.nodes[np.argmax(folded)].tolist()}. Mend the mesh where it was made."
+        )
+    return np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)
+
+
+def _turning(triangles: IntArray, cell: IntArray) -> FloatArray:
+    """+1 or -1 for each triangle, so that those of a cell all turn the same way round its surface.
+
+    Two triangles of a closed surface that share an edge turn alike if they run along it in opposite directions.
+    """
+    count = len(triangles)
+    start, end = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
+    owner = np.repeat(np.arange(count), 3)
+    key = np.stack([cell[owner], np.minimum(start, end), np.maximum(start, end)])
+    order = np.lexsort(key)
+    first, second = order[0::2], order[1::2]
+    same = np.where((start < end)[first] == (start < end)[second], -1.0, 1.0)
+    turn = np.zeros(count)
+    _, at = np.unique(cell, return_index=True)
+    turn[at] = 1.0
+    a, b = owner[first], owner[second]
+    for _ in range(count):
+        before = np.count_nonzero(turn)
+        known = (turn[a] != 0.0) & (turn[b] == 0.0)
+        turn[b[known]] = turn[a[known]] * same[known]
+        known = (turn[b] != 0.0) & (turn[a] == 0.0)
+        turn[a[known]] = turn[b[known]] * same[known]
+        if np.count_nonzero(turn) == before:
+            break
+    return turn
+
+
+def _surfaces(mesh: MeshFile) -> Iterable[tuple[str, list[tuple[int, ...]]]]:
+    """Faces of each named surface, by their corners: the flat cells of a region, or triangles of a set of nodes."""
+    flat: dict[int, tuple[int, ...]] = {}
+    at = 0
+    for block in mesh.blocks:
+        if block.shape in ("triangle", "quad"):
+            flat |= {at + n: tuple(corners) for n, corners in enumerate(block.corners.tolist())}
+        at += len(block.nodes)
+    named = {
+        name: rows for name, index in mesh.regions.items() if (rows := [flat[c] for c in index.tolist() if c in flat])
+    }
+    if mesh.tets is not None:  # the tetrahedra's own nodes are some of the file's
+        by_id = np.argsort(mesh.node_ids)
+        place = by_id[np.searchsorted(mesh.node_ids, mesh.tets.node_ids, sorter=by_id)]
+        named = {name: [tuple(r) for r in place[rows].tolist()] for name, rows in mesh.tets.facets.items()} | named
+    return named.items()
+
+
+def _on_surface(corners: list[tuple[int, ...]], faces: _Faces, count: int) -> IntArray:
+    """Triangles (k, 3) that the faces with these corners became; a face that no cell has is left out."""
+    wanted = {tuple(sorted(face)) for face in corners}
+    there = np.zeros(count, dtype=bool)
+    there[np.concatenate([np.array(face) for face in wanted])] = True
+    found: dict[tuple[int, ...], IntArray] = {}
+    for keys, triangles in faces:
+        for row in np.flatnonzero(there[keys].all(axis=1)):
+            key = tuple(sorted(keys[row].tolist()))
+            if key in wanted:
+                found[key] = triangles[row]
+    return np.concatenate(list(found.values())) if found else np.empty((0, 3), dtype=np.int64)
