@@ -1,7 +1,8 @@
 # The commands a person types, which are also the ones that CI runs.
 #
 #   make demo    set-up, then the demonstration: a phantom heel through a whole study, a report in ./demo
-#   make test    set-up, then lint, types, import contract and all tests
+#   make test    set-up, then lint, types, import contract and the tests
+#   make test-all  the same with the tests that need full-size images or minutes
 #   make setup   only the environment in .venv, redone when requirements.lock or pyproject.toml changes
 #   make lint    ruff, mypy and the import contract
 #   make format  rewrite the sources as ruff formats them
@@ -25,12 +26,15 @@ else
 BIN := $(VENV)/bin
 endif
 
+# Both cores to the end: a worker that has nothing left takes tests from the other.
+PYTEST := -n 2 --dist worksteal
+
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format lock docs peers clean
+.PHONY: help setup demo test test-all lint format lock docs peers clean
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n '3,13p' Makefile | sed 's/^# \{0,1\}//'
+	@sed -n '3,14p' Makefile | sed 's/^# \{0,1\}//'
 
 setup: $(VENV)/installed.stamp
 
@@ -52,7 +56,10 @@ demo: setup
 	$(BIN)/mrstrain demo --out demo
 
 test: setup lint
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest $(PYTEST) -m "not full_size"
+
+test-all: setup lint
+	$(BIN)/python -m pytest $(PYTEST)
 
 lint: setup
 	$(BIN)/ruff check .

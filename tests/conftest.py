@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import os
+import pickle
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from hypothesis import settings
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # each has a core: threads of two workers would wait for one another
+    os.environ |= dict.fromkeys(
+        ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
+    )
 
 # The same examples in every run: a failure that comes and goes tells nobody anything.
 settings.register_profile("fixed", derandomize=True, deadline=None)
@@ -39,19 +47,41 @@ def tissue_points(heel):
 
 
 @pytest.fixture(scope="session")
-def small_pair():
-    """A heel at 1.6 mm voxels, pressed, moved and scanned again; truth known."""
-    from phantoms.heel import heel_pair
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """Fill a folder once for all tests, whichever worker asks first; nobody may write into it afterwards."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
-    return heel_pair(seed=3, shape=(64, 72, 68), spacing_mm=1.6, load=0.6)
+    def made(name: str, fill: Callable[[Path], None]) -> Path:
+        folder, filled = shared / name, shared / f"{name}.filled"
+        with FileLock(shared / f"{name}.lock"):
+            if not filled.exists():
+                folder.mkdir(exist_ok=True)
+                fill(folder)
+                filled.touch()
+        return folder
+
+    return made
 
 
 @pytest.fixture(scope="session")
-def tiny_pair():
-    """The same at 2.5 mm, where seconds count."""
+def small_pair(made_once):
+    """A heel at 1.6 mm voxels, pressed, moved and scanned again; truth known."""
+    return _kept(made_once, "small-pair", shape=(64, 72, 68), spacing_mm=1.6)
+
+
+@pytest.fixture(scope="session")
+def tiny_pair(made_once):
+    """The same at 2.3 mm, the largest voxels whose bias field is found on every other one: where seconds count."""
+    return _kept(made_once, "tiny-pair", shape=(44, 50, 46), spacing_mm=2.3)
+
+
+def _kept(made_once, name: str, **size):
+    """A pair of images, made by one worker and read by the others."""
     from phantoms.heel import heel_pair
 
-    return heel_pair(seed=3, shape=(40, 46, 42), spacing_mm=2.5, load=0.6)
+    folder = made_once(name, lambda place: (place / "pair").write_bytes(pickle.dumps(heel_pair(3, load=0.6, **size))))
+    return pickle.loads((folder / "pair").read_bytes())
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from sybil import Sybil
 from sybil.parsers.markdown import PythonCodeBlockParser
 
 from dvc.io.images.labels import read_labels
-from dvc.io.images.write import write_image, write_mask
+from dvc.io.images.write import write_mask
 from fe.mesh_file import write_tet_mesh
 from mrstrain.cli.app import app
 from mrstrain.studies.file import read_study
@@ -26,6 +26,7 @@ from tests.quick import QUICK
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
+GIVEN = ROOT / "tests" / "golden" / "given"
 PAGES = sorted([ROOT / "README.md", *DOCS.rglob("*.md")])
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 
@@ -84,11 +85,12 @@ def heel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_lines_of_the_readme(
-    tiny_pair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_image(tmp_path / "Load0.nii.gz", tiny_pair.reference)
-    write_image(tmp_path / "Load1.nii.gz", tiny_pair.loaded)
-    write_mask(tmp_path / "calcaneus.nii.gz", tiny_pair.bone)
+    for load in ("Load0", "Load1"):
+        shutil.copy(GIVEN / f"{load}.nii.gz", tmp_path)
+    bone = read_labels(GIVEN / "tissues.nii.gz", GIVEN / "tissues.csv").region("bone")
+    write_mask(tmp_path / "calcaneus.nii.gz", bone)
     monkeypatch.chdir(tmp_path)
     (block,) = Sybil(parsers=[PythonCodeBlockParser()]).parse(ROOT / "README.md").examples()
     block.evaluate()
@@ -96,18 +98,21 @@ def test_the_lines_of_the_readme(
     assert (tmp_path / "results" / "Load1" / "max_shear.nii.gz").is_file()
 
 
+@pytest.mark.full_size
 def test_register(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(heel, tmp_path / "heel")
     shutil.copy(heel / "quick.txt", tmp_path)
     follow("register.md", tmp_path, monkeypatch)
 
 
+@pytest.mark.full_size
 def test_validate(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(heel, tmp_path / "heel")
     write_model(heel, tmp_path / "abaqus", 1, 0.8)
     follow("validate.md", tmp_path, monkeypatch)
 
 
+@pytest.mark.full_size
 def test_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "quick.txt").write_text(QUICK)
     follow("preset.md", tmp_path, monkeypatch)
@@ -118,7 +123,7 @@ def test_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("material.md", tmp_path, monkeypatch)
 
 
-@pytest.mark.slow
+@pytest.mark.full_size
 def test_cohort(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for seed in (1, 2):
         subject = tmp_path / f"subject-{seed}"

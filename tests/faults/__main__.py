@@ -2,6 +2,7 @@
 
     python -m tests.faults                               every fault of faults.toml, against the tests of `make test`
     python -m tests.faults --only load-order-reversed    one of them
+    python -m tests.faults --suite all --own             against those of `make test-all` that each fault names
 
 For each fault the sources are copied, its text is replaced in the copy, and pytest runs there: first the tests that the
 fault names, then, if they pass, the suite. What failed is run once more without the fault, since a test that fails
@@ -30,12 +31,12 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTEST = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
-SUITES: dict[str, list[str] | None] = {"short": [], "all": [], "none": None}
-"""What pytest gets beside for the tests of `make test`, for all tests, and for no more than a fault names."""
+SUITES = {"short": ["-m", "not full_size"], "all": []}
+"""What pytest gets beside for the tests of `make test`, and for those of `make test-all`."""
 
 _LEFT_OUT = shutil.ignore_patterns(".*", "site", "demo", "out", "build", "dist", "*.egg-info")
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+?\.(?:py|md)(?:::.+?)?)(?: - (.*))?$", re.MULTILINE)
-_INTERRUPTED, _NOT_FOUND = 2, 4  # pytest's exit status
+_INTERRUPTED, _NOT_FOUND, _NONE_SELECTED = 2, 4, 5  # pytest's exit status
 
 
 class NotTriedError(Exception):
@@ -45,8 +46,8 @@ class NotTriedError(Exception):
 class Trial:
     """Copies of the sources, with a fault or without, and pytest in them."""
 
-    def __init__(self, folder: Path, suite: list[str] | None, limit_s: float) -> None:
-        self._folder, self._suite, self._limit_s = folder, suite, limit_s
+    def __init__(self, folder: Path, suite: list[str], limit_s: float, own: bool) -> None:
+        self._folder, self._suite, self._limit_s, self._own = folder, suite, limit_s, own
         self._whole, self._alone = folder / "whole", Lock()  # copied by one, or tested in by one, at a time
         shutil.copytree(ROOT, self._whole, ignore=_LEFT_OUT)
         self._passes = cache(lambda test: self._failed(self._whole, [test]) is None)
@@ -68,8 +69,8 @@ class Trial:
         try:
             seed(copy, fault)
             failed = self._failed(copy, fault["tests"])
-            if failed is None and self._suite is not None:
-                failed = self._failed(copy, self._suite)
+            if failed is None and not self._own:
+                failed = self._failed(copy, [])
         finally:
             shutil.rmtree(copy, ignore_errors=True)
         with self._alone:
@@ -82,7 +83,7 @@ class Trial:
         status, said = self._pytest(copy, tests)
         if status == _NOT_FOUND and any("::" in test for test in tests):  # renamed within its file
             status, said = self._pytest(copy, [test.split("::")[0] for test in tests])
-        if status == 0:
+        if status in (0, _NONE_SELECTED):
             return None
         found = _FAILED.search(said)
         if found is None or (status == _INTERRUPTED and "::" not in found[1]):
@@ -93,7 +94,7 @@ class Trial:
         data = os.environ.get("MRSTRAIN_TEST_DATA", str(ROOT.parent / "shared" / "data"))
         settings = {"PYTHONPATH": str(copy), "MRSTRAIN_TEST_DATA": data, "COLUMNS": "400"}
         with subprocess.Popen(
-            [*PYTEST, *tests], cwd=copy, start_new_session=True, text=True, stdin=subprocess.DEVNULL,
+            [*PYTEST, *self._suite, *tests], cwd=copy, start_new_session=True, text=True, stdin=subprocess.DEVNULL,
             env={k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | settings,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         ) as running:  # fmt: skip
@@ -121,7 +122,8 @@ def main() -> int:
     """Try the faults that the command line names; the exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--only", action="append", metavar="NAME", help="of a fault; repeat for several")
-    parser.add_argument("--suite", choices=SUITES, default="short", help="what runs where a fault's own tests pass")
+    parser.add_argument("--suite", choices=SUITES, default="short", help="the tests that are tried")
+    parser.add_argument("--own", action="store_true", help="no more than the tests that a fault names")
     parser.add_argument("--jobs", type=int, default=1, help="faults at once")
     parser.add_argument("--limit-minutes", type=float, default=60.0, help="of each run of pytest")
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("results.json"))
@@ -136,7 +138,7 @@ def main() -> int:
     )
     chosen, writing = [fault for fault in listed if fault["name"] in (asked.only or faults)], Lock()
     with tempfile.TemporaryDirectory(prefix="faults-") as folder, ThreadPoolExecutor(asked.jobs) as pool:
-        trial = Trial(Path(folder), SUITES[asked.suite], 60.0 * asked.limit_minutes)
+        trial = Trial(Path(folder), SUITES[asked.suite], 60.0 * asked.limit_minutes, asked.own)
 
         def one(fault: dict[str, Any]) -> str:
             told = trial.run(fault) | {"suite": asked.suite, "commit": head.stdout.strip()}

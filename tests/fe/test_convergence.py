@@ -11,8 +11,11 @@ from dvc.errors import InputError
 from dvc.images.image import LabelMap
 from dvc.io.images.write import write_labels
 from fe.convergence import extrapolated
+from fe.mesh_file import write_tet_mesh
 from mrstrain.cli.app import app
+from mrstrain.records.provenance import provenance
 from tests.fe.test_meshing import half_onion
+from tests.fe.test_simulate import dome
 
 
 @pytest.mark.parametrize("order", [0.8, 1.0, 2.0])
@@ -52,11 +55,38 @@ def test_no_limit_is_told_where_there_is_none() -> None:
             extrapolated(sizes, sizes)
 
 
+def test_meshes_are_made_once_and_simulated_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With blocks in the place of the mesher's tetrahedra."""
+    counts, made = {6.0: (3, 4, 4), 4.0: (4, 6, 6), 2.5: (5, 8, 8)}, []
+
+    def block_of(labels: Path, *, out: Path, edge_mm: float, names: Path, bones: list[str], **_: object) -> None:
+        inputs = {"labels": Path(labels), "names": Path(names)}
+        write_tet_mesh(out, dome(counts[edge_mm]), provenance("mesh", inputs, {"bones": list(bones)}))
+        made.append(edge_mm)
+
+    monkeypatch.setattr("mrstrain.models.converge.make_mesh", block_of)
+    write_labels(tmp_path / "map.nii.gz", half_onion())
+    given = [text for edge in counts for text in ("--edge-mm", str(edge))]
+    given += ["--names", str(tmp_path / "map.csv"), "--load", "pressed=1", "--set", "luboz"]
+    given += ["--plate-normal", "-1", "0", "0", "--shear-direction", "0", "1", "0", "--out", str(tmp_path / "study")]
+    done, again = (CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given]) for _ in range(2))
+    assert done.exit_code == again.exit_code == 0, done.output + again.output
+    assert made == sorted(counts, reverse=True)
+    with (tmp_path / "study" / "convergence.csv").open(newline="") as file:
+        travel = next(csv.DictReader(file))
+    assert travel["figure"] == "plate travel, mm"
+    values = [float(travel[f"edge_{edge:g}_mm"]) for edge in counts]
+    assert values == sorted(values)  # finer meshes are softer
+    assert len(set(values)) == 3
+    assert again.output.splitlines()[-6:] == done.output.splitlines()[-6:]
+
+
+@pytest.mark.full_size
 def test_the_command(tmp_path: Path) -> None:
     onion = half_onion()
     plain = LabelMap(onion.grid, np.where(onion.labels == 3, 2, onion.labels), {1: "bone", 2: "fat"})  # nothing thin
     write_labels(tmp_path / "map.nii.gz", plain)
-    sizes = [text for edge in ("4.5", "2.8", "1.7") for text in ("--edge-mm", edge)]
+    sizes = [text for edge in ("5.0", "3.2", "2.2") for text in ("--edge-mm", edge)]
     given = [*sizes, "--names", str(tmp_path / "map.csv"), "--load", "pressed=3", "--set", "luboz"]
     out = tmp_path / "study"
     done = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
@@ -65,12 +95,12 @@ def test_the_command(tmp_path: Path) -> None:
     with (out / "convergence.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximal shear of fat, p50"]
-    assert 0.1 < float(rows[0]["edge_1.7_mm"]) < 10.0
+    assert 0.1 < float(rows[0]["edge_2.2_mm"]) < 10.0
     assert any(row["limit"] for row in rows) == (out / "convergence.png").is_file()
-    before = (out / "mesh-2.8.vtu").read_bytes()
+    before = (out / "mesh-3.2.vtu").read_bytes()
     again = CliRunner().invoke(app, ["converge", str(tmp_path / "map.nii.gz"), *given, "--out", str(out)])
     assert again.exit_code == 0
-    assert (out / "mesh-2.8.vtu").read_bytes() == before  # the mesher is not deterministic: it was not asked again
+    assert (out / "mesh-3.2.vtu").read_bytes() == before  # the mesher is not deterministic: it was not asked again
     assert again.output.splitlines()[-6:] == done.output.splitlines()[-6:]
 
 

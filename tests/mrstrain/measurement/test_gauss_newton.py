@@ -68,7 +68,7 @@ def test_another_persons_heel_is_not_trusted(written, small_pair, tmp_path):
     write_image(tmp_path / "Load1.nii.gz", scan(Heel(5), small_pair.reference.grid, snr=25.0, number=7))
     results = run(
         written / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "out", bone=written / "bone.nii.gz",
-        threads=1,
+        bending=USUAL_BENDING, volume=USUAL_VOLUME, threads=1,
     )  # fmt: skip
     told = json.loads((tmp_path / "out" / "Load1" / "quality.json").read_text())
     assert told["verdict"]["level"] == "distrust"
@@ -88,7 +88,7 @@ def test_a_change_of_volume_that_was_allowed_is_told_and_costs_trust(tiny_pair, 
     write_mask(tmp_path / "bone.nii.gz", tiny_pair.bone)
     run(
         tmp_path / "reference.nii.gz", [tmp_path / "loaded.nii.gz"], out=tmp_path / "out", threads=1,
-        bone=tmp_path / "bone.nii.gz",
+        bone=tmp_path / "bone.nii.gz", bending=USUAL_BENDING,
     )  # fmt: skip
     told = json.loads((tmp_path / "out" / "loaded" / "quality.json").read_text())
     assert told["verdict"]["level"] != "trust"
@@ -105,7 +105,7 @@ def test_an_offset_of_brightness_is_not_trusted(written, small_pair, tmp_path):
     write_image(tmp_path / "Load1.nii.gz", Image(loaded.grid, (loaded.values + rising).astype(np.float32)))
     run(
         written / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "out", bone=written / "bone.nii.gz",
-        threads=1,
+        bending=USUAL_BENDING, threads=1,
     )  # fmt: skip
     told = json.loads((tmp_path / "out" / "Load1" / "quality.json").read_text())
     right = json.loads((written / "out" / "Load1" / "quality.json").read_text())
@@ -193,6 +193,7 @@ def test_the_twin_of_a_pair_is_measured_again_and_told(tiny_pair, tmp_path):
     write_image(tmp_path / "Load1.nii.gz", tiny_pair.loaded)
     write_mask(tmp_path / "bone.nii.gz", tiny_pair.bone)
     given = {"bone": tmp_path / "bone.nii.gz", "threads": 1, "twin": True}
+    given |= {"bending": USUAL_BENDING, "volume": USUAL_VOLUME}
     stages = []
     results = run(
         tmp_path / "Load0.nii.gz", [tmp_path / "Load1.nii.gz"], out=tmp_path / "out", **given,

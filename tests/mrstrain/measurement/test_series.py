@@ -128,11 +128,11 @@ def test_row_8_one_image_given_twice_is_refused_before_anything_is_made(spy, sca
 
 
 def test_row_17_a_disk_too_small_for_all_loads_is_told_first(spy, scans, tmp_path, monkeypatch):
-    """77,000 voxels at 30 bytes: 2.3 MB for each image."""
+    """101,000 voxels at 30 bytes: 3 MB for each image."""
     arguments = {"out": tmp_path / "new" / "out", "bone": scans / "bone.nii.gz"}
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 3 * 10**6))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 4 * 10**6))
     both = [scans / "Load1.nii.gz", scans / "Load2.nii.gz"]
-    with pytest.raises(OutputError, match="the results of 2 images need about 5 MB and the disk has 3 MB left"):
+    with pytest.raises(OutputError, match="the results of 2 images need about 6 MB and the disk has 4 MB left"):
         register(scans / "Load0.nii.gz", both, **arguments)
     assert not (tmp_path / "new").exists()
     assert register(scans / "Load0.nii.gz", both[:1], **arguments).cases
@@ -150,6 +150,7 @@ def test_loads_at_once_are_those_one_after_the_other_bit_for_bit(scans, tmp_path
             repeat=scans / "again.nii.gz",
             align="none",
             bending=4.0,
+            volume=300.0,
             workers=workers,
             threads=1,
         )
@@ -171,6 +172,7 @@ def test_loads_at_once_are_those_one_after_the_other_bit_for_bit(scans, tmp_path
     assert floors[0] == floors[1] == floors[2] is not None  # the repeat scan's, whichever was finished first
 
 
+@pytest.mark.full_size
 def test_row_26_two_threads_give_the_same_bits_again(tiny_pair):
     settings = Settings((Preset("quick", QUICK, parse_parameters(QUICK)),), threads=2)
     with Worker(threads=2) as worker:

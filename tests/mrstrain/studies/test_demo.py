@@ -117,11 +117,16 @@ def test_a_model_that_its_limit_of_time_ended_is_no_failure_of_the_demonstration
 
 
 def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_truth(tmp_path, monkeypatch):
-    """Load2 alone, voxels of 2 mm, and nothing but its registration."""
+    """Load2 alone, voxels of 2.3 mm, and nothing but its registration."""
     (load2,) = (load for load in LOADS if load.name == "Load2")
     monkeypatch.setattr(demonstration, "LOADS", [load2])
-    monkeypatch.setattr(demonstration, "phantom", partial(phantom, spacing_mm=2.0, loads=["Load2"]))
+    monkeypatch.setattr(demonstration, "phantom", partial(phantom, spacing_mm=2.3, loads=["Load2"]))
     monkeypatch.setattr(demonstration, "run", partial(run, only=["register Load2"]))
+    demonstration._make(tmp_path / "demo", 3, False, None)
+    quick = "[registration]\nborders = false\nbending = 3.0\nvolume = 300.0\n"
+    study = tmp_path / "demo" / "study.toml"
+    assert "[registration]" not in study.read_text()
+    study.write_text(study.read_text() + quick)
     shown = demonstration.demo(tmp_path / "demo", seed=3)
     assert not shown.complete  # the rest has no result
     assert shown.lines[0].startswith("Verdicts on the registrations: Load2 ")

@@ -27,11 +27,10 @@ from mrstrain.studies.check import check
 from mrstrain.studies.cohort import cohort
 from mrstrain.studies.file import read_study
 from mrstrain.studies.init import init
+from mrstrain.studies.plan import plan
 from mrstrain.studies.run import forecast, report, run, run_studies
 from tests.processes import cluster_of_two, under_way, wait_for
 from tests.quick import QUICK
-
-pytestmark = pytest.mark.slow
 
 STUDY = """
 [study]
@@ -48,7 +47,9 @@ normal_n = 8.0
 image = "Load2.nii.gz"
 normal_n = 2.0
 [registration]
-parameters = ["quick.txt"]
+bending = 3.0
+volume = 300.0
+borders = false
 [mesh]
 edge_mm = 9.0
 labels = "to_mesh.nii.gz"
@@ -71,32 +72,42 @@ def coarse(labels: LabelMap) -> LabelMap:
 
 
 @pytest.fixture(scope="module")
-def images(tmp_path_factory, small_pair) -> Path:
-    """A heel at 1.6 mm; the repeat scan serves for Load2 too, with one voxel changed: no image is given twice."""
-    folder = tmp_path_factory.mktemp("images")
-    write_image(folder / "Load0.nii.gz", small_pair.reference)
-    write_image(folder / "Load1.nii.gz", small_pair.loaded)
-    values = small_pair.repeat.values.copy()
-    values[0, 0, 0] += 1.0
-    write_image(folder / "Load2.nii.gz", type(small_pair.repeat)(small_pair.repeat.grid, values))
-    write_image(folder / "Load0-again.nii.gz", small_pair.repeat)
-    write_labels(folder / "tissues.nii.gz", small_pair.labels)
-    write_labels(folder / "to_mesh.nii.gz", coarse(small_pair.labels))
-    (folder / "quick.txt").write_text(QUICK)
-    (folder / "study.toml").write_text(STUDY)
-    return folder
+def images(made_once, tiny_pair, small_pair) -> Path:
+    """A heel at 2.3 mm; the repeat scan serves for Load2 too, with one voxel changed: no image is given twice."""
+
+    def fill(folder: Path) -> None:
+        write_image(folder / "Load0.nii.gz", tiny_pair.reference)
+        write_image(folder / "Load1.nii.gz", tiny_pair.loaded)
+        values = tiny_pair.repeat.values.copy()
+        values[0, 0, 0] += 1.0
+        write_image(folder / "Load2.nii.gz", type(tiny_pair.repeat)(tiny_pair.repeat.grid, values))
+        write_image(folder / "Load0-again.nii.gz", tiny_pair.repeat)
+        write_labels(folder / "tissues.nii.gz", tiny_pair.labels)
+        write_labels(folder / "to_mesh.nii.gz", coarse(small_pair.labels))
+        (folder / "study.toml").write_text(STUDY)
+
+    return made_once("study-images", fill)
 
 
 @pytest.fixture(scope="module")
-def done(images, tmp_path_factory):
-    """The study, run in a process of its own on two workers."""
-    folder = tmp_path_factory.mktemp("done") / "study"
-    shutil.copytree(images, folder)
-    told = subprocess.run(
-        [sys.executable, "-m", "mrstrain", "run", str(folder)], capture_output=True, text=True, check=False
-    )
-    assert told.returncode == 0, told.stderr
-    return folder, told
+def done(images, made_once, tmp_path_factory):
+    """The study, run once for all in a process of its own on two workers; each test worker has a copy."""
+
+    def fill(folder: Path) -> None:
+        shutil.copytree(images, folder / "study")
+        told = subprocess.run(
+            [sys.executable, "-m", "mrstrain", "run", str(folder / "study")],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert told.returncode == 0, told.stderr
+        (folder / "told.json").write_text(json.dumps([told.stdout, told.stderr]))
+
+    folder = made_once("study-done", fill)
+    own = tmp_path_factory.mktemp("done") / "study"
+    shutil.copytree(folder / "study", own)
+    return own, *json.loads((folder / "told.json").read_text())
 
 
 def shear_of(folder: Path, load: str) -> np.ndarray:
@@ -109,7 +120,7 @@ def areas(study: Path) -> list[float]:
 
 
 def test_every_result_is_there_and_the_report_tells_it(done):
-    folder, told = done
+    folder, stdout, stderr = done
     out = folder / "results"
     for name in (
         "registration/Load1/displacement.nii.gz",
@@ -127,18 +138,29 @@ def test_every_result_is_there_and_the_report_tells_it(done):
     assert "Registration of Load1" in page
     assert "Area between the volume-strain curves" in page
     assert "how each stage ended" in page.lower()
-    assert f"Report: {out / 'report.html'}" in told.stdout
-    assert "akrami" in told.stdout
-    assert "register Load1" not in told.stderr  # quiet in a pipe: that is in the log
-    assert "all: 6 stages 100 %" in told.stderr
+    assert re.search(r"^Report: .*study/results/report\.html$", stdout, re.M)
+    assert "akrami" in stdout
+    assert "register Load1" not in stderr  # quiet in a pipe: that is in the log
+    assert "all: 6 stages 100 %" in stderr
     log = (out / "study.log").read_text()
     assert all(f"{stage}: done after" in log for stage in STAGES)
     record = json.loads((out / "provenance.json").read_text())
-    assert {f["name"] for f in record["inputs"]["inputs"]} >= {"Load0.nii.gz", "tissues.nii.gz", "quick.txt"}
+    assert {f["name"] for f in record["inputs"]["inputs"]} >= {"Load0.nii.gz", "tissues.nii.gz"}
+
+
+def test_parameter_files_are_inputs_of_every_registration(images, tmp_path):
+    study = tmp_path / "study"
+    shutil.copytree(images, study)
+    (study / "quick.txt").write_text(QUICK)
+    own = 'parameters = ["quick.txt"]\n'
+    (study / "study.toml").write_text(STUDY.replace("bending = 3.0\nvolume = 300.0\nborders = false\n", own))
+    registrations = [stage for stage in plan(read_study(study)) if stage.kind == "register"]
+    assert len(registrations) == 3
+    assert all(study / "quick.txt" in stage.files for stage in registrations)
 
 
 def test_run_again_does_nothing_in_under_ten_seconds(done):
-    folder, _ = done
+    folder, *_ = done
     before = (folder / "results" / "mesh" / "mesh.vtu").stat().st_mtime_ns
     assert set(forecast(folder).values()) == {"done already"}
     began = time.monotonic()
@@ -164,7 +186,7 @@ def test_a_disk_with_too_little_room_is_refused_before_anything_is_made(done, im
 
 
 def test_the_report_alone(done):
-    folder, _ = done
+    folder, *_ = done
     first = (folder / "results" / "report.html").read_text()
     (folder / "results" / "report.html").unlink()
     report(folder)
@@ -174,7 +196,7 @@ def test_the_report_alone(done):
 
 
 def test_only_what_changed_is_done_anew(done, tmp_path):
-    folder, _ = done
+    folder, *_ = done
     study = tmp_path / "study"
     shutil.copytree(folder, study)
     (study / "study.toml").write_text(STUDY.replace("normal_n = 8.0", "normal_n = 6.0"))
@@ -190,7 +212,7 @@ def test_only_what_changed_is_done_anew(done, tmp_path):
 
 
 def test_a_broken_image_leaves_the_others_to_finish_and_is_named(done, tmp_path):
-    folder, _ = done
+    folder, *_ = done
     study = tmp_path / "Doe_Jane" / "heel"
     shutil.copytree(folder, study)
     whole = (study / "Load2.nii.gz").read_bytes()
@@ -211,13 +233,13 @@ def test_a_broken_image_leaves_the_others_to_finish_and_is_named(done, tmp_path)
 
 
 def test_two_runs_in_one_folder(done):
-    folder, _ = done
+    folder, *_ = done
     with FileLock(folder / "results" / ".study" / "lock"), pytest.raises(OutputError, match="another run"):
         run(folder)
 
 
 def test_killed_and_run_again_gives_the_same(done, images, tmp_path):
-    folder, _ = done
+    folder, *_ = done
     study = tmp_path / "study"
     shutil.copytree(images, study)
     command = [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--workers", "1"]
@@ -237,10 +259,10 @@ def test_killed_and_run_again_gives_the_same(done, images, tmp_path):
         assert np.array_equal(shear_of(study, load), shear_of(folder, load), equal_nan=True)
 
 
-@pytest.mark.parametrize("stage", ["mesh", "simulate akrami", "compare"])
+@pytest.mark.parametrize("stage", [pytest.param("mesh", marks=pytest.mark.full_size), "simulate akrami", "compare"])
 def test_killed_in_any_stage_and_run_again(done, tmp_path, stage):
     """Made anew and killed half-way, a stage has no result; the next run makes it, and what builds on it alone."""
-    folder, _ = done
+    folder, *_ = done
     study = tmp_path / "study"
     shutil.copytree(folder, study)
     records, left = study / "results" / ".study", STAGES[STAGES.index(stage) :]
@@ -268,7 +290,7 @@ def test_killed_in_any_stage_and_run_again(done, tmp_path, stage):
 
 def test_a_registration_whose_process_is_killed_fails_alone_and_is_named(done, images, tmp_path):
     """As the system does where memory runs out."""
-    folder, _ = done
+    folder, *_ = done
     study = tmp_path / "study"
     shutil.copytree(images, study)
     command = [sys.executable, "-m", "mrstrain", "run", str(study), "--only", "register", "--workers", "1"]
@@ -294,7 +316,7 @@ def test_a_registration_whose_process_is_killed_fails_alone_and_is_named(done, i
 
 
 def test_a_cluster_whose_worker_is_killed_loses_nothing(done, images, tmp_path):
-    folder, _ = done
+    folder, *_ = done
     study = tmp_path / "study"
     shutil.copytree(images, study)
     with cluster_of_two(tmp_path) as (address, workers):
@@ -363,7 +385,7 @@ def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
 
 
 def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path):
-    folder, _ = done
+    folder, *_ = done
     places = []
     for name in ("Ada", "Ben"):
         places.append(tmp_path / name)

@@ -210,7 +210,7 @@ def test_senseless_parameters_are_refused(given, told):
 
 
 FAT, FAT_MM, BONE = 0.06, 0.2, 0.02
-OURS = Settings(gauss_newton=GaussNewton(bending=4.0))
+OURS = Settings(gauss_newton=GaussNewton(bending=4.0, volume=300.0))
 
 
 @pytest.fixture(scope="module")
