@@ -26,8 +26,9 @@ else
 BIN := $(VENV)/bin
 endif
 
-# Both cores to the end: a worker that has nothing left takes tests from the other.
-PYTEST := -n 2 --dist worksteal
+# Both cores to the end: a worker that has nothing left takes tests from the other, and each computes on one thread.
+PYTEST := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=2 \
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-all lint format lock docs peers clean
@@ -56,10 +57,10 @@ demo: setup
 	$(BIN)/mrstrain demo --out demo
 
 test: setup lint
-	$(BIN)/python -m pytest $(PYTEST) -m "not full_size"
+	$(PYTEST) -m "not full_size"
 
 test-all: setup lint
-	$(BIN)/python -m pytest $(PYTEST)
+	$(PYTEST)
 
 lint: setup
 	$(BIN)/ruff check .

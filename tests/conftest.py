@@ -7,19 +7,21 @@ import pickle
 from collections.abc import Callable
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from filelock import FileLock
 from hypothesis import settings
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # each has a core: threads of two workers would wait for one another
-    os.environ |= dict.fromkeys(
-        ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
-    )
-
 # The same examples in every run: a failure that comes and goes tells nobody anything.
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread() -> None:
+    """Two workers have a core each: tests of threads ask for theirs."""
+    numba.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
