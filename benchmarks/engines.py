@@ -27,8 +27,7 @@ from dvc.deformation.strain import StrainField
 from dvc.images.image import Mask
 from dvc.images.resample import shows
 from dvc.registration.elastix import run as elastix
-from dvc.registration.gauss_newton.fit import GaussNewton
-from dvc.registration.gauss_newton.with_borders import AtBorders
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Settings, register
 from dvc.worker import Worker
 from mrstrain.records.provenance import versions
@@ -39,9 +38,9 @@ from phantoms.heel import HeelPair, heel_pair, pressed
 ENGINES = {
     "elastix, heel-mr": Settings.of("heel-mr"),
     "elastix, 4 mm": Settings.of(str(Path(__file__).with_name("four_mm.txt"))),
-    "gauss-newton": Settings(gauss_newton=GaussNewton()),
-    "gauss-newton, bending 1": Settings(gauss_newton=GaussNewton(bending=1.0)),
-    "gauss-newton, labels": Settings(gauss_newton=GaussNewton(), borders=AtBorders()),
+    "gauss-newton": Settings(GaussNewton()),
+    "gauss-newton, bending 1": Settings(GaussNewton(bending=1.0)),
+    "gauss-newton, labels": Settings(GaussNewtonWithInterfaces()),
 }
 MARGIN_MM = 4.0
 NEAR_MM = 3.0
@@ -114,7 +113,7 @@ def measured_by(settings: Settings, pair: HeelPair, still: bool) -> dict[str, ob
             pair.repeat if still else pair.loaded,
             bone=pair.bone,
             tissue=Mask(pair.labels.grid, pair.labels.labels > 0),
-            labels=None if settings.borders is None else pair.labels,
+            labels=pair.labels,
             settings=replace(settings, threads=1),
             worker=worker,
             progress=watch,
@@ -127,7 +126,7 @@ def measured_by(settings: Settings, pair: HeelPair, still: bool) -> dict[str, ob
         "wall_s": wall,
         "peak_gib_of_worker": peak,
         "choice": None if found.choice is None else found.choice.as_dict(),
-        "errors": errors(pair, still, found.bspline),
+        "errors": errors(pair, still, found.displacement),
     }
 
 

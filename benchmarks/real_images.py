@@ -41,7 +41,7 @@ def floor_of(found: Registration) -> dict[str, float]:
     maps = strain_maps(found.deformation, found.tissue)
     floor = noise_floor(maps, found.tissue.inside)
     loaded, motion = found.loaded, found.alignment.motion
-    after = carry(loaded, found.reference.grid, lambda X: motion.apply(X + found.bspline.displacement(X)))
+    after = carry(loaded, found.reference.grid, lambda X: motion.apply(X + found.displacement.displacement(X)))
     E = maps.green_lagrange[maps.valid & found.tissue.inside].astype(float)
     half = np.sqrt(((E[:, 0] - E[:, 3]) / 2) ** 2 + E[:, 1] ** 2)  # in-plane maximal shear, x and y
     return {

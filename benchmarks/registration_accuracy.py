@@ -109,7 +109,7 @@ def main() -> None:
                 settings=Settings.of(given.by, threads=threads),
                 worker=worker,
             )
-            runs[given.by] = (scored(pair, result.bspline), time.perf_counter() - began)
+            runs[given.by] = (scored(pair, result.displacement), time.perf_counter() - began)
             if not given.skip_default:
                 began = time.perf_counter()
                 moving = without_motion(pair.loaded, pair.foot_motion)

@@ -36,8 +36,9 @@ from dvc.deformation.strain import StrainField
 from dvc.io.images.labels import read_labels
 from dvc.io.images.read import read_image
 from dvc.mesh import TetMesh
+from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.fit import scaled
-from dvc.registration.gauss_newton.with_borders import fit_with_borders
+from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
 from dvc.registration.register import Settings, register
 from fe.materials import NeoHooke
 from fe.mesh_file import read_tet_mesh
@@ -59,8 +60,8 @@ class Here:
 
     def run(self, what, function, *given, watch=None):
         found = function(*given)
-        if function is fit_with_borders:
-            self.given, self.found = given, found[0]
+        if function is fit_with_interfaces:
+            self.pair, self.found = given[0], found[0]
         return found
 
 
@@ -90,8 +91,8 @@ def positive_solved(A, b):
 class Correlation:
     """Images as the engine was given them, the mesh, and the elastic body."""
 
-    def __init__(self, mesh: TetMesh, given: tuple, stiffness_mpa: dict[str, float]) -> None:
-        fixed, moving, inside, body = given[:4]
+    def __init__(self, mesh: TetMesh, pair: AlignedPair, stiffness_mpa: dict[str, float]) -> None:
+        fixed, moving, inside, body = pair.fixed, pair.moving, pair.compared, pair.body
         scale = float(np.nanpercentile(fixed.values[body.inside], 75))
         fixed, self.moving = scaled(fixed, scale), scaled(moving, scale)
         self.filtered = spline_filter(np.nan_to_num(self.moving.values), order=3, mode="mirror")
@@ -298,7 +299,7 @@ def main() -> None:
 
     for factor in (1.0, 3.0):
         stiffness = {n: law.shear_modulus_mpa * (1.0 if n == "fat" else factor) for n, law in laws.items()}
-        problem = Correlation(mesh, worker.given, stiffness)
+        problem = Correlation(mesh, worker.pair, stiffness)
         if factor == 1.0:
             told = truth.both_errors(problem, np.where(np.isfinite(exact), exact, start))
             told["taken_from_the_start"] = int(np.count_nonzero(~np.isfinite(exact).all(axis=1)))

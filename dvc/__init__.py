@@ -27,8 +27,11 @@ from dvc.io.transforms.displacement_image import read_displacement
 from dvc.io.transforms.read import read_transform
 from dvc.mesh import TetMesh
 from dvc.registration.align import Alignment
+from dvc.registration.elastix.engine import Elastix
 from dvc.registration.elastix.presets import Preset, load_preset, preset_names, read_parameter_file
-from dvc.registration.gauss_newton.with_borders import AtBorders
+from dvc.registration.engine import AlignedPair, Engine
+from dvc.registration.engines import engine_named
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Registration, Settings, register
 from dvc.trust.landmarks import read_landmarks, target_registration_error
 from dvc.trust.quality import Quality, assess, noise_floor
@@ -36,12 +39,16 @@ from dvc.trust.verdict import Verdict
 
 __all__ = [
     "Affine",
+    "AlignedPair",
     "Alignment",
-    "AtBorders",
     "BSpline",
     "BorderedSpline",
     "Composed",
     "Deformation",
+    "Elastix",
+    "Engine",
+    "GaussNewton",
+    "GaussNewtonWithInterfaces",
     "Grid",
     "Image",
     "LabelMap",
@@ -59,6 +66,7 @@ __all__ = [
     "Verdict",
     "Within",
     "assess",
+    "engine_named",
     "evaluate_on_grid",
     "fit_mask",
     "load_preset",

@@ -255,11 +255,10 @@ def measure(
         loaded = scan(heel, where, motion, foot, snr=case.snr, number=number + 1)
     # A wave moves the bone too: nothing there to align on.
     settings = Settings.of(case.preset, align_on="none" if wave else "bone", threads=worker.threads)
-    own = settings.gauss_newton
     if motion is None:
         settings = settings.of_repeat()
-    elif own is not None and case.keeps_volume:
-        settings = replace(settings, gauss_newton=replace(own, volume=own.weights.volume))
+    elif case.keeps_volume:
+        settings = replace(settings, engine=settings.engine.keeping_volume())
     found = register(
         reference,
         loaded,
@@ -271,11 +270,11 @@ def measure(
         progress=lambda stage, fraction: progress(fraction if stage != "aligning" else 0.0),
     )
     with making:
-        edge = float(found.bspline.control.spacing_mm.min())
+        edge = float(found.displacement.spacing_mm.min())
         kept = np.zeros(grid.shape, dtype=bool)
         kept[::_STRIDE, ::_STRIDE, ::_STRIDE] = True
         kept &= labels.labels > 0
-        u, H = evaluate_on_grid(found.bspline, grid, kept)
+        u, H = evaluate_on_grid(found.displacement, grid, kept)
         X = grid.points(kept)
         known = np.isfinite(u).all(axis=1) & shows(loaded, found.alignment.motion.apply(X + u), edge)
         true_u, true_H = (np.zeros_like(u), np.zeros_like(H)) if motion is None else motion.evaluate(X)

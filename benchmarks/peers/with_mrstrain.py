@@ -26,12 +26,12 @@ def main() -> None:
         Mask(mask.grid, mask.values > 0) for mask in (read_image(folder / f"{name}.mha") for name in ("bone", "body"))
     )
     settings = Settings.of(sys.argv[3], threads=threads)
-    labels = None if settings.borders is None else read_labels(folder / "labels.mha", folder / "labels.csv")
+    labels = read_labels(folder / "labels.mha", folder / "labels.csv") if settings.engine.needs_labels else None
     found = register(reference, loaded, bone=bone, tissue=body, labels=labels, settings=settings)
-    if isinstance(found.bspline, BSpline):
-        write_elastix_transform(folder, found.bspline, None, reference.grid)[0].rename(folder / "found.txt")
+    if isinstance(found.displacement, BSpline):
+        write_elastix_transform(folder, found.displacement, None, reference.grid)[0].rename(folder / "found.txt")
     else:
-        write_bordered_spline(folder / "found.npz", found.bspline)
+        write_bordered_spline(folder / "found.npz", found.displacement)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Borders:
+class Interfaces:
     """Where tissues meet, and the two factors that a displacement gets by it.
 
     With b the distance (mm) from the bone at rest and d the depth of a point below the border of its own tissue,
@@ -59,8 +59,8 @@ class Borders:
     reach_mm: float
 
     @classmethod
-    def of(cls, labels: LabelMap, bone: Mask | None, reach_mm: float, body: Mask | None = None) -> Borders:
-        """Borders of the tissues in a label map.
+    def of(cls, labels: LabelMap, bone: Mask | None, reach_mm: float, body: Mask | None = None) -> Interfaces:
+        """Interfaces of the tissues in a label map.
 
         Parameters
         ----------
@@ -97,13 +97,13 @@ class Borders:
         return cls.between(labels.grid, frozen(own.reshape(values.shape), np.int64), rest, float(reach_mm))
 
     @classmethod
-    def between(cls, grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Borders:
-        """Borders between tissues that are numbered from 0 on; parameters as the attributes."""
+    def between(cls, grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Interfaces:
+        """Interfaces between tissues that are numbered from 0 on; parameters as the attributes."""
         depths = [_depth_mm(own == number, grid.spacing_mm) for number in range(int(own.max()) + 1)]
         depth = np.stack([spline_filter(depth, order=3, mode="mirror") for depth in depths])
         return cls(grid, frozen(depth, np.float64), own, rest, reach_mm)
 
-    def turned(self, rotation: FloatArray) -> Borders:
+    def turned(self, rotation: FloatArray) -> Interfaces:
         """The borders of a body that is turned about the world's origin."""
         return replace(self, grid=self.grid.moved_by(rotation, np.zeros(3)))
 
@@ -194,7 +194,7 @@ def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BorderedSpline:
-    """x = X + u(X), u = m v + psi w: two cubic B-splines v (mm) and w, and the factors of `Borders`.
+    """x = X + u(X), u = m v + psi w: two cubic B-splines v (mm) and w, and the factors of `Interfaces`.
 
     u is continuous, and zero in the bone at rest. Its gradient H = m grad v + v (x) grad m + psi grad w + w (x) grad
     psi jumps across borders: by 2 m w (x) n, n the border's normal, between two tissues that both may move. On a border
@@ -204,7 +204,7 @@ class BorderedSpline:
     ----------
     smooth, jump : BSpline
         v and w on one control grid, LPS.
-    borders : Borders
+    borders : Interfaces
 
     Raises
     ------
@@ -214,7 +214,7 @@ class BorderedSpline:
 
     smooth: BSpline
     jump: BSpline
-    borders: Borders
+    borders: Interfaces
 
     def __post_init__(self) -> None:
         if not self.smooth.control.same_as(self.jump.control, tolerance_voxels=1e-6):
@@ -224,6 +224,11 @@ class BorderedSpline:
     def control(self) -> Grid:
         """Control points of both splines."""
         return self.smooth.control
+
+    @property
+    def spacing_mm(self) -> FloatArray:
+        """Distance (3,) between the control points along their axes, mm."""
+        return self.control.spacing_mm
 
     def turned(self, rotation: FloatArray) -> BorderedSpline:
         """The same displacement of a body that is turned, with its borders, about the world's origin."""
@@ -287,7 +292,3 @@ class BorderedSpline:
             for f, part in enumerate(parts)
         )
         return np.asarray(u), np.asarray(H)
-
-
-Spline = BSpline | BorderedSpline
-"""What a registration finds: one B-spline, or two that know the tissues' borders."""

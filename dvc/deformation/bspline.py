@@ -83,6 +83,11 @@ class BSpline:
             )
         object.__setattr__(self, "coefficients_mm", coefficients)
 
+    @property
+    def spacing_mm(self) -> FloatArray:
+        """Distance (3,) between the control points along their axes, mm."""
+        return self.control.spacing_mm
+
     def turned(self, rotation: FloatArray) -> BSpline:
         """The same displacement of a body that is turned, with its control points, about the world's origin."""
         turned = np.einsum("ij,j...->i...", rotation, self.coefficients_mm)

@@ -1,41 +1,35 @@
 """From a pair of images to the deformation of the tissue: correct shading, align on the bone, register non-rigidly.
 
 The rigid motion of the bone is put into the loaded image's header, which moves the image without resampling
-it. The B-spline found then maps the reference configuration straight to the bone-aligned loaded one, so its
-displacement is that of the tissue relative to its bone; T(X) = R (X + u(X)) + t is the whole motion.
+it. The displacement found then maps the reference configuration straight to the bone-aligned loaded one, so it is that
+of the tissue relative to its bone; T(X) = R (X + u(X)) + t is the whole motion.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import singledispatch
 from itertools import combinations
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvc.arrays import FloatArray
-from dvc.deformation.bordered_spline import Spline
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Composed, Deformation, RigidMotion, Within
-from dvc.errors import InputError, ParameterError
+from dvc.errors import InputError
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.shading import without_shading
 from dvc.images.tissue import tissue_mask
 from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
-from dvc.registration.elastix.presets import Preset, preset_or_file
-from dvc.registration.engines import by_elastix, by_gauss_newton
-from dvc.registration.gauss_newton.fit import Choice, GaussNewton
-from dvc.registration.gauss_newton.with_borders import USUAL_SKIN, AtBorders
+from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
+from dvc.registration.engines import DEFAULT, engine_named
 from dvc.worker import Worker
 
-Progress = Callable[[str, float], None]
 _Scan = TypeVar("_Scan", Image, Mask, LabelMap)
-
-GAUSS_NEWTON, AT_BORDERS = "gauss-newton", "gauss-newton-borders"
-"""Names of our own engine, without and with borders of tissues, where elastix has presets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,81 +38,30 @@ class Settings:
 
     Attributes
     ----------
-    presets : tuple of Preset
-        Non-rigid stages of elastix, one after the other; each starts from the coefficients of the one before.
+    engine : Engine
+        What finds the non-rigid part, with its parameters.
     align_on : {"bone", "image", "none"}
         What is aligned rigidly first.
     seed : int
         Seed of every random number.
     threads : int
-        Threads of each worker. What our own engine finds, the bone's alignment and the correction of shading are
-        equal bit for bit on any number of threads; what elastix finds, on equal numbers.
-    gauss_newton : GaussNewton, optional
-        Parameters of our own engine, which then takes the place of elastix and the presets.
-    borders : AtBorders, optional
-        Our own engine then lets strain jump at the borders of the tissues of a label map.
-
-    Raises
-    ------
-    ParameterError
-        If borders are asked of elastix.
+        Threads of each worker. What the Gauss-Newton engine finds, the bone's alignment and the correction of the bias
+        field are equal bit for bit on any number of threads; what elastix finds, on equal numbers.
     """
 
-    presets: tuple[Preset, ...] = ()
+    engine: Engine = field(default_factory=lambda: engine_named(DEFAULT))
     align_on: AlignOn = "bone"
     seed: int = 1
     threads: int = 1
-    gauss_newton: GaussNewton | None = None
-    borders: AtBorders | None = None
-
-    def __post_init__(self) -> None:
-        if self.borders is not None and self.gauss_newton is None:
-            raise ParameterError(
-                f"Borders of tissues are for the engine {GAUSS_NEWTON}; elastix finds one smooth spline. Leave out "
-                "--borders, or the engine, preset or parameter files of elastix."
-            )
-
-    @property
-    def engine(self) -> str:
-        """Name of what finds the non-rigid part."""
-        return "elastix" if self.gauss_newton is None else GAUSS_NEWTON
-
-    @property
-    def name(self) -> str:
-        """What an error model is known by: one of the two names of our own engine, or the last preset of elastix."""
-        if self.gauss_newton is None:
-            return self.presets[-1].name
-        return GAUSS_NEWTON if self.borders is None else AT_BORDERS
-
-    @property
-    def needs_one_contrast(self) -> bool:
-        """Whether what is brighter than its neighbours must be so in both images; not for mutual information."""
-        metrics = [metric for preset in self.presets for metric in preset.parameters.get("Metric", ())]
-        return not any("MutualInformation" in metric for metric in metrics)
-
-    @property
-    def text(self) -> str:
-        """All parameters of the non-rigid part, as written."""
-        if self.gauss_newton is None:
-            return "\n".join(p.text for p in self.presets)
-        return self.gauss_newton.text if self.borders is None else self.borders.text(self.gauss_newton)
 
     def of_repeat(self) -> Settings:
-        """For a repeat scan: a weight chosen for it alone would smooth away the noise that it is to show."""
-        own = self.gauss_newton
-        if own is None:
-            return self
-        borders = None if self.borders is None else replace(self.borders, skin=self.borders.skin or USUAL_SKIN)
-        fixed = replace(own, bending=own.weights.bending, volume=own.weights.volume)
-        return replace(self, gauss_newton=fixed, borders=borders)
+        """The settings for a repeat scan, which is smoothed no more than a loaded image."""
+        return replace(self, engine=self.engine.of_repeat())
 
     @classmethod
-    def of(cls, name: str = GAUSS_NEWTON, **others: object) -> Settings:
-        """Settings by name: our own engine's, a preset of elastix, or the path of a parameter file (.txt)."""
-        if name in {GAUSS_NEWTON, AT_BORDERS}:
-            own = cls(gauss_newton=GaussNewton(), borders=AtBorders() if name == AT_BORDERS else None)
-            return replace(own, **others)  # type: ignore[arg-type]
-        return replace(cls(presets=(preset_or_file(name),)), **others)  # type: ignore[arg-type]
+    def of(cls, name: str = DEFAULT, **others: Any) -> Settings:
+        """Settings with an engine by its name, as in `dvc.registration.engines.engine_named`."""
+        return cls(engine_named(name), **others)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,13 +77,15 @@ class Registration:
     bone : Mask or None
     alignment : Alignment
         The bone's rigid motion, reference to loaded.
-    bspline : BSpline or BorderedSpline
-        Displacement of tissue relative to its bone, reference configuration, LPS mm; with borders the second.
+    displacement : Displacement
+        Of tissue relative to its bone, reference configuration, LPS mm.
     settings : Settings
     seconds : float
         Wall time.
-    choice : Choice or None
-        How strongly Gauss-Newton smoothed, and why; None for elastix.
+    choice : Regularisation or None
+        How strongly the engine smoothed, and why; None where it decides nothing from the images.
+    unlike_study : str
+        Why an error model of the engine does not hold for this pair; empty where it does.
     """
 
     reference: Image
@@ -148,20 +93,21 @@ class Registration:
     tissue: Mask
     bone: Mask | None
     alignment: Alignment
-    bspline: Spline
+    displacement: Displacement
     settings: Settings
     seconds: float
-    choice: Choice | None = None
+    choice: Regularisation | None = None
+    unlike_study: str = ""
 
     @property
     def deformation(self) -> Deformation:
         """Displacement of tissue relative to its bone; defined in the tissue (and one voxel around it)."""
-        return Within(self.bspline, self.tissue)
+        return Within(self.displacement, self.tissue)
 
     @property
     def total(self) -> Deformation:
         """The whole motion, bone included: reference points to points of the loaded scan as acquired."""
-        return Composed([self.bspline, self.alignment.motion])
+        return Composed([self.displacement, self.alignment.motion])
 
 
 def register(
@@ -187,12 +133,13 @@ def register(
     tissue : Mask, optional
         Body on the reference grid, bone included; found by a threshold where it is not given.
     labels : LabelMap, optional
-        Tissues on the reference grid; needed, and used, where ``settings.borders`` is given.
+        Tissues on the reference grid; needed by an engine that lets strain jump at their interfaces, and unused by the
+        others.
     settings : Settings, optional
         The engine gauss-newton, seed 1, one thread by default.
     start : Deformation, optional
-        Result of another load (its ``bspline``) to start from: the first guess, which the registration then corrects
-        against these two images, so no error is carried on. elastix starts from a `BSpline` alone.
+        Result of another load (its ``displacement``) to start from: the first guess, which the registration then
+        corrects against these two images, so no error is carried on. elastix starts from a `BSpline` alone.
     worker : Worker, optional
         Process to compute in; a new one by default.
     progress : callable, optional
@@ -205,82 +152,70 @@ def register(
     Raises
     ------
     InputError
-        If the two images are the same, a mask or the labels are missing, empty or on another grid, or elastix is to
-        start from something else than one B-spline.
+        If the two images are the same, a mask or the labels are missing, empty or on another grid, or the engine
+        cannot begin from ``start``.
     RegistrationError
-        If the bone cannot be found in the loaded image, if the contrast of the two images is turned round and is not
-        to be followed by mutual information, or if elastix fails; with elastix' reason.
+        If the bone cannot be found in the loaded image, if the contrast of the two images is inverted and the engine
+        cannot follow that, or if the engine fails.
     WorkerError
         If the process dies.
     """
     began = time.monotonic()
-    chosen = settings or Settings.of()
-    if not chosen.presets and chosen.gauss_newton is None:
-        raise ParameterError("No registration stage given; name a preset or parameter files.")
-    _refuse_other_spacing(chosen.presets)
-    tell = progress or (lambda _stage, _fraction: None)
+    chosen = settings or Settings()
+    engine, tell = chosen.engine, progress or (lambda _stage, _fraction: None)
     refuse_one_image_twice([("The unloaded image", reference), ("the loaded one", loaded)])
     body = tissue if tissue is not None else tissue_mask(reference)
     _check_masks(reference, body, bone, chosen.align_on)
-    if chosen.borders is not None:
-        _check_labels(reference, labels)
-    if chosen.gauss_newton is None and start is not None and not isinstance(start, BSpline):
-        raise InputError(
-            f"elastix starts from one B-spline, and a {type(start).__name__} is given: start from a result without "
-            f"borders, or register with {GAUSS_NEWTON}."
-        )
+    tissues = _checked_labels(reference, labels) if engine.needs_labels else None
+    if start is not None:
+        engine.check_start(start)
     own = worker is None
     runner = worker or Worker(chosen.threads)
     try:
-        tell("aligning", 0.0)
-        # Axes toward L, P, S: a scan stored in another orientation then gives the same result.
-        fixed = runner.run("correcting the shading", without_shading, reference.toward_lps())
-        tell("aligning", 0.2)
-        moving = runner.run("correcting the shading", without_shading, loaded.toward_lps())
-        tell("aligning", 0.4)
-        inside = body.toward_lps()
-        on = None if bone is None else bone.toward_lps()
-        # elastix draws samples from a box along the world's axes, which of an oblique image holds a part or nothing:
-        # what follows is done in a world whose axes are those of the unloaded image.
-        turn = Rotation.from_matrix(fixed.grid.direction).as_matrix()
-        fixed, moving, inside = _turned(fixed, turn.T), _turned(moving, turn.T), _turned(inside, turn.T)
-        on = None if on is None else _turned(on, turn.T)
-        begun_at = None if start is None else _turned_start(start, turn.T)
-        alignment = _align(fixed, moving, inside, on, chosen, runner)
-        if chosen.align_on == "none" and chosen.needs_one_contrast:  # a rigid alignment refuses it by itself
-            refuse_turned_contrast(fixed, moving, inside, alignment.motion)
-        tell("aligning", 1.0)
-        bspline: Spline | None = None
-        choice = None
-        if chosen.gauss_newton is not None:
-            rigid = on if chosen.align_on == "bone" else None
-            borders = None
-            if chosen.borders is not None and labels is not None:
-                borders = chosen.borders, _turned(labels.toward_lps(), turn.T)
-            bspline, choice = by_gauss_newton(
-                fixed, moving, inside, rigid, alignment, chosen.gauss_newton, begun_at, runner,
-                lambda fraction: tell("registering", fraction), borders,
-            )  # fmt: skip
-        last = begun_at if isinstance(begun_at, BSpline) else None
-        for number, preset in enumerate(chosen.presets if chosen.gauss_newton is None else ()):
-            stage = "registering" if len(chosen.presets) == 1 else f"registering, stage {number + 1}"
-            bspline = last = by_elastix(
-                fixed,
-                moving,
-                inside,
-                alignment,
-                preset,
-                _seeds(chosen)[number + 1],
-                last,
-                runner,
-                lambda fraction, stage=stage: tell(stage, fraction),  # type: ignore[misc]
-            )
+        pair, alignment, turn = _aligned(reference, loaded, body, bone, tissues, chosen, runner, tell)
+        found = engine.find(
+            pair, start=None if start is None else _turned_start(start, turn.T), seeds=_seeds(chosen)[1:],
+            worker=runner, progress=tell,
+        )  # fmt: skip
     finally:
         if own:
             runner.close()
-    assert bspline is not None
-    alignment, bspline = alignment.turned(turn), bspline.turned(turn)
-    return Registration(reference, loaded, body, bone, alignment, bspline, chosen, time.monotonic() - began, choice)
+    return Registration(
+        reference, loaded, body, bone, alignment.turned(turn), found.displacement.turned(turn), chosen,
+        time.monotonic() - began, found.choice, found.unlike_study,
+    )  # fmt: skip
+
+
+def _aligned(
+    reference: Image,
+    loaded: Image,
+    body: Mask,
+    bone: Mask | None,
+    labels: LabelMap | None,
+    settings: Settings,
+    worker: Worker,
+    tell: Progress,
+) -> tuple[AlignedPair, Alignment, FloatArray]:
+    """The images without bias field, aligned, in a world whose axes are those of the unloaded one; and its rotation.
+
+    elastix draws samples from a box along the world's axes, which of an oblique image holds a part or nothing.
+    """
+    tell("aligning", 0.0)
+    # Axes toward L, P, S: a scan stored in another orientation then gives the same result.
+    fixed = worker.run("correcting the shading", without_shading, reference.toward_lps())
+    tell("aligning", 0.2)
+    moving = worker.run("correcting the shading", without_shading, loaded.toward_lps())
+    tell("aligning", 0.4)
+    turn: FloatArray = Rotation.from_matrix(fixed.grid.direction).as_matrix()
+    fixed, moving, body = _turned(fixed, turn.T), _turned(moving, turn.T), _turned(body.toward_lps(), turn.T)
+    bone = None if bone is None else _turned(bone.toward_lps(), turn.T)
+    labels = None if labels is None else _turned(labels.toward_lps(), turn.T)
+    alignment = _align(fixed, moving, body, bone, settings, worker)
+    if settings.align_on == "none" and settings.engine.needs_one_contrast:  # a rigid alignment refuses it by itself
+        refuse_turned_contrast(fixed, moving, body, alignment.motion)
+    tell("aligning", 1.0)
+    rigid = bone if settings.align_on == "bone" else None
+    return AlignedPair.of(fixed, moving, alignment.motion, body, rigid, labels), alignment, turn
 
 
 def _turned(scan: _Scan, rotation: FloatArray) -> _Scan:
@@ -317,21 +252,26 @@ def _check_masks(reference: Image, body: Mask, bone: Mask | None, on: AlignOn) -
             raise InputError(f"The {name} mask is empty.")
 
 
-def _check_labels(reference: Image, labels: LabelMap | None) -> None:
+def _checked_labels(reference: Image, labels: LabelMap | None) -> LabelMap:
     if labels is None:
-        raise InputError("Borders of tissues are asked for, and no label map is given: give --labels, too.")
+        raise InputError("Strain may jump at tissue interfaces only where a label map tells them: give --labels, too.")
     if not labels.grid.same_as(reference.grid):
         raise InputError("The label map is not on the unloaded image's grid; bring it there (fit_mask).")
     if not labels.labels.any():
         raise InputError("The label map is empty.")
+    return labels
 
 
+@singledispatch
 def _turned_start(start: Deformation, rotation: FloatArray) -> Deformation:
-    """The start in a world that is turned about its origin."""
-    if isinstance(start, BSpline):
-        return start.turned(rotation)
+    """The start in a world that is rotated about its origin."""
     there = RigidMotion(rotation, np.zeros(3))
     return Composed([there.inverse(), start, there])
+
+
+@_turned_start.register
+def _(start: BSpline, rotation: FloatArray) -> Deformation:  # and a B-spline still, which elastix needs
+    return start.turned(rotation)
 
 
 def _align(
@@ -344,17 +284,6 @@ def _align(
 
 
 def _seeds(settings: Settings) -> list[int]:
-    """Independent seeds: of the rigid alignment, then of each non-rigid stage."""
-    drawn = np.random.SeedSequence(settings.seed).generate_state(1 + len(settings.presets))
+    """Independent seeds: of the rigid alignment, then those of the engine."""
+    drawn = np.random.SeedSequence(settings.seed).generate_state(1 + settings.engine.seeds)
     return [int(s) % 2**30 + 1 for s in drawn]
-
-
-def _refuse_other_spacing(presets: tuple[Preset, ...]) -> None:
-    """Stages add their coefficients up, so their control points must be the same."""
-    name = "FinalGridSpacingInPhysicalUnits"
-    found = {p.parameters.get(name, p.parameters.get("FinalGridSpacingInVoxels", ("default",))) for p in presets}
-    if len(found) > 1:
-        raise ParameterError(
-            f"The stages end with different spacings of control points: {sorted(map(' '.join, found))}. Each stage "
-            f"starts from the coefficients of the one before, so {name} must be the same in all."
-        )

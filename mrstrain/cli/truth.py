@@ -119,7 +119,7 @@ def accuracy(
     Without options 110 registrations: gauss-newton, seven motions and eight waves, voxels of 0.8 mm at SNR 25, 12 and
     50, of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr these alone (default 0.8 mm, 25).
     """
-    from dvc.registration.register import GAUSS_NEWTON
+    from dvc.registration.engines import DEFAULT
     from mrstrain.records.progress import live
     from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES, cases_of
     from mrstrain.truth.accuracy import accuracy as run
@@ -127,7 +127,7 @@ def accuracy(
     conditions = CONDITIONS
     if spacing or snr or slice_spacing:
         conditions = tuple(((s, s, slice_spacing or s), r) for s in spacing or [0.8] for r in snr or [25.0])
-    cases = cases_of(preset or (GAUSS_NEWTON,), conditions, motion or (*MOTIONS, *WAVES), seed or SEEDS)
+    cases = cases_of(preset or (DEFAULT,), conditions, motion or (*MOTIONS, *WAVES), seed or SEEDS)
     with live() as progress:
         study = run(out, cases=cases, workers=workers, tell_plan=typer.echo, progress=progress)
     for line in study.summary():

@@ -14,10 +14,8 @@ from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
-from dvc.registration.gauss_newton.fit import USUAL_VOLUME
-from dvc.registration.register import GAUSS_NEWTON
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
-from mrstrain.measurement.engines import engine_of, settings_of
+from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.measured_folder import measurements_in
 from mrstrain.measurement.register import register
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
@@ -100,8 +98,8 @@ def level(
     target, place = Path(out), Path(model)
     # Refused now rather than after the images are made.
     # Beyond its mesh a model is carried on without regard to volume: what the images then ask for is no tissue's.
-    volume = USUAL_VOLUME if engine_of(engine, preset, parameters) == GAUSS_NEWTON else None
-    settings_of(
+    volume = volume_kept(engine, preset, parameters)
+    engine_of(
         engine, preset, parameters, volume=volume, borders=borders, labelled=labels is not None, allow_unknown=True
     )
     if not place.is_dir():

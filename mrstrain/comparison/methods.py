@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dvc.errors import ParameterError
 from dvc.io.images.read import format_of
-from dvc.io.transforms.elastix_text import parse_parameters
+from dvc.registration.engines import methods_of
 from dvc.report.viewer import NIIVUE
 from fe.simulate import LoadStep
 from validate.curves import DRAWS
@@ -44,7 +43,6 @@ METHODS = "Methods, to be pasted"
 _IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")
 """Roles in a record of the files that are read as images."""
 _GIVEN = "the displacement was taken as it was given."
-_COARSE = " (every two voxels, if that is more)"
 _PUBLISHED = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")  # tables 2 and 3 of Trebbi 2023
 
 Record = Mapping[str, Any]
@@ -127,21 +125,13 @@ def _measured(measured: Mapping[str, Path]) -> str:
 
 def _registration(record: Record) -> str:
     given, versions = record.get("parameters", {}), record.get("versions", {})
-    stages, own = given.get("stages") or [], given.get("gauss_newton")
-    if record.get("command") != "register" or not (stages or own):
+    how = methods_of(given, versions)
+    if record.get("command") != "register" or not how:
         return _GIVEN
     align = {
         "bone": "The loaded image was aligned with the unloaded one rigidly on the bone, and then",
         "image": "The loaded image was aligned with the unloaded one rigidly on the whole image, and then",
     }.get(str(given.get("align")), "The loaded image was, without rigid alignment,")
-    elastix = f"elastix (Klein 2010, Shamonin 2014; itk-elastix {versions.get('itk-elastix', '?')})"
-    ours = f"mrstrain {versions.get('mrstrain', '?')}"
-    on_bone = given.get("align") == "bone"
-    how = (
-        f"with {elastix} through {ours}: {'; then '.join(_stage(stage) for stage in stages)}"
-        if not own
-        else f"with the Gauss-Newton engine of {ours}: {_weights(own, given.get('borders'), on_bone)}"
-    )
     if given.get("align") != "none":
         how += "; rigid alignment by Gauss-Newton least squares (Baker 2004)"
     return (
@@ -167,56 +157,6 @@ def _files(record: Record) -> str:
     return (
         f" {done} by mrstrain's own code, with nibabel "
         f"{versions.get('nibabel', '?')} for the headers of NIfTI files{of_dicom if 'DICOM' in formats else ''}."
-    )
-
-
-def _weights(own: Record, borders: Record | None, on_bone: bool) -> str:
-    bending = own.get("bending")
-    weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
-    volume = own.get("volume")
-    kept = (
-        "300/mm3, or of its gradient alone where the images ask for such a change"
-        if volume is None
-        else f"{volume:g}/mm3"
-    )
-    held = (
-        f", on change of volume in soft tissue ({kept}) and on strain of the bone ({own.get('rigidity'):g}/mm3)"
-        if on_bone
-        else f" and on change of volume in the tissue ({kept})"
-    )
-    told = (
-        f"a cubic B-spline with control points every {own.get('spacing_mm'):g} mm{_COARSE}, least squares over all "
-        "voxels of the tissue and 3 mm around it, and "
-        "penalties on bending (the square of the Laplacian of its coefficients, less where the displacement is curved; "
-        f"weight {weight}){held}"
-    )
-    if borders is None:
-        return told
-    skin = borders.get("skin")
-    weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
-    return (
-        f"{told}; from there a second B-spline was added that vanishes on the borders of the label map's tissues, so "
-        f"that strain may jump there, {'the bone held at rest and ' if on_bone else ''}strain of a tissue called skin "
-        f"penalised (weight {weight}), and bending counted by the Laplacian of both splines' Laplacian"
-    )
-
-
-def _stage(stage: Record) -> str:
-    try:
-        told = parse_parameters(str(stage.get("text", "")))
-    except ParameterError:
-        return f"parameters '{stage.get('name')}'"
-
-    def value(name: str) -> str:
-        """Values of a parameter, one for all where they are equal."""
-        values = told.get(name, ())
-        return ", ".join(dict.fromkeys(values) if len(set(values)) == 1 else values) or "elastix' default"
-
-    spacing = value("FinalGridSpacingInPhysicalUnits")
-    return (
-        f"parameters '{stage.get('name')}', metric {value('Metric')}, {value('Transform')} with control points every "
-        f"{spacing} mm{_COARSE}, {value('NumberOfResolutions')} resolutions, {value('Optimizer')} with "
-        f"{value('MaximumNumberOfIterations')} iterations of {value('NumberOfSpatialSamples')} samples"
     )
 
 

@@ -19,7 +19,7 @@ from dvc.images.image import Image
 from dvc.images.noise import signal_to_noise
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
-from dvc.registration.register import Registration, Settings
+from dvc.registration.register import Registration
 from dvc.report import figures
 from dvc.report.page import Picture, Table
 from dvc.report.planes import View
@@ -39,7 +39,6 @@ from mrstrain.measurement.twin_check import TwinCheck
 from mrstrain.records.inputs import Subject, is_bones_name
 
 _MOSTLY = 0.5
-_UNLABELLED = 0.1
 _SIGMA_SCALE = 0.1
 _TWIN = (
     "The unloaded image was moved by what was measured, its noise drawn anew, and the pair registered as the real one: "
@@ -146,7 +145,6 @@ def error_bars(
     bone, regions = _bone_and_tissues(subject, found.tissue.inside, model)
     try:
         chosen = _model_for(found, model)
-        _refuse_unlabelled(found, subject)
         table = chosen.table_for(*_poorer(found))
         if not bone.any():
             raise InputError("The error depends on the distance to bone, and no bone was given.")
@@ -205,9 +203,9 @@ def _held(table: ErrorTable) -> str:
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
     """The error model of what was used; InputError with the reason where there is none."""
-    used = found.settings
-    if len(used.presets) > 1:
-        raise InputError("The error of several stages, one after the other, has not been measured.")
+    used = found.settings.engine
+    if used.without_error_model:
+        raise InputError(used.without_error_model)
     if given is None:
         raise InputError(
             f"The error of {used.name} has not been measured; `mrstrain accuracy --preset {used.name}` does that."
@@ -218,39 +216,10 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
             f"{used.name}` measures that."
         )
     if given.parameters_sha256 != hashlib.sha256(used.text.encode()).hexdigest():
-        raise InputError(_otherwise(used))
-    if used.borders is not None and used.align_on != "bone":
-        raise InputError(
-            f"The error of {used.name} was measured with the bone held at rest; here nothing was aligned on a bone."
-        )
-    if found.choice is not None and found.choice.frees_volume:
-        raise InputError(
-            f"The error of {used.name} was measured on phantoms that keep their volume; here the images ask for a "
-            "change of volume, which was allowed."
-        )
+        raise InputError(used.unlike_its_error_model)
+    if found.unlike_study:
+        raise InputError(found.unlike_study)
     return given
-
-
-def _refuse_unlabelled(found: Registration, subject: Subject) -> None:
-    """Refuse a registration with borders of tissues of which a part has no label."""
-    if found.settings.borders is None or subject.labels is None:
-        return
-    share = float(np.mean(subject.labels.labels[found.tissue.inside] == 0))
-    if share > _UNLABELLED:
-        raise InputError(
-            f"{share:.0%} of the body has no label: the error of {found.settings.name} was measured on bodies of which "
-            "every tissue has one. Label it, or take one smooth spline (--no-borders)."
-        )
-
-
-def _otherwise(used: Settings) -> str:
-    """Why an error model of this engine or preset does not hold for these settings of it."""
-    if used.gauss_newton is not None and used.gauss_newton.bending is not None:
-        return (
-            f"The error of {used.name} was measured with the weight of the bending chosen by its rule, as for a loaded "
-            f"image; here it was fixed at {used.gauss_newton.bending:g}/mm, as for a repeat scan or by --bending."
-        )
-    return f"The error of {used.name} was measured with other parameters; `mrstrain accuracy` measures that of yours."
 
 
 def _poorer(found: Registration) -> tuple[FloatArray, float]:

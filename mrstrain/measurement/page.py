@@ -10,7 +10,7 @@ import numpy as np
 from dvc.arrays import Float32Array
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Image, LabelMap
-from dvc.registration.gauss_newton.fit import Choice
+from dvc.registration.engine import Regularisation
 from dvc.report import figures
 from dvc.report.page import Cell, Picture, Section, Table, write_report
 from dvc.report.planes import View
@@ -20,13 +20,6 @@ from dvc.trust.verdict import Verdict, worst
 from mrstrain.records.inputs import Subject
 
 _SHEAR_SCALE = 0.5
-WITH_BORDERS = (
-    "Strain may jump where the tissues of the label map meet, and bone that was aligned on does not move at all: the "
-    "figures of the bone are those of the smooth spline that came before. Labels that are off by more than a voxel "
-    "spoil it (then take --no-borders). The whole motion is in transform.h5, as displacements at voxels; text files of "
-    "elastix are not written, since elastix knows no spline with borders."
-)
-"""What a load's part of the report says of it."""
 _CLOSING = (
     Section(
         "How to read this",
@@ -199,20 +192,10 @@ def _number(value: object) -> float | None:
     return float(value) if isinstance(value, int | float) else None
 
 
-def weights_table(choice: Choice) -> Table:
+def weights_table(choice: Regularisation) -> Table:
     """Tell the weights of the prior, and of those that were tried what they left of half of the voxels."""
-    used = choice.weights
-    stiff = f"strain of {choice.rigidity_of}"
-    rows: list[tuple[Cell, ...]] = [
-        ("bending", used.bending, "1/mm", "used"),
-        ("change of volume in soft tissue", used.volume, "1/mm3", "used"),
-        ("gradient of that change", used.volume_gradient, "1/mm", "used"),
-        (stiff, used.rigidity, "1/mm3", "used"),
-    ]
-    rows += [("bending", weight, "1/mm", 100.0 * (left - 1.0)) for weight, left in choice.tried]
-    rows += [(stiff, weight, "1/mm3", 100.0 * (left - 1.0)) for weight, left in choice.tried_in_skin]
     columns = ("penalty on", "weight", "unit", "residual left out, % above the least")
-    return Table("Weights of the registration", columns, tuple(rows), f"{choice.rule}. {choice.volume_told}")
+    return Table("Weights of the registration", columns, tuple(choice.rows()), choice.caption)
 
 
 def region_table(regions: Sequence[RegionRow]) -> Table:

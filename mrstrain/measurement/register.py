@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.deformation.bordered_spline import Spline
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
 from dvc.images.image import Image, Mask
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.read import read_image
 from dvc.registration.align import AlignOn
-from dvc.registration.register import GAUSS_NEWTON, Registration, Settings, refuse_one_image_twice
+from dvc.registration.register import Registration, Settings, refuse_one_image_twice
 from dvc.registration.register import register as register_pair
 from dvc.trust.error_model import ErrorModel, error_model_of, read_error_model
 from dvc.trust.landmarks import read_landmarks
 from dvc.worker import Worker, each_in_workers, usable_cores
-from mrstrain.measurement.engines import settings_of
+from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.page import write_series_report
 from mrstrain.measurement.results import Case, write_case
 from mrstrain.measurement.strain import read_any, without_motion
@@ -41,7 +40,6 @@ Told = Callable[[str, str, float], None]
 REPEAT = "repeat"
 """Name of a repeat scan's results."""
 _BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plate's axes
-_BYTES_WITH_BORDERS = 24  # more: transform.h5 then holds displacements
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,14 +180,12 @@ def register(
     for option, value in (("--landmarks", landmarks), ("--start", start)):
         if value is not None and len(loads) != 1:
             raise InputError(f"{option}: belongs to one loaded image; {len(loads)} are given. Register that one alone.")
-    settings = settings_of(
+    chosen = engine_of(
         engine, preset, parameters, bending=bending, volume=volume, borders=borders, labelled=labels is not None,
         allow_unknown=allow_unknown_parameters,
     )  # fmt: skip
     if start_frame is not None and start is None:
         raise ParameterError("--start-frame is the frame of --start, which is not given.")
-    if start is not None and settings.gauss_newton is None:
-        raise ParameterError(f"--start is for --engine {GAUSS_NEWTON}; elastix begins at results of its own (--chain).")
     files = (load0, *paths, bone, tissue, labels, names, landmarks, start, mesh, error_model)
     given = [Path(p) for p in files if p is not None]
     refuse_touching_inputs(target, cases, given)
@@ -218,18 +214,20 @@ def register(
     body = subject.tissue or tissue_mask(subject.reference)
     held = {"bone": subject.bone, "image": body, "none": None}[align]
     begun_at = None if start is None else without_motion(read_any(start, start_frame), held)[0]
+    if begun_at is not None:
+        chosen.check_start(begun_at)
     refuse_one_image_twice(
         [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
     )
-    each_voxel = _BYTES_PER_VOXEL + (0 if settings.borders is None else _BYTES_WITH_BORDERS)
+    each_voxel = _BYTES_PER_VOXEL + chosen.cost.bytes_per_voxel
     needed = each_voxel * int(np.prod(subject.reference.grid.shape)) * len(cases)
     refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
     make_output(target)
     cores = usable_cores()
     at_once = 1 if chain else min(workers or cores, cores, len(cases))
     each = threads or max(1, cores // at_once)
-    settings = replace(settings, align_on=align, seed=seed, threads=each)
-    model = model or error_model_of(settings.name)
+    settings = Settings(chosen, align, seed, each)
+    model = model or error_model_of(chosen.name)
     record = record_of(
         subject,
         {
@@ -269,7 +267,6 @@ def record_of(
     subject: Subject, files: Mapping[str, list[Path]], settings: Settings, more: Mapping[str, object]
 ) -> dict[str, object]:
     """What a registration is made from; ``more`` are parameters beside the settings."""
-    own = settings.gauss_newton
     return provenance(
         "register",
         {**subject.files, **files},
@@ -278,10 +275,8 @@ def record_of(
             "seed": settings.seed,
             "threads": settings.threads,
             "plate_normal_lps": subject.plate_normal.tolist(),
-            "engine": settings.engine,
-            "gauss_newton": None if own is None else asdict(own),
-            "borders": None if settings.borders is None else asdict(settings.borders),
-            "stages": [{"name": s.name, "text": s.text} for s in settings.presets],
+            "engine": settings.engine.family,
+            **settings.engine.record(),
             **more,
         },
     )
@@ -315,7 +310,7 @@ class _Run:
             self._floor_known.set()
 
     def all(self, at_once: int, chain: bool) -> None:
-        last: list[Spline] = []
+        last: list[Deformation] = []
 
         def one(name: str, worker: Worker) -> None:
             start = None if name == REPEAT else last[-1] if chain and last else self.start
@@ -337,7 +332,7 @@ class _Run:
                 )
                 made = None
                 if name != REPEAT:
-                    last.append(found.bspline)
+                    last.append(found.displacement)
                     made = twin_check(found, self.subject, start, worker, told) if self.twin else None
                     self._floor_known.wait()
                 self._write(name, found, made)

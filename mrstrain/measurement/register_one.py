@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.read import read_image
 from dvc.registration.align import AlignOn
+from dvc.registration.register import Settings
 from dvc.registration.register import register as register_pair
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.trust.quality import read_noise_floor
 from dvc.worker import Worker
-from mrstrain.measurement.engines import settings_of
+from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.measured_folder import spline_in
 from mrstrain.measurement.register import REPEAT, record_of
 from mrstrain.measurement.results import Case, write_case
@@ -77,13 +77,9 @@ def register_one(
         allow_missing=allow_missing,
     )
     loaded = read_image(load, allow_missing=allow_missing)
-    settings = replace(
-        settings_of(engine, preset, parameters, bending=bending, volume=volume, borders=borders, labelled=True),
-        align_on=align,
-        seed=seed,
-        threads=threads,
-    )
-    model = error_model_of(settings.name) if error_model is None else read_error_model(error_model)
+    chosen = engine_of(engine, preset, parameters, bending=bending, volume=volume, borders=borders, labelled=True)
+    settings = Settings(chosen, align, seed, threads)
+    model = error_model_of(chosen.name) if error_model is None else read_error_model(error_model)
     floor = None if repeat is None else read_noise_floor(repeat / "quality.json")
     start = None if after is None else spline_in(after)
     record = record_of(

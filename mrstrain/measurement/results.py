@@ -10,7 +10,6 @@ import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.atomic_files import whole_folder
-from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation, RigidMotion
 from dvc.deformation.strain_maps import StrainMaps, strain_maps
 from dvc.errors import InputError
@@ -21,10 +20,8 @@ from dvc.images.similarity import brightness_offset, local_correlation, most_sim
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
 from dvc.io.result_folder import write_maps, write_mesh_results
-from dvc.io.transforms.bordered_spline import NAME as BORDERS
-from dvc.io.transforms.bordered_spline import write_bordered_spline
-from dvc.io.transforms.write import write_elastix_transform, write_itk_transform
-from dvc.registration.gauss_newton.fit import Choice
+from dvc.io.transforms.write import write_displacement_as_found, write_itk_transform
+from dvc.registration.engine import Regularisation
 from dvc.registration.register import Registration
 from dvc.report.page import Picture, Section
 from dvc.trust.error_model import ErrorModel
@@ -125,12 +122,12 @@ def write_case(
     reference, loaded, motion = found.reference, found.loaded, found.alignment.motion
     grid = reference.grid
     measured = Measured(name, subject, found.tissue, found.deformation, motion)
-    edge = float(found.bspline.control.spacing_mm.min())  # nearer to the scan's end a spline sees half its tissue
+    edge = float(found.displacement.spacing_mm.min())  # nearer to the scan's end it rests on half its tissue
     maps = strain_maps(found.deformation, found.tissue, lambda x: shows(loaded, motion.apply(x), edge))
     before = carry(loaded, grid)
     aligned = carry(loaded, grid, motion.apply)
-    # Beyond the spline, in the air, the image is shown where the bone's motion alone puts it.
-    registered = carry(loaded, grid, lambda X: motion.apply(X + np.nan_to_num(found.bspline.displacement(X))))
+    # Beyond what was found, in the air, the image is shown where the bone's motion alone puts it.
+    registered = carry(loaded, grid, lambda X: motion.apply(X + np.nan_to_num(found.displacement.displacement(X))))
     both = Mask(grid, found.tissue.inside & np.isfinite(aligned) & np.isfinite(registered))  # the same voxels for both
     _, as_scanned = local_correlation(reference, before, found.tissue)
     local_rigid, rigid = local_correlation(reference, aligned, both)
@@ -141,7 +138,7 @@ def write_case(
     errors = None if landmarks is None else target_registration_error(found.total, *landmarks)
     noise = _noise_in_air(found)
     offset = None
-    if noise and found.settings.gauss_newton is not None:  # correlation, as in elastix, is blind to an even one
+    if noise and found.settings.engine.sees_brightness:
         offset = brightness_offset(reference, registered, both, noise[0])
     quality = assess(
         maps,
@@ -154,7 +151,7 @@ def write_case(
         floor=floor,
         in_bone=None if found.choice is None else found.choice.in_bone,
     )
-    quality = replace(quality, verdict=with_volume(quality.verdict, found.choice))
+    quality = replace(quality, verdict=with_caution(quality.verdict, found.choice))
     view = page.view_of(subject, maps)
     labels = _regions(measured)
     bars = error_bars(found, subject, maps, model, twin)
@@ -167,16 +164,13 @@ def write_case(
     def more(partial: Path) -> None:
         write_image(partial / "aligned.nii.gz", Image(grid, aligned))
         write_image(partial / "registered.nii.gz", Image(grid, registered))
-        if isinstance(found.bspline, BSpline):
-            write_elastix_transform(partial, found.bspline, motion, grid)
-        else:
-            write_bordered_spline(partial / BORDERS, found.bspline)
-        write_itk_transform(partial / ITK_FILE, found.bspline, motion)
+        write_displacement_as_found(found.displacement, partial, motion, grid)
+        write_itk_transform(partial / ITK_FILE, found.displacement, motion, grid)
         bars.write(partial, maps, quality.verdict)
 
     return _written(
         folder, measured, maps, quality, pictures, _alignment(found), record, more, bars, found.choice,
-        borders=found.settings.borders is not None,
+        note=found.settings.engine.note,
     )  # fmt: skip
 
 
@@ -204,16 +198,11 @@ def write_measured(folder: Path, measured: Measured, record: Mapping[str, object
     return _written(folder, measured, maps, quality, pictures, alignment, record, lambda _: None)
 
 
-def with_volume(verdict: Verdict, choice: Choice | None) -> Verdict:
-    """The verdict, at best "Use with care" where the images asked for a change of volume.
-
-    On phantoms that change their volume like that, two thirds to all of the change came back. Images of another foot
-    ask for one too, and fit better once it is allowed: what is doubted all the same is then not to be trusted.
-    """
-    if choice is None or not choice.frees_volume:
+def with_caution(verdict: Verdict, choice: Regularisation | None) -> Verdict:
+    """The verdict, lowered by one level where the engine has a doubt of its own: to "Use with care", or below."""
+    if choice is None or not choice.caution:
         return verdict
-    reason = f"{choice.volume_told} It may be larger than was found."
-    return Verdict("caution" if verdict.level == "trust" else "distrust", (*verdict.reasons, reason))
+    return Verdict("caution" if verdict.level == "trust" else "distrust", (*verdict.reasons, choice.caution))
 
 
 def _written(
@@ -226,15 +215,15 @@ def _written(
     record: Mapping[str, object],
     more: Callable[[Path], None],
     bars: ErrorBars | None = None,
-    choice: Choice | None = None,
-    borders: bool = False,
+    choice: Regularisation | None = None,
+    note: str = "",
 ) -> Case:
     subject = measured.subject
     regions = region_statistics(_regions(measured), maps.by_quantity)
     told = quality.as_dict() | {"alignment": dict(alignment)}
     tables = [page.key_figures(quality, alignment), page.region_table(regions)]
     if choice is not None:
-        told["regularisation"] = choice.as_dict() | {"borders": borders}
+        told["regularisation"] = choice.as_dict()
         tables.append(page.weights_table(choice))
     if bars is not None:
         told["error_of_max_shear"] = bars.as_dict()
@@ -257,7 +246,7 @@ def _written(
         tuple(tables),
         tuple(pictures.values()),
         (
-            *((page.WITH_BORDERS,) if borders else ()),
+            *((note,) if note else ()),
             *(() if bars is None or bars.uncertainty is not None else (f"No error bars. {bars.told}",)),
             *(() if bars is None or not bars.of_twin else (f"Error bars: {bars.of_twin}",)),
         ),
@@ -306,7 +295,7 @@ def _alignment(found: Registration) -> dict[str, object]:
         "similarity_before": plain(alignment.similarity_before),
         "similarity": plain(alignment.similarity),
         "repeatability_rms_mm": plain(alignment.repeatability_mm),
-        "control_spacing_mm": found.bspline.control.spacing_mm.tolist(),
-        "engine": found.settings.engine,
+        "control_spacing_mm": found.displacement.spacing_mm.tolist(),
+        "engine": found.settings.engine.family,
         "seconds": round(found.seconds, 1),
     }

@@ -86,7 +86,7 @@ def twin_check(
         )
     except MrstrainError as reason:
         return TwinCheck(None, str(reason))
-    placed, edge = again.alignment.motion, float(again.bspline.control.spacing_mm.min())
+    placed, edge = again.alignment.motion, float(again.displacement.spacing_mm.min())
     maps = strain_maps(again.deformation, again.tissue, lambda x: shows(twin, placed.apply(x), edge))
     folded = float(np.mean(maps.jacobian[found.tissue.inside] <= 0.0))
     if folded > _FOLDED:

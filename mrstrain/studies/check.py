@@ -25,7 +25,7 @@ from fe.simulate import LoadStep, check_loads
 from fe.simulate import check as check_simulation
 from fe.surface_sets import fixed_facets
 from mrstrain.comparison.model_files import Reading, model_files
-from mrstrain.measurement.engines import settings_of
+from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.register import REPEAT
 from mrstrain.records.inputs import is_bones_name
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
@@ -192,20 +192,20 @@ def _registration(study: Study, found: _Findings, reference: Image | None, label
     for mask in (images.bone_mask, images.tissue):
         if mask is not None and reference is not None:
             found.tried(read_mask, study.path(mask), reference.grid)
-    settings = found.tried(
-        settings_of, how.engine, how.preset, [study.path(p) for p in how.parameters], bending=how.bending,
+    engine = found.tried(
+        engine_of, how.engine, how.preset, [study.path(p) for p in how.parameters], bending=how.bending,
         volume=how.volume, borders=how.borders, labelled=True,
     )  # fmt: skip
-    if settings is None:
+    if engine is None:
         return
     own = how.error_model
-    model = error_model_of(settings.name) if own is None else found.tried(read_error_model, study.path(own))
+    model = error_model_of(engine.name) if own is None else found.tried(read_error_model, study.path(own))
     if model is None:
-        found.notes.append(f"{settings.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
-    elif model.preset != settings.name:
+        found.notes.append(f"{engine.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
+    elif model.preset != engine.name:
         found.notes.append(
-            f"The error model is that of {model.preset}, and {settings.name} will be used: results will have no "
-            f"intervals (`mrstrain accuracy --preset {settings.name}` makes one)."
+            f"The error model is that of {model.preset}, and {engine.name} will be used: results will have no "
+            f"intervals (`mrstrain accuracy --preset {engine.name}` makes one)."
         )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from dvc.errors import InputError
 from fe.published import MaterialSet, material_set
 from fe.surface_sets import BONE
-from mrstrain.measurement.engines import settings_of
+from mrstrain.measurement.engines import engine_of
 from mrstrain.records.provenance import file_hash
 from mrstrain.studies.file import Load, Study
 
@@ -73,13 +73,13 @@ def unlike(studies: Sequence[Study]) -> list[str]:
 def _registered(study: Study) -> str:
     how = study.registration
     own = [study.path(file) for file in how.parameters]
-    settings = settings_of(
+    engine = engine_of(
         how.engine, how.preset, own, bending=how.bending, volume=how.volume, borders=how.borders, labelled=True
     )
     weights = {name: value for name in ("bending", "volume") if (value := getattr(how, name)) is not None}
     files = [*own, *([] if how.error_model is None else [study.path(how.error_model)])]
     said = [
-        settings.name,
+        engine.name,
         *(f"{name} {value:g}" for name, value in weights.items()),
         *(word for word in ("chain", "twin") if getattr(how, word)),
         *(["aligned on the image"] if how.align == "image" else []),

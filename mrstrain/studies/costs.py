@@ -11,7 +11,7 @@ from dvc.images.image import LabelMap
 from dvc.io.images.labels import read_labels
 from dvc.io.images.read import read_image
 from dvc.mesh import TetMesh
-from dvc.registration.register import GAUSS_NEWTON
+from dvc.registration.engine import Cost
 from fe.mesh_file import read_tet_mesh
 from fe.simulate import LoadStep
 from mrstrain.measurement.engines import engine_of
@@ -21,8 +21,7 @@ from mrstrain.studies.file import Study
 from mrstrain.studies.plan import Stage, labels_to_mesh
 
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
-_REGISTER_S, _REGISTER_S_PER_MVOXEL, _MAPS_S_PER_MVOXEL = 35.0, 7.0, 3.5
-_BORDERS = 2.5  # times as long with borders of tissues (docs/decisions/0009)
+_REGISTER_S, _MAPS_S_PER_MVOXEL = 35.0, 3.5  # beside what the engine takes (`Cost`)
 _TWIN = 1.3  # times as long again: the twin is made and registered
 _CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
 # Of P1's time and memory: P2 20 times as long on 60,000 cells of the heel, MINI a third of P2's time on 56,000, where
@@ -33,7 +32,7 @@ _MESH_S = 100.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
 # GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
 # with borders 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells .84.
-_REGISTER_GIB, _REGISTER_GIB_PER_MVOXEL, _BORDERS_GIB_PER_MVOXEL, _ELASTIX_GIB = 0.65, 0.175, 0.1, 0.75
+_REGISTER_GIB = 0.65
 _SIMULATE_GIB, _SIMULATE_GIB_PER_CELL = 0.2, 1.0 / 79e3
 _OTHER_GIB = 1.5
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
@@ -79,12 +78,9 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
         Of the mesh.
     """
     loads = len(study.loads)
-    slower = _BORDERS if _with_borders(study) else 1.0
-    registering = _REGISTER_S + (slower * _REGISTER_S_PER_MVOXEL + _MAPS_S_PER_MVOXEL) * voxels / 1e6
-    if stage.kind == "register":
-        return (1.0 + _TWIN * bool(stage.arguments.get("twin"))) * registering
-    if stage.kind == "level":
-        return 1.5 * registering
+    if stage.kind in ("register", "level"):
+        registering = _REGISTER_S + (_cost(study).seconds_per_mvoxel + _MAPS_S_PER_MVOXEL) * voxels / 1e6
+        return registering * (1.5 if stage.kind == "level" else 1.0 + _TWIN * bool(stage.arguments.get("twin")))
     if stage.kind == "mesh":
         return _MESH_S
     if stage.kind == "compare":
@@ -102,9 +98,8 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
 def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
     """About how much memory a stage takes, GiB, all its processes together; parameters as in `seconds_of`."""
     if stage.kind in ("register", "level"):
-        more = _BORDERS_GIB_PER_MVOXEL if _with_borders(study) else 0.0
-        loading = 0.0 if _by_gauss_newton(study) else _ELASTIX_GIB
-        return _REGISTER_GIB + loading + (_REGISTER_GIB_PER_MVOXEL + more) * voxels / 1e6
+        cost = _cost(study)
+        return _REGISTER_GIB + cost.gib + cost.gib_per_mvoxel * voxels / 1e6
     if stage.kind in ("simulate", "drive"):
         times = _ELEMENT_GIB[study.models.element] if stage.kind == "simulate" else 1.0
         return _SIMULATE_GIB + times * _SIMULATE_GIB_PER_CELL * cells
@@ -133,13 +128,10 @@ def mesh_given(study: Study, file: str) -> TetMesh:
     return read_tet_mesh(study.path(file), unit=study.mesh.unit, frame=study.mesh.frame)
 
 
-def _by_gauss_newton(study: Study) -> bool:
+def _cost(study: Study) -> Cost:
     how = study.registration
-    return engine_of(how.engine, how.preset, how.parameters) == GAUSS_NEWTON
-
-
-def _with_borders(study: Study) -> bool:
-    return _by_gauss_newton(study) and study.registration.borders is not False
+    files = [study.path(file) for file in how.parameters]
+    return engine_of(how.engine, how.preset, files, borders=how.borders, labelled=True).cost
 
 
 def costs(

@@ -14,7 +14,7 @@ import numpy as np
 
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError
-from dvc.registration.register import AT_BORDERS, GAUSS_NEWTON, Settings
+from dvc.registration.engines import DEFAULT, engine_named
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
@@ -52,9 +52,6 @@ SEEDS = (1, 2)
 LABELS_OFF = (0, 1, -1)
 """By how many voxels bones and skin are too large in label maps, in turn, where the engine believes them."""
 
-_SECONDS = 30.0  # of one run on one core, as measured, half of it to make and to score the pair
-_BORDERS_SECONDS = 52.0  # with borders of tissues
-_ELASTIX_SECONDS = 75.0  # as measured: 3,500 iterations, whatever the voxel
 _MEGABYTES = 5.0  # of one run's samples, as measured at 0.8 mm
 
 
@@ -92,31 +89,30 @@ class Study:
 
 
 def cases_of(
-    presets: Sequence[str] = (GAUSS_NEWTON,),
+    presets: Sequence[str] = (DEFAULT,),
     conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
     motions: Sequence[str] = (*MOTIONS, *WAVES),
     seeds: Sequence[int] = SEEDS,
 ) -> list[Case]:
     """Every preset with every condition (voxel in mm, SNR), motion and seed; waves with the first seed alone.
 
-    By default seven motions with two heels each and eight waves, at five conditions: 110 registrations. With borders of
-    tissues label maps are exact, too large and too small in turn, and there are no waves, which move bone as they move
-    tissue.
+    By default seven motions with two heels each and eight waves, at five conditions: 110 registrations. For an engine
+    that needs labels these are exact, too large and too small in turn, and there are no waves, which move bone as they
+    move tissue.
     """
     return [
-        Case(preset, spacing, snr, motion, seed, LABELS_OFF[(m + s) % len(LABELS_OFF)] if preset == AT_BORDERS else 0)
-        for preset in presets
+        Case(preset, spacing, snr, motion, seed, LABELS_OFF[(m + s) % len(LABELS_OFF)] if labelled else 0)
+        for preset, labelled in [(preset, engine_named(preset).needs_labels) for preset in presets]
         for spacing, snr in conditions
         for m, motion in enumerate(motions)
-        if not (preset == AT_BORDERS and motion.startswith("wave-"))
+        if not (labelled and motion.startswith("wave-"))
         for s, seed in enumerate(seeds[:1] if motion.startswith("wave-") else seeds)
     ]
 
 
 def expected_minutes(cases: Sequence[Case], workers: int) -> float:
     """About how long registrations take, so many at once."""
-    own = {GAUSS_NEWTON: _SECONDS, AT_BORDERS: _BORDERS_SECONDS}
-    return sum(own.get(case.preset, _ELASTIX_SECONDS) for case in cases) / workers / 60.0
+    return sum(engine_named(case.preset).cost.phantom_seconds for case in cases) / workers / 60.0
 
 
 def accuracy(
@@ -160,7 +156,8 @@ def accuracy(
     wanted = list(cases_of() if cases is None else cases)
     if not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
-            f"A study needs at least one case, and each only once (none is {AT_BORDERS} with a wave, which moves bone)."
+            "A study needs at least one case, and each only once (an engine that needs labels has none with a wave, "
+            "which moves bone)."
         )
     for case in wanted:
         _check(case)
@@ -210,11 +207,7 @@ def _refuse_one_name_for_two(cases: Sequence[Case]) -> None:
 
 
 def _check(case: Case) -> None:
-    for preset in Settings.of(case.preset).presets:
-        if "BSplineTransform" not in preset.transform:
-            raise InputError(
-                f"{preset.name} finds no B-spline ({preset.transform}); a study judges non-rigid registration."
-            )
+    engine_named(case.preset)
     heel_grid(case.spacing_mm)
     if case.wavelength_mm is not None and not case.wavelength_mm >= 2.0 * max(case.spacing_mm):
         raise InputError(f"{case.motion}: a wave needs at least two voxels of {max(case.spacing_mm):g} mm.")
@@ -232,7 +225,7 @@ def _check(case: Case) -> None:
 
 def _key(case: Case) -> str:
     """What a run's result depends on beside its case."""
-    text = Settings.of(case.preset).text
+    text = engine_named(case.preset).text
     return hashlib.sha256(f"{text}; {software_key('phantoms')}".encode()).hexdigest()
 
 
@@ -285,7 +278,7 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
             if any(r.case.labels_off for r in plain):
                 off = ", ".join(f"{by:+d}" for by in sorted({r.case.labels_off for r in plain}))
                 source += f", bones and skin in label maps too large by {off} voxels"
-            fit_error_model(some, Settings.of(preset).text, source).write(
+            fit_error_model(some, engine_named(preset).text, source).write(
                 target / f"error_model_{Path(preset).stem}.json"
             )
     record = provenance(
@@ -294,7 +287,7 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
         {
             "cases": [r.case.name for r in runs],
             "failures": dict(failures),
-            "presets": {p: Settings.of(p).text for p in presets},
+            "presets": {p: engine_named(p).text for p in presets},
             "seconds_of_registration": {r.case.name: round(r.seconds, 1) for r in runs},
         },
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.atomic_files import whole_file
-from dvc.deformation.bordered_spline import NUMBERS, BorderedSpline, Borders
+from dvc.deformation.bordered_spline import NUMBERS, BorderedSpline, Interfaces
 from dvc.deformation.bspline import BSpline
 from dvc.errors import InputError, MrstrainError
 from dvc.images.image import Grid
@@ -67,12 +67,12 @@ def read_bordered_spline(path: Path | str) -> BorderedSpline:
         ) from failure
 
 
-_latest: list[Borders] = []
+_latest: list[Interfaces] = []
 """Loads of one study have their borders in common, which take seconds to find and room in the memory."""
 
 
-def _between(grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Borders:
-    """Borders as they were last found, if these are the same; found anew otherwise."""
+def _between(grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Interfaces:
+    """Interfaces as they were last found, if these are the same; found anew otherwise."""
     known = _latest[-1] if _latest else None
     if (
         known is None
@@ -80,7 +80,7 @@ def _between(grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Borders:
         or not np.array_equal(_told(known.grid), _told(grid))
         or not np.array_equal(known.own, own)
     ):
-        known = Borders.between(grid, own, rest, reach_mm)
+        known = Interfaces.between(grid, own, rest, reach_mm)
         _latest[:] = [known]
     return known
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from functools import singledispatch
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,13 @@ import SimpleITK as sitk
 
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
-from dvc.deformation.bordered_spline import BorderedSpline, Spline
+from dvc.deformation.bordered_spline import BorderedSpline
 from dvc.deformation.bspline import BSpline
-from dvc.deformation.protocol import RigidMotion
+from dvc.deformation.protocol import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.images.image import Grid
+from dvc.io.transforms.bordered_spline import NAME as BORDERED_SPLINE
+from dvc.io.transforms.bordered_spline import write_bordered_spline
 from dvc.io.transforms.elastix_text import Value, format_parameters
 
 StrPath = str | os.PathLike[str]
@@ -119,16 +122,19 @@ def _euler_angles(rotation: FloatArray) -> list[float]:
     return [float(x), float(y), float(z)]
 
 
-def write_itk_transform(path: StrPath, bspline: Spline, then: RigidMotion | None = None) -> Path:
+def write_itk_transform(
+    path: StrPath, displacement: Deformation, then: RigidMotion | None = None, grid: Grid | None = None
+) -> Path:
     """Write ``x = R (X + u(X)) + t`` as an ITK composite transform (.h5 or .tfm), as 3D Slicer reads it.
 
-    ITK has no spline with borders: of a `BorderedSpline` u is written at the voxels on which it was found, the box
-    around the tissue. Between them ITK interpolates linearly; outside the box, as outside a B-spline, it takes u as 0.
+    A B-spline is written as one. ITK has no spline whose gradient jumps at tissue interfaces: of a `BorderedSpline` u
+    is written at the voxels on which it was found, the box around the tissue, and of any other displacement at those
+    of ``grid``. Between them ITK interpolates linearly; outside the box, as outside a B-spline, it takes u as 0.
 
     Raises
     ------
     InputError
-        If the name ends in neither.
+        If the name ends in neither, or the displacement needs a grid and none is given.
     OutputError
         If the file cannot be written; nothing is left under its name.
     """
@@ -141,19 +147,63 @@ def write_itk_transform(path: StrPath, bspline: Spline, then: RigidMotion | None
         motion.SetMatrix(then.rotation.ravel().tolist())
         motion.SetTranslation(then.translation_mm.tolist())
         composite.AddTransform(motion)
-    if isinstance(bspline, BorderedSpline):
-        grid = bspline.borders.grid
-        u = bspline.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
-        composite.AddTransform(sitk.DisplacementFieldTransform(_itk_image(grid, u)))
-    else:
-        images = [_itk_image(bspline.control, component) for component in bspline.coefficients_mm]
-        composite.AddTransform(sitk.BSplineTransform(images, 3))
+    composite.AddTransform(_itk_part(displacement, grid))
     with whole_file(place) as part:
         try:
             sitk.WriteTransform(composite, os.fspath(part))
         except RuntimeError as failure:
             raise OSError(str(failure)) from failure
     return place
+
+
+@singledispatch
+def _itk_part(displacement: Deformation, grid: Grid | None) -> sitk.Transform:
+    """Any displacement as a field at the voxels of a grid, 0 where it is not defined."""
+    if grid is None:
+        raise InputError(f"To write a {type(displacement).__name__} for ITK, give the grid of its displacement field.")
+    u = displacement.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
+    return sitk.DisplacementFieldTransform(_itk_image(grid, np.nan_to_num(u)))
+
+
+@_itk_part.register
+def _(displacement: BSpline, grid: Grid | None) -> sitk.Transform:
+    return sitk.BSplineTransform([_itk_image(displacement.control, c) for c in displacement.coefficients_mm], 3)
+
+
+@_itk_part.register
+def _(displacement: BorderedSpline, grid: Grid | None) -> sitk.Transform:
+    grid = displacement.borders.grid
+    u = displacement.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
+    return sitk.DisplacementFieldTransform(_itk_image(grid, u))
+
+
+@singledispatch
+def write_displacement_as_found(
+    displacement: Deformation, folder: Path, then: RigidMotion | None, reference: Grid
+) -> None:
+    """Write a displacement as it was found, with its own gradient, in the files that hold it: those of its kind.
+
+    A `BSpline` as elastix' text files, with the motion that follows; a `BorderedSpline` as a file of its own. Of any
+    other kind there is no such file, and its displacement image has to do.
+
+    Parameters
+    ----------
+    folder : existing folder
+    then : RigidMotion, optional
+        The motion (R, t) after the displacement.
+    reference : Grid
+        The grid that transformix resamples a moving image to.
+    """
+
+
+@write_displacement_as_found.register
+def _(displacement: BSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
+    write_elastix_transform(folder, displacement, then, reference)
+
+
+@write_displacement_as_found.register
+def _(displacement: BorderedSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
+    write_bordered_spline(folder / BORDERED_SPLINE, displacement)
 
 
 def _itk_image(grid: Grid, values: FloatArray) -> sitk.Image:

@@ -23,8 +23,10 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, ParameterError
-from dvc.images.image import Grid, Image, Mask
+from dvc.images.image import Grid, Image
 from dvc.images.resample import smoothed
+from dvc.registration.engine import AlignedPair
+from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.level import Level, Weights
 from dvc.registration.gauss_newton.roughness import NUMBERS
 
@@ -40,7 +42,6 @@ USUAL_VOLUME = 300.0
 # Where the images ask for a change of volume, its gradient is held instead: while it is looked for with this weight
 # over how sharply a displacement is seen (mm4), so that large voxels and small ones are judged alike; then with 1/mm.
 _LOOKING_MM4, _FREED = 1000.0, 100.0
-_ASKED = 0.04  # the change of volume that a hundredth of the soft tissue exceeds: between loads and swelling
 _RATIO = np.sqrt(10.0)
 _POWERS = -4, 3  # powers of the ratio that are tried at the most: weights of 0.03 to 95
 _CHECK_TOLERANCE, _CHECK_MOST = 0.05, 80
@@ -49,8 +50,8 @@ _LAST_STEPS = 2
 
 
 @dataclass(frozen=True, slots=True)
-class GaussNewton:
-    """Parameters of the engine.
+class Parameters:
+    """Parameters of the fit: the spacing of the control points and the weights of the prior.
 
     Attributes
     ----------
@@ -109,79 +110,9 @@ class GaussNewton:
         return Weights(bending, USUAL_VOLUME if self.volume is None else self.volume, self.rigidity)
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """The prior's weights that were used, and why.
-
-    Attributes
-    ----------
-    weights : Weights
-    rule : str
-        In words.
-    tried : tuple of (bending, left-out residual)
-        Mean square residual of the half of the voxels that was left out, over that of the best.
-    tried_in_skin : tuple of (rigidity, left-out residual)
-        Likewise for the weight of strain in the skin, where borders of tissues are known.
-    rigidity_of : {"bone", "skin"}
-        Whose strain the weight "rigidity" is of.
-    asked : float or None
-        The change of volume that a hundredth of the soft tissue exceeds if only its gradient is held; None where the
-        weight of the change of volume was fixed beforehand.
-    in_bone : (root mean square displacement in mm, 95th percentile of the maximal shear), optional
-        Within the bone, of the smooth displacement that came before one that holds the bone at rest.
-    """
-
-    weights: Weights
-    rule: str
-    tried: tuple[tuple[float, float], ...] = ()
-    tried_in_skin: tuple[tuple[float, float], ...] = ()
-    rigidity_of: str = "bone"
-    asked: float | None = None
-    in_bone: tuple[float, float] | None = None
-
-    @property
-    def frees_volume(self) -> bool:
-        """Whether the images ask for a change of volume, so that only its gradient was held."""
-        return self.asked is not None and self.asked > _ASKED
-
-    @property
-    def volume_told(self) -> str:
-        """How the change of volume was held, and why."""
-        if self.asked is None:
-            return f"Its weight was fixed beforehand, {self.weights.volume:g}/mm3."
-        found = f"{100.0 * self.asked:.1f} % or more in a hundredth of the soft tissue"
-        if self.frees_volume:
-            return (
-                f"The images ask for a change of volume, of {found}: it was allowed, and only its gradient held "
-                f"({self.weights.volume_gradient:g}/mm)."
-            )
-        return f"The images ask for no more change of volume than noise does, {found}: volume was kept."
-
-    def as_dict(self) -> dict[str, object]:
-        """Plain values for JSON."""
-        told: dict[str, object] = {
-            "weights": asdict(self.weights),
-            "rigidity_of": self.rigidity_of,
-            "rule": self.rule,
-            "tried": [{"bending": b, "left_out_over_best": round(v, 6)} for b, v in self.tried],
-            "change_of_volume": {
-                "rule": self.volume_told,
-                "asked": None if self.asked is None else round(self.asked, 4),
-                "allowed_above": None if self.asked is None else _ASKED,
-            },
-        }
-        if self.tried_in_skin:
-            told["tried_in_skin"] = [{"rigidity": w, "left_out_over_best": round(v, 6)} for w, v in self.tried_in_skin]
-        return told
-
-
 def fit(
-    fixed: Image,
-    moving: Image,
-    inside: Mask,
-    body: Mask,
-    bone: Mask | None,
-    options: GaussNewton,
+    pair: AlignedPair,
+    parameters: Parameters,
     start: Deformation | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[BSpline, Choice]:
@@ -189,15 +120,9 @@ def fit(
 
     Parameters
     ----------
-    fixed, moving : Image
-        Without shading; rigid motion already in the moving image's grid. Missing voxels are left out.
-    inside : Mask
-        Voxels of ``fixed`` that are compared.
-    body : Mask
-        Tissue, bone included, on the same grid.
-    bone : Mask or None
-        Of it, what is rigid.
-    options : GaussNewton
+    pair : AlignedPair
+        Images without their bias field; missing voxels are left out.
+    parameters : Parameters
     start : Deformation, optional
         First guess, u in mm LPS; where it is not defined its nearest value is taken.
     progress : callable, optional
@@ -216,17 +141,15 @@ def fit(
     RegistrationError
         If it diverges.
     """
-    scale = float(np.nanpercentile(fixed.values[body.inside], 75))
-    if not scale > 0:
-        raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
-    pictures = scaled(fixed, scale), scaled(moving, scale)
-    core = np.zeros(body.grid.shape, dtype=bool)
-    if bone is not None:
-        core = distance_transform_edt(bone.inside, sampling=bone.grid.spacing_mm) > _RIM_MM
-    weights, asked = options.weights, None
-    spacing = np.maximum(options.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
+    fixed, inside = pair.fixed, pair.compared.inside
+    pictures = brightness_scaled(pair)
+    core = np.zeros(pair.body.grid.shape, dtype=bool)
+    if pair.bone is not None:
+        core = distance_transform_edt(pair.bone.inside, sampling=pair.bone.grid.spacing_mm) > _RIM_MM
+    weights, choice = parameters.weights, Choice(parameters.weights, "fixed beforehand")
+    spacing = np.maximum(parameters.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
     axes = np.array(fixed.grid.direction)
-    soft = body.inside & ~core
+    soft = pair.body.inside & ~core
     coefficients, control = np.zeros(0), fixed.grid
     for number, (sigma_mm, factor, steps, stop_mm) in enumerate(LEVELS):
         guess = start if number == 0 else BSpline(control, turned(axes, coefficients))
@@ -234,20 +157,20 @@ def fit(
         coefficients = (
             np.zeros((3, *control.shape)) if guess is None else turned(axes.T, spline_through(guess, control))
         )
-        level = _level(pictures, inside.inside, soft, core, control, sigma_mm)
+        level = _level(pictures, inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps * weights.patience, stop_mm=stop_mm)
-        if options.volume is None and number == len(LEVELS) - 2:
-            asked = _volume_asked(level, coefficients, weights)
-            if asked > _ASKED:
+        if parameters.volume is None and number == len(LEVELS) - 2:
+            choice = replace(choice, asked=_volume_asked(level, coefficients, weights))
+            if choice.frees_volume:
                 weights = replace(weights, volume=0.0, volume_gradient=_FREED)
         progress((number + 1) / (len(LEVELS) + 2))
-    choice = Choice(weights, "fixed beforehand", asked=asked)
+    choice = replace(choice, weights=weights)
     level.roughness = level.following(coefficients)
-    if options.bending is None:
-        part = _middle(inside.inside)
-        middle = Level(*pictures, inside.inside & part, soft & part, core & part, control)
+    if parameters.bending is None:
+        part = _middle(inside)
+        middle = Level(*pictures, inside & part, soft & part, core & part, control)
         middle.roughness = level.roughness
-        choice = replace(choose(middle, coefficients, weights), asked=asked)
+        choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
         progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
     steps = _LAST_STEPS * choice.weights.patience
     coefficients = level.descend(coefficients, choice.weights, steps=steps, stop_mm=LEVELS[-1][-1])
@@ -335,6 +258,20 @@ def _level(
     fixed, moving = (_thinned(smoothed(i, sigma_mm), sigma_mm) for i in pictures)
     every = tuple(slice(None, None, int(n)) for n in _stride(pictures[0].grid, sigma_mm))
     return Level(fixed, moving, inside[every], soft[every], bone[every], control, _BLURRED * sigma_mm)
+
+
+def brightness_scaled(pair: AlignedPair) -> tuple[Image, Image]:
+    """Both images over the brightness of the tissue in the fixed one.
+
+    Raises
+    ------
+    InputError
+        If that is not above zero.
+    """
+    scale = float(np.nanpercentile(pair.fixed.values[pair.body.inside], 75))
+    if not scale > 0:
+        raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
+    return scaled(pair.fixed, scale), scaled(pair.moving, scale)
 
 
 def scaled(image: Image, scale: float) -> Image:

@@ -80,6 +80,28 @@ class State:
         return self.images.square / self.images.count
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Splines:
+    """What a displacement is the sum of, and how each part of it is smoothed.
+
+    Attributes
+    ----------
+    factors : (ni, nj, nk, splines, 4) or None
+        At the voxels, as in `SplineSums`; None for one B-spline alone.
+    rough : sequence of (float, float)
+        Of each spline, how its bending and its square count beside the first one's bending.
+    laplacians : {1, 2}
+        What its bending is, as in `Roughness`.
+    """
+
+    factors: FloatArray | None = None
+    rough: Sequence[tuple[float, float]] = ((1.0, REST),)
+    laplacians: int = 1
+
+
+ONE_SPLINE = Splines()
+
+
 class Level:
     """Two images at one resolution, the control points, and the tissue that the prior is about.
 
@@ -95,12 +117,7 @@ class Level:
         Control points, around all of ``fixed``.
     rim_mm : float
         Along the ends of ``moving``, which is not used there.
-    factors : (ni, nj, nk, splines, 4), optional
-        At the voxels, as in `SplineSums`: the displacement is then a sum of splines.
-    rough : sequence of (float, float)
-        Of each spline, how its bending and its square count beside the first one's bending.
-    laplacians : {1, 2}
-        What its bending is, as in `Roughness`.
+    splines : Splines
     """
 
     def __init__(
@@ -112,14 +129,12 @@ class Level:
         stiff: BoolArray,
         control: Grid,
         rim_mm: float = 0.0,
-        factors: FloatArray | None = None,
-        rough: Sequence[tuple[float, float]] = ((1.0, REST),),
-        laplacians: int = 1,
+        splines: Splines = ONE_SPLINE,
     ) -> None:
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
         self.control = control
-        self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm, factors)
-        self.roughness = Roughness(control, rough, laplacians)
+        self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm, splines.factors)
+        self.roughness = Roughness(control, splines.rough, splines.laplacians)
         self._tissue = _share_at(control, soft | stiff, fixed.grid)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0

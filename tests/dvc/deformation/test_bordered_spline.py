@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dvc.deformation.bordered_spline import BorderedSpline, Borders
+from dvc.deformation.bordered_spline import BorderedSpline, Interfaces
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation, evaluate_on_grid
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.io.transforms.bordered_spline import read_bordered_spline, write_bordered_spline
-from dvc.registration.gauss_newton.fit import Choice, GaussNewton, control_grid, fit
+from dvc.registration.engine import AlignedPair
+from dvc.registration.gauss_newton.choice import Choice
+from dvc.registration.gauss_newton.fit import Parameters, control_grid, fit
 from dvc.registration.gauss_newton.spline_sums import SplineSums
-from dvc.registration.gauss_newton.with_borders import AtBorders, fit_with_borders
+from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
 
 NAMES = {1: "bone", 2: "fat", 3: "skin"}
 GRID = Grid((34, 32, 30), np.array([1.0, 1.0, 1.2]), np.array([-12.0, 5.0, 3.0]))
@@ -36,8 +38,8 @@ def layers(grid: Grid = GRID) -> LabelMap:
     return LabelMap(grid, np.where(z > SKIN_MM + 4.0, 0, labels), NAMES)
 
 
-def borders_of(labels: LabelMap, rest: str | None = "bone") -> Borders:
-    return Borders.of(labels, None if rest is None else labels.region(rest), REACH_MM)
+def borders_of(labels: LabelMap, rest: str | None = "bone") -> Interfaces:
+    return Interfaces.of(labels, None if rest is None else labels.region(rest), REACH_MM)
 
 
 def inner_points(count: int, seed: int = 1) -> np.ndarray:
@@ -46,7 +48,7 @@ def inner_points(count: int, seed: int = 1) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def borders() -> Borders:
+def borders() -> Interfaces:
     return borders_of(layers())
 
 
@@ -58,12 +60,12 @@ def test_what_has_no_label_in_the_body_never_is_the_bone_at_rest():
     z = height(GRID.points())
     gap, far = (z > BONE_MM) & (z < BONE_MM + 2.0), z > SKIN_MM + 4.0
     values[gap] = 0
-    whole, with_gap = (Borders.of(replace(labels, labels=v), bone, REACH_MM, body) for v in (labels.labels, values))
+    whole, with_gap = (Interfaces.of(replace(labels, labels=v), bone, REACH_MM, body) for v in (labels.labels, values))
     np.testing.assert_array_equal(with_gap.own, whole.own)
     assert set(np.unique(whole.own[far])) == {2, 3}  # the skin, and what lies more than 3 mm outside it
     assert np.count_nonzero(whole.own[far] == 3) > 100
-    assert np.unique(Borders.of(replace(labels, labels=values), bone, REACH_MM).own[gap]).tolist() == [0, 1]
-    alone = Borders.of(replace(labels, labels=bone.inside.astype(np.int64)), bone, REACH_MM, body)
+    assert np.unique(Interfaces.of(replace(labels, labels=values), bone, REACH_MM).own[gap]).tolist() == [0, 1]
+    alone = Interfaces.of(replace(labels, labels=bone.inside.astype(np.int64)), bone, REACH_MM, body)
     assert np.all((alone.own == alone.rest) == bone.inside)
 
 
@@ -75,7 +77,7 @@ def spline(borders) -> BorderedSpline:
 
 
 def test_factors_are_those_of_the_distance_from_a_plane(borders):
-    """Borders of voxels' faces would be 0.3 mm off, and their normals would be the axes."""
+    """Interfaces made of voxels' faces would be 0.3 mm off, and their normals would be the axes."""
     points = inner_points(4000)
     z = height(points)
     here = z > BONE_MM
@@ -185,12 +187,12 @@ def test_what_does_not_fit_together_is_refused(spline, borders):
     labels = layers()
     empty = LabelMap(GRID, np.zeros(GRID.shape, dtype=np.int64), {})
     with pytest.raises(InputError, match="no tissue"):
-        Borders.of(empty, None, REACH_MM)
+        Interfaces.of(empty, None, REACH_MM)
     with pytest.raises(InputError, match="above 0"):
-        Borders.of(labels, None, 0.0)
+        Interfaces.of(labels, None, 0.0)
     aside = Grid(GRID.shape, GRID.spacing_mm, GRID.origin_mm + 50.0)
     with pytest.raises(GeometryError, match="grid of the label map"):
-        Borders.of(labels, Mask(aside, labels.labels == 1), REACH_MM)
+        Interfaces.of(labels, Mask(aside, labels.labels == 1), REACH_MM)
 
 
 @pytest.fixture(scope="module")
@@ -256,13 +258,13 @@ def scanned(skin: float) -> tuple[Image, Image, Mask, LabelMap]:
     return fixed, moving, Mask(GRID, inside), LabelMap(GRID, np.where(layers().labels, layers().labels, 3), NAMES)
 
 
-KEPT = GaussNewton(volume=300.0)
+KEPT = Parameters(volume=300.0)
 
 
 @pytest.fixture(scope="module")
 def along_stiff_skin() -> tuple[BorderedSpline, Choice]:
     fixed, moving, body, labels = scanned(skin=0.0)
-    return fit_with_borders(fixed, moving, body, body, labels.region("bone"), labels, KEPT, AtBorders())
+    return fit_with_interfaces(AlignedPair(fixed, moving, body, body, labels.region("bone"), labels), KEPT)
 
 
 def shear_errors(found: Deformation, skin: float) -> dict[str, float]:
@@ -282,7 +284,7 @@ def shear_errors(found: Deformation, skin: float) -> dict[str, float]:
 def test_strain_that_jumps_is_found_up_to_the_border(along_stiff_skin):
     """One spline: .058 in bone, .059 in fat, .081 in skin; with borders 0, .011, .007."""
     fixed, moving, body, labels = scanned(skin=0.0)
-    smooth = shear_errors(fit(fixed, moving, body, body, labels.region("bone"), KEPT)[0], 0.0)
+    smooth = shear_errors(fit(AlignedPair(fixed, moving, body, body, labels.region("bone")), KEPT)[0], 0.0)
     sharp = shear_errors(along_stiff_skin[0], 0.0)
     assert sharp["bone"] < 0.002
     assert sharp["fat"] < 0.4 * smooth["fat"]
@@ -292,9 +294,8 @@ def test_strain_that_jumps_is_found_up_to_the_border(along_stiff_skin):
 def test_the_images_tell_whether_the_skin_resists(along_stiff_skin):
     """Where skin does not shear it is made stiff, 300; where it shears as fat does it is not, below 0.1."""
     fixed, moving, body, labels = scanned(skin=1.0)
-    found, choice = fit_with_borders(
-        fixed, moving, body, body, labels.region("bone"), labels, replace(KEPT, bending=3.0), AtBorders()
-    )
+    pair = AlignedPair(fixed, moving, body, body, labels.region("bone"), labels)
+    found, choice = fit_with_interfaces(pair, replace(KEPT, bending=3.0))
     assert choice.weights.rigidity < 1.0
     assert shear_errors(found, 1.0)["skin"] < 0.02
     stiff = along_stiff_skin[1]
@@ -306,7 +307,8 @@ def test_the_images_tell_whether_the_skin_resists(along_stiff_skin):
 def test_without_skin_and_bone_and_with_a_fixed_weight():
     fixed, moving, body, labels = scanned(skin=1.0)
     plain = LabelMap(GRID, labels.labels, {1: "bone", 2: "fat", 3: "cartilage"})
-    found, choice = fit_with_borders(fixed, moving, body, body, None, plain, replace(KEPT, bending=30.0), AtBorders())
+    pair = AlignedPair(fixed, moving, body, body, None, plain)
+    found, choice = fit_with_interfaces(pair, replace(KEPT, bending=30.0))
     assert choice.weights.bending == 30.0
     assert not choice.tried
     assert not choice.tried_in_skin

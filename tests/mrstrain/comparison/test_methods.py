@@ -15,11 +15,11 @@ import pytest
 
 import dvc
 from dvc.io.images import read as imagefile
-from dvc.registration import engines as nonrigid
+from dvc.registration import engine as nonrigid
+from dvc.registration.elastix import engine as elastix
 from dvc.registration.elastix.presets import load_preset
 from dvc.registration.gauss_newton import fit as gaussnewton
-from dvc.registration.gauss_newton.fit import GaussNewton
-from dvc.registration.gauss_newton.with_borders import AtBorders
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Settings
 from mrstrain.comparison.methods import methods
 from mrstrain.measurement.register import record_of
@@ -145,7 +145,7 @@ def test_our_own_engine_is_told_with_its_weights(tmp_path: Path) -> None:
 def test_borders_are_told(tmp_path: Path) -> None:
     place = measured(tmp_path, "Load1")
     record = json.loads((place / "provenance.json").read_text())
-    record["parameters"] |= {"stages": [], "gauss_newton": asdict(GaussNewton()), "borders": asdict(AtBorders())}
+    record["parameters"] |= {"stages": [], "engine": "gauss-newton"} | GaussNewtonWithInterfaces().record()
     (place / "provenance.json").write_text(json.dumps(record))
     text = told({"Load1": place}, {"ansys": tmp_path / "Load1.csv"})
     assert "vanishes on the borders of the label map's tissues" in text
@@ -275,7 +275,7 @@ def test_a_levelled_model_counts_as_registered_alike_whatever_files_its_images_c
 
 
 def test_what_the_engine_compares_and_holds_is_told(tmp_path: Path) -> None:
-    assert gaussnewton._LEAST_VOXELS == nonrigid._LEAST_VOXELS == 2.0
+    assert gaussnewton._LEAST_VOXELS == elastix._LEAST_VOXELS == 2.0
     for align, bone in (("bone", True), ("image", False), ("none", False)):
         place = measured(tmp_path / align, "Load1", align)
         assert "mm (every two voxels, if that is more)" in told({"Load1": place}, {})

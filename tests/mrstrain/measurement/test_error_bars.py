@@ -13,15 +13,17 @@ from scipy.stats import foldnorm
 
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Image, LabelMap, Mask
+from dvc.registration.elastix.engine import Elastix
 from dvc.registration.elastix.presets import load_preset
-from dvc.registration.gauss_newton.fit import Choice, GaussNewton
-from dvc.registration.gauss_newton.with_borders import AtBorders
+from dvc.registration.engine import AlignedPair
+from dvc.registration.gauss_newton.choice import Choice
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Settings
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, error_model_of, uncertainty_of
 from dvc.trust.twin_judgement import judged
 from dvc.trust.verdict import Verdict
 from mrstrain.measurement.error_bars import error_bars
-from mrstrain.measurement.results import with_volume
+from mrstrain.measurement.results import with_caution
 from mrstrain.measurement.twin_check import TwinCheck
 from mrstrain.records.inputs import Subject
 
@@ -53,7 +55,8 @@ def given(with_labels: bool = True, with_bone: bool = True):
     maps = StrainMaps(GRID, inside, np.zeros((*GRID.shape, 3)), np.zeros((*GRID.shape, 6)), shear, np.ones(GRID.shape))
     settings = Settings.of("heel-mr")
     body = Mask(GRID, inside)
-    return SimpleNamespace(settings=settings, tissue=body, reference=image, loaded=image, choice=None), subject, maps
+    found = SimpleNamespace(settings=settings, tissue=body, reference=image, loaded=image, choice=None, unlike_study="")
+    return found, subject, maps
 
 
 def test_every_bone_is_left_out_whatever_its_name() -> None:
@@ -118,13 +121,13 @@ def test_the_noisier_image_counts() -> None:
 
 def test_several_stages_have_no_known_error() -> None:
     found, subject, maps = given()
-    found.settings = Settings((load_preset("heel-mr"), load_preset("heel-mr")))
+    found.settings = Settings(Elastix((load_preset("heel-mr"), load_preset("heel-mr"))))
     assert "several stages" in error_bars(found, subject, maps, model()).told
 
 
 def test_a_preset_without_a_model_is_told() -> None:
     found, subject, maps = given()
-    found.settings = Settings((replace(load_preset("heel-mr"), name="mine"),))
+    found.settings = Settings(Elastix((replace(load_preset("heel-mr"), name="mine"),)))
     bars = error_bars(found, subject, maps, error_model_of("mine"))
     assert "mine has not been measured" in bars.told
 
@@ -132,25 +135,34 @@ def test_a_preset_without_a_model_is_told() -> None:
 def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     found, subject, maps = given()
     found.settings = Settings.of("gauss-newton")
-    own = model("gauss-newton", text=found.settings.text)
+    own = model("gauss-newton", text=found.settings.engine.text)
     assert error_bars(found, subject, maps, own).uncertainty is not None
     assert "that of heel-mr" in error_bars(found, subject, maps, model()).told
-    found.choice = Choice(GaussNewton().weights, "", asked=0.01)
-    assert error_bars(found, subject, maps, own).uncertainty is not None
-    found.choice = Choice(GaussNewton().weights, "", asked=0.05)
-    assert "phantoms that keep their volume" in error_bars(found, subject, maps, own).told
-    found.settings = Settings(gauss_newton=GaussNewton(bending=2.0))
+    found.unlike_study = "This pair is unlike any phantom."
+    assert error_bars(found, subject, maps, own).told == found.unlike_study
+    found.settings = Settings(GaussNewton(bending=2.0))
     assert "fixed at 2/mm" in error_bars(found, subject, maps, own).told
-    found.settings, found.choice = replace(Settings.of("gauss-newton"), borders=AtBorders()), None
+    found.settings, found.unlike_study = Settings(GaussNewtonWithInterfaces()), ""
     assert "gauss-newton-borders was used" in error_bars(found, subject, maps, own).told
-    with_borders = model("gauss-newton-borders", text=found.settings.text)
-    assert error_bars(found, subject, maps, with_borders).uncertainty is not None
-    unlabelled = subject.labels.labels.copy()
+    with_interfaces = model("gauss-newton-borders", text=found.settings.engine.text)
+    assert error_bars(found, subject, maps, with_interfaces).uncertainty is not None
+
+
+def test_an_error_model_is_for_pairs_like_those_of_its_study() -> None:
+    _, subject, maps = given()
+    body, labels = Mask(GRID, np.isfinite(maps.max_shear)), subject.labels
+    pair = AlignedPair(subject.reference, subject.reference, body, body, subject.bone, labels)
+    engine, (kept, freed) = (
+        GaussNewtonWithInterfaces(),
+        (Choice(GaussNewton().weights, "", asked=asked) for asked in (0.01, 0.05)),
+    )
+    assert engine.unlike_study(pair, kept) == ""
+    assert "phantoms that keep their volume" in engine.unlike_study(pair, freed)
+    unlabelled = labels.labels.copy()
     unlabelled[12:20] = 0
-    partly = replace(subject, labels=replace(subject.labels, labels=unlabelled))
-    assert "of the body has no label" in error_bars(found, partly, maps, with_borders).told
-    found.settings = replace(found.settings, align_on="image")
-    assert "with the bone held at rest" in error_bars(found, subject, maps, with_borders).told
+    partly = replace(pair, labels=replace(labels, labels=unlabelled))
+    assert "of the body has no label" in engine.unlike_study(partly, kept)
+    assert "with the bone held at rest" in engine.unlike_study(replace(partly, bone=None), freed)
 
 
 def twin_of(maps: StrainMaps, sd: float, bias: float = 0.03) -> TwinCheck:
@@ -255,12 +267,12 @@ def test_without_an_error_model_the_twin_tells_the_least_error() -> None:
 
 def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:
     allowed, kept = (Choice(GaussNewton().weights, "", asked=asked) for asked in (0.05, 0.01))
-    doubted = with_volume(Verdict("trust"), allowed)
+    doubted = with_caution(Verdict("trust"), allowed)
     assert doubted.level == "caution"
     assert "ask for a change of volume, of 5.0 % or more" in doubted.reasons[0]
-    assert with_volume(Verdict("trust"), kept).level == "trust"
-    assert with_volume(Verdict("caution", ("Less alike.",)), allowed).level == "distrust"
-    folded = with_volume(Verdict("distrust", ("It folds.",)), allowed)
+    assert with_caution(Verdict("trust"), kept).level == "trust"
+    assert with_caution(Verdict("caution", ("Less alike.",)), allowed).level == "distrust"
+    folded = with_caution(Verdict("distrust", ("It folds.",)), allowed)
     assert folded.level == "distrust"
     assert folded.reasons == ("It folds.", doubted.reasons[0])
 
@@ -269,7 +281,7 @@ def test_a_change_of_volume_that_was_allowed_is_told_in_the_verdict() -> None:
 def test_our_own_engine_and_the_preset_for_heels_come_with_their_error(name: str) -> None:
     stored = error_model_of(name)
     assert stored is not None
-    assert stored.parameters_sha256 == hashlib.sha256(Settings.of(name).text.encode()).hexdigest()
+    assert stored.parameters_sha256 == hashlib.sha256(Settings.of(name).engine.text.encode()).hexdigest()
     table = stored.table_for(np.full(3, 0.8), 25.0)
     bias, sd = table.expected("fat", np.array([0.02, 0.3]), np.array([6.0, 0.5], dtype=np.float32))
     assert bias[0] > 0.002  # noise lifts small shears

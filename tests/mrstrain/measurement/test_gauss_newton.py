@@ -14,10 +14,11 @@ from dvc.io.images.labels import read_mask
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_mask
 from dvc.registration.elastix.presets import load_preset
-from dvc.registration.gauss_newton.fit import USUAL_BENDING, USUAL_VOLUME, Choice, GaussNewton
-from dvc.registration.gauss_newton.with_borders import AtBorders
+from dvc.registration.gauss_newton.choice import Choice
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+from dvc.registration.gauss_newton.fit import USUAL_BENDING, USUAL_VOLUME
 from dvc.registration.register import Settings
-from mrstrain.measurement.engines import settings_of
+from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.page import weights_table
 from mrstrain.measurement.register import register as run
 from mrstrain.measurement.register_one import register_one
@@ -82,7 +83,7 @@ def test_another_persons_heel_is_not_trusted(written, small_pair, tmp_path):
 
 def test_a_change_of_volume_that_was_allowed_is_told_and_costs_trust(tiny_pair, tmp_path, monkeypatch):
     """By a limit under which every pair asks for one, in what is made of a result."""
-    monkeypatch.setattr("dvc.registration.gauss_newton.fit._ASKED", -1.0)
+    monkeypatch.setattr("dvc.registration.gauss_newton.choice._ASKED", -1.0)
     for name in ("reference", "loaded"):
         write_image(tmp_path / f"{name}.nii.gz", getattr(tiny_pair, name))
     write_mask(tmp_path / "bone.nii.gz", tiny_pair.bone)
@@ -144,7 +145,7 @@ def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkey
     used = {}
 
     def never(reference, loaded, *, settings, **_):
-        used[float(loaded.values[0, 0, 0])] = settings.gauss_newton
+        used[float(loaded.values[0, 0, 0])] = settings.engine
         raise RegistrationError("enough")
 
     for module in ("register", "register_one"):
@@ -173,19 +174,18 @@ def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkey
 
 def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_path):
     (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
-    assert settings_of(None, None).gauss_newton == GaussNewton()
-    assert settings_of(None, None, bending=2.0).gauss_newton == GaussNewton(bending=2.0)
-    assert settings_of(None, None, labelled=True).borders == AtBorders()
-    for without in ({}, {"labelled": True, "borders": False}):
-        assert settings_of(None, None, **without).borders is None
-    assert settings_of("elastix", None, labelled=True).borders is None
+    assert engine_of(None, None) == GaussNewton()
+    assert engine_of(None, None, bending=2.0) == GaussNewton(bending=2.0)
+    assert engine_of(None, None, labelled=True) == GaussNewtonWithInterfaces()
+    assert engine_of(None, None, labelled=True, borders=False) == GaussNewton()
+    assert engine_of("elastix", None, labelled=True) == engine_of("elastix", None)
     for engine, preset, files, name in (
         (None, "heel-mr", [], "heel-mr"),
         ("elastix", None, [], "heel-mr"),
         (None, None, [tmp_path / "mine.txt"], "mine.txt"),
     ):
-        chosen = settings_of(engine, preset, files)
-        assert (chosen.engine, chosen.name) == ("elastix", name)
+        chosen = engine_of(engine, preset, files)
+        assert (chosen.family, chosen.name) == ("elastix", name)
 
 
 def test_the_twin_of_a_pair_is_measured_again_and_told(tiny_pair, tmp_path):

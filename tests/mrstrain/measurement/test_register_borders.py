@@ -12,7 +12,7 @@ import pytest
 import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
 
-from dvc.deformation.bordered_spline import BorderedSpline, Borders
+from dvc.deformation.bordered_spline import BorderedSpline, Interfaces
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation, RigidMotion, evaluate_on_grid
 from dvc.deformation.strain import StrainField
@@ -23,13 +23,14 @@ from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_labels
 from dvc.io.transforms.bordered_spline import NAME
 from dvc.io.transforms.read import read_transform
-from dvc.registration.align import not_aligned
-from dvc.registration.engines import by_gauss_newton
-from dvc.registration.gauss_newton.fit import GaussNewton, control_grid
-from dvc.registration.gauss_newton.with_borders import USUAL_SKIN, AtBorders
+from dvc.registration.engine import AlignedPair
+from dvc.registration.engines import engine_named
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+from dvc.registration.gauss_newton.fit import control_grid
+from dvc.registration.gauss_newton.with_interfaces import USUAL_SKIN
 from dvc.registration.register import Settings, register
 from dvc.worker import Worker
-from mrstrain.measurement.engines import settings_of
+from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.measured_folder import measurements_in, spline_in
 from mrstrain.measurement.register import register as run
 from mrstrain.measurement.register_one import register_one
@@ -102,8 +103,8 @@ def test_strain_is_found_up_to_bone_and_skin(pad, out, worker):
         *(read_image(pad.folder / f"Load{n}.nii.gz") for n in (0, 1)), bone=pad.labels.region("bone"),
         tissue=Mask(GRID, pad.labels.labels > 0), labels=pad.labels, worker=worker,
     )  # fmt: skip
-    assert isinstance(smooth.bspline, BSpline)
-    _, H = smooth.bspline.evaluate(GRID.points().reshape(-1, 3))
+    assert isinstance(smooth.displacement, BSpline)
+    _, H = smooth.displacement.evaluate(GRID.points().reshape(-1, 3))
     before = pad.shear_error(StrainField.from_gradient(H).max_shear.reshape(GRID.shape))
     after = pad.shear_error(shear_of(out / "Load1"))
     assert after["fat"] < 0.6 * before["fat"]
@@ -208,7 +209,7 @@ def test_a_study_begins_a_load_where_the_one_before_ended(pad, out, monkeypatch)
             pad.folder / "Load0.nii.gz", pad.folder / "Load1.nii.gz", out=pad.folder / "one", after=out / "Load1",
             borders=True, **more,
         )  # fmt: skip
-    assert used["settings"].borders == AtBorders()
+    assert used["settings"].engine == GaussNewtonWithInterfaces()
     np.testing.assert_array_equal(used["labels"].labels, pad.labels.labels)
     u = np.asarray(nibabel.load(out / "Load1" / "displacement.nii.gz").dataobj)[:, :, :, 0]
     known = np.isfinite(u).all(axis=-1)
@@ -226,13 +227,13 @@ def layers() -> dict[str, object]:
     fixed, moving, body, labels = scanned(skin=0.0)
     return {
         "reference": fixed, "loaded": moving, "tissue": body, "labels": labels, "bone": labels.region("bone"),
-        "settings": Settings(gauss_newton=FIXED, borders=AtBorders(30.0), align_on="none"),
+        "settings": Settings(GaussNewtonWithInterfaces(FIXED, 30.0), align_on="none"),
     }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def found(layers, worker) -> BorderedSpline:
-    spline = register(**layers, worker=worker).bspline
+    spline = register(**layers, worker=worker).displacement
     assert isinstance(spline, BorderedSpline)
     return spline
 
@@ -254,7 +255,7 @@ def test_the_images_may_lie_askew_and_be_stored_in_any_order(layers, found, work
     askew = register(
         **{name: stored(layers[name], field) for name, field in given.items()}, settings=layers["settings"],
         worker=worker,
-    ).bspline  # fmt: skip
+    ).displacement  # fmt: skip
     X = layers["reference"].grid.points()[4:-4:3, 4:-4:3, 4:-4:3].reshape(-1, 3)
     u, H = found.evaluate(X)
     other_u, other_H = askew.evaluate(X @ turn.T)
@@ -265,16 +266,12 @@ def test_the_images_may_lie_askew_and_be_stored_in_any_order(layers, found, work
 def test_threads_do_not_change_a_bit(layers):
     """From images as they are: N4 and elastix, which come before, do not promise that."""
     fixed, moving, body, labels, bone = (layers[name] for name in ("reference", "loaded", "tissue", "labels", "bone"))
-    as_scanned, told = not_aligned(fixed, moving, body), []
+    pair = AlignedPair.of(fixed, moving, RigidMotion.identity(), body, bone, labels)
+    engine, told = GaussNewtonWithInterfaces(GaussNewton(bending=3.0)), []
     for threads in (1, 2):
         with Worker(threads) as worker:
-            told.append(
-                by_gauss_newton(
-                    fixed, moving, body, bone, as_scanned, GaussNewton(bending=3.0), None, worker, lambda _: None,
-                    (AtBorders(), labels),
-                )
-            )  # fmt: skip
-    (one, choice), (two, same) = told
+            told.append(engine.find(pair, start=None, seeds=(), worker=worker, progress=lambda *_: None))
+    (one, choice), (two, same) = ((found.displacement, found.choice) for found in told)
     assert choice == same
     assert len(choice.tried_in_skin) >= 3
     np.testing.assert_array_equal(one.smooth.coefficients_mm, two.smooth.coefficients_mm)
@@ -286,10 +283,9 @@ def test_labels_of_the_bone_alone_hold_nothing_but_the_bone(layers, worker):
     """Tissue without a label is none that is at rest, though no label is nearer than the bone's."""
     fixed, moving, body, bone = (layers[name] for name in ("reference", "loaded", "tissue", "bone"))
     alone = LabelMap(fixed.grid, bone.inside.astype(np.int64), {1: "bone"})
-    found, _ = by_gauss_newton(
-        fixed, moving, body, bone, not_aligned(fixed, moving, body), FIXED, None, worker, lambda _: None,
-        (AtBorders(), alone),
-    )  # fmt: skip
+    pair = AlignedPair.of(fixed, moving, RigidMotion.identity(), body, bone, alone)
+    engine = GaussNewtonWithInterfaces(FIXED)
+    found = engine.find(pair, start=None, seeds=(), worker=worker, progress=lambda *_: None).displacement
     fat = layers["labels"].region("fat").points()
     true = sheared(fat, 0.0)
     u = found.displacement(fat)
@@ -304,13 +300,13 @@ def test_a_result_with_borders_may_be_a_start(layers, worker):
     control = control_grid(labels.grid, np.full(3, 4.0))
     there = np.broadcast_to(far[:, None, None, None], (3, *control.shape))
     start = BorderedSpline(
-        BSpline(control, there), BSpline(control, np.zeros_like(there)), Borders.of(labels, None, 3.0)
+        BSpline(control, there), BSpline(control, np.zeros_like(there)), Interfaces.of(labels, None, 3.0)
     )
     moved = replace(loaded, grid=loaded.grid.moved_by(np.eye(3), far))
     X = labels.grid.points()[8:-8:3, 8:-8:3, 8:-8:3].reshape(-1, 3)
 
     def off_mm(begun_at: BorderedSpline | None) -> float:
-        found = register(**{**layers, "bone": None, "loaded": moved}, start=begun_at, worker=worker).bspline
+        found = register(**{**layers, "bone": None, "loaded": moved}, start=begun_at, worker=worker).displacement
         return float(np.median(np.linalg.norm(found.displacement(X) - far - sheared(X, 0.0), axis=1)))
 
     assert off_mm(start) < 0.5
@@ -329,14 +325,12 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
         register(**{**layers, "labels": replace(labels, labels=np.zeros_like(labels.labels))})
     with pytest.raises(InputError, match="a BorderedSpline is given"):
         register(**{**layers, "settings": Settings.of("heel-mr"), "start": found})
-    with pytest.raises(ParameterError, match="elastix finds one smooth spline"):
-        Settings(Settings.of("heel-mr").presets, borders=AtBorders())
     with pytest.raises(ParameterError, match="must be above 0"):
-        AtBorders(0.0)
+        GaussNewtonWithInterfaces(skin=0.0)
     with pytest.raises(ParameterError, match="borders are for the engine gauss-newton"):
-        settings_of(None, "heel-mr", borders=True)
+        engine_of(None, "heel-mr", borders=True)
     with pytest.raises(InputError, match="Borders need the tissues"):
-        settings_of(None, None, borders=True)
+        engine_of(None, None, borders=True)
     for wrong, kind, said in (
         ({"bone": pad.folder / "bone.nrrd"}, InputError, "label map"),
         (asked(pad, preset="heel-mr"), ParameterError, "borders are for"),
@@ -347,14 +341,13 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
 
 
 def test_its_parameters_are_not_those_of_the_plain_engine():
-    plain = Settings.of()
-    with_borders = replace(plain, borders=AtBorders())
-    assert with_borders == Settings.of("gauss-newton-borders")
-    assert (with_borders.name, with_borders.engine) == ("gauss-newton-borders", plain.engine)
-    told = json.loads(with_borders.text)
+    plain, with_interfaces = GaussNewton(), GaussNewtonWithInterfaces()
+    assert engine_named("gauss-newton-borders") == with_interfaces
+    assert (with_interfaces.name, with_interfaces.family) == ("gauss-newton-borders", plain.family)
+    told = json.loads(with_interfaces.text)
     assert told.pop("borders")["skin"] is None
     assert told == json.loads(plain.text)
-    assert json.loads(with_borders.of_repeat().text)["borders"]["skin"] == USUAL_SKIN
-    fixed = Settings(gauss_newton=GaussNewton(bending=2.0, volume=100.0), borders=AtBorders())
-    assert fixed.of_repeat() == replace(fixed, borders=AtBorders(USUAL_SKIN))
-    assert replace(with_borders, borders=AtBorders(7.0)).of_repeat().borders == AtBorders(7.0)
+    assert json.loads(with_interfaces.of_repeat().text)["borders"]["skin"] == USUAL_SKIN
+    fixed = GaussNewtonWithInterfaces(GaussNewton(bending=2.0, volume=100.0))
+    assert fixed.of_repeat() == replace(fixed, skin=USUAL_SKIN)
+    assert replace(with_interfaces, skin=7.0).of_repeat().skin == 7.0

@@ -15,30 +15,28 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, evaluate_on_grid
 from dvc.deformation.strain import StrainField
 from dvc.errors import ParameterError
-from dvc.images.image import Image, LabelMap
+from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.resample import smoothed
 from dvc.io.transforms.read import read_transform
 from dvc.io.transforms.write import write_elastix_transform
-from dvc.registration.gauss_newton.fit import (
-    USUAL_VOLUME,
-    Choice,
-    GaussNewton,
-    _level,
-    choose,
-    control_grid,
-    fit,
-    spline_through,
-)
+from dvc.registration.engine import AlignedPair
+from dvc.registration.gauss_newton.choice import Choice
+from dvc.registration.gauss_newton.engine import GaussNewton
+from dvc.registration.gauss_newton.fit import USUAL_VOLUME, _level, choose, control_grid, fit, spline_through
 from dvc.registration.gauss_newton.level import Level, Weights
-from dvc.registration.gauss_newton.with_borders import AtBorders, fit_with_borders
+from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
 from dvc.registration.register import Settings, register
 from tests.textures import GRID, TURNED, everything, pair_of, scanned, texture
+
+
+def pair_in(where: Mask, fixed: Image, moving: Image, **more: object) -> AlignedPair:
+    return AlignedPair(fixed, moving, where, where, **more)  # type: ignore[arg-type]
 
 
 def found_by(motion: Affine, noise: float = 0.0, **options: float | None) -> tuple[BSpline, np.ndarray]:
     fixed, moving = pair_of(motion, noise)
     chosen = replace(GaussNewton(spacing_mm=5.0, bending=3.0, volume=0.0), **options)  # type: ignore[arg-type]
-    return fit(fixed, moving, everything(), everything(), None, chosen)[0], GRID.points(everything().inside)
+    return fit(pair_in(everything(), fixed, moving), chosen)[0], GRID.points(everything().inside)
 
 
 GAIN_MM = 0.1
@@ -67,7 +65,7 @@ def test_images_may_differ_by_a_smooth_gain():
     fixed, moving = pair_of(Affine(np.eye(3), SHIFT), 0.05)
     ramp = 1.3 + 0.001 * (TURNED.points()[..., 0] - GRID.centre_mm[0])
     shaded = Image(TURNED, (moving.values * ramp).astype(np.float32))
-    bspline, _ = fit(fixed, shaded, everything(), everything(), None, GaussNewton(5.0, 3.0, 0.0))
+    bspline, _ = fit(pair_in(everything(), fixed, shaded), GaussNewton(5.0, 3.0, 0.0))
     assert rms(bspline.displacement(GRID.points(everything().inside)) - SHIFT) < GAIN_MM
 
 
@@ -77,7 +75,7 @@ def test_what_bends_is_smoothed_less_than_what_does_not():
         wave = np.zeros_like(X)
         wave[..., 0] = height_mm * np.sin(2.0 * np.pi * X[..., 1] / 15.0)
         images = scanned(texture(X + wave), TURNED.points().reshape(-1, 3), 0.1)
-        choice = fit(*images, everything(), everything(), None, GaussNewton(5.0, volume=0.0))[1]
+        choice = fit(pair_in(everything(), *images), GaussNewton(5.0, volume=0.0))[1]
         assert min(v for _, v in choice.tried) == 1.0
         return choice.weights.bending
 
@@ -139,7 +137,7 @@ def test_a_change_of_volume_that_the_images_ask_for_is_found():
     _, true = swollen(X)
 
     def share(**options: float) -> tuple[float, Choice]:
-        bspline, choice = fit(*swollen_pair(), where, where, None, GaussNewton(5.0, 3.0, **options))
+        bspline, choice = fit(pair_in(where, *swollen_pair()), GaussNewton(5.0, 3.0, **options))
         J = np.linalg.det(bspline.evaluate(X)[1] + np.eye(3))
         return float(((J - 1.0) * (true - 1.0)).sum() / ((true - 1.0) ** 2).sum()), choice
 
@@ -151,20 +149,19 @@ def test_a_change_of_volume_that_the_images_ask_for_is_found():
     assert by_rule.frees_volume
     assert "images ask for a change of volume" in str(by_rule.as_dict()["change_of_volume"])
     assert "fixed beforehand, 300/mm3" in by_hand.volume_told
-    tissue = LabelMap(GRID, np.ones(GRID.shape, dtype=np.int16), {1: "fat"})  # and so it is where borders are known
-    options = GaussNewton(5.0, 3.0)
-    _, with_borders = fit_with_borders(*swollen_pair(), where, where, None, tissue, options, AtBorders())
-    assert with_borders.frees_volume
-    assert with_borders.weights.volume == 0.0
-    assert with_borders.weights.volume_gradient == by_rule.weights.volume_gradient > 0.0
+    tissue = LabelMap(GRID, np.ones(GRID.shape, dtype=np.int16), {1: "fat"})  # and so it is where interfaces are known
+    _, at_interfaces = fit_with_interfaces(pair_in(where, *swollen_pair(), labels=tissue), GaussNewton(5.0, 3.0))
+    assert at_interfaces.frees_volume
+    assert at_interfaces.weights.volume == 0.0
+    assert at_interfaces.weights.volume_gradient == by_rule.weights.volume_gradient > 0.0
 
 
 def test_where_volume_is_kept_the_rule_changes_nothing():
     shear = np.eye(3) + np.array([[0.0, 0.12, 0.0], [0.0, 0.0, 0.06], [0.0, 0.0, 0.0]])
     motion = Affine(shear, GRID.centre_mm - shear @ GRID.centre_mm)
-    pair = pair_of(motion, 0.1)
-    found, choice = fit(*pair, everything(), everything(), None, GaussNewton(5.0, 3.0))
-    same, _ = fit(*pair, everything(), everything(), None, GaussNewton(5.0, 3.0, USUAL_VOLUME))
+    pair = pair_in(everything(), *pair_of(motion, 0.1))
+    found, choice = fit(pair, GaussNewton(5.0, 3.0))
+    same, _ = fit(pair, GaussNewton(5.0, 3.0, USUAL_VOLUME))
     assert choice.asked is not None
     assert not choice.frees_volume
     assert GaussNewton().text == GaussNewton(volume=USUAL_VOLUME).text
@@ -195,8 +192,8 @@ def test_missing_voxels_count_for_nothing():
     fixed, moving = pair_of(Affine(np.eye(3), SHIFT))
     hole, gap = fixed.values.copy(), moving.values.copy()
     hole[10:16, 10:16, 10:16], gap[20:27, 18:25, 14:20] = np.nan, np.nan
-    options = GaussNewton(5.0, 3.0, 0.0)
-    bspline, _ = fit(Image(GRID, hole), Image(TURNED, gap), everything(), everything(), None, options)
+    pair = pair_in(everything(), Image(GRID, hole), Image(TURNED, gap))
+    bspline, _ = fit(pair, GaussNewton(5.0, 3.0, 0.0))
     assert rms(bspline.displacement(GRID.points(everything().inside)) - SHIFT) < 0.02
 
 
@@ -210,7 +207,7 @@ def test_senseless_parameters_are_refused(given, told):
 
 
 FAT, FAT_MM, BONE = 0.06, 0.2, 0.02
-OURS = Settings(gauss_newton=GaussNewton(bending=4.0, volume=300.0))
+OURS = Settings(GaussNewton(bending=4.0, volume=300.0))
 
 
 @pytest.fixture(scope="module")
@@ -231,16 +228,16 @@ def shear_error(pair, deformation, tissue: str) -> tuple[float, float]:
 
 def test_a_pressed_heel_is_measured(registered, small_pair):
     """Voxels of 1.6 mm, control points every 3.2 mm. No registration at all: .15 in fat, 0.7 mm."""
-    shear, u_mm = shear_error(small_pair, registered.bspline, "fat")
+    shear, u_mm = shear_error(small_pair, registered.displacement, "fat")
     assert shear < FAT
     assert u_mm < FAT_MM
-    assert shear_error(small_pair, registered.bspline, "bone")[0] < BONE
+    assert shear_error(small_pair, registered.displacement, "bone")[0] < BONE
     assert registered.choice.weights.bending == 4.0
 
 
 def test_its_spline_goes_through_an_elastix_file_unchanged(registered, small_pair, tmp_path):
     motion, grid = registered.alignment.motion, small_pair.reference.grid
-    last = write_elastix_transform(tmp_path, registered.bspline, motion, grid)[-1]
+    last = write_elastix_transform(tmp_path, registered.displacement, motion, grid)[-1]
     X = small_pair.labels.region("fat").points()[::50]
     np.testing.assert_allclose(
         read_transform(last).displacement(X), registered.total.displacement(X), atol=1e-6, equal_nan=True
@@ -252,14 +249,14 @@ def test_a_start_is_where_it_begins_and_is_corrected_against_the_images(worker):
     far = np.array([14.0, -10.0, 9.0])
     fixed, near = pair_of(Affine(np.eye(3), SHIFT), 0.05)
     moving = Image(TURNED.moved_by(np.eye(3), far), near.values)
-    options = Settings(gauss_newton=GaussNewton(5.0, 3.0, 0.0), align_on="none")
+    options = Settings(GaussNewton(5.0, 3.0, 0.0), align_on="none")
     control = control_grid(GRID, np.full(3, 5.0))
     start = BSpline(control, spline_through(Affine(np.eye(3), far), control))
     X = GRID.points(everything().inside)
 
     def off(begun_at: BSpline | None) -> float:
         found = register(fixed, moving, tissue=everything(), settings=options, start=begun_at, worker=worker)
-        return rms(found.bspline.displacement(X) - SHIFT - far)
+        return rms(found.displacement.displacement(X) - SHIFT - far)
 
     assert off(start) < 0.25 * np.linalg.norm(SHIFT)
     assert off(None) > 3.0
@@ -271,15 +268,17 @@ def test_any_number_of_threads_gives_the_same_bits(tmp_path):
     script = f"""
 import hashlib, numpy as np
 from dvc.registration.align import align
-from dvc.registration.gauss_newton.fit import GaussNewton, fit
+from dvc.registration.engine import AlignedPair
+from dvc.registration.gauss_newton.fit import Parameters, fit
 from dvc.images.image import Grid, Image, Mask
 pair = np.load({str(tmp_path / "pair.npz")!r})
 grid = Grid({GRID.shape}, np.array({GRID.spacing_mm.tolist()}), np.array({GRID.origin_mm.tolist()}))
 inside = np.zeros(grid.shape, dtype=bool)
 inside[4:-4, 4:-4, 4:-4] = True
 mask = Mask(grid, inside)
-found, choice = fit(Image(grid, pair["fixed"]), Image(grid, pair["moving"]), mask, mask, None, GaussNewton(5.0))
-on = align(Image(grid, pair["fixed"]), Image(grid, pair["moving"]), mask, "image", 1)
+pair = AlignedPair(Image(grid, pair["fixed"]), Image(grid, pair["moving"]), mask, mask)
+found, choice = fit(pair, Parameters(5.0))
+on = align(pair.fixed, pair.moving, mask, "image", 1)
 of_both = found.coefficients_mm.tobytes() + on.motion.rotation.tobytes() + on.motion.translation_mm.tobytes()
 print(hashlib.sha256(of_both).hexdigest(), choice.weights.bending, on.similarity, on.repeatability_mm)
 """

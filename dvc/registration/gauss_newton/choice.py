@@ -1,0 +1,106 @@
+"""How strongly a Gauss-Newton registration smoothed, and why."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+from dvc.registration.gauss_newton.level import Weights
+
+_ASKED = 0.04  # the change of volume that a hundredth of the soft tissue exceeds: between loads and swelling
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The prior's weights that were used, and why.
+
+    Attributes
+    ----------
+    weights : Weights
+    rule : str
+        In words.
+    tried : tuple of (bending, left-out residual)
+        Mean square residual of the half of the voxels that was left out, over that of the best.
+    tried_in_skin : tuple of (rigidity, left-out residual)
+        Likewise for the weight of strain in the skin, where the tissues are known.
+    at_interfaces : bool
+        Whether strain was let jump at tissue interfaces; the weight "rigidity" is then that of the skin's strain.
+    asked : float or None
+        The change of volume that a hundredth of the soft tissue exceeds if only its gradient is held; None where the
+        weight of the change of volume was fixed beforehand.
+    in_bone : (root mean square displacement in mm, 95th percentile of the maximal shear), optional
+        Within the bone, of the smooth displacement that came before one that holds the bone at rest.
+    """
+
+    weights: Weights
+    rule: str
+    tried: tuple[tuple[float, float], ...] = ()
+    tried_in_skin: tuple[tuple[float, float], ...] = ()
+    at_interfaces: bool = False
+    asked: float | None = None
+    in_bone: tuple[float, float] | None = None
+
+    @property
+    def rigidity_of(self) -> str:
+        """Whose strain the weight "rigidity" is of."""
+        return "skin" if self.at_interfaces else "bone"
+
+    @property
+    def frees_volume(self) -> bool:
+        """Whether the images ask for a change of volume, so that only its gradient was held."""
+        return self.asked is not None and self.asked > _ASKED
+
+    @property
+    def caution(self) -> str:
+        """Why the result is to be used with care: the images asked for a change of volume.
+
+        On phantoms that change their volume like that, two thirds to all of the change came back. Images of another
+        foot ask for one too, and fit better once it is allowed.
+        """
+        return f"{self.volume_told} It may be larger than was found." if self.frees_volume else ""
+
+    @property
+    def volume_told(self) -> str:
+        """How the change of volume was held, and why."""
+        if self.asked is None:
+            return f"Its weight was fixed beforehand, {self.weights.volume:g}/mm3."
+        found = f"{100.0 * self.asked:.1f} % or more in a hundredth of the soft tissue"
+        if self.frees_volume:
+            return (
+                f"The images ask for a change of volume, of {found}: it was allowed, and only its gradient held "
+                f"({self.weights.volume_gradient:g}/mm)."
+            )
+        return f"The images ask for no more change of volume than noise does, {found}: volume was kept."
+
+    @property
+    def caption(self) -> str:
+        """The rules by which the weights were chosen."""
+        return f"{self.rule}. {self.volume_told}"
+
+    def rows(self) -> list[tuple[str, float, str, str | float]]:
+        """Each weight: what it penalises, its value, its unit, and "used" or what it left out, % above the least."""
+        stiff = f"strain of {self.rigidity_of}"
+        used: list[tuple[str, float, str, str | float]] = [
+            ("bending", self.weights.bending, "1/mm", "used"),
+            ("change of volume in soft tissue", self.weights.volume, "1/mm3", "used"),
+            ("gradient of that change", self.weights.volume_gradient, "1/mm", "used"),
+            (stiff, self.weights.rigidity, "1/mm3", "used"),
+        ]
+        used += [("bending", weight, "1/mm", 100.0 * (left - 1.0)) for weight, left in self.tried]
+        return used + [(stiff, weight, "1/mm3", 100.0 * (left - 1.0)) for weight, left in self.tried_in_skin]
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        told: dict[str, object] = {
+            "weights": asdict(self.weights),
+            "rigidity_of": self.rigidity_of,
+            "rule": self.rule,
+            "tried": [{"bending": b, "left_out_over_best": round(v, 6)} for b, v in self.tried],
+            "change_of_volume": {
+                "rule": self.volume_told,
+                "asked": None if self.asked is None else round(self.asked, 4),
+                "allowed_above": None if self.asked is None else _ASKED,
+            },
+        }
+        if self.tried_in_skin:
+            told["tried_in_skin"] = [{"rigidity": w, "left_out_over_best": round(v, 6)} for w, v in self.tried_in_skin]
+        return told | {"borders": self.at_interfaces}

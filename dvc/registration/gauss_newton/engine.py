@@ -1,0 +1,222 @@
+"""The Gauss-Newton engine, with one smooth spline, and with strain that may jump at tissue interfaces."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvc.deformation.protocol import Deformation
+from dvc.errors import ParameterError
+from dvc.registration.engine import AlignedPair, Cost, Displacement, Engine, Found, Progress, other_parameters
+from dvc.registration.gauss_newton.choice import Choice
+from dvc.registration.gauss_newton.fit import Parameters, fit
+from dvc.registration.gauss_newton.with_interfaces import STAGE, USUAL_SKIN, fit_with_interfaces
+from dvc.worker import Worker
+
+_UNLABELLED = 0.1  # of the body: more than that was never in a phantom
+_NOTE = (
+    "Strain may jump where the tissues of the label map meet, and bone that was aligned on does not move at all: the "
+    "figures of the bone are those of the smooth spline that came before. Labels that are off by more than a voxel "
+    "spoil it (then take --no-borders). The whole motion is in transform.h5, as displacements at voxels; text files of "
+    "elastix are not written, since elastix knows no spline with borders."
+)
+
+_Fit = Callable[..., tuple[Displacement, Choice]]
+
+
+@dataclass(frozen=True, slots=True)
+class GaussNewton(Parameters, Engine):
+    """One cubic B-spline for all tissues. Attributes and errors are those of `Parameters`."""
+
+    family = name = "gauss-newton"
+
+    @property
+    def unlike_its_error_model(self) -> str:
+        """Why an error model of its name does not hold for it, where its parameters are not those of the model."""
+        return _bending_fixed(self.name, self) or other_parameters(self.name)
+
+    def of_repeat(self) -> GaussNewton:
+        """With the usual weights: those chosen for a pair without strain would smooth away the noise it is to show."""
+        return replace(self, bending=self.weights.bending, volume=self.weights.volume)
+
+    def keeping_volume(self) -> GaussNewton:
+        """With the weight of tissue that keeps its volume, whatever the images ask for."""
+        return replace(self, volume=self.weights.volume)
+
+    def record(self) -> dict[str, object]:
+        """Its parameters as plain values, for provenance."""
+        return {"gauss_newton": asdict(self), "borders": None, "stages": []}
+
+    @classmethod
+    def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
+        """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
+        own = record.get("gauss_newton")
+        return _methods(own, record, versions) if own and record.get("borders") is None else ""
+
+    def find(
+        self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
+    ) -> Found:
+        """Find the displacement between the images of a pair; as in `Engine`."""
+        displacement, choice = _run(fit, pair, (self,), start, worker, progress)
+        return Found(displacement, choice, _volume_freed(self.name, choice))
+
+
+@dataclass(frozen=True, slots=True)
+class GaussNewtonWithInterfaces(Engine):
+    """Strain may jump at the interfaces of the tissues in a label map, and the bone is rigid.
+
+    Attributes
+    ----------
+    smooth : GaussNewton
+        What comes before, and the weights for both.
+    skin : float or None
+        Weight k of strain in the skin, 1/mm3; None: chosen for each pair by cross-validation.
+
+    Raises
+    ------
+    ParameterError
+        For a weight that is not above zero.
+    """
+
+    smooth: GaussNewton = GaussNewton()
+    skin: float | None = None
+
+    family, name, note = GaussNewton.family, "gauss-newton-borders", _NOTE
+    needs_labels = True
+    # 2.5 times as long as without (docs/decisions/0009); transform.h5 then holds displacements
+    cost = Cost(17.5, phantom_seconds=52.0, gib_per_mvoxel=0.275, bytes_per_voxel=24.0)
+
+    def __post_init__(self) -> None:
+        if self.skin is not None and not (np.isfinite(self.skin) and self.skin > 0):
+            raise ParameterError(f"The weight of strain in the skin must be above 0; got {self.skin}.")
+
+    @property
+    def text(self) -> str:
+        """Every number that decides the result, as JSON: those of the smooth spline, and those of the last stage."""
+        return json.dumps(json.loads(self.smooth.text) | {"borders": {"skin": self.skin} | STAGE})
+
+    @property
+    def unlike_its_error_model(self) -> str:
+        """Why an error model of its name does not hold for it, where its parameters are not those of the model."""
+        return _bending_fixed(self.name, self.smooth) or other_parameters(self.name)
+
+    def of_repeat(self) -> GaussNewtonWithInterfaces:
+        """With the usual weights: those chosen for a pair without strain would smooth away the noise it is to show."""
+        return replace(self, smooth=self.smooth.of_repeat(), skin=self.skin or USUAL_SKIN)
+
+    def keeping_volume(self) -> GaussNewtonWithInterfaces:
+        """With the weight of tissue that keeps its volume, whatever the images ask for."""
+        return replace(self, smooth=self.smooth.keeping_volume())
+
+    def record(self) -> dict[str, object]:
+        """Its parameters as plain values, for provenance."""
+        return self.smooth.record() | {"borders": {"skin": self.skin}}
+
+    @classmethod
+    def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
+        """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
+        own, last = record.get("gauss_newton"), record.get("borders")
+        if not own or last is None:
+            return ""
+        skin, held = last.get("skin"), record.get("align") == "bone"
+        weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
+        return (
+            f"{_methods(own, record, versions)}; from there a second B-spline was added that vanishes on the borders "
+            "of the label map's tissues, so that strain may jump there, "
+            f"{'the bone held at rest and ' if held else ''}strain of a tissue called skin penalised (weight {weight})"
+            ", and bending counted by the Laplacian of both splines' Laplacian"
+        )
+
+    def find(
+        self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
+    ) -> Found:
+        """Find the displacement between the images of a pair; as in `Engine`."""
+        displacement, choice = _run(fit_with_interfaces, pair, (self.smooth, self.skin), start, worker, progress)
+        return Found(displacement, choice, self.unlike_study(pair, choice))
+
+    def unlike_study(self, pair: AlignedPair, choice: Choice) -> str:
+        """Why its error model does not hold for a pair; empty where it does."""
+        if pair.bone is None:
+            return (
+                f"The error of {self.name} was measured with the bone held at rest; here nothing was aligned on a bone."
+            )
+        if choice.frees_volume or pair.labels is None:
+            return _volume_freed(self.name, choice)
+        share = float(np.mean(pair.labels.labels[pair.body.inside] == 0))
+        if share <= _UNLABELLED:
+            return ""
+        return (
+            f"{share:.0%} of the body has no label: the error of {self.name} was measured on bodies of which every "
+            "tissue has one. Label it, or take one smooth spline (--no-borders)."
+        )
+
+
+def _run(
+    fitting: _Fit,
+    pair: AlignedPair,
+    given: tuple[object, ...],
+    start: Deformation | None,
+    worker: Worker,
+    tell: Progress,
+) -> tuple[Displacement, Choice]:
+    """Run a fit in the worker, which leaves the share that is done in a file."""
+    with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
+        done = Path(folder) / "share done"
+        done.write_text("0")
+        found = worker.run(
+            "registering with gauss-newton", fitting, pair.cut(), *given, start, partial(_note, str(done)),
+            watch=lambda: tell("registering", float(done.read_text() or 0)),
+        )  # fmt: skip
+    tell("registering", 1.0)
+    return found
+
+
+def _note(path: str, share: float) -> None:
+    """Write the share that is done where the process that waits looks for it."""
+    Path(path).write_text(f"{share:.3f}")
+
+
+def _bending_fixed(name: str, used: Parameters) -> str:
+    if used.bending is None:
+        return ""
+    return (
+        f"The error of {name} was measured with the weight of the bending chosen by its rule, as for a loaded image; "
+        f"here it was fixed at {used.bending:g}/mm, as for a repeat scan or by --bending."
+    )
+
+
+def _volume_freed(name: str, choice: Choice) -> str:
+    if not choice.frees_volume:
+        return ""
+    return (
+        f"The error of {name} was measured on phantoms that keep their volume; here the images ask for a change of "
+        "volume, which was allowed."
+    )
+
+
+def _methods(own: Mapping[str, Any], record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
+    bending, volume = own.get("bending"), own.get("volume")
+    weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
+    kept = (
+        "300/mm3, or of its gradient alone where the images ask for such a change"
+        if volume is None
+        else f"{volume:g}/mm3"
+    )
+    held = (
+        f", on change of volume in soft tissue ({kept}) and on strain of the bone ({own.get('rigidity'):g}/mm3)"
+        if record.get("align") == "bone"
+        else f" and on change of volume in the tissue ({kept})"
+    )
+    return (
+        f"with the Gauss-Newton engine of mrstrain {versions.get('mrstrain', '?')}: a cubic B-spline with control "
+        f"points every {own.get('spacing_mm'):g} mm (every two voxels, if that is more), least squares over all "
+        "voxels of the tissue and 3 mm around it, and penalties on bending (the square of the Laplacian of its "
+        f"coefficients, less where the displacement is curved; weight {weight}){held}"
+    )

@@ -1,0 +1,166 @@
+"""Gauss-Newton registration where the tissues are known: strain may jump at their interfaces, and bone is rigid.
+
+The smooth displacement of `dvc.registration.gauss_newton.fit` is the start of one more stage at full resolution, for a
+`BorderedSpline` u = m v + psi w. Minimised is
+
+    1/(2 s^2) sum r^2 + b/2 int (c l^4 |Δ Δ v|^2 + 3 L^2 c l^4 |Δ Δ w|^2 + q |w|^2) + v/2 int (J - 1)^2
+    + k/2 int_skin |E|^2
+
+with L the reach of an interface, q = 0.02 / mm2, and c and l as in `dvc.registration.gauss_newton.roughness`; the bone
+has no strain by construction. Images say little about the inside of a skin as thin as two voxels. How much it resists
+strain, k, is chosen as the bending is, by the residual of voxels that were left out: what the skin does moves the fat
+beside it. docs/decisions/0009 has the reasons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.deformation.bordered_spline import NUMBERS, BorderedSpline, Interfaces
+from dvc.deformation.bspline import BSpline
+from dvc.deformation.protocol import Deformation
+from dvc.deformation.strain import StrainField
+from dvc.errors import InputError
+from dvc.images.image import Grid, Mask
+from dvc.registration.engine import AlignedPair
+from dvc.registration.gauss_newton.choice import Choice
+from dvc.registration.gauss_newton.fit import LEVELS, Parameters, brightness_scaled, choose, fit, turned
+from dvc.registration.gauss_newton.level import Level, Splines, Weights
+from dvc.registration.gauss_newton.roughness import REST
+
+_SKIN = "skin"
+USUAL_SKIN = 3.0
+"""Weight of strain in the skin, 1/mm3, to begin with; between those that loaded pairs get, 0.3 to 300."""
+_SKIN_POWERS = -5, 4  # of the square root of ten, times that: 0.01 to 300
+_SKIN_MARGIN = 3e-4  # of the left-out residual: skin is stiff unless the images say more than that against it
+_STEPS = 3
+_LAPLACIANS = 2  # within a tissue; a smooth spline that has to follow jumps does it better with one
+_BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
+_SMOOTH_SHARE = 0.4  # of the time
+STAGE = {
+    "usual_skin": USUAL_SKIN,
+    "powers": _SKIN_POWERS,
+    "margin": _SKIN_MARGIN,
+    "laplacians": _LAPLACIANS,
+    "steps": _STEPS,
+    "of_jumps": [_BENDING, _SQUARE],
+    "distances": NUMBERS,
+}
+"""Every number that decides the result of this stage, for a record."""
+
+
+def fit_with_interfaces(
+    pair: AlignedPair,
+    parameters: Parameters,
+    skin: float | None = None,
+    start: Deformation | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> tuple[BorderedSpline, Choice]:
+    """Find the displacement that carries the fixed image to the moving one, its gradient free to jump at interfaces.
+
+    Parameters
+    ----------
+    pair : AlignedPair
+        With labels. A tissue that is named "skin" may resist strain; the bone, if there is one, does not move.
+    skin : float, optional
+        Weight k of strain in the skin, 1/mm3; chosen by cross-validation where not given.
+
+    The other parameters, and errors, are those of `dvc.registration.gauss_newton.fit.fit`.
+
+    Returns
+    -------
+    displacement : BorderedSpline
+        LPS mm.
+    choice : Choice
+        Its weight "rigidity" is the skin's, k; zero where there is no skin.
+    """
+    smooth, first = fit(
+        pair, replace(parameters, bending=parameters.weights.bending), start,
+        lambda share: progress(_SMOOTH_SHARE * share),
+    )  # fmt: skip
+    axes, control = np.array(pair.fixed.grid.direction), smooth.control
+    stage = _Stage.of(pair, control)
+    weights = replace(first.weights, rigidity=(skin or USUAL_SKIN) if stage.has_skin else 0.0)
+    steps, stop_mm = _STEPS * weights.patience, LEVELS[-1][-1]
+    coefficients: FloatArray = np.concatenate([turned(axes.T, smooth.coefficients_mm), np.zeros((3, *control.shape))])
+    coefficients = stage.whole.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
+    stage.whole.roughness = stage.slab.roughness = stage.whole.following(coefficients)
+    progress(_SMOOTH_SHARE + 0.1)
+    in_skin = stage.skin_chosen(coefficients, weights, skin)
+    progress(_SMOOTH_SHARE + 0.3)
+    choice = Choice(in_skin.weights, "bending fixed beforehand")
+    if parameters.bending is None:
+        choice = choose(stage.slab, coefficients, in_skin.weights)
+    choice = replace(
+        choice,
+        rule=f"{choice.rule}; in skin {in_skin.rule}" if stage.has_skin else choice.rule,
+        tried_in_skin=in_skin.tried,
+        at_interfaces=True,
+        asked=first.asked,
+        in_bone=None if pair.bone is None else _moved(smooth, pair.bone),
+    )
+    progress(_SMOOTH_SHARE + 0.5)
+    coefficients = stage.whole.descend(coefficients, choice.weights, steps=steps, stop_mm=stop_mm)
+    progress(1.0)
+    v, w = (BSpline(control, turned(axes, part)) for part in np.split(coefficients, 2))
+    return BorderedSpline(v, w, stage.interfaces), choice
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stage:
+    """The last stage at full resolution: in the whole body, and in a slab of it in which weights are chosen."""
+
+    interfaces: Interfaces
+    whole: Level
+    slab: Level
+    has_skin: bool
+    slab_has_skin: bool
+
+    @classmethod
+    def of(cls, pair: AlignedPair, control: Grid) -> _Stage:
+        labels, inside = pair.labels, pair.compared.inside
+        if labels is None:
+            raise InputError("Strain can jump at tissue interfaces only where a label map tells the tissues.")
+        interfaces = Interfaces.of(labels, pair.bone, float(control.spacing_mm.mean()), pair.body)
+        soft = pair.body.inside & (interfaces.own != interfaces.rest)
+        named = [number for number, name in labels.names.items() if name.lower() == _SKIN]
+        skin = soft & np.isin(labels.labels, named)
+        pictures = brightness_scaled(pair)
+        rough = ((1.0, REST), (_BENDING * interfaces.reach_mm**2, _SQUARE))
+        splines = Splines(interfaces.at_voxels(), rough, _LAPLACIANS)
+
+        def level(part: BoolArray) -> Level:
+            return Level(*pictures, inside & part, soft & part, skin & part, control, splines=splines)
+
+        part = _slab(inside)
+        return cls(interfaces, level(np.ones_like(soft)), level(part), bool(skin.any()), bool((skin & part).any()))
+
+    def skin_chosen(self, coefficients: FloatArray, weights: Weights, fixed: float | None) -> Choice:
+        """Choose the weight of strain in the skin, unless it is fixed or the slab has no skin."""
+        if fixed is not None:
+            return Choice(weights, "rigidity fixed beforehand")
+        if not self.slab_has_skin:
+            return Choice(weights, "rigidity as usual, as too little of it is in the image")
+        return choose(self.slab, coefficients, weights, "rigidity", _SKIN_POWERS, _SKIN_MARGIN)
+
+
+def _moved(smooth: BSpline, bone: Mask) -> tuple[float, float] | None:
+    """Root mean square displacement (mm) and 95th percentile of the maximal shear in the bone."""
+    u, H = smooth.evaluate_on_grid(bone.grid, bone.inside)
+    known = np.isfinite(u).all(axis=1)
+    if not known.any():
+        return None
+    shear = StrainField.from_gradient(H[known]).max_shear
+    return float(np.sqrt((u[known] ** 2).sum(axis=1).mean())), float(np.percentile(shear, 95))
+
+
+def _slab(inside: BoolArray) -> BoolArray:
+    """The middle third of a mask's voxels along the first axis, from skin to skin."""
+    share = np.cumsum(np.count_nonzero(inside, axis=(1, 2))) / max(np.count_nonzero(inside), 1)
+    part = np.zeros_like(inside)
+    part[(share > 1.0 / 3.0) & (share <= 2.0 / 3.0)] = True
+    return part
