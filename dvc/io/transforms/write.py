@@ -16,6 +16,7 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import RigidMotion
 from dvc.errors import InputError
 from dvc.images.image import Grid
+from dvc.images.itk_image import to_sitk
 from dvc.io.transforms.elastix_text import Value, format_parameters
 
 StrPath = str | os.PathLike[str]
@@ -49,46 +50,52 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
     OutputError
         If a file cannot be written; nothing is left under its name.
     """
-    names = ["TransformParameters.0.txt", "TransformParameters.1.txt"]
-    control = bspline.control
-    stages: list[dict[str, Sequence[Value]]] = [
-        {
-            # RecursiveBSplineTransform is the same map, but elastix then gives I - H as its Jacobian.
-            "Transform": ["BSplineTransform"],
-            "NumberOfParameters": [bspline.coefficients_mm.size],
-            "TransformParameters": np.concatenate([c.ravel(order="F") for c in bspline.coefficients_mm]).tolist(),
-            "InitialTransformParameterFileName": [_NO_INITIAL],
-            "GridSize": list(control.shape),
-            "GridIndex": [0, 0, 0],
-            "GridSpacing": control.spacing_mm.tolist(),
-            "GridOrigin": control.origin_mm.tolist(),
-            "GridDirection": control.direction.T.ravel().tolist(),
-            "BSplineTransformSplineOrder": [3],
-            "UseCyclicTransform": [False],
-        }
-    ]
+    image = _image_parameters(reference)
+    stages = {"TransformParameters.0.txt": _bspline_parameters(bspline)}
     if then is not None:
-        stages.append(
-            {
-                "Transform": ["EulerTransform"],
-                "NumberOfParameters": [6],
-                "TransformParameters": [*_euler_angles(then.rotation), *then.translation_mm.tolist()],
-                "InitialTransformParameterFileName": [names[0]],
-                "CenterOfRotationPoint": [0.0, 0.0, 0.0],
-                "ComputeZYX": [False],
-            }
-        )
-    image: dict[str, Sequence[Value]] = {
+        stages["TransformParameters.1.txt"] = {
+            "Transform": ["EulerTransform"],
+            "NumberOfParameters": [6],
+            "TransformParameters": [*_euler_angles(then.rotation), *then.translation_mm.tolist()],
+            "InitialTransformParameterFileName": list(stages),
+            "CenterOfRotationPoint": [0.0, 0.0, 0.0],
+            "ComputeZYX": [False],
+        }
+    for name, stage in stages.items():
+        write_whole(Path(folder) / name, format_parameters({**stage, **image}))
+    return [Path(folder) / name for name in stages]
+
+
+def _bspline_parameters(bspline: BSpline) -> dict[str, Sequence[Value]]:
+    control = bspline.control
+    return {
+        # RecursiveBSplineTransform is the same map, but elastix then gives I - H as its Jacobian.
+        "Transform": ["BSplineTransform"],
+        "NumberOfParameters": [bspline.coefficients_mm.size],
+        "TransformParameters": np.concatenate([c.ravel(order="F") for c in bspline.coefficients_mm]).tolist(),
+        "InitialTransformParameterFileName": [_NO_INITIAL],
+        "GridSize": list(control.shape),
+        "GridIndex": [0, 0, 0],
+        "GridSpacing": control.spacing_mm.tolist(),
+        "GridOrigin": control.origin_mm.tolist(),
+        "GridDirection": control.direction.T.ravel().tolist(),
+        "BSplineTransformSplineOrder": [3],
+        "UseCyclicTransform": [False],
+    }
+
+
+def _image_parameters(grid: Grid) -> dict[str, Sequence[Value]]:
+    return {
         "HowToCombineTransforms": ["Compose"],
         "FixedImageDimension": [3],
         "MovingImageDimension": [3],
         "FixedInternalImagePixelType": ["float"],
         "MovingInternalImagePixelType": ["float"],
-        "Size": list(reference.shape),
+        "Size": list(grid.shape),
         "Index": [0, 0, 0],
-        "Spacing": reference.spacing_mm.tolist(),
-        "Origin": reference.origin_mm.tolist(),
-        "Direction": reference.direction.T.ravel().tolist(),
+        "Spacing": grid.spacing_mm.tolist(),
+        "Origin": grid.origin_mm.tolist(),
+        "Direction": grid.direction.T.ravel().tolist(),
         "UseDirectionCosines": [True],
         "ResampleInterpolator": ["FinalBSplineInterpolator"],
         "FinalBSplineInterpolationOrder": [3],
@@ -98,12 +105,6 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
         "ResultImagePixelType": ["float"],
         "CompressResultImage": [True],
     }
-    written = []
-    for name, stage in zip(names, stages, strict=False):
-        path = Path(folder) / name
-        write_whole(path, format_parameters({**stage, **image}))
-        written.append(path)
-    return written
 
 
 def _euler_angles(rotation: FloatArray) -> list[float]:
@@ -144,9 +145,9 @@ def write_itk_transform(path: StrPath, bspline: Spline, then: RigidMotion | None
     if isinstance(bspline, BorderedSpline):
         grid = bspline.borders.grid
         u = bspline.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
-        composite.AddTransform(sitk.DisplacementFieldTransform(_itk_image(grid, u)))
+        composite.AddTransform(sitk.DisplacementFieldTransform(to_sitk(grid, u)))
     else:
-        images = [_itk_image(bspline.control, component) for component in bspline.coefficients_mm]
+        images = [to_sitk(bspline.control, component) for component in bspline.coefficients_mm]
         composite.AddTransform(sitk.BSplineTransform(images, 3))
     with whole_file(place) as part:
         try:
@@ -154,13 +155,3 @@ def write_itk_transform(path: StrPath, bspline: Spline, then: RigidMotion | None
         except RuntimeError as failure:
             raise OSError(str(failure)) from failure
     return place
-
-
-def _itk_image(grid: Grid, values: FloatArray) -> sitk.Image:
-    """Values (ni, nj, nk) or (ni, nj, nk, components) as an image of ITK."""
-    reordered = np.ascontiguousarray(np.moveaxis(values, (0, 1, 2), (2, 1, 0)))
-    image = sitk.GetImageFromArray(reordered, isVector=values.ndim == 4)
-    image.SetSpacing(grid.spacing_mm.tolist())
-    image.SetOrigin(grid.origin_mm.tolist())
-    image.SetDirection(grid.direction.ravel().tolist())
-    return image

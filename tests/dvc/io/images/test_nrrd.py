@@ -224,6 +224,10 @@ def test_vectors_and_colours_are_refused(tmp_path: Path) -> None:
         ({"space origin": "(10,-20)"}, "'space origin' is missing or not"),
         ({"space directions": "(0,1e200,0) (2,0,0) (0,0,-1)"}, "must be positive"),
         ({"data file": "a" * 300}, "is not there"),
+        ({"dimension": None}, "'dimension' is missing"),
+        ({"dimension": "1"}, "3 sizes in 1 dimensions"),
+        ({"endian": "litle"}, "is 'litle', neither little nor big"),
+        ({"space units": '"mm" "mm"\n"mm"'}, "a line of the NRRD header is no field: '\"mm\"'"),
     ],
     ids=str,
 )
@@ -249,6 +253,12 @@ def test_nrrd_headers_that_are_refused(tmp_path: Path, fields: dict[str, str | N
         ({"ElementDataFile": "elsewhere.raw"}, "'elsewhere.raw', is not there"),
         ({"ElementDataFile": "LIST"}, "several files"),
         ({"ElementDataFile": None}, "not a MetaImage file"),
+        ({"TransformMatrix": None}, "does not say how the image lies .*no TransformMatrix"),
+        ({"Offset": None, "offse": "10 -20 30"}, "does not say how the image lies .*no Offset"),
+        ({"ElementSpacing": None, "ElementSpacin": "1.5 2 1"}, "does not say how the image lies .*no ElementSpacing"),
+        ({"BinaryDataByteOrderMSB": None}, "does not give the byte order"),
+        ({"BinaryDataByteOrderMSB": "Flse"}, "'binarydatabyteordermsb' is 'flse', neither True nor False"),
+        ({"Offset": "10 -20\n30"}, "a line of the MetaImage header is no field: '30'"),
     ],
     ids=str,
 )
