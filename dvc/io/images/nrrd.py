@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,6 @@ from dvc.io.images.text_header import (
     detached_file,
     grid_of_axes,
     header_start,
-    numbers_in,
     unit_of_length,
     whole_numbers,
 )
@@ -202,22 +202,34 @@ def _vectors(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
             f"'{space or 'none'}', space directions: {'given' if written else 'none'}); the spaces that are "
             f"read are {sorted(_TO_LPS)}."
         )
-    vectors: list[FloatArray | None] = []
-    for item in re.findall(r"none|\([^)]*\)", written):
-        vectors.append(None if item == "none" else np.array(numbers_in(path, item.strip("()"), "space directions")))
-        if item != "none" and vectors[-1] is not None and len(vectors[-1]) != 3:
-            raise ImageFileError(f"{path}: a space direction {item} that does not have three components.")
-    return vectors
+    if not re.fullmatch(r"((none|\([^()]*\))\s*)+", written):
+        raise ImageFileError(f"{path}: the header's 'space directions' are no vectors: '{written[:60]}'; damaged.")
+    items = re.findall(r"none|\([^()]*\)", written)
+    return [None if item == "none" else _vector(path, item, "space directions") for item in items]
+
+
+def _vector(path: Path, written: str, field: str) -> FloatArray:
+    """The three numbers of ``(x,y,z)``."""
+    inside = re.fullmatch(r"\(([^()]*)\)", written)
+    numbers: list[float] = []
+    with suppress(ValueError):
+        numbers = [float(part) for part in inside[1].split(",")] if inside else []
+    if len(numbers) != 3:
+        raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
+    return np.array(numbers)
 
 
 def _nrrd_grid(path: Path, fields: Mapping[str, str], sizes: list[int], axes: list[int]) -> Grid:
     space = fields["space"].lower()
     signs = np.array(_TO_LPS[_SPACES.get(space, space)], dtype=np.float64)
     columns = np.stack([v for v in _vectors(path, fields) if v is not None], axis=1)
-    origin = np.array(numbers_in(path, fields.get("space origin", "").strip("()"), "space origin", 3))
+    origin = _vector(path, fields.get("space origin", ""), "space origin")
     scale = MM_PER_UNIT[_nrrd_unit(path, fields)]
     return grid_of_axes(path, [sizes[a] for a in axes], columns * signs[:, None] * scale, origin * signs * scale)
 
 
 def _nrrd_unit(path: Path, fields: Mapping[str, str]) -> str:
-    return unit_of_length(path, {u.strip().lower() for u in re.findall(r'"([^"]*)"', fields.get("space units", ""))})
+    written = fields.get("space units", "")
+    if not re.fullmatch(r'("[^"]*"\s*)*', written):
+        raise ImageFileError(f"{path}: the header's 'space units' are no words in quotes: '{written[:60]}'; damaged.")
+    return unit_of_length(path, {unit.strip().lower() for unit in re.findall(r'"([^"]*)"', written)})
