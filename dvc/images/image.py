@@ -324,12 +324,3 @@ def reordered_to_lps(grid: Grid, values: npt.NDArray[_T]) -> npt.NDArray[_T]:
     rest = tuple(range(3, values.ndim))
     reordered = values.transpose((*order, *rest))
     return np.ascontiguousarray(reordered[tuple(slice(None, None, -1 if f else 1) for f in flips)])
-
-
-def reordered_from_lps(grid: Grid, values: npt.NDArray[_T]) -> npt.NDArray[_T]:
-    """Values on ``grid.toward_lps()`` put back into the voxel order of ``grid``."""
-    order, flips = grid.axes_to_lps()
-    rest = tuple(range(3, values.ndim))
-    unflipped = values[tuple(slice(None, None, -1 if f else 1) for f in flips)]
-    inverse = tuple(int(a) for a in np.argsort(order))
-    return np.ascontiguousarray(unflipped.transpose((*inverse, *rest)))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import SimpleITK as sitk
 
-from dvc.images.image import Image
+from dvc.images.image import Grid, Image
+from dvc.images.itk_image import from_sitk, to_sitk
 from dvc.images.resample import fill_missing
 from dvc.images.tissue import bright_voxels
 
@@ -36,8 +35,9 @@ def without_shading(image: Image) -> Image:
     if not inside.any():
         return image
     low = float(known.values.min())
-    scan = _to_sitk(image, known.values - low + 1e-3 * float(np.ptp(known.values)))
-    mask = _to_sitk(image, inside.astype(np.uint8))
+    box = Grid(image.grid.shape, image.grid.spacing_mm, np.zeros(3))  # N4 works along the image's own axes
+    scan = to_sitk(box, known.values - low + 1e-3 * float(np.ptp(known.values)))
+    mask = to_sitk(box, inside.astype(np.uint8))
     shrink = [
         int(np.clip(round(_COARSE_MM / s), 1, max(1, n // 8)))
         for s, n in zip(image.grid.spacing_mm, image.grid.shape, strict=True)
@@ -47,9 +47,9 @@ def without_shading(image: Image) -> Image:
     n4.SetNumberOfControlPoints([_CONTROL_POINTS] * 3)
     with _one_thread():
         n4.Execute(sitk.Shrink(scan, shrink), sitk.Shrink(mask, shrink))
-        log_field = sitk.GetArrayFromImage(n4.GetLogBiasFieldAsImage(scan)).T
-    found = log_field[inside]  # away from tissue the spline is extrapolated and may be anything
-    field = np.exp(np.clip(log_field, found.min(), found.max()) - float(np.median(found)))
+        _, log_field = from_sitk(n4.GetLogBiasFieldAsImage(scan))
+    in_tissue = log_field[inside]  # elsewhere the spline is extrapolated and may be anything
+    field = np.exp(np.clip(log_field, in_tissue.min(), in_tissue.max()) - float(np.median(in_tissue)))
     return Image(image.grid, low + (image.values - low) / field.astype(np.float32))
 
 
@@ -62,9 +62,3 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
-
-
-def _to_sitk(image: Image, values: npt.NDArray[Any]) -> sitk.Image:
-    made = sitk.GetImageFromArray(np.ascontiguousarray(values.T))
-    made.SetSpacing([float(s) for s in image.grid.spacing_mm])
-    return made

@@ -213,6 +213,21 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
             read_result("heel", whole)
 
 
+def test_an_frd_file_with_a_spring_is_read_and_one_that_contradicts_itself_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, "frd")["path"]
+    text = path.read_text()
+    spring = f" -1{99:10d}   11    0    2\n -2{TAGS[0]:10d}{TAGS[1]:10d}\n"
+    end_of_elements = " -3\n  100CL"
+    path.write_text(text.replace(end_of_elements, spring + end_of_elements, 1))
+    u, _ = read_result("heel", path).deformation.evaluate(INSIDE)
+    path.write_text(text)
+    np.testing.assert_array_equal(u, read_result("heel", path).deformation.evaluate(INSIDE)[0])
+    last = text.rindex(f" -1{TAGS[3]:10d}")
+    path.write_text(text[:last] + f" -1{7:10d}" + text[last + 13 :])
+    with pytest.raises(ImageFileError, match=r"Load1\.frd: a displacement belongs to node 7, which the file"):
+        read_result("heel", path)
+
+
 def test_a_gmsh_file_whose_nodes_stand_in_another_order_is_refused(tmp_path: Path) -> None:
     mesh = tmp_path / "Load2.msh"
     mesh.write_text(

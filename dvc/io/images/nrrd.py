@@ -1,33 +1,33 @@
-"""NRRD and MetaImage files: a text header, then the voxels, raw or compressed.
-
-Both headers are read here, with the same checks of length and checksum as for NIfTI: readers return garbage
-for a MetaImage whose compressed voxels are damaged. Slicer's .seg.nrrd is an NRRD file with names.
+"""NRRD files: a text header, then the voxels, raw or compressed. Slicer's .seg.nrrd is an NRRD file with names.
 
 References
 ----------
 .. [1] NRRD file format: https://teem.sourceforge.net/nrrd/format.html
-.. [2] MetaImage: https://itk.org/Wiki/ITK/MetaIO/Documentation
 """
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.errors import GeometryError, ImageFileError
+from dvc.errors import ImageFileError
 from dvc.images.image import Grid
 from dvc.io.images.stored import MAX_BYTES, StoredVolume, pick_volume, refuse_if_too_large
+from dvc.io.images.text_header import (
+    HEADER_LIMIT,
+    MM_PER_UNIT,
+    detached_file,
+    grid_of_axes,
+    header_start,
+    unit_of_length,
+    whole_numbers,
+)
 
-_log = logging.getLogger("dvc.images")
-
-_HEADER_LIMIT = 1 << 20
-_LARGEST_SIZE = 2.0**63
 _INTEGERS = {"char": "1", "short": "2", "int": "4", "long long": "8", "longlong": "8"}
 _NRRD_TYPES: dict[str, str] = {"float": "f4", "double": "f8"}
 for _name, _size in _INTEGERS.items():
@@ -48,22 +48,6 @@ _SPACES = {
     "ras": "right-anterior-superior",
     "las": "left-anterior-superior",
 }
-_MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "µm": 0.001, "micron": 0.001}
-
-_META_TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    "MET_INT": "i4",
-    "MET_UINT": "u4",
-    "MET_LONG": "i4",
-    "MET_ULONG": "u4",
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
 
 
 def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
@@ -74,17 +58,17 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     ImageFileError
         If the file is not an NRRD file or its header does not end.
     """
-    start = _start(path)
+    start = header_start(path)
     if not re.match(rb"NRRD000\d\r?\n", start):
         raise ImageFileError(f"{path}: not an NRRD file (no NRRD magic at its start). Export it again.")
     end = re.search(rb"\r?\n\r?\n", start)
-    if end is None and path.stat().st_size >= _HEADER_LIMIT:
+    if end is None and path.stat().st_size >= HEADER_LIMIT:
         raise ImageFileError(f"{path}: the NRRD header does not end; the file is damaged.")
     text = start[: end.start() if end else len(start)].decode("utf-8", errors="replace")
     fields: dict[str, str] = {}
     pairs: dict[str, str] = {}
     for line in text.splitlines()[1:]:
-        if line.startswith("#"):
+        if line.startswith("#") or not line.strip():
             continue
         pair, field = line.find(":="), line.find(": ")
         if pair > 0 and (field < 0 or pair < field):
@@ -92,12 +76,14 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
         elif ":" in line:
             name, value = line.split(":", 1)
             fields[name.strip().lower()] = value.strip()
+        else:
+            raise ImageFileError(f"{path}: a line of the NRRD header is no field: '{line[:60]}'; it is damaged.")
     return fields, pairs, end.end() if end else len(start)
 
 
 def nrrd_shape(path: Path) -> tuple[int, ...]:
     """All sizes that the header claims, without any other check."""
-    return tuple(_whole_numbers(path, nrrd_fields(path)[0], "sizes"))
+    return tuple(whole_numbers(path, nrrd_fields(path)[0], "sizes"))
 
 
 def read_nrrd_header(
@@ -114,7 +100,9 @@ def read_nrrd_header(
         not 3D, or uses an encoding other than raw and gzip.
     """
     fields, _, end = nrrd_fields(path)
-    sizes = _whole_numbers(path, fields, "sizes")
+    sizes = whole_numbers(path, fields, "sizes")
+    if whole_numbers(path, fields, "dimension") != [len(sizes)]:
+        raise ImageFileError(f"{path}: {len(sizes)} sizes in {fields['dimension']} dimensions; the header is damaged.")
     axes, other = _nrrd_axes(path, fields, sizes)
     select = components = None
     if vectors:
@@ -128,7 +116,7 @@ def read_nrrd_header(
     data, start = path, end
     detached = fields.get("data file", fields.get("datafile"))
     if detached is not None:
-        data, start = _detached(path, detached), 0
+        data, start = detached_file(path, detached), 0
     skips = {
         fields.get("line skip", fields.get("lineskip", "0")),
         fields.get("byte skip", fields.get("byteskip", "0")),
@@ -141,6 +129,8 @@ def read_nrrd_header(
     order = fields.get("endian", "little").lower()
     if "endian" not in fields and not kind.endswith("char") and _NRRD_TYPES[kind][1] != "1":
         raise ImageFileError(f"{path}: the NRRD header does not give the byte order (endian); save it again.")
+    if order not in ("little", "big"):
+        raise ImageFileError(f"{path}: the byte order (endian) is '{order}', neither little nor big: damaged.")
     return StoredVolume(
         path=data,
         grid=_nrrd_grid(path, fields, sizes, axes),
@@ -212,161 +202,34 @@ def _vectors(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
             f"'{space or 'none'}', space directions: {'given' if written else 'none'}); the spaces that are "
             f"read are {sorted(_TO_LPS)}."
         )
-    vectors: list[FloatArray | None] = []
-    for item in re.findall(r"none|\([^)]*\)", written):
-        vectors.append(None if item == "none" else np.array(_numbers(path, item.strip("()"), "space directions")))
-        if item != "none" and vectors[-1] is not None and len(vectors[-1]) != 3:
-            raise ImageFileError(f"{path}: a space direction {item} that does not have three components.")
-    return vectors
+    if not re.fullmatch(r"((none|\([^()]*\))\s*)+", written):
+        raise ImageFileError(f"{path}: the header's 'space directions' are no vectors: '{written[:60]}'; damaged.")
+    items = re.findall(r"none|\([^()]*\)", written)
+    return [None if item == "none" else _vector(path, item, "space directions") for item in items]
+
+
+def _vector(path: Path, written: str, field: str) -> FloatArray:
+    """The three numbers of ``(x,y,z)``."""
+    inside = re.fullmatch(r"\(([^()]*)\)", written)
+    numbers: list[float] = []
+    with suppress(ValueError):
+        numbers = [float(part) for part in inside[1].split(",")] if inside else []
+    if len(numbers) != 3:
+        raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
+    return np.array(numbers)
 
 
 def _nrrd_grid(path: Path, fields: Mapping[str, str], sizes: list[int], axes: list[int]) -> Grid:
     space = fields["space"].lower()
     signs = np.array(_TO_LPS[_SPACES.get(space, space)], dtype=np.float64)
     columns = np.stack([v for v in _vectors(path, fields) if v is not None], axis=1)
-    origin = np.array(_numbers(path, fields.get("space origin", "").strip("()"), "space origin", 3))
-    scale = _MM_PER_UNIT[_nrrd_unit(path, fields)]
-    return _lps_grid(path, [sizes[a] for a in axes], columns * signs[:, None] * scale, origin * signs * scale)
+    origin = _vector(path, fields.get("space origin", ""), "space origin")
+    scale = MM_PER_UNIT[_nrrd_unit(path, fields)]
+    return grid_of_axes(path, [sizes[a] for a in axes], columns * signs[:, None] * scale, origin * signs * scale)
 
 
 def _nrrd_unit(path: Path, fields: Mapping[str, str]) -> str:
-    return _unit(path, {u.strip().lower() for u in re.findall(r'"([^"]*)"', fields.get("space units", ""))})
-
-
-def _unit(path: Path, units: set[str]) -> str:
-    """The one unit of length; mm where none is given."""
-    known = {unit or "mm" for unit in units} or {"mm"}
-    if len(known) != 1 or not known <= set(_MM_PER_UNIT):
-        raise ImageFileError(f"{path}: lengths in {sorted(units)}; the units that are read are mm, cm, m and um.")
-    return known.pop()
-
-
-def _lps_grid(path: Path, shape: list[int], columns: FloatArray, origin: FloatArray) -> Grid:
-    with np.errstate(over="ignore"):
-        spacing = np.linalg.norm(columns, axis=0)
-    if not np.isfinite(spacing).all() or np.any(spacing <= 0):
-        raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
-    try:
-        return Grid((shape[0], shape[1], shape[2]), spacing, origin, columns / spacing)
-    except GeometryError as error:
-        raise ImageFileError(f"{path}: {error}") from error
-
-
-def meta_fields(path: Path) -> tuple[dict[str, str], int]:
-    """Fields of a MetaImage header, and where it ends (bytes).
-
-    Raises
-    ------
-    ImageFileError
-        If the file is not a MetaImage file or its header does not end.
-    """
-    start = _start(path)
-    last = re.search(rb"^[ \t]*ElementDataFile[ \t]*=[^\r\n]*\r?\n?", start, re.MULTILINE)
-    if last is None:
-        raise ImageFileError(f"{path}: not a MetaImage file (its header has no ElementDataFile). Export it again.")
-    text = start[: last.end()].decode("utf-8", errors="replace")
-    lines = [line.split("=", 1) for line in text.splitlines() if "=" in line]
-    return {name.strip().lower(): value.strip() for name, value in lines}, last.end()
-
-
-def meta_shape(path: Path) -> tuple[int, ...]:
-    """All sizes that the header claims, without any other check."""
-    return tuple(_whole_numbers(path, meta_fields(path)[0], "dimsize"))
-
-
-def read_meta_header(
-    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
-) -> StoredVolume:
-    """Read what a MetaImage file (.mha, .mhd) holds, and where its voxels lie in LPS mm.
-
-    With ``vectors``, a file of three components per voxel is needed in place of a scalar one.
-
-    Raises
-    ------
-    ImageFileError
-        If the header is damaged, claims more than ``max_bytes``, is sheared, is not a 3D image of what is needed,
-        or its voxels are written as text.
-    """
-    fields, end = meta_fields(path)
-    sizes = _whole_numbers(path, fields, "dimsize")
-    if len(sizes) != 3 or fields.get("ndims") != "3":
-        raise ImageFileError(f"{path}: a {len(sizes)}D image of sizes {sizes}; a 3D image is needed.")
-    layout = (3, *sizes) if vectors else tuple(sizes)
-    refuse_if_too_large(path, layout, max_bytes)
-    pick_volume(path, 1, volume)
-    channels = fields.get("elementnumberofchannels", "1")
-    if vectors and channels != "3":
-        raise ImageFileError(f"{path}: {channels} components per voxel; vectors of three are needed.")
-    if not vectors and channels != "1":
-        raise ImageFileError(f"{path}: each voxel holds {channels} values; a scalar image is needed.")
-    kind = fields.get("elementtype", "")
-    if kind not in _META_TYPES or not _truth(fields, "binarydata", True):
-        raise ImageFileError(f"{path}: voxels of type '{kind}', or written as text, are not read; save it as binary.")
-    if _numbers(path, fields.get("headersize", "0"), "HeaderSize", 1) != [0.0]:
-        raise ImageFileError(f"{path}: MetaImage files with a HeaderSize are not read; save it again as .mha.")
-    data, start = path, end
-    if fields["elementdatafile"] != "LOCAL":
-        data, start = _detached(path, fields["elementdatafile"]), 0
-    big = _truth(fields, "binarydatabyteordermsb", False) or _truth(fields, "elementbyteordermsb", False)
-    matrix = _first(fields, ("transformmatrix", "rotation", "orientation"), "1 0 0 0 1 0 0 0 1")
-    origin = _first(fields, ("offset", "position", "origin"), "0 0 0")
-    spacing = _first(fields, ("elementspacing", "elementsize"), "1 1 1")
-    rows = np.array(_numbers(path, matrix, "TransformMatrix", 9)).reshape(3, 3)
-    unit = _unit(path, {fields.get("distanceunits", "mm").lower()})
-    scale = _MM_PER_UNIT[unit]
-    # A row of the matrix is the direction of one image axis.
-    columns = rows.T * np.array(_numbers(path, spacing, "ElementSpacing", 3))
-    return StoredVolume(
-        path=data,
-        grid=_lps_grid(path, sizes, columns * scale, np.array(_numbers(path, origin, "Offset", 3)) * scale),
-        dtype=np.dtype((">" if big else "<") + _META_TYPES[kind]),
-        layout=layout,
-        unit=unit,
-        file_start=start,
-        components=0 if vectors else None,
-        compressed=_truth(fields, "compresseddata", False),
-    )
-
-
-def _first(fields: Mapping[str, str], names: tuple[str, ...], default: str) -> str:
-    return next((fields[name] for name in names if name in fields), default)
-
-
-def _truth(fields: Mapping[str, Any], name: str, default: bool) -> bool:
-    return str(fields.get(name, default)).lower() in ("true", "t", "1")
-
-
-def _start(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(_HEADER_LIMIT)
-
-
-def _detached(path: Path, name: str) -> Path:
-    """Find the file beside a header that holds its voxels."""
-    if name.startswith("LIST") or "%" in name:
-        raise ImageFileError(f"{path}: voxels spread over several files are not read; save it as one file.")
-    data = path.parent / name
-    try:
-        there = data.is_file()
-    except OSError:  # no name that a file can have
-        there = False
-    if not there:
-        raise ImageFileError(f"{path}: the file of its voxels, '{name}', is not there; keep the two together.")
-    return data
-
-
-def _numbers(path: Path, text: str, field: str, count: int | None = None) -> list[float]:
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if not numbers or (count is not None and len(numbers) != count):
-        raise ImageFileError(f"{path}: the header's '{field}' is missing or not a list of numbers: '{text[:60]}'.")
-    return numbers
-
-
-def _whole_numbers(path: Path, fields: Mapping[str, str], field: str) -> list[int]:
-    numbers = _numbers(path, fields.get(field, ""), field)
-    if not all(n.is_integer() and abs(n) < _LARGEST_SIZE for n in numbers):
-        raise ImageFileError(f"{path}: the header's '{field}' must be whole numbers; got {numbers}: damaged.")
-    return [int(n) for n in numbers]
+    written = fields.get("space units", "")
+    if not re.fullmatch(r'("[^"]*"\s*)*', written):
+        raise ImageFileError(f"{path}: the header's 'space units' are no words in quotes: '{written[:60]}'; damaged.")
+    return unit_of_length(path, {unit.strip().lower() for unit in re.findall(r'"([^"]*)"', written)})

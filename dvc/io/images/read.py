@@ -18,8 +18,9 @@ from dvc.arrays import Float32Array
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image
 from dvc.io.images.dicom import dicom_shape, is_dicom, read_dicom
+from dvc.io.images.metaimage import meta_shape, read_meta_header
 from dvc.io.images.nifti import nifti_shape, read_nifti_header
-from dvc.io.images.nrrd import meta_shape, nrrd_shape, read_meta_header, read_nrrd_header
+from dvc.io.images.nrrd import nrrd_shape, read_nrrd_header
 from dvc.io.images.stored import MAX_BYTES, StoredVolume, Voxels
 
 _log = logging.getLogger("dvc.images")

@@ -101,10 +101,9 @@ def write_vectors(
     frame: str = "LPS",
     *,
     unit: str,
-    configuration: str = "reference",
     verdict: Verdict | None = None,
 ) -> None:
-    """Write several values per voxel in single precision, and what they mean in a JSON file beside it.
+    """Write several values per voxel of the reference image, and what they mean in a JSON file beside it.
 
     NIfTI: 5D, (ni, nj, nk, 1, c). Three components in the frame LPS get the intent "vector" (1007) [1]_; the
     affine is RAS as always, so that a reader must take the components' frame from the JSON file. Everything
@@ -121,7 +120,6 @@ def write_vectors(
     meaning : what is written, in a line
     frame : "LPS", or "invariant" for components that no frame changes
     unit : "mm", "1", ...
-    configuration : "reference" or "deformed": where the voxels are
     verdict : Verdict, optional
         Whether the values may be trusted; told in the JSON file.
 
@@ -140,22 +138,20 @@ def write_vectors(
         )
     if frame not in ("LPS", "invariant"):
         raise InputError(f"{place}: frame '{frame}'; components are written in LPS, or are invariant.")
-    if configuration not in ("reference", "deformed"):
-        raise InputError(f"{place}: configuration '{configuration}'; it is reference or deformed.")
     vector = frame == "LPS" and len(components) == 3
     _write(place, grid, array.astype(np.float32, copy=False), vector=vector)
-    told: dict[str, object] = {
+    declared: dict[str, object] = {
         "file": place.name,
         "meaning": meaning,
         "components": list(components),
         "frame": frame,
         "unit": unit,
-        "configuration": configuration,
+        "configuration": "reference",
         "missing": "NaN",
     }
     if verdict is not None:
-        told["verdict"] = verdict.as_dict()
-    write_whole(_beside(place, ".json"), json.dumps(told, indent=2) + "\n")
+        declared["verdict"] = verdict.as_dict()
+    write_whole(_beside(place, ".json"), json.dumps(declared, indent=2) + "\n")
 
 
 def refuse_overwriting_inputs(outputs: Iterable[StrPath], inputs: Iterable[StrPath]) -> None:

@@ -7,14 +7,12 @@ make geometry elsewhere in the file is refused: a mesh in the wrong place gives 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
-from dvc.arrays import FloatArray, IntArray
 from dvc.errors import ImageFileError
+from dvc.io.meshes.raw import NumberedMesh, RawMesh, damage_named
 
 _log = logging.getLogger("dvc.io.meshes.abaqus")
 
@@ -37,22 +35,6 @@ _ELSEWHERE = {"INCLUDE", "SYSTEM", "NGEN", "NCOPY", "NFILL", "ELGEN", "ELCOPY", 
 
 
 @dataclass(slots=True)
-class AbaqusMesh:
-    """What one input file says: ``points`` (n, 3) in the file's unit, their ``node_ids`` (n,), blocks, sets.
-
-    ``blocks`` are pairs of an element shape, in meshio's names, and node *indices* (m, k); ``sets`` give the
-    indices of the elements of each element set, counted through all blocks, ``node_sets`` those of the nodes of
-    each node set.
-    """
-
-    points: FloatArray
-    node_ids: IntArray
-    blocks: list[tuple[str, IntArray]]
-    sets: dict[str, IntArray]
-    node_sets: dict[str, IntArray]
-
-
-@dataclass(slots=True)
 class _Keyword:
     line: int
     name: str
@@ -60,12 +42,12 @@ class _Keyword:
     rows: list[list[str]] = field(default_factory=list)
 
 
-def read_abaqus(path: Path) -> AbaqusMesh:
+def read_abaqus(path: Path) -> RawMesh:
     """Read the mesh of an Abaqus or CalculiX input file.
 
     Reads ``*NODE`` (any number of blocks), ``*ELEMENT`` (solids incl. hybrid and reduced ones, shells,
     membranes, surface elements), ``*ELSET`` and ``*NSET`` (lists, GENERATE, sets of sets). Springs, trusses, connectors
-    and the reference points of an assembly carry no tissue: they are left out, and logged.
+    and the reference points of an assembly are not tissue: they are left out, and logged.
 
     Raises
     ------
@@ -73,15 +55,14 @@ def read_abaqus(path: Path) -> AbaqusMesh:
         If the file is damaged, holds a solid element of another kind, more than one part, an instance that is
         moved, or nodes and elements that come from elsewhere (``*INCLUDE``, ``*NGEN`` and their like).
     """
-    coordinates: dict[int, list[float]] = {}
-    elements: list[tuple[_Keyword, str, list[list[int]]]] = []
-    sets: list[_Keyword] = []
+    mesh = NumberedMesh(path)
+    element_sets, node_sets = _Sets(path, "ELSET"), _Sets(path, "NSET")
     parts, in_assembly = 0, False
     for keyword in _keywords(path):
         where = f"{path}, *{keyword.name} in line {keyword.line}"
         parts += keyword.name == "PART"
         _refuse_what_lies_elsewhere(where, keyword, parts)
-        try:
+        with damage_named(f"{where}: a row or an option"):
             if keyword.name in {"ASSEMBLY", "END INSTANCE"}:
                 in_assembly = True
             elif keyword.name in {"INSTANCE", "END ASSEMBLY"}:
@@ -90,27 +71,18 @@ def read_abaqus(path: Path) -> AbaqusMesh:
                 _log.info("%s: %d reference points of the assembly are left out.", where, len(keyword.rows))
             elif keyword.name == "NODE":
                 for row in keyword.rows:
-                    if int(row[0]) in coordinates:
-                        raise ImageFileError(f"{where}: node {row[0]} is defined twice.")
-                    coordinates[int(row[0])] = ([float(x or 0.0) for x in row[1:4]] + [0.0] * 3)[:3]
+                    mesh.add_node(int(row[0]), ([float(x or 0.0) for x in row[1:4]] + [0.0] * 3)[:3])
             elif keyword.name == "ELEMENT":
-                block = _elements(where, keyword)
-                if block is not None:
-                    elements.append((keyword, *block))
+                numbers = _add_elements(where, keyword, mesh)
+                if "ELSET" in keyword.options:
+                    element_sets.extend(keyword, map(str, numbers))
             elif keyword.name in {"ELSET", "NSET"}:
+                rows: Iterable[Iterable[object]] = keyword.rows
                 if "GENERATE" in keyword.options:
-                    keyword.rows = [[str(i) for i in _generated(row)] for row in keyword.rows]
-                sets.append(keyword)
-        except (ValueError, IndexError, KeyError) as error:
-            if isinstance(error, ImageFileError):
-                raise
-            raise ImageFileError(f"{where}: a row or an option could not be read ({error}).") from error
-    if not coordinates or not elements:
-        raise ImageFileError(
-            f"{path} has {len(coordinates)} nodes and {len(elements)} blocks of elements that are read: "
-            "there is no mesh in it."
-        )
-    return _assembled(path, coordinates, elements, sets)
+                    rows = map(_generated, keyword.rows)
+                chosen = element_sets if keyword.name == "ELSET" else node_sets
+                chosen.extend(keyword, (str(x) for row in rows for x in row if x))
+    return mesh.by_index(element_sets.resolved(), node_sets.resolved())
 
 
 def _keywords(path: Path) -> Iterator[_Keyword]:
@@ -171,7 +143,8 @@ def _generated(row: list[str]) -> range:
     return range(first, last + 1, step[0] if step else 1)
 
 
-def _elements(where: str, keyword: _Keyword) -> tuple[str, list[list[int]]] | None:
+def _add_elements(where: str, keyword: _Keyword, mesh: NumberedMesh) -> list[int]:
+    """Add the elements of a keyword, if they are of a kind that is read, and give their numbers."""
     kind = keyword.options["TYPE"].upper()
     stems = [s for s in _SHAPES if kind.startswith(s) and set(kind[len(s) :]) <= _VARIANTS]
     if not stems:
@@ -181,7 +154,7 @@ def _elements(where: str, keyword: _Keyword) -> tuple[str, list[list[int]]] | No
                 f"{', '.join(s for s in _SHAPES if s.startswith('C3D'))} and their variants (H, R, I, M ...)."
             )
         _log.warning("%s: elements of type %s carry no tissue and are left out.", where, kind)
-        return None
+        return []
     shape, width = _SHAPES[max(stems, key=len)]
     # An element of many nodes goes over several lines, so rows are joined before they are cut.
     numbers = [int(x) for row in keyword.rows for x in row if x]
@@ -190,44 +163,10 @@ def _elements(where: str, keyword: _Keyword) -> tuple[str, list[list[int]]] | No
             f"{where}: {kind} elements need {width + 1} numbers each; the {len(numbers)} numbers here are no "
             "multiple of that. The file may be cut short."
         )
-    return shape, [numbers[i : i + width + 1] for i in range(0, len(numbers), width + 1)]
-
-
-def _assembled(
-    path: Path,
-    coordinates: dict[int, list[float]],
-    elements: list[tuple[_Keyword, str, list[list[int]]]],
-    sets: list[_Keyword],
-) -> AbaqusMesh:
-    index_of = {number: index for index, number in enumerate(coordinates)}
-    blocks: list[tuple[str, IntArray]] = []
-    position: dict[int, int] = {}
-    element_sets, node_sets = _Sets(path, "ELSET"), _Sets(path, "NSET")
-    for keyword, shape, rows in elements:
-        for number, *nodes in rows:
-            missing = [node for node in nodes if node not in index_of]
-            if missing:
-                raise ImageFileError(
-                    f"{path}: element {number} uses node {missing[0]}, which the file does not define."
-                )
-            if number in position:
-                raise ImageFileError(f"{path}: element {number} is defined twice.")
-            position[number] = len(position)
-        if "ELSET" in keyword.options:
-            element_sets.extend(keyword, (str(row[0]) for row in rows))
-        if rows:
-            nodes_of = [[index_of[node] for node in row[1:]] for row in rows]
-            blocks.append((shape, np.array(nodes_of, dtype=np.int64)))
-    for keyword in sets:
-        chosen = element_sets if keyword.name == "ELSET" else node_sets
-        chosen.extend(keyword, (x for row in keyword.rows for x in row if x))
-    return AbaqusMesh(
-        np.array(list(coordinates.values()), dtype=np.float64),
-        np.array(list(coordinates), dtype=np.int64),
-        blocks,
-        element_sets.resolved(position),
-        node_sets.resolved(index_of),
-    )
+    rows = [numbers[i : i + width + 1] for i in range(0, len(numbers), width + 1)]
+    for number, *nodes in rows:
+        mesh.add_element(number, shape, nodes)
+    return [row[0] for row in rows]
 
 
 class _Sets:
@@ -245,28 +184,25 @@ class _Sets:
         self._spelling.setdefault(name.casefold(), name)
         self._entries.setdefault(name.casefold(), []).extend(more)
 
-    def resolved(self, position: Mapping[int, int]) -> dict[str, IntArray]:
-        found = {}
+    def resolved(self) -> dict[str, list[int]]:
+        """Numbers of the members of each set."""
+        members = {}
         for key, name in self._spelling.items():
             try:
-                found[name] = np.unique(np.array(self._members(key, position), dtype=np.int64))
+                members[name] = self._members(key)
             except ImageFileError as error:
                 if self._kind == "ELSET":
                     raise
                 _log.warning("%s The set is left out.", error)  # nodes of an assembly: no tissue is lost with them
-        return {name: index for name, index in found.items() if len(index)}
+        return members
 
-    def _members(self, name: str, position: Mapping[int, int], seen: tuple[str, ...] = ()) -> list[int]:
+    def _members(self, name: str, seen: tuple[str, ...] = ()) -> list[int]:
         key = name.strip('"').casefold()
         if key in seen or key not in self._entries:
             raise ImageFileError(
                 f"{self._path}: the {_SET_OF[self._kind]} {name!r} is not defined, or contains itself."
             )
-        found: list[int] = []
+        members: list[int] = []
         for entry in self._entries[key]:
-            if entry.isdigit():
-                # A set may name elements that were left out, and GENERATE numbers that no element has.
-                found.extend([position[int(entry)]] if int(entry) in position else [])
-            else:
-                found.extend(self._members(entry, position, (*seen, key)))
-        return found
+            members += [int(entry)] if entry.isdigit() else self._members(entry, (*seen, key))
+        return members

@@ -11,13 +11,13 @@ import logging
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import ImageFileError
+from dvc.io.meshes.raw import RawMesh, damage_named
 
 _log = logging.getLogger("dvc.io.meshes.febio")
 
@@ -45,60 +45,31 @@ _KINDS = {
 _LINES = (5, 19)  # springs and beams, which carry no tissue
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class XpltResult:
-    """What a file says, in its own unit.
+def read_xplt(path: Path) -> RawMesh:
+    """Read a plot file: its regions are FEBio's parts, its field the last state's displacement.
 
-    Attributes
-    ----------
-    points : (n, 3)
-    node_ids : (n,)
-        FEBio's numbers of the nodes, where the file has them; else counted from 0.
-    blocks : list of (kind in meshio's names, node indices (m, k))
-    parts : mapping of str to (k,) int
-        Cells of each part, counted through all blocks.
-    displacement : (n, 3) or None
-        Of the last state.
-    """
-
-    points: FloatArray
-    node_ids: IntArray
-    blocks: list[tuple[str, IntArray]]
-    parts: dict[str, IntArray]
-    displacement: FloatArray | None
-
-
-def read_xplt(path: Path) -> XpltResult:
-    """Read a plot file.
+    Nodes have FEBio's numbers, where the file has them; else they are counted from 0.
 
     Raises
     ------
     ImageFileError
-        If it is none, cut short, changes its mesh between states, or holds elements that are not read.
+        If it is none, damaged, cut short, changes its mesh between states, or holds elements that are not read.
     """
-    try:
+    with damage_named(f"{path}: its sections"):
         data = path.read_bytes()
         if len(data) < 4 or struct.unpack_from("<I", data)[0] != _MAGIC:
             raise ImageFileError(f"{path} is no plot file of FEBio.")
-        root: bytes | None = None
-        mesh: bytes | None = None
-        state: bytes | None = None
+        last: dict[int, bytes] = {}
         for tag, body in _sections(data):
-            if tag == _MESH and mesh is not None:
+            if tag == _MESH and tag in last:
                 raise ImageFileError(f"{path}: its mesh changes between states (remeshing), and one mesh is read.")
-            root, mesh, state = (
-                body if tag == wanted else kept
-                for wanted, kept in ((_ROOT, root), (_MESH, mesh), (_STATE, state))
-            )  # fmt: skip
-        if root is None or mesh is None:
+            last[tag] = body
+        if _ROOT not in last or _MESH not in last:
             raise ImageFileError(f"{path} has no mesh: it is cut short.")
-        points, ids = _nodes(mesh)
-        blocks, parts = _cells(path, mesh)
-        return XpltResult(points, ids, blocks, parts, None if state is None else _moved(path, root, state, len(points)))
-    except (OSError, ValueError, struct.error, zlib.error, StopIteration) as error:
-        if isinstance(error, ImageFileError):
-            raise
-        raise ImageFileError(f"{path} cannot be read as a plot file of FEBio ({error}); it is damaged.") from error
+        points, ids = _nodes(last[_MESH])
+        blocks, parts = _cells(path, last[_MESH])
+        u = _displacement(path, last[_ROOT], last[_STATE], len(points)) if _STATE in last else None
+        return RawMesh(path, points, ids, blocks, parts, at_nodes={} if u is None else {_DISPLACEMENT: u})
 
 
 def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -133,7 +104,7 @@ def _chunks(body: bytes) -> Iterator[tuple[int, bytes]]:
 def _at(body: bytes, *tags: int) -> bytes:
     """The first chunk down a path of tags."""
     for tag in tags:
-        body = next((found for name, found in _chunks(body) if name == tag), b"")
+        body = next((chunk for name, chunk in _chunks(body) if name == tag), b"")
     return body
 
 
@@ -151,9 +122,9 @@ def _nodes(mesh: bytes) -> tuple[FloatArray, IntArray]:
     body = _at(mesh, *_COORDINATES)
     if len(body) != count * record.itemsize:
         raise ValueError(f"{len(body)} bytes of coordinates for {count} nodes")
-    found = np.frombuffer(body, record)
-    ids = found["id"].astype(np.int64)
-    return found["x"].astype(np.float64), ids if len(np.unique(ids)) == count else np.arange(count)
+    nodes = np.frombuffer(body, record)
+    ids = nodes["id"].astype(np.int64)
+    return nodes["x"].astype(np.float64), ids if len(np.unique(ids)) == count else np.arange(count)
 
 
 def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[str, IntArray]]:
@@ -176,10 +147,10 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
         name = names.get(part) or f"part {part}"
         parts.setdefault(name, []).append(np.arange(known, known + len(rows)))
         known += len(rows)
-    return blocks, {name: np.concatenate(found) for name, found in parts.items()}
+    return blocks, {name: np.concatenate(cells) for name, cells in parts.items()}
 
 
-def _moved(path: Path, root: bytes, state: bytes, count: int) -> FloatArray | None:
+def _displacement(path: Path, root: bytes, state: bytes, count: int) -> FloatArray | None:
     """Displacement in a state, (n, 3)."""
     status = _at(state, *_STATUS)
     if status and _number(status):

@@ -1,4 +1,9 @@
-"""What meshio reads past in a Gmsh file: numbers of nodes, groups of one name, and the order of some cells' nodes."""
+"""Gmsh files (.msh), by meshio and what it passes over: node numbers, groups of one name, the order of some nodes.
+
+References
+----------
+.. [1] Gmsh reference manual, sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import meshio
 import numpy as np
+from meshio._mesh import topological_dimension
 
 from dvc.arrays import IntArray
 from dvc.errors import ImageFileError
+from dvc.io.meshes.raw import RawMesh, damage_named
+from dvc.io.meshes.through_meshio import read_through_meshio
 
 # Quadratic cells of Gmsh in VTK's order, of those that meshio leaves as they are.
 _TO_VTK = {
@@ -20,12 +29,45 @@ _TO_VTK = {
 }
 
 
-def in_vtk_order(kind: str, nodes: IntArray) -> IntArray:
+def read_gmsh(path: Path) -> RawMesh:
+    """Read a .msh file (version 2.2 or 4.1, text or binary): its regions are the physical groups.
+
+    Raises
+    ------
+    ImageFileError
+        If it is damaged or of another version.
+    """
+    names = _group_names(path)
+    with _names_apart(path, names) as (place, real):
+        mesh = read_through_meshio(path, lambda _: meshio.gmsh.read(str(place)))
+    blocks = [(block.type, _in_vtk_order(block.type, block.data)) for block in mesh.cells]
+    sizes = [len(data) for _, data in blocks]
+    groups: list[tuple[str, IntArray]] = []
+    if "gmsh:physical" in mesh.cell_data:
+        tag = np.concatenate(mesh.cell_data["gmsh:physical"])
+        dimension = np.repeat([topological_dimension.get(kind, -1) for kind, _ in blocks], sizes)
+        for d, t in np.unique(np.column_stack([dimension, tag])[tag != 0], axis=0).tolist():
+            groups.append((names.get((d, t), f"physical {t}"), np.flatnonzero((dimension == d) & (tag == t))))
+    starts = np.cumsum([0, *sizes])[:-1]
+    for name, parts in mesh.cell_sets.items():  # version 4.1, where a cell may be in several groups
+        if not name.startswith("gmsh:"):
+            if len(parts) != len(starts):
+                raise ImageFileError(f"{path}: its $Elements section is cut short.")
+            pairs = zip(parts, starts, strict=True)
+            cells = np.concatenate([np.asarray(part, dtype=np.int64) + start for part, start in pairs])
+            groups.append((real[name], cells))
+    regions: dict[str, IntArray] = {}
+    for name, cells in groups:  # a volume and its surface may share a name: their cells are told apart by their shape
+        regions[name] = np.union1d(regions.get(name, np.empty(0, dtype=np.int64)), cells)
+    return RawMesh(path, mesh.points, node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
+
+
+def _in_vtk_order(kind: str, nodes: IntArray) -> IntArray:
     """Nodes (m, k) of cells that meshio read from a Gmsh file, in VTK's order for quadratic wedges and pyramids too."""
     return nodes[:, _TO_VTK[kind]] if kind in _TO_VTK else nodes
 
 
-def gmsh_node_numbers(path: Path, count: int) -> IntArray:
+def node_numbers(path: Path, count: int) -> IntArray:
     """Node tags of a .msh file (version 2.2 or 4.1, text or binary), (count,), in the file's order.
 
     Gmsh numbers nodes freely: from any number, with gaps, in any order. Boundary conditions are given by
@@ -42,13 +84,9 @@ def gmsh_node_numbers(path: Path, count: int) -> IntArray:
     ------
     ImageFileError
         If the file has another version, or its nodes are not ``count`` different ones.
-
-    References
-    ----------
-    Gmsh reference manual, sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
     """
     data = path.read_bytes()
-    try:
+    with damage_named(f"{path}: its $Nodes section"):
         version, binary, size = _section(data, b"MeshFormat").split()[:3]
         body = _section(data, b"Nodes", whole=binary == b"1")
         if version == b"2.2":
@@ -60,10 +98,6 @@ def gmsh_node_numbers(path: Path, count: int) -> IntArray:
                 f"{path} is a Gmsh file of version {version.decode(errors='replace')}; 2.2 and 4.1 are read. "
                 "Save it again with Gmsh (Mesh.MshFileVersion = 4.1)."
             )
-    except (ValueError, IndexError) as error:
-        if isinstance(error, ImageFileError):
-            raise
-        raise ImageFileError(f"{path}: its $Nodes section is damaged ({error}).") from error
     if len(tags) != count or len(np.unique(tags)) != count:
         raise ImageFileError(
             f"{path}: {len(np.unique(tags))} different node numbers were found for {count} nodes; the file is damaged."
@@ -74,7 +108,7 @@ def gmsh_node_numbers(path: Path, count: int) -> IntArray:
 _GROUP = re.compile(rb'^[ \t]*(\d+)[ \t]+(\d+)[ \t]+"(.*)"[ \t]*\r?$', re.MULTILINE)
 
 
-def gmsh_group_names(path: Path) -> dict[tuple[int, int], str]:
+def _group_names(path: Path) -> dict[tuple[int, int], str]:
     """Names of a .msh file's physical groups by dimension and tag; a volume and its surface may share one."""
     try:
         named = _section(path.read_bytes(), b"PhysicalNames")
@@ -84,7 +118,7 @@ def gmsh_group_names(path: Path) -> dict[tuple[int, int], str]:
 
 
 @contextmanager
-def with_names_apart(path: Path, names: dict[tuple[int, int], str]) -> Iterator[tuple[Path, dict[str, str]]]:
+def _names_apart(path: Path, names: dict[tuple[int, int], str]) -> Iterator[tuple[Path, dict[str, str]]]:
     """A file in which every group has a name of its own, as meshio needs it, and the real name of each of these.
 
     It is ``path`` itself where no two groups share a name.

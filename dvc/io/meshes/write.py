@@ -18,7 +18,8 @@ import numpy as np
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError
-from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS, MeshFile, silenced
+from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS, MeshFile
+from dvc.io.meshes.through_meshio import silenced
 from dvc.trust.verdict import LEVELS, Verdict
 
 VERDICT_FIELD = "verdict_0_trust_1_use_with_care_2_do_not_trust"
@@ -129,7 +130,7 @@ def write_nodal_displacements(
     _, own_u = _in_own_frame(mesh, "u_mm", u, len(u), "node")
     undefined = np.asarray(np.isnan(own_u).any(axis=1))
     columns = ["node", *(f"{axis}_{mesh.unit}" for axis in ("x", "y", "z", "ux", "uy", "uz"))]
-    has_numbers = mesh.path.suffix.lower() in {".inp", ".msh"}
+    has_numbers = mesh.path.suffix.lower() not in {".vtu", ".vtk"}
     declared: dict[str, object] = {
         "mesh": mesh.path.name,
         "frame": mesh.frame,

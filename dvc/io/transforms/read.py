@@ -20,6 +20,7 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
 from dvc.errors import InputError, ParameterError
 from dvc.images.image import Grid
+from dvc.images.itk_image import from_sitk as image_from_sitk
 from dvc.io.transforms.bordered_spline import read_bordered_spline
 from dvc.io.transforms.elastix_text import Parameters, parse_parameters
 
@@ -43,8 +44,8 @@ class Added:
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H (n, 3, 3), the sum of the parts'; NaN where any part is undefined."""
-        found = [part.evaluate(points_mm) for part in self.parts]
-        return np.asarray(sum(u for u, _ in found)), np.asarray(sum(H for _, H in found))
+        evaluated = [part.evaluate(points_mm) for part in self.parts]
+        return np.asarray(sum(u for u, _ in evaluated)), np.asarray(sum(H for _, H in evaluated))
 
 
 def read_transform(path: StrPath) -> Deformation:
@@ -266,12 +267,11 @@ def _from_sitk(transform: Any) -> Deformation:
     if isinstance(transform, sitk.BSplineTransform):
         if transform.GetOrder() != 3:
             raise InputError(f"a B-spline of order {transform.GetOrder()}; only cubic ones are read.")
-        images = transform.GetCoefficientImages()
-        coefficients = np.stack([sitk.GetArrayFromImage(image).T for image in images])
-        return BSpline(_grid_of(images[0]), coefficients)
+        images = [image_from_sitk(image) for image in transform.GetCoefficientImages()]
+        return BSpline(images[0][0], np.stack([coefficients for _, coefficients in images]))
     if isinstance(transform, sitk.DisplacementFieldTransform):
-        field = transform.GetDisplacementField()
-        return SampledDisplacement(_grid_of(field), sitk.GetArrayFromImage(field).transpose(2, 1, 0, 3))
+        grid, u = image_from_sitk(transform.GetDisplacementField())
+        return SampledDisplacement(grid, u.astype(np.float64, copy=False))
     if isinstance(transform, sitk.TranslationTransform):
         return Affine(np.eye(3), np.array(transform.GetOffset()))
     if transform.GetTransformEnum() == sitk.sitkIdentity:
@@ -283,10 +283,3 @@ def _from_sitk(transform: Any) -> Deformation:
     if isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform):
         return RigidMotion.about(np.array(transform.GetCenter()), matrix, np.array(shift))
     return _about(np.array(transform.GetCenter()), matrix, np.array(shift))
-
-
-def _grid_of(image: Any) -> Grid:
-    """Read the grid of a SimpleITK image, which is LPS mm already."""
-    size = image.GetSize()
-    direction = np.reshape(image.GetDirection(), (3, 3))
-    return Grid((size[0], size[1], size[2]), np.array(image.GetSpacing()), np.array(image.GetOrigin()), direction)

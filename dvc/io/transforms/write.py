@@ -17,6 +17,7 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.images.image import Grid
+from dvc.images.itk_image import to_sitk
 from dvc.io.transforms.bordered_spline import NAME as BORDERED_SPLINE
 from dvc.io.transforms.bordered_spline import write_bordered_spline
 from dvc.io.transforms.elastix_text import Value, format_parameters
@@ -52,46 +53,52 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
     OutputError
         If a file cannot be written; nothing is left under its name.
     """
-    names = ["TransformParameters.0.txt", "TransformParameters.1.txt"]
-    control = bspline.control
-    stages: list[dict[str, Sequence[Value]]] = [
-        {
-            # RecursiveBSplineTransform is the same map, but elastix then gives I - H as its Jacobian.
-            "Transform": ["BSplineTransform"],
-            "NumberOfParameters": [bspline.coefficients_mm.size],
-            "TransformParameters": np.concatenate([c.ravel(order="F") for c in bspline.coefficients_mm]).tolist(),
-            "InitialTransformParameterFileName": [_NO_INITIAL],
-            "GridSize": list(control.shape),
-            "GridIndex": [0, 0, 0],
-            "GridSpacing": control.spacing_mm.tolist(),
-            "GridOrigin": control.origin_mm.tolist(),
-            "GridDirection": control.direction.T.ravel().tolist(),
-            "BSplineTransformSplineOrder": [3],
-            "UseCyclicTransform": [False],
-        }
-    ]
+    image = _image_parameters(reference)
+    stages = {"TransformParameters.0.txt": _bspline_parameters(bspline)}
     if then is not None:
-        stages.append(
-            {
-                "Transform": ["EulerTransform"],
-                "NumberOfParameters": [6],
-                "TransformParameters": [*_euler_angles(then.rotation), *then.translation_mm.tolist()],
-                "InitialTransformParameterFileName": [names[0]],
-                "CenterOfRotationPoint": [0.0, 0.0, 0.0],
-                "ComputeZYX": [False],
-            }
-        )
-    image: dict[str, Sequence[Value]] = {
+        stages["TransformParameters.1.txt"] = {
+            "Transform": ["EulerTransform"],
+            "NumberOfParameters": [6],
+            "TransformParameters": [*_euler_angles(then.rotation), *then.translation_mm.tolist()],
+            "InitialTransformParameterFileName": list(stages),
+            "CenterOfRotationPoint": [0.0, 0.0, 0.0],
+            "ComputeZYX": [False],
+        }
+    for name, stage in stages.items():
+        write_whole(Path(folder) / name, format_parameters({**stage, **image}))
+    return [Path(folder) / name for name in stages]
+
+
+def _bspline_parameters(bspline: BSpline) -> dict[str, Sequence[Value]]:
+    control = bspline.control
+    return {
+        # RecursiveBSplineTransform is the same map, but elastix then gives I - H as its Jacobian.
+        "Transform": ["BSplineTransform"],
+        "NumberOfParameters": [bspline.coefficients_mm.size],
+        "TransformParameters": np.concatenate([c.ravel(order="F") for c in bspline.coefficients_mm]).tolist(),
+        "InitialTransformParameterFileName": [_NO_INITIAL],
+        "GridSize": list(control.shape),
+        "GridIndex": [0, 0, 0],
+        "GridSpacing": control.spacing_mm.tolist(),
+        "GridOrigin": control.origin_mm.tolist(),
+        "GridDirection": control.direction.T.ravel().tolist(),
+        "BSplineTransformSplineOrder": [3],
+        "UseCyclicTransform": [False],
+    }
+
+
+def _image_parameters(grid: Grid) -> dict[str, Sequence[Value]]:
+    return {
         "HowToCombineTransforms": ["Compose"],
         "FixedImageDimension": [3],
         "MovingImageDimension": [3],
         "FixedInternalImagePixelType": ["float"],
         "MovingInternalImagePixelType": ["float"],
-        "Size": list(reference.shape),
+        "Size": list(grid.shape),
         "Index": [0, 0, 0],
-        "Spacing": reference.spacing_mm.tolist(),
-        "Origin": reference.origin_mm.tolist(),
-        "Direction": reference.direction.T.ravel().tolist(),
+        "Spacing": grid.spacing_mm.tolist(),
+        "Origin": grid.origin_mm.tolist(),
+        "Direction": grid.direction.T.ravel().tolist(),
         "UseDirectionCosines": [True],
         "ResampleInterpolator": ["FinalBSplineInterpolator"],
         "FinalBSplineInterpolationOrder": [3],
@@ -101,12 +108,6 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
         "ResultImagePixelType": ["float"],
         "CompressResultImage": [True],
     }
-    written = []
-    for name, stage in zip(names, stages, strict=False):
-        path = Path(folder) / name
-        write_whole(path, format_parameters({**stage, **image}))
-        written.append(path)
-    return written
 
 
 def _euler_angles(rotation: FloatArray) -> list[float]:
@@ -162,19 +163,19 @@ def _itk_part(displacement: Deformation, grid: Grid | None) -> sitk.Transform:
     if grid is None:
         raise InputError(f"To write a {type(displacement).__name__} for ITK, give the grid of its displacement field.")
     u = displacement.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
-    return sitk.DisplacementFieldTransform(_itk_image(grid, np.nan_to_num(u)))
+    return sitk.DisplacementFieldTransform(to_sitk(grid, np.nan_to_num(u)))
 
 
 @_itk_part.register
 def _(displacement: BSpline, grid: Grid | None) -> sitk.Transform:
-    return sitk.BSplineTransform([_itk_image(displacement.control, c) for c in displacement.coefficients_mm], 3)
+    return sitk.BSplineTransform([to_sitk(displacement.control, c) for c in displacement.coefficients_mm], 3)
 
 
 @_itk_part.register
 def _(displacement: BorderedSpline, grid: Grid | None) -> sitk.Transform:
     grid = displacement.borders.grid
     u = displacement.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
-    return sitk.DisplacementFieldTransform(_itk_image(grid, u))
+    return sitk.DisplacementFieldTransform(to_sitk(grid, u))
 
 
 @singledispatch
@@ -204,13 +205,3 @@ def _(displacement: BSpline, folder: Path, then: RigidMotion | None, reference: 
 @write_displacement_as_found.register
 def _(displacement: BorderedSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
     write_bordered_spline(folder / BORDERED_SPLINE, displacement)
-
-
-def _itk_image(grid: Grid, values: FloatArray) -> sitk.Image:
-    """Values (ni, nj, nk) or (ni, nj, nk, components) as an image of ITK."""
-    reordered = np.ascontiguousarray(np.moveaxis(values, (0, 1, 2), (2, 1, 0)))
-    image = sitk.GetImageFromArray(reordered, isVector=values.ndim == 4)
-    image.SetSpacing(grid.spacing_mm.tolist())
-    image.SetOrigin(grid.origin_mm.tolist())
-    image.SetDirection(grid.direction.ravel().tolist())
-    return image

@@ -11,12 +11,12 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image, Mask
+from dvc.images.itk_image import to_itk
 
 Parameters = Mapping[str, tuple[str, ...]]
 
@@ -91,12 +91,12 @@ def register(
     parameter_object = itk.ParameterObject.New()
     parameter_object.AddParameterMap({name: list(values) for name, values in parameters.items()})
     method = itk.ElastixRegistrationMethod[image_type, image_type].New()
-    method.SetFixedImage(_to_itk(fixed.grid, fixed.values, itk))
-    method.SetMovingImage(_to_itk(moving.grid, moving.values, itk))
+    method.SetFixedImage(to_itk(fixed.grid, fixed.values, itk))
+    method.SetMovingImage(to_itk(moving.grid, moving.values, itk))
     if fixed_mask is not None:
-        method.SetFixedMask(_to_itk(fixed_mask.grid, fixed_mask.inside.astype(np.uint8), itk))
+        method.SetFixedMask(to_itk(fixed_mask.grid, fixed_mask.inside.astype(np.uint8), itk))
     if moving_mask is not None:
-        method.SetMovingMask(_to_itk(moving_mask.grid, moving_mask.inside.astype(np.uint8), itk))
+        method.SetMovingMask(to_itk(moving_mask.grid, moving_mask.inside.astype(np.uint8), itk))
     if initial_transform is not None:
         method.SetInitialTransformParameterFileName(initial_transform)
     method.SetParameterObject(parameter_object)
@@ -111,14 +111,6 @@ def register(
     found = method.GetTransformParameterObject().GetParameterMap(0)
     transform = {str(name): tuple(str(v) for v in found[name]) for name in found}
     return Registered(transform, _final_metric(Path(folder)))
-
-
-def _to_itk(grid: Grid, values: np.ndarray[Any, Any], itk: Any) -> Any:
-    image = itk.image_from_array(np.ascontiguousarray(values.T))
-    image.SetSpacing([float(s) for s in grid.spacing_mm])
-    image.SetOrigin([float(o) for o in grid.origin_mm])
-    image.SetDirection(itk.matrix_from_array(np.array(grid.direction)))
-    return image
 
 
 def self_test() -> str:

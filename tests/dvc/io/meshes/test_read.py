@@ -197,7 +197,7 @@ def test_what_cannot_be_a_mesh_file_is_refused(tmp_path: Path) -> None:
         ("*Node\n", "*Node\nfour, 0, 0, 0\n", "could not be read .*'four'"),
         ("PART ONE", "PART TWO", "'PART TWO' is not defined"),
         ("PART ONE", "Skin", "'Skin' is not defined, or contains itself"),
-        ("\n21, ", f"\n21, {TAGS[0] + 1}, {TAGS[1]}, 1, 1\n22, ", "which the file does not define"),
+        ("\n21, ", f"\n21, {TAGS[0] + 1}, {TAGS[1]}, 1, 1\n99, ", "which the file does not define"),
     ],
 )
 def test_what_is_not_read_in_an_abaqus_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -206,6 +206,31 @@ def test_what_is_not_read_in_an_abaqus_file_is_refused(tmp_path: Path, old: str,
     assert old in text
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(ImageFileError, match=message):
+        read_mesh(path)
+
+
+def row(*numbers: int) -> str:
+    return "".join(f"{n:9d}" for n in numbers)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("(3i9,6e21.13e3)", "(3i9,6f21.13e3)", r"a row of NBLOCK could not be read"),
+        ("(3i9,6e21.13e3)", "(3i0,6e21.13e3)", r"a row of NBLOCK could not be read .*'\(3i0,6e21.13e3\)' is no format"),
+        ("(19i9)", "(19i0)", r"a row of EBLOCK could not be read .*'\(19i0\)' is no format"),
+        ("(8i10)", "(8i0)", r"a row of CMBLOCK could not be read"),
+        (row(4, 0, 1), row(3, 0, 1), r"element 1 has 3 nodes; a tetra has 4"),
+        (row(4, 0, 2), row(4, 0, 1), r"element 1 is defined twice"),
+        (f"{TAGS[1]:9d}{0:9d}{0:9d}", f"{TAGS[0]:9d}{0:9d}{0:9d}", f"node {TAGS[0]} is defined twice"),
+    ],
+)
+def test_a_damaged_ansys_archive_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = written(tmp_path, "cdb")
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(ImageFileError, match=rf"heel\.cdb: {message}"):
         read_mesh(path)
 
 
@@ -257,6 +282,12 @@ def test_results_come_back_in_the_frame_and_unit_of_the_users_mesh(
     declared = json.loads((tmp_path / "bc.json").read_text())
     assert (declared["frame"], declared["unit"], declared["nodes"]) == (frame, unit, 27)
     assert declared["node"] == "number in the mesh file"
+
+
+def test_nodes_of_an_ansys_archive_are_declared_by_their_numbers(tmp_path: Path) -> None:
+    mesh = read_mesh(written(tmp_path, "cdb"))
+    write_nodal_displacements(tmp_path / "bc.csv", mesh, np.zeros_like(mesh.points_mm))
+    assert json.loads((tmp_path / "bc.json").read_text())["node"] == "number in the mesh file"
 
 
 def test_a_node_without_a_displacement_is_empty_and_counted_never_zero(tmp_path: Path) -> None:

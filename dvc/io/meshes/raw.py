@@ -1,0 +1,140 @@
+"""A mesh as its file gives it, before unit, frame and geometry are checked: what every reader returns."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from meshio._common import num_nodes_per_cell
+
+from dvc.arrays import IntArray
+from dvc.errors import ImageFileError
+
+_DAMAGE = (
+    ValueError, IndexError, KeyError, TypeError, AttributeError, ArithmeticError, OSError, StopIteration,
+    struct.error, zlib.error,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawMesh:
+    """Nodes, cells, sets and nodal fields in the file's own unit, frame and order.
+
+    Attributes
+    ----------
+    path : Path
+    points : (n, 3)
+    node_ids : (n,) int
+        The file's number of each node; the index from 0 in a format without numbers.
+    blocks : list of (kind in meshio's names, node indices (m, k))
+        Cells are counted through all blocks.
+    regions : mapping of str to (k,) int
+        Cells of each named set.
+    node_sets : mapping of str to (k,) int
+        Node indices of each named set.
+    at_nodes : mapping of str to (n, ...)
+        Fields; NaN at nodes for which the file gives no value.
+    """
+
+    path: Path
+    points: Any
+    node_ids: IntArray
+    blocks: list[tuple[str, Any]]
+    regions: Mapping[str, IntArray]
+    node_sets: Mapping[str, IntArray] = field(default_factory=dict)
+    at_nodes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class NumberedMesh:
+    """Nodes and elements as a text file lists them: by number, and elements by the numbers of their nodes."""
+
+    path: Path
+    nodes: dict[int, list[float]] = field(default_factory=dict)
+    elements: dict[int, tuple[str, list[int]]] = field(default_factory=dict)
+
+    def add_node(self, number: int, coordinates: list[float]) -> None:
+        """Add a node; refuse a number that is taken."""
+        if number in self.nodes:
+            raise ImageFileError(f"{self.path}: node {number} is defined twice.")
+        self.nodes[number] = coordinates
+
+    def add_element(self, number: int, kind: str, nodes: list[int]) -> None:
+        """Add an element, its kind in meshio's names; refuse a number that is taken and a wrong count of nodes."""
+        if number in self.elements:
+            raise ImageFileError(f"{self.path}: element {number} is defined twice.")
+        if len(nodes) != num_nodes_per_cell[kind]:
+            raise ImageFileError(
+                f"{self.path}: element {number} has {len(nodes)} nodes; a {kind} has {num_nodes_per_cell[kind]}. "
+                "The file is damaged."
+            )
+        self.elements[number] = kind, nodes
+
+    def by_index(
+        self,
+        regions: Mapping[str, Iterable[int]],
+        node_sets: Mapping[str, Iterable[int]] | None = None,
+        at_nodes: Mapping[str, Mapping[int, list[float]]] | None = None,
+    ) -> RawMesh:
+        """The mesh by indices: nodes in the file's order, cells grouped by kind.
+
+        Sets may name elements and nodes that were left out; a field may not.
+
+        Raises
+        ------
+        ImageFileError
+            If there are no nodes, or an element or a field names a node that the file does not define.
+        """
+        if not self.nodes:
+            raise ImageFileError(f"{self.path} has no nodes: there is no mesh in it.")
+        index_of = {number: index for index, number in enumerate(self.nodes)}
+        rows: dict[str, list[list[int]]] = {}
+        numbers: dict[str, list[int]] = {}
+        for number, (kind, nodes) in self.elements.items():
+            missing = [node for node in nodes if node not in index_of]
+            if missing:
+                raise ImageFileError(
+                    f"{self.path}: element {number} uses node {missing[0]}, which the file does not define."
+                )
+            rows.setdefault(kind, []).append([index_of[node] for node in nodes])
+            numbers.setdefault(kind, []).append(number)
+        cell_of = {number: cell for cell, number in enumerate(n for group in numbers.values() for n in group)}
+        fields = {}
+        for name, values in (at_nodes or {}).items():
+            fields[name] = np.full((len(index_of), 3), np.nan)
+            for number, value in values.items():
+                if number not in index_of:
+                    raise ImageFileError(
+                        f"{self.path}: a {name} belongs to node {number}, which the file does not define."
+                    )
+                fields[name][index_of[number]] = value
+        return RawMesh(
+            self.path,
+            np.array(list(self.nodes.values()), dtype=np.float64),
+            np.array(list(self.nodes), dtype=np.int64),
+            [(kind, np.array(block, dtype=np.int64)) for kind, block in rows.items()],
+            {name: _known(members, cell_of) for name, members in regions.items()},
+            {name: _known(members, index_of) for name, members in (node_sets or {}).items()},
+            fields,
+        )
+
+
+def _known(members: Iterable[int], position: Mapping[int, int]) -> IntArray:
+    return np.unique(np.array([position[number] for number in members if number in position], dtype=np.int64))
+
+
+@contextmanager
+def damage_named(place: str) -> Iterator[None]:
+    """Turn whatever reading a damaged file raises into an `ImageFileError` that begins with ``place``."""
+    try:
+        yield
+    except ImageFileError:
+        raise
+    except _DAMAGE as error:
+        raise ImageFileError(f"{place} could not be read ({error}); the file is damaged.") from error
