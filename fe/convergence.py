@@ -37,12 +37,12 @@ class Limit:
     error: float
 
 
-def size_mm(mesh: TetMesh) -> float:
+def cell_size_mm(mesh: TetMesh) -> float:
     """Size of a mesh's cells: the cube root of their mean volume, mm."""
     return float(np.cbrt(mesh.volumes_mm3.mean()))
 
 
-def extrapolated(sizes_mm: FloatArray, values: FloatArray) -> Limit:
+def extrapolate(sizes_mm: FloatArray, values: FloatArray) -> Limit:
     """Extrapolate a figure (n,) from meshes of sizes (n,), three or more (Richardson, with the order observed).
 
     Raises
@@ -53,7 +53,7 @@ def extrapolated(sizes_mm: FloatArray, values: FloatArray) -> Limit:
     Examples
     --------
     >>> h = np.array([4.0, 2.0, 1.0])
-    >>> found = extrapolated(h, 5.0 + 0.1 * h**2)
+    >>> found = extrapolate(h, 5.0 + 0.1 * h**2)
     >>> round(found.limit, 3), round(found.order, 2), round(found.error, 3)
     (5.0, 2.0, 0.02)
     """

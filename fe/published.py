@@ -1,4 +1,4 @@
-"""Sets of material laws, tissue by tissue: seven published ones, and the user's own in the same form."""
+"""Material parameter sets, tissue by tissue: seven published ones, and the user's own in the same form."""
 
 from __future__ import annotations
 
@@ -48,20 +48,20 @@ _TO_MPA = {"_mpa": 1.0, "_kpa": 1e-3}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaterialSet:
-    """Laws of the tissues of one study.
+    """A material parameter set: a constitutive model with its parameters for each tissue.
 
     Attributes
     ----------
     name, title, source : str
         Short name, who proposed it, and where the numbers are printed.
-    laws : mapping of tissue to Material
-        "all" where one law serves every tissue.
+    materials : mapping of tissue to Material
+        "all" where one serves every tissue.
     """
 
     name: str
     title: str
     source: str
-    laws: Mapping[str, Material]
+    materials: Mapping[str, Material]
 
     def for_regions(self, regions: Iterable[str]) -> tuple[dict[str, Material], tuple[str, ...]]:
         """The law of each region of a mesh, and a sentence for each region that has none of its own.
@@ -76,16 +76,16 @@ class MaterialSet:
 
         Examples
         --------
-        >>> laws, notes = material_set("friedman").for_regions(["fat", "skin", "muscle"])
-        >>> laws["muscle"] is laws["fat"], notes
+        >>> materials, notes = material_set("friedman").for_regions(["fat", "skin", "muscle"])
+        >>> materials["muscle"] is materials["fat"], notes
         (True, ("friedman has no law for muscle; fat's is used.",))
         """
         found: dict[str, Material] = {}
         notes = []
-        known = {tissue.casefold(): law for tissue, law in self.laws.items()}
+        known = {tissue.casefold(): law for tissue, law in self.materials.items()}
         for region in regions:
-            if WHOLE in self.laws:
-                found[region] = self.laws[WHOLE]
+            if WHOLE in self.materials:
+                found[region] = self.materials[WHOLE]
                 continue
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
             name = next((t for t in tried if t.casefold() in known), None)
@@ -93,7 +93,7 @@ class MaterialSet:
                 instead = f", nor one for {' or '.join(tried[1:])} to put in its place" if tried[1:] else ""
                 raise InputError(
                     f"The set {self.name} has no law for the region '{region}'{instead}; it has "
-                    f"{', '.join(self.laws)}. Add it to the set in a file of your own, or rename the region."
+                    f"{', '.join(self.materials)}. Add it to the set in a file of your own, or rename the region."
                 )
             found[region] = known[name.casefold()]
             if name != region:
@@ -116,7 +116,7 @@ def material_set(name: str | Path) -> MaterialSet:
 
     Examples
     --------
-    >>> material_set("erdemir").laws["all"].told
+    >>> material_set("erdemir").materials["all"].description
     'Ogden, mu0 56.09 kPa, alpha 6.82, nu 0.49'
     """
     if str(name).endswith(".toml"):
@@ -147,7 +147,7 @@ def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
     return _parsed(str(path), text)
 
 
-def as_toml(name: str, title: str, laws: Mapping[str, Material]) -> str:
+def as_toml(name: str, title: str, materials: Mapping[str, Material]) -> str:
     """A set as text in the form that `read_material_sets` takes; Ogden's numbers in the convention of Abaqus.
 
     Examples
@@ -165,7 +165,7 @@ def as_toml(name: str, title: str, laws: Mapping[str, Material]) -> str:
     """
     key = json.dumps(name) if not re.fullmatch(r"[\w-]+", name, re.ASCII) else name
     lines = [f"[{key}]", f"title = {json.dumps(title)}"]
-    for tissue, law in laws.items():
+    for tissue, law in materials.items():
         at = json.dumps(tissue) if not re.fullmatch(r"[\w-]+", tissue, re.ASCII) else tissue
         lines += ["", f"[{key}.{at}]", f'law = "{_NAMES[type(law)]}"']
         lines += [f"{k} = {v}" for k, v in _told(law).items()]
@@ -211,8 +211,8 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
         tissues = {key: value for key, value in content.items() if key not in head}
         if not tissues:
             raise InputError(f"{where}: the set '{name}' has no tissue; add [{name}.fat] with a law.")
-        laws = {tissue: _law(f"{where}, {name}.{tissue}", given) for tissue, given in tissues.items()}
-        sets[name] = MaterialSet(name, str(head["title"]), str(head["source"]), MappingProxyType(laws))
+        materials = {tissue: _law(f"{where}, {name}.{tissue}", given) for tissue, given in tissues.items()}
+        sets[name] = MaterialSet(name, str(head["title"]), str(head["source"]), MappingProxyType(materials))
     if not sets:
         raise InputError(f"{where}: no material set in it.")
     return sets

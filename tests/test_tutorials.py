@@ -15,7 +15,7 @@ from sybil.parsers.markdown import PythonCodeBlockParser
 
 from dvc.io.images.labels import read_labels
 from dvc.io.images.write import write_mask
-from fe.mesh_file import write_tet_mesh
+from fe import write_tet_mesh
 from mrstrain.cli.app import app
 from mrstrain.studies.file import read_study
 from mrstrain.truth.phantom import phantom

@@ -11,7 +11,7 @@ from dvc.errors import ParameterError
 from dvc.io.images.read import format_of
 from dvc.io.transforms.elastix_text import parse_parameters
 from dvc.report.viewer import NIIVUE
-from fe.simulate import LoadStep
+from fe import LoadStep
 from validate.curves import DRAWS
 from validate.location_intervals import DRAWS as LOCATED
 
@@ -291,7 +291,7 @@ def _solver(record: Record) -> str:
         if made
         else ""
     )
-    loads = _listed([f"{step['name']} {LoadStep(**step).told}" for path in given["paths"] for step in path])
+    loads = _listed([f"{step['name']} {LoadStep(**step)}" for path in given["paths"] for step in path])
     axes = {load: told.get("plate_axes_lps") for load, told in record.get("outcome", {}).items()}
     if any(own != first for own in axes.values() for first in axes.values()):
         loads += "".join(

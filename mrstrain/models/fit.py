@@ -9,13 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import whole_file, write_whole
-from fe import figures
-from fe.fitting import Fit, read_curves
-from fe.fitting import fit as fit_law
+import fe
+from dvc.atomic_files import write_whole
+from fe import Fit, Material, Ogden, as_toml, figures, read_curves
 from fe.hyperelastic import OGDEN
-from fe.materials import Material, Ogden
-from fe.published import as_toml
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 
@@ -32,7 +29,7 @@ class Fitted:
     def summary(self) -> list[str]:
         """A few lines for a person."""
         found = self.found
-        lines = [found.material.told]
+        lines = [found.material.description]
         for p in found.parameters:
             scale, unit = (1.0, "") if p.name.startswith("alpha") else (1000.0, " kPa")
             lines.append(
@@ -58,7 +55,7 @@ class Fitted:
                 )
         if not found.stable_where_measured:
             lines.append("NOT stable (Drucker) at every stretch measured: take another law, or simulate less strain.")
-        lines += [f"These curves cannot tell it from: {other.told}" for other in found.others]
+        lines += [f"These curves cannot tell it from: {other.description}" for other in found.others]
         return [*lines, f"Results: {self.out}"]
 
 
@@ -92,9 +89,9 @@ def fit(
     Parameters
     ----------
     curve : path
-        As `fe.fitting.read_curves` takes it: stretch, and nominal or true stress in kPa or MPa.
+        As `fe.read_curves` takes it: stretch, and nominal or true stress in kPa or MPa.
     law : str
-        A name of `fe.fitting.LAWS`.
+        A name of `fe.LAWS`.
     out : path
         Gets ``fit.json``, ``fit.csv`` (measured and fitted), ``fit.png``, and ``material.toml`` with the law.
     test : str, optional
@@ -111,12 +108,12 @@ def fit(
     """
     path, target = Path(curve), Path(out)
     curves = read_curves(path, test)
-    found = fit_law(curves, law, nu)
+    found = fe.fit(curves, law, nu)
     refuse_touching_inputs(target, _FILES, [path])
     make_output(target)
     given = {"law": law, "test": test, "nu": nu, "tissue": tissue}
     record = provenance("fit", {"curve": path}, given)
-    told = asdict(found) | {"material": found.material.told, "others": [o.told for o in found.others]}
+    told = asdict(found) | {"material": found.material.description, "others": [o.description for o in found.others]}
     write_json(
         target / "fit.json",
         told
@@ -135,8 +132,7 @@ def fit(
         for row in np.column_stack([c.stretch, 1000.0 * c.stress_mpa, fitted]):
             writer.writerow([c.mode, *(f"{v:.8g}" for v in row)])
     write_whole(target / "fit.csv", text.getvalue())
-    with whole_file(target / "fit.png") as part:
-        part.write_bytes(figures.stress_stretch(curves, found))
+    figures.write_figure(target / "fit.png", figures.stress_stretch(curves, found))
     source = f"{law} fitted to {path.name}"
     if at_bound := [p.name for p in found.parameters if p.at_bound]:
         source += f", which does not determine {', '.join(at_bound)}"

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from dvc.errors import InputError
-from fe.fitting import LAWS, Curve, fit, read_curves
-from fe.materials import MODES, Material, NeoHooke, Ogden, Yeoh
-from fe.published import material_set
+from fe import LAWS, MODES, Curve, Material, NeoHooke, Ogden, Yeoh, fit, material_set, read_curves
 
 TABLE_2 = {"fat": ("Ogden", np.linspace(0.5, 1.0, 30)), "skin": ("Isihara", np.linspace(1.0, 1.5, 30)),
            "muscle": ("Yeoh", np.linspace(1.0, 1.4, 30))}  # fmt: skip

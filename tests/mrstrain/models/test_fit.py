@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dvc.errors import InputError
-from fe.published import material_set
+from fe import material_set
 from mrstrain.cli.app import app
 from mrstrain.models.fit import fit
 
@@ -72,10 +72,10 @@ def test_the_results_do_not_replace_the_curve(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["luboz", "trebbi", "akrami"])
 def test_sets_survive_being_written(tmp_path: Path, name: str) -> None:
-    from fe.published import as_toml
+    from fe import as_toml
 
     file = tmp_path / "again.toml"
     laws = material_set(name).laws
     file.write_text(as_toml("a set, with spaces", "x", laws))
     again = material_set(file).laws
-    assert {t: law.told for t, law in again.items()} == {t: law.told for t, law in laws.items()}
+    assert {t: law.description for t, law in again.items()} == {t: law.description for t, law in laws.items()}
