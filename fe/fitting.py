@@ -133,10 +133,6 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     nu : float
         Poisson's ratio of the material made; the fit itself takes the tissue as incompressible.
 
-    Returns
-    -------
-    Fit
-
     Raises
     ------
     InputError

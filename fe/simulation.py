@@ -211,7 +211,7 @@ class Simulation:
 
         picture = base64.b64encode(png_bytes(self.plot())).decode("ascii")
         ended = sum(state.reached == 1.0 for state in self.states)
-        title = f"{self.name}: {'all' if ended == len(self.loads) else ended} of {len(self.loads)} loads reached"
+        title = f"{self.name}: {ended} of {len(self.loads)} loads reached"
         names = list(self.materials.materials)
         rows = [
             ["load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N"]

@@ -123,6 +123,11 @@ def test_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("material.md", tmp_path, monkeypatch)
 
 
+def test_simulate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
+    follow("simulate.md", tmp_path, monkeypatch)
+
+
 @pytest.mark.full_size
 def test_cohort(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for seed in (1, 2):

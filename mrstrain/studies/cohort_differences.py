@@ -22,7 +22,7 @@ def refuse_other_laws(studies: Sequence[Study]) -> None:
     Raises
     ------
     InputError
-        Naming set and studies, or as from `fe.published.material_set`.
+        Naming set and studies, or as from `fe.material_set`.
     """
     seen: dict[str, tuple[str, MaterialSet]] = {}
     for study in studies:

@@ -74,8 +74,12 @@ def test_it_comes_back_from_its_folder_as_it_was(simulation: fe.Simulation, tmp_
         assert np.array_equal(np.unique(read.mesh.facets["bone"]), np.unique(simulation.mesh.facets["bone"]))
     (tmp_path / "again").mkdir()
     read.write(tmp_path / "again")
-    for name in ("regions.csv", "curve.csv"):
-        assert (tmp_path / "again" / name).read_text() == (tmp_path / name).read_text()
+    assert (tmp_path / "again" / "regions.csv").read_text() == (tmp_path / "regions.csv").read_text()
+    curve, was = (
+        np.genfromtxt(folder / "curve.csv", delimiter=",", skip_header=1, usecols=range(1, 15))
+        for folder in (tmp_path / "again", tmp_path)
+    )
+    assert curve == pytest.approx(was, rel=1e-7, abs=1e-12, nan_ok=True)
     assert str(read) == str(simulation)
 
 
@@ -98,7 +102,7 @@ def test_what_was_not_reached_comes_back_and_is_marked_everywhere(unreached: fe.
 
 def test_a_notebook_shows_a_picture_and_a_table(simulation: fe.Simulation) -> None:
     shown = simulation._repr_html_()
-    assert "mine: all 3 of 3 loads reached" in shown
+    assert "mine: 3 of 3 loads reached" in shown
     assert shown.count("<tr>") == 1 + len(LOADS)
     state, row = simulation.state("sheared"), next(r for r in simulation.regions if r.load == "sheared")
     assert f"<td>{state.plate_displacement_mm[0]:.2f}</td><td>{state.plate_displacement_mm[1]:.2f}</td>" in shown

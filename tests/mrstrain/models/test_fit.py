@@ -15,7 +15,7 @@ from mrstrain.models.fit import fit
 
 def write_curve(path: Path) -> Path:
     stretch = np.linspace(0.5, 1.0, 25)
-    stress = 1000.0 * material_set("trebbi").laws["fat"].nominal_stress(stretch)
+    stress = 1000.0 * material_set("trebbi").materials["fat"].nominal_stress(stretch)
     path.write_text(
         "stretch,nominal_stress_kpa\n" + "".join(f"{a},{b}\n" for a, b in zip(stretch, stress, strict=True))
     )
@@ -29,8 +29,8 @@ def test_the_set_it_writes_is_the_law_that_made_the_curve(tmp_path: Path) -> Non
     done = CliRunner().invoke(app, ["fit", *given])
     assert done.exit_code == 0, done.output
     assert "Ogden, mu0 10.54 kPa, alpha 6.2" in done.output
-    law = material_set(out / "material.toml").laws["fat"]
-    assert law.vector == pytest.approx(material_set("trebbi").laws["fat"].vector, rel=1e-8)
+    law = material_set(out / "material.toml").materials["fat"]
+    assert law.vector == pytest.approx(material_set("trebbi").materials["fat"].vector, rel=1e-8)
     told = json.loads((out / "fit.json").read_text())
     assert told["parameters"][1]["value"] == pytest.approx(6.2)
     assert told["provenance"]["inputs"]["curve"][0]["name"] == "heel fat.csv"
@@ -41,7 +41,7 @@ def test_the_set_it_writes_is_the_law_that_made_the_curve(tmp_path: Path) -> Non
 
 def test_a_modulus_at_its_bound_is_told_and_goes_with_the_set(tmp_path: Path) -> None:
     stretch = np.linspace(1.0, 1.4, 30)
-    muscle = material_set("trebbi").laws["muscle"].nominal_stress(stretch)
+    muscle = material_set("trebbi").materials["muscle"].nominal_stress(stretch)
     stress = muscle + np.random.default_rng(0).normal(0.0, 0.03 * muscle.max(), 30)
     curve = tmp_path / "muscle.csv"
     rows = "".join(f"{a},{b}\n" for a, b in zip(stretch, stress, strict=True))
@@ -75,7 +75,7 @@ def test_sets_survive_being_written(tmp_path: Path, name: str) -> None:
     from fe import as_toml
 
     file = tmp_path / "again.toml"
-    laws = material_set(name).laws
+    laws = material_set(name).materials
     file.write_text(as_toml("a set, with spaces", "x", laws))
-    again = material_set(file).laws
+    again = material_set(file).materials
     assert {t: law.description for t, law in again.items()} == {t: law.description for t, law in laws.items()}
