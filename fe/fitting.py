@@ -169,11 +169,11 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     for start in _starts(sought, modelled, stress):
         scales = np.where(np.arange(count) < count - sought.exponents, np.maximum(np.abs(start), 1e-3 * size), 1.0)
         with np.errstate(over="ignore", invalid="ignore"):
-            found = least_squares(
+            optimum = least_squares(
                 lambda v: np.nan_to_num((modelled(v) - stress) / size, nan=1e6, posinf=1e6, neginf=-1e6),
                 start, jac="3-point", x_scale=scales, xtol=1e-14, ftol=1e-14, gtol=1e-14,
             )  # fmt: skip
-        optima.append(found)
+        optima.append(optimum)
     best, others = _chosen(sought, optima, len(stress))
     if sought.exponents and np.abs(best.x[-sought.exponents :]).max() > _MOST:
         raise InputError(f"{law}: the best exponent is beyond {_MOST:g}; these curves cannot tell it. Use fewer terms.")

@@ -233,28 +233,28 @@ class LoadPath:
         outside[equations] = np.where(displaced, 0.0, aim)
         self.assembler.share(contact.followers)
         if downhill:
-            found = self._descended(outside)
+            converged = self._descended(outside)
         else:
             rotation = Parallel()
             if contact.status.turns:
                 rotation = Turning(contact, self.assembler, self.solver, np.broadcast_to(moment_nmm, 3))
             imposed = Imposed(outside, equations[displaced], (aim - self.plate.displacement_mm)[displaced])
-            found = equilibrium(
+            converged = equilibrium(
                 self.assembler, self.solver, self.state, imposed, self.tolerance, self._changed, self.log, rotation
             )
-        if found is None:
+        if converged is None:
             return False
-        moved = contact.displacement_mm(found.state)
+        moved = contact.displacement_mm(converged.state)
         if np.abs(moved - [contact.plate.gap_mm, 0.0, 0.0]).max() > self.extent_mm:
             self.log("the plate would have moved farther than the body is large")
             return False
-        self.state = found.state
-        self.iterations += found.iterations
+        self.state = converged.state
+        self.iterations += converged.iterations
         self.plate = PlateState(
             moved,
-            contact.force_n(found.forces),
+            contact.force_n(converged.forces),
             np.degrees(Rotation.from_matrix(contact.status.rotation).as_rotvec()),
-            contact.moment_nmm(found.state, found.forces),
+            contact.moment_nmm(converged.state, converged.forces),
             self._area_mm2(),
         )
         self.curve.append(self.plate)

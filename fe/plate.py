@@ -33,7 +33,7 @@ class Plate:
         Whether it turns freely about its pivot, in all three axes, once it presses; if not, it stays parallel.
     pivot_mm : (3,), optional
         Point in front of which the pivot lies on the plate's face at the start, LPS; by default the place on the
-        surface that is touched first. The pivot moves with the plate, and moments are told about it.
+        surface that is touched first. The pivot moves with the plate, and moments are given about it.
 
     Attributes
     ----------
@@ -157,10 +157,12 @@ class Contact:
     def centre_mm(self, state: FloatArray) -> FloatArray:
         """Where the pivot is, (3,) mm."""
         status = self.status
-        found = (self._positions(state)[status.nodes] - status.places_mm[status.nodes] @ status.rotation.T).mean(axis=0)
+        centre = (self._positions(state)[status.nodes] - status.places_mm[status.nodes] @ status.rotation.T).mean(
+            axis=0
+        )
         if not self.plate.taped:
-            found[1:] = self._pivot[1:]
-        return np.asarray(found)
+            centre[1:] = self._pivot[1:]
+        return np.asarray(centre)
 
     def displacement_mm(self, state: FloatArray) -> FloatArray:
         """Displacement of the pivot from the plate's start, (3,) mm."""

@@ -80,12 +80,12 @@ class MaterialSet:
         >>> materials["muscle"] is materials["fat"], notes
         (True, ("friedman has no law for muscle; fat's is used.",))
         """
-        found: dict[str, Material] = {}
+        by_region: dict[str, Material] = {}
         notes = []
         known = {tissue.casefold(): law for tissue, law in self.materials.items()}
         for region in regions:
             if WHOLE in self.materials:
-                found[region] = self.materials[WHOLE]
+                by_region[region] = self.materials[WHOLE]
                 continue
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
             name = next((t for t in tried if t.casefold() in known), None)
@@ -95,10 +95,10 @@ class MaterialSet:
                     f"The set {self.name} has no law for the region '{region}'{instead}; it has "
                     f"{', '.join(self.materials)}. Add it to the set in a file of your own, or rename the region."
                 )
-            found[region] = known[name.casefold()]
+            by_region[region] = known[name.casefold()]
             if name != region:
                 notes.append(f"{self.name} has no law for {region}; {name}'s is used.")
-        return found, tuple(notes)
+        return by_region, tuple(notes)
 
 
 def published_names() -> list[str]:
@@ -168,14 +168,14 @@ def as_toml(name: str, title: str, materials: Mapping[str, Material]) -> str:
     for tissue, law in materials.items():
         at = json.dumps(tissue) if not re.fullmatch(r"[\w-]+", tissue, re.ASCII) else tissue
         lines += ["", f"[{key}.{at}]", f'law = "{_NAMES[type(law)]}"']
-        lines += [f"{k} = {v}" for k, v in _told(law).items()]
+        lines += [f"{k} = {v}" for k, v in _numbers_of(law).items()]
     return "\n".join(lines) + "\n"
 
 
 _NAMES: Mapping[type[Material], str] = {NeoHooke: "neo-Hooke", Yeoh: "Yeoh", Hencky: "linear elastic", Ogden: "Ogden"}
 
 
-def _told(law: Material) -> dict[str, object]:
+def _numbers_of(law: Material) -> dict[str, object]:
     """The numbers of a law as a file has them."""
     c10, c20, c30, hencky = law.vector[:OGDEN].tolist()
     given: dict[type[Material], dict[str, object]] = {
@@ -198,11 +198,11 @@ def _published() -> dict[str, MaterialSet]:
 
 def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
     try:
-        told = tomllib.loads(text)
+        tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as failure:
         raise InputError(f"{where}: not a TOML file: {failure}.") from failure
     sets = {}
-    for name, content in told.items():
+    for name, content in tables.items():
         if not isinstance(content, dict):
             raise InputError(
                 f"{where}: '{name}' stands outside any set; a file starts with the set's name in brackets."
@@ -238,7 +238,7 @@ def _law(where: str, given: object) -> Material:
             raise InputError(f"{where}: '{bare}' is given twice.")
         values[argument] = _numbers(where, key, value, scale or 1.0, several=law == "Ogden" and bare != "nu")
     needed = {f"{name}_mpa": f"{name}_kpa" for name in form.stresses} | {name: name for name in form.plain}
-    missing = [told for name, told in needed.items() if name not in values and told[:-4] not in form.optional]
+    missing = [key for name, key in needed.items() if name not in values and key[:-4] not in form.optional]
     if missing:
         raise InputError(f"{where}: {law} needs {', '.join(missing)}.")
     try:

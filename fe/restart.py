@@ -27,7 +27,7 @@ _PLATE = [field.name for field in fields(PlateState)]
 def fingerprint(problem: Problem, load_count: int) -> str:
     """A hash of all that the first loads of a problem depend on, the solver and its libraries included.
 
-    Those are told by `dvc.software`.
+    `dvc.software` tells those.
     """
     mesh, plate = problem.mesh, problem.plate
     digest = hashlib.sha256()

@@ -281,8 +281,8 @@ class Simulation:
         write_regions_csv(place / "regions.csv", self.regions)
         write_curve_csv(place / "curve.csv", self.states)
         parameters = {"fixed": list(self.fixed), "turns": self.turns} | self.parameters()
-        told = {"outcome": {s.load.name: self._outcome(s) for s in self.states}, "notes": list(self.notes)}
-        text = json.dumps(told | dict(record or {"parameters": parameters}), indent=2, allow_nan=False)
+        content = {"outcome": {s.load.name: self._outcome(s) for s in self.states}, "notes": list(self.notes)}
+        text = json.dumps(content | dict(record or {"parameters": parameters}), indent=2, allow_nan=False)
         write_whole(place / RECORD, text + "\n")
         figures.write_figure(place / "slices.png", self.plot())
         figures.write_figure(place / "force_travel.png", figures.force_displacement(self.states))

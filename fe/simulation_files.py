@@ -44,8 +44,8 @@ def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
 
 
 def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
-    told = json.loads((place / RECORD).read_text(encoding="utf-8"))
-    given, outcome = told["parameters"], told["outcome"]
+    content = json.loads((place / RECORD).read_text(encoding="utf-8"))
+    given, outcome = content["parameters"], content["outcome"]
     paths = tuple(tuple(LoadStep(**load) for load in path) for path in given["paths"])
     loads = {load.name: load for path in paths for load in path}
     curves = read_curve_csv(place / "curve.csv")
@@ -84,7 +84,7 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
         "fixed": tuple(given["fixed"]),
         "element": given["element"].split(":")[0],
         "turns": given["turns"],
-        "remarks": tuple(told["notes"]),
+        "remarks": tuple(content["notes"]),
     }
 
 

@@ -72,14 +72,14 @@ def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
     scale, true = _STRESS[stress[0]]
     tests: dict[str, list[tuple[float, float]]] = {}
     for line, row in enumerate(rows, start=2):
-        told = {(k or "").strip().lower(): (v or "").strip() for k, v in row.items() if not isinstance(v, list)}
+        cells = {(k or "").strip().lower(): (v or "").strip() for k, v in row.items() if not isinstance(v, list)}
         try:
-            stretch, value = float(told["stretch"]), scale * float(told[stress[0]])
+            stretch, value = float(cells["stretch"]), scale * float(cells[stress[0]])
         except ValueError as failure:
             raise InputError(f"{path}, line {line}: {failure}.") from failure
         if not (np.isfinite([stretch, value]).all() and stretch > 0.0):
-            raise InputError(f"{path}, line {line}: a stretch is positive, and both numbers finite; got {told}.")
-        name = mode or told["test"].lower()
+            raise InputError(f"{path}, line {line}: a stretch is positive, and both numbers finite; got {cells}.")
+        name = mode or cells["test"].lower()
         if name not in MODES:
             raise InputError(f"{path}, line {line}: no test '{name}'; there are {', '.join(MODES)}.")
         tests.setdefault(name, []).append((stretch, value / stretch if true else value))

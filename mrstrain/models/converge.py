@@ -47,7 +47,7 @@ class Converged:
         lines = ["Size of the cells, mm: " + ", ".join(f"{s:.2f}" for s in self.sizes_mm)]
         for row in self.rows:
             values = ", ".join(f"{v:.4g}" for v in row.values)
-            limit, tends = row.limit, "no limit can be told"
+            limit, tends = row.limit, "no limit can be determined"
             if np.isfinite(limit.limit):
                 tends = f"tends to {limit.limit:.4g} (order {limit.order:.1f}), the finest is off by {limit.error:+.1%}"
             lines.append(f"{row.load}, {row.figure}: {values}; {tends}")
@@ -164,9 +164,9 @@ def _is_of(place: Path, inputs: dict[str, Path], bones: Sequence[str]) -> bool:
         return False
     hashes = {role: [file_hash(path)] for role, path in inputs.items()}
     try:
-        told = json.loads(about.read_text(encoding="utf-8"))
-        known = {role: [f["sha256"] for f in files] for role, files in told["inputs"].items()}
-        return bool(known == hashes and told["parameters"]["bones"] == list(bones))
+        record = json.loads(about.read_text(encoding="utf-8"))
+        known = {role: [f["sha256"] for f in files] for role, files in record["inputs"].items()}
+        return bool(known == hashes and record["parameters"]["bones"] == list(bones))
     except (ValueError, KeyError, TypeError, AttributeError):  # not what `mesh` writes
         return False
 

@@ -235,9 +235,9 @@ def _beside(place: Path) -> list[Path]:
 def _mesh_made(place: Path) -> dict[str, object] | None:
     """How `mesh` made a mesh, by the record that it leaves beside it; None for meshes made elsewhere."""
     try:
-        told = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
-        if told["command"] == "mesh":
-            return {"edge_mm": told["parameters"]["edge_mm"], "pytetwild": told["versions"]["pytetwild"]}
+        record = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
+        if record["command"] == "mesh":
+            return {"edge_mm": record["parameters"]["edge_mm"], "pytetwild": record["versions"]["pytetwild"]}
     except (OSError, ValueError, KeyError, TypeError):
         pass
     return None

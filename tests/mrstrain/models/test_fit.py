@@ -47,7 +47,7 @@ def test_a_modulus_at_its_bound_is_told_and_goes_with_the_set(tmp_path: Path) ->
     rows = "".join(f"{a},{b}\n" for a, b in zip(stretch, stress, strict=True))
     curve.write_text("stretch,nominal_stress_mpa\n" + rows)
     done = fit(curve, "Yeoh", out=tmp_path / "out", test="uniaxial", tissue="muscle")
-    assert [p.at_bound for p in done.found.parameters] == [True, False, False]
+    assert [p.at_bound for p in done.fit.parameters] == [True, False, False]
     assert sum("do not determine C10: alone they would have it lower" in line for line in done.summary()) == 1
     told = json.loads((tmp_path / "out" / "fit.json").read_text())
     assert told["parameters"][0]["at_bound"] is True
