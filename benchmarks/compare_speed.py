@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from benchmarks.memory import peak_kib
-from fe.mesh_file import read_tet_mesh
+from fe import read_tet_mesh
 from mrstrain.records.provenance import versions
 
 

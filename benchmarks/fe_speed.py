@@ -23,16 +23,12 @@ import numpy as np
 
 from dvc.arrays import IntArray
 from dvc.mesh import TetMesh
+from fe import LoadState, LoadStep, PlateState, Tolerance, material_set, read_tet_mesh, write_calculix
 from fe.assembly import Assembler
-from fe.decks import write_calculix
 from fe.elements import edges_of, element
 from fe.linear import Solver
-from fe.mesh_file import read_tet_mesh
 from fe.model import Model
-from fe.newton import Tolerance, equilibrium
-from fe.plate_path import PlateState
-from fe.published import material_set
-from fe.simulate import LoadStep, State
+from fe.newton import Imposed, equilibrium
 from mrstrain.records.provenance import versions
 
 LIFT_MM = 1.5
@@ -70,8 +66,8 @@ def ours(place: Path, name: str) -> dict[str, Any]:
     assembler.share({0: 3 * nodes + 2})
     solver = Solver(assembler.indptr, assembler.indices)
     found = equilibrium(
-        assembler, solver, np.zeros(model.unknowns), np.zeros(assembler.size), np.array([assembler.own_equations]),
-        np.array([LIFT_MM]), Tolerance(),
+        assembler, solver, np.zeros(model.unknowns),
+        Imposed(np.zeros(assembler.size), np.array([assembler.own_equations]), np.array([LIFT_MM])), Tolerance(),
     )  # fmt: skip
     assert found is not None
     return {
@@ -89,7 +85,7 @@ def calculix(place: Path, quadratic: bool, limit_s: float) -> dict[str, Any]:
     u[nodes, 2] = LIFT_MM
     cells = len(mesh.cells)
     still = PlateState(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
-    state = State(LoadStep("lift", 1.0), 1.0, u, np.zeros((cells, 4)), np.zeros((cells, 3, 3)), nodes, (still,), 0, 0.0)
+    state = LoadState(LoadStep("lift", 1.0), 1.0, u, np.zeros(cells), np.zeros((cells, 3, 3)), nodes, (still,), 0, 0.0)
     with tempfile.TemporaryDirectory() as folder:
         deck = Path(folder) / "lift.inp"
         write_calculix(deck, mesh, laws, state, quadratic=quadratic)

@@ -28,7 +28,7 @@ from dvc.io.images.labels import read_labels, read_mask
 from dvc.io.images.write import write_image, write_labels
 from dvc.mesh import TetMesh
 from dvc.trust.random_field import GaussianField
-from fe.mesh_file import read_tet_mesh, write_tet_mesh
+from fe import read_tet_mesh, write_tet_mesh
 from mrstrain import mesh as make_mesh
 from mrstrain import run, simulate
 from mrstrain.measurement.measured_folder import spline_in

@@ -19,7 +19,7 @@ import numpy as np
 
 from dvc.deformation.nodal import OnMesh
 from dvc.io.images.labels import read_labels
-from fe.meshing import mesh_labels
+from fe import mesh_labels
 from mrstrain.records.provenance import versions
 
 

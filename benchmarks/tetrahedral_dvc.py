@@ -40,9 +40,7 @@ from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.fit import scaled
 from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
 from dvc.registration.register import Settings, register
-from fe.materials import NeoHooke
-from fe.mesh_file import read_tet_mesh
-from fe.published import material_set
+from fe import NeoHooke, material_set, read_tet_mesh
 from mrstrain.records.provenance import versions
 from phantoms.accuracy_run import distances_mm
 from validate.fe_result import read_result

@@ -32,7 +32,7 @@ class Assembler:
     fixed : (f,) int
         Unknowns whose value never changes.
     shared : mapping of int to (s,) int
-        For each shared equation, numbered from 0, the unknowns that may ever be told to follow it.
+        For each shared equation, numbered from 0, the unknowns that may ever follow it.
     """
 
     def __init__(self, model: Model, fixed: IntArray, shared: Mapping[int, IntArray]) -> None:
@@ -126,11 +126,11 @@ class Assembler:
 
     def acting(self, state: FloatArray, directions: FloatArray) -> FloatArray:
         """The tangent times directions (unknowns, k), by unknown, as if each stood in an equation of its own."""
-        found = np.zeros_like(directions)
+        product = np.zeros_like(directions)
         cells = np.flatnonzero((directions != 0.0).any(axis=1)[self._cells].any(axis=1))
         for part, _, local, _ in self._in_chunks(state, cells, with_tangent=True):
-            _add_products(self._cells[part], local, directions, found)
-        return found
+            _add_products(self._cells[part], local, directions, product)
+        return product
 
     def _run(self, state: FloatArray, forces: FloatArray, data: FloatArray | None) -> float:
         lowest = np.inf
@@ -233,16 +233,16 @@ def _add_tangents(places: IntArray, local: FloatArray, data: FloatArray) -> None
 
 
 @njit(cache=True)
-def _add_products(cells: IntArray, local: FloatArray, directions: FloatArray, found: FloatArray) -> None:
+def _add_products(cells: IntArray, local: FloatArray, directions: FloatArray, product: FloatArray) -> None:
     width = cells.shape[1]
     for n in range(len(cells)):
         pair = 0
         for i in range(width):
             for j in range(i, width):
                 for k in range(directions.shape[1]):
-                    found[cells[n, i], k] += local[n, pair] * directions[cells[n, j], k]
+                    product[cells[n, i], k] += local[n, pair] * directions[cells[n, j], k]
                     if j > i:
-                        found[cells[n, j], k] += local[n, pair] * directions[cells[n, i], k]
+                        product[cells[n, j], k] += local[n, pair] * directions[cells[n, i], k]
                 pair += 1
 
 

@@ -37,24 +37,24 @@ class Limit:
     error: float
 
 
-def size_mm(mesh: TetMesh) -> float:
+def cell_size_mm(mesh: TetMesh) -> float:
     """Size of a mesh's cells: the cube root of their mean volume, mm."""
     return float(np.cbrt(mesh.volumes_mm3.mean()))
 
 
-def extrapolated(sizes_mm: FloatArray, values: FloatArray) -> Limit:
+def extrapolate(sizes_mm: FloatArray, values: FloatArray) -> Limit:
     """Extrapolate a figure (n,) from meshes of sizes (n,), three or more (Richardson, with the order observed).
 
     Raises
     ------
     InputError
-        If there are fewer than three sizes, or the coarsest is not 1.5 times the finest or more: nothing could be told.
+        If there are fewer than three sizes, or the coarsest is not 1.5 times the finest or more.
 
     Examples
     --------
     >>> h = np.array([4.0, 2.0, 1.0])
-    >>> found = extrapolated(h, 5.0 + 0.1 * h**2)
-    >>> round(found.limit, 3), round(found.order, 2), round(found.error, 3)
+    >>> limit = extrapolate(h, 5.0 + 0.1 * h**2)
+    >>> round(limit.limit, 3), round(limit.order, 2), round(limit.error, 3)
     (5.0, 2.0, 0.02)
     """
     h, f = np.asarray(sizes_mm, dtype=np.float64), np.asarray(values, dtype=np.float64)
@@ -67,10 +67,10 @@ def extrapolated(sizes_mm: FloatArray, values: FloatArray) -> Limit:
     best: tuple[float, float, float] | None = None
     for order in _ORDERS:
         columns = np.column_stack([np.ones_like(h), h**order])
-        found, *_ = np.linalg.lstsq(columns, f, rcond=None)
-        cost = float(np.sqrt(np.mean((columns @ found - f) ** 2)))
+        coefficients, *_ = np.linalg.lstsq(columns, f, rcond=None)
+        cost = float(np.sqrt(np.mean((columns @ coefficients - f) ** 2)))
         if best is None or cost < best[0] - 1e-15:
-            best = cost, float(order), float(found[0])
+            best = cost, float(order), float(coefficients[0])
     assert best is not None
     scatter, order, limit = best
     steps = np.diff(f[np.argsort(h)])

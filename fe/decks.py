@@ -1,4 +1,4 @@
-"""A state of load written for another solver: the same mesh, laws and supports, the plate's nodes where they ended.
+"""A state of load written for another solver: same mesh, materials, supports, and plate nodes.
 
 A hyperelastic state depends on where its supports are, and not on the way there. So a deck in which bone is fixed and
 the nodes on the plate are moved to where they ended has our state for its solution, and its reactions are the plate's
@@ -20,7 +20,7 @@ from dvc.mesh import TetMesh
 from fe.elements import Space, edges_of
 from fe.hyperelastic import OGDEN
 from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
-from fe.simulate import State
+from fe.solution import LoadState
 from fe.surface_sets import BONE
 
 _UNUSED = 1e30  # D of a volumetric term that is not wanted: its stiffness is 1 / D
@@ -30,8 +30,8 @@ _PER_LINE = 12
 def write_calculix(
     path: Path,
     mesh: TetMesh,
-    laws: Mapping[str, Material],
-    state: State,
+    materials: Mapping[str, Material],
+    state: LoadState,
     *,
     fixed: Sequence[str] = (BONE,),
     quadratic: bool = False,
@@ -42,9 +42,9 @@ def write_calculix(
     ----------
     path : path
         Ending in .inp. CalculiX prints displacements of all nodes and the plate's total force to the .dat file.
-    laws : mapping of region to Material
+    materials : mapping of region to Material
         Neo-Hooke, Yeoh and Ogden; volume as in `fe.materials`, which is CalculiX' own (D1 = 2 / K).
-    state : State
+    state : LoadState
     fixed : sequence of str
         Facets that do not move.
     quadratic : bool
@@ -56,25 +56,25 @@ def write_calculix(
     InputError
         For Hencky's law, which CalculiX does not have.
     """
-    write_whole(path, "\n".join(_deck(mesh, laws, state, fixed, quadratic)) + "\n")
+    write_whole(path, "\n".join(_deck(mesh, materials, state, fixed, quadratic)) + "\n")
 
 
 def _deck(
-    mesh: TetMesh, laws: Mapping[str, Material], state: State, fixed: Sequence[str], quadratic: bool
+    mesh: TetMesh, materials: Mapping[str, Material], state: LoadState, fixed: Sequence[str], quadratic: bool
 ) -> Iterator[str]:
     space = _space(mesh, quadratic)
     yield from (f"** {line}" for line in _about(state))
     yield "*NODE, NSET=NALL"
     for number, (x, y, z) in enumerate(space.nodes_mm.tolist(), start=1):
         yield f"{number}, {x:.12g}, {y:.12g}, {z:.12g}"
-    for region in laws:
-        yield f"*ELEMENT, TYPE={'C3D10' if quadratic else 'C3D4'}, ELSET={_short('E', region, laws)}"
+    for region in materials:
+        yield f"*ELEMENT, TYPE={'C3D10' if quadratic else 'C3D4'}, ELSET={_short('E', region, materials)}"
         for cell in mesh.regions[region]:
             yield f"{cell + 1}, " + ", ".join(str(n + 1) for n in space.cells[cell])
-    for region, law in laws.items():
-        yield f"*MATERIAL, NAME={_short('M', region, laws)}"
+    for region, law in materials.items():
+        yield f"*MATERIAL, NAME={_short('M', region, materials)}"
         yield from _law(region, law)
-        yield f"*SOLID SECTION, ELSET={_short('E', region, laws)}, MATERIAL={_short('M', region, laws)}"
+        yield f"*SOLID SECTION, ELSET={_short('E', region, materials)}, MATERIAL={_short('M', region, materials)}"
     held, on_plate, moved = _supports(mesh, space, state, fixed)
     for name, nodes in (("NBONE", held), ("NPLATE", on_plate)):
         yield f"*NSET, NSET={name}"
@@ -100,7 +100,9 @@ def _deck(
     yield "*END STEP"
 
 
-def _supports(mesh: TetMesh, space: Space, state: State, fixed: Sequence[str]) -> tuple[IntArray, IntArray, FloatArray]:
+def _supports(
+    mesh: TetMesh, space: Space, state: LoadState, fixed: Sequence[str]
+) -> tuple[IntArray, IntArray, FloatArray]:
     """Nodes that are fixed, nodes on the plate, and how far those move; middles of edges go with their ends."""
     count = len(mesh.points_mm)
     bone = np.zeros(count, dtype=bool)
@@ -136,7 +138,7 @@ def _law(region: str, law: Material) -> Iterator[str]:
     elif isinstance(law, Ogden):
         pairs = law.vector[OGDEN:].reshape(-1, 2)
         if len(pairs) > 3:
-            raise InputError(f"{region}: CalculiX takes Ogden laws of up to three terms; this has {len(pairs)}.")
+            raise InputError(f"{region}: CalculiX takes Ogden models of up to three terms; this has {len(pairs)}.")
         yield f"*HYPERELASTIC, OGDEN, N={len(pairs)}"
         numbers = [
             *(f"{mu:.12g}, {alpha:.12g}" for mu, alpha in pairs),
@@ -155,8 +157,8 @@ def _law(region: str, law: Material) -> Iterator[str]:
 def write_febio(
     path: Path,
     mesh: TetMesh,
-    laws: Mapping[str, Material],
-    state: State,
+    materials: Mapping[str, Material],
+    state: LoadState,
     *,
     fixed: Sequence[str] = (BONE,),
     quadratic: bool = False,
@@ -184,10 +186,10 @@ def write_febio(
         _child(stepper, name, value)
     solver = _child(control, "solver", type="solid")
     _child(solver, "symmetric_stiffness", "symmetric")
-    materials = _child(root, "Material")
-    for number, (region, law) in enumerate(laws.items(), start=1):
+    listed = _child(root, "Material")
+    for number, (region, law) in enumerate(materials.items(), start=1):
         kind, numbers = _febio_law(region, law)
-        material = _child(materials, "material", id=str(number), name=_short("M", region, laws), type=kind)
+        material = _child(listed, "material", id=str(number), name=_short("M", region, materials), type=kind)
         for name, size in (*numbers.items(), ("k", law.bulk_modulus_mpa)):
             _child(material, name, f"{size:.12g}")
         _child(material, "pressure_model", "Abaqus")
@@ -195,15 +197,15 @@ def write_febio(
     nodes = _child(whole, "Nodes", name="all")
     for number, place in enumerate(space.nodes_mm.tolist(), start=1):
         _child(nodes, "node", ",".join(f"{v:.12g}" for v in place), id=str(number))
-    for region in laws:
-        elements = _child(whole, "Elements", type="tet10" if quadratic else "tet4", name=_short("E", region, laws))
+    for region in materials:
+        elements = _child(whole, "Elements", type="tet10" if quadratic else "tet4", name=_short("E", region, materials))
         for cell in mesh.regions[region]:
             _child(elements, "elem", ",".join(str(n + 1) for n in space.cells[cell]), id=str(cell + 1))
     for name, members in (("bone", held), ("plate", on_plate)):
         _child(whole, "NodeSet", ",".join(str(n + 1) for n in members), name=name)
     domains = _child(root, "MeshDomains")
-    for region in laws:
-        _child(domains, "SolidDomain", name=_short("E", region, laws), mat=_short("M", region, laws))
+    for region in materials:
+        _child(domains, "SolidDomain", name=_short("E", region, materials), mat=_short("M", region, materials))
     data = _child(root, "MeshData")
     boundary = _child(root, "Boundary")
     still = _child(boundary, "bc", name="bone", type="zero displacement", node_set="bone")
@@ -250,7 +252,7 @@ def _febio_law(region: str, law: Material) -> tuple[str, dict[str, float]]:
     raise InputError(f"{region}: no FEBio deck is written for {law.law}; choose another set.")
 
 
-def _about(state: State) -> tuple[str, ...]:
+def _about(state: LoadState) -> tuple[str, ...]:
     force = ", ".join(f"{f:.4g}" for f in state.force_n)
     return (
         f"Written by mrstrain: the state under {state.load.name}, {state.reached:.0%} of it reached. mm, N, MPa; LPS.",
@@ -264,6 +266,6 @@ def _space(mesh: TetMesh, quadratic: bool) -> Space:
     return Space.on(mesh, "P2" if quadratic else "P1", np.zeros(len(mesh.cells), dtype=np.int64))
 
 
-def _short(prefix: str, region: str, laws: Mapping[str, Material]) -> str:
+def _short(prefix: str, region: str, materials: Mapping[str, Material]) -> str:
     """A name of its own that CalculiX takes: letters and digits, under 20 characters."""
-    return f"{prefix}{list(laws).index(region) + 1}" + "".join(c for c in region.upper() if c.isalnum())[:15]
+    return f"{prefix}{list(materials).index(region) + 1}" + "".join(c for c in region.upper() if c.isalnum())[:15]

@@ -69,37 +69,38 @@ def descend(
     outside: FloatArray,
     tolerance: Tolerance,
     changed: Callable[[FloatArray, FloatArray], bool] = lambda _state, _forces: False,
-    told: Callable[[str], None] = lambda _: None,
-    farthest_mm: float = np.inf,
-    over: Callable[[], bool] = lambda: False,
+    log: Callable[[str], None] = lambda _: None,
+    is_over: Callable[[], bool] = lambda: False,
 ) -> Converged | None:
     """Find the state in balance with forces from outside to which a body in a viscous medium comes.
 
     Parameters
     ----------
-    assembler, solver, state, outside, tolerance, told
+    assembler, solver, state, tolerance, log
         As in `fe.newton.equilibrium`; no unknown is prescribed.
+    outside : (equations,)
+        External forces, N.
     changed : callable
         As there; asked after every step.
-    farthest_mm : float
-        Given up where a node has moved by more, mm.
-    over : callable
+    is_over : callable
         Asked before every step; given up where it is true.
 
     Returns
     -------
     Converged or None
-        None if it is not found in 400 steps. As in `fe.newton.Tolerance`, steps that stay in balance are enough.
+        None if it is not found in 400 steps, or a node moves farther than the body is large. As in
+        `fe.newton.Tolerance`, steps that stay in balance are enough.
     """
     model = assembler.model
     now, damping, thickness = state.copy(), _FIRST, np.ones(len(model.space.nodes_mm))
     growth, balanced = _MOST_GROWTH[0], 0
+    largest_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
     forces, residual, lowest = assembler.residual(now)
     if not lowest > 0.0:
         return None
     tangent = assembler.tangent(now)
     for count in range(1, _MOST_STEPS + 1):
-        if over():
+        if is_over():
             return None
         before_n = max(out_of_balance(outside - residual, assembler), 1e-300)
         by_node = np.repeat(damping * thickness * model.node_volumes_mm3, 3)
@@ -115,13 +116,13 @@ def descend(
             continue
         now, forces, residual = step.state, step.forces, step.residual
         balance = step.after_n / max(reaction(assembler, forces), 1e-9)
-        told(
+        log(
             f"    downhill {count}: out of balance {balance:.1e}, step {step.largest_mm:.1e} mm, least det F "
             f"{step.lowest:.3f}, damping {damping:.1e}"
         )
         moved_mm = float(np.abs(now[: -model.space.pressures]).max())
-        if moved_mm > farthest_mm:
-            told(f"    given up: a node has moved by {moved_mm:.0f} mm, and the body is not that large")
+        if moved_mm > largest_mm:
+            log(f"    given up: a node has moved by {moved_mm:.0f} mm, and the body is not that large")
             return None
         wrong = step.unforeseen_n / before_n
         damping = max(_LEAST, damping * float(_by(_CHANGES, np.linalg.norm(np.minimum(wrong, _CLIPPED)))))

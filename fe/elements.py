@@ -26,7 +26,7 @@ from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 
-TOLD = {
+DESCRIPTIONS = {
     "P1": "stabilised linear tetrahedra, displacement and pressure",
     "MINI": "linear tetrahedra with a bubble, displacement and pressure",
     "P2": "quadratic tetrahedra with straight edges, linear pressure (Taylor-Hood)",

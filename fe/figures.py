@@ -1,9 +1,10 @@
-"""Figures of the finite-element side, each as PNG bytes; what a figure's docstring says is its caption."""
+"""Figures of the finite-element side; what a figure's docstring says is its caption."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from matplotlib import colormaps
@@ -14,16 +15,17 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from dvc.arrays import FloatArray, IntArray
-from dvc.deformation.strain import StrainField
+from dvc.atomic_files import whole_file
 from dvc.mesh import TetMesh
 from dvc.report.figures import REGION_COLOURS
 from dvc.report.planes import letters
 from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.convergence import Limit
-from fe.fitting import Curve, Fit
+from fe.fitting import Fit
 from fe.plate import Plate
 from fe.result import volume_percentiles
-from fe.simulate import State
+from fe.solution import LoadState
+from fe.stress_curves import Curve
 from fe.surface_sets import BONE
 
 _POINTS = 200
@@ -33,7 +35,13 @@ _MARGIN_MM = 7.0  # around what is drawn; the letters stand there
 _UNKNOWN = "#c9ced6"
 
 
-def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
+def write_figure(path: Path, figure: Figure) -> None:
+    """Write a figure as PNG."""
+    with whole_file(path) as part:
+        part.write_bytes(png_bytes(figure))
+
+
+def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> Figure:
     """Measured nominal stress (points) and the fitted law (lines), by kind of test.
 
     The line is dashed where Drucker's condition fails: a simulation that gets there is not to be trusted.
@@ -54,11 +62,11 @@ def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> bytes:
     axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
     label_axes(axes, "stretch", "nominal stress, kPa")
     axes.legend(fontsize=9, frameon=False)
-    return png_bytes(figure)
+    return figure
 
 
-def sagittal_slice(mesh: TetMesh, states: Sequence[State]) -> bytes:
-    """Maximal shear on the slice through the bone's lowest point, along the plate's normal and the shear's direction.
+def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
+    """Maximum shear strain on the slice through the bone's lowest point, along the plate's normal and the shear.
 
     Those of the first load, where loads have directions of their own. Cells are cut in the unloaded configuration and
     drawn where they are under load; the dashed line is the plate. The colours end where a hundredth of the volume is
@@ -70,13 +78,15 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[State]) -> bytes:
     for state in states:
         load = state.load
         part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%})"
-        told = f"{load.name}: {load.told}{part}"
+        title = f"{load.name}: {load}{part}"
         along = _along_plate(mesh, state, axes, middle)
-        panels.append(Slice(told, state.u_mm, StrainField.from_gradient(state.gradients).max_shear, along))
+        panels.append(Slice(title, state.u_mm, state.strain.max_shear, along))
     return slice_sheet(mesh, panels, axes, middle)
 
 
-def _along_plate(mesh: TetMesh, state: State, axes: FloatArray, on_slice_mm: FloatArray) -> tuple[float, float] | None:
+def _along_plate(
+    mesh: TetMesh, state: LoadState, axes: FloatArray, on_slice_mm: FloatArray
+) -> tuple[float, float] | None:
     """Height of the plate where the slice's shear coordinate is 0, and its slope; None for one along the slice."""
     assert state.plate_axes is not None
     on_plate = ((mesh.points_mm + state.u_mm)[state.on_plate] @ axes).mean(axis=0)
@@ -109,7 +119,7 @@ class Slice:
     face: tuple[float, float] | None = None
 
 
-def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> bytes:
+def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> Figure:
     """Fields on one slice, in one colour scale that ends where a hundredth of the volume is above.
 
     Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
@@ -155,8 +165,8 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
                 **FONT,
             )  # fmt: skip
     bar = figure.colorbar(drawn, ax=list(spots[: len(panels)]), shrink=0.8, extend="max")
-    bar.set_label("maximal shear", color=INK, **FONT)
-    return png_bytes(figure)
+    bar.set_label("max. shear strain", color=INK, **FONT)
+    return figure
 
 
 def _lowest_bone_point(mesh: TetMesh, axes: FloatArray) -> FloatArray:
@@ -202,22 +212,22 @@ def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray)
     return cells, polygons
 
 
-def force_travel(states: Sequence[State]) -> bytes:
-    """Force of the plate over its travel since the first touch, along the normal force (left) and the shear (right)."""
+def force_displacement(states: Sequence[LoadState]) -> Figure:
+    """Force of the plate over its displacement from the first touch on, along normal (left) and shear (right)."""
     figure, panels = chart(2)
     for axes, axis, name in zip(panels, (0, 1), ("normal", "shear"), strict=True):
         for number, state in enumerate(states):
-            travel, force = ([getattr(at, what)[axis] for at in state.curve] for what in ("travel_mm", "force_n"))
+            moved, force = ([getattr(at, what)[axis] for at in state.curve] for what in ("displacement_mm", "force_n"))
             axes.plot(
-                travel, force, marker=".", label=state.load.name, linewidth=1.8,
+                moved, force, marker=".", label=state.load.name, linewidth=1.8,
                 color=REGION_COLOURS[number % len(REGION_COLOURS)],
             )  # fmt: skip
-        label_axes(axes, f"{name} travel, mm", f"{name} force, N")
+        label_axes(axes, f"{name} displacement, mm", f"{name} force, N")
     panels[0].legend(fontsize=9, frameon=False)
-    return png_bytes(figure)
+    return figure
 
 
-def mesh_slice(mesh: TetMesh, plate: Plate) -> bytes:
+def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
     """The mesh on a slice through the bone's lowest point, coloured by tissue."""
     figure, (panel,) = chart()
     cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, _lowest_bone_point(mesh, plate.axes))
@@ -229,10 +239,10 @@ def mesh_slice(mesh: TetMesh, plate: Plate) -> bytes:
     panel.set_aspect("equal")
     label_axes(panel, "along the shear, mm", "along the normal force, mm")
     panel.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return png_bytes(figure)
+    return figure
 
 
-def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[float], Limit]]) -> bytes:
+def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[float], Limit]]) -> Figure:
     """Figures relative to what they tend to, over the size of the cells (cube root of their mean volume).
 
     A figure that does not depend on the mesh any more lies on the grey line.
@@ -249,4 +259,4 @@ def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[f
     axes.set_xlim(0.0, 1.05 * max(sizes_mm))
     label_axes(axes, "size of the cells, mm", "figure over its limit")
     axes.legend(fontsize=8, frameon=False)
-    return png_bytes(figure)
+    return figure

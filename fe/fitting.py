@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -17,37 +15,13 @@ from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from fe.hyperelastic import HENCKY, OGDEN
 from fe.materials import HIGHEST_NU, MODES, Hencky, Material, NeoHooke, Ogden, Yeoh, nominal_stress
+from fe.stress_curves import Curve
 
-_STRESS = {
-    "nominal_stress_kpa": (1e-3, False),
-    "nominal_stress_mpa": (1.0, False),
-    "true_stress_kpa": (1e-3, True),
-    "true_stress_mpa": (1.0, True),
-}
 _EXPONENTS = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # starts of an Ogden fit
 _MOSTLY = 0.8
 _MOST = 60.0  # an exponent beyond this is not one that a curve can tell
 _SOFTEST = 1e-3  # least C10 of a polynomial law, of that of the neo-Hookean law that suits the same curves best
 _ABSURD = 1e-4  # curves of a law with a positive modulus are refused less often than this
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Curve:
-    """A test of an incompressible solid.
-
-    Attributes
-    ----------
-    mode : str
-        One of `fe.materials.MODES`: uniaxial, equibiaxial, pure shear.
-    stretch : (n,)
-        Length over undeformed length along the loading axis; below 1 in compression.
-    stress_mpa : (n,)
-        Force over undeformed area, MPa; below 0 in compression.
-    """
-
-    mode: str
-    stretch: FloatArray
-    stress_mpa: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,55 +121,6 @@ LAWS: Mapping[str, _Law] = {
 """Laws that can be fitted. Isihara's is Yeoh's without C30."""
 
 
-def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
-    """Curves of a CSV file, one for each kind of test.
-
-    Columns: ``stretch``; one of ``nominal_stress_kpa``, ``nominal_stress_mpa``, ``true_stress_kpa``,
-    ``true_stress_mpa`` (nominal: force over undeformed area; true: over deformed); and ``test``, a name of
-    `fe.materials.MODES`, unless ``mode`` gives it for the whole file. In other columns nothing is read.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, a column is missing or ambiguous, or a value is no number; with its line.
-    """
-    try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            rows = list(reader)
-            columns = [c.strip().lower() for c in reader.fieldnames or []]
-    except (OSError, UnicodeDecodeError, csv.Error) as failure:
-        raise InputError(f"Cannot read the curve {path}: {failure}.") from failure
-    stress = [c for c in columns if c in _STRESS]
-    if len(columns) == 1 and ";" in columns[0]:
-        raise InputError(f"{path}: columns are divided by semicolons; write it with commas (and points in numbers).")
-    if "stretch" not in columns or len(stress) != 1:
-        raise InputError(
-            f"{path}: a curve needs a column 'stretch' and one of {', '.join(_STRESS)}, so that unit and kind of "
-            f"stress are said (stretch = 1 + strain); its columns are {', '.join(columns) or 'none'}."
-        )
-    mode = None if mode is None else mode.strip().lower()
-    if mode is None and "test" not in columns:
-        raise InputError(f"{path}: say which test it is: {', '.join(MODES)} (--test, or a column 'test').")
-    scale, true = _STRESS[stress[0]]
-    tests: dict[str, list[tuple[float, float]]] = {}
-    for line, row in enumerate(rows, start=2):
-        told = {(k or "").strip().lower(): (v or "").strip() for k, v in row.items() if not isinstance(v, list)}
-        try:
-            stretch, value = float(told["stretch"]), scale * float(told[stress[0]])
-        except ValueError as failure:
-            raise InputError(f"{path}, line {line}: {failure}.") from failure
-        if not (np.isfinite([stretch, value]).all() and stretch > 0.0):
-            raise InputError(f"{path}, line {line}: a stretch is positive, and both numbers finite; got {told}.")
-        name = mode or told["test"].lower()
-        if name not in MODES:
-            raise InputError(f"{path}, line {line}: no test '{name}'; there are {', '.join(MODES)}.")
-        tests.setdefault(name, []).append((stretch, value / stretch if true else value))
-    if not tests:
-        raise InputError(f"{path}: no row under the header.")
-    return [Curve(name, *np.array(points).T) for name, points in tests.items()]
-
-
 def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     """Fit a law to curves of an incompressible solid by least squares of the nominal stress.
 
@@ -207,10 +132,6 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         A name of `LAWS`.
     nu : float
         Poisson's ratio of the material made; the fit itself takes the tissue as incompressible.
-
-    Returns
-    -------
-    Fit
 
     Raises
     ------
@@ -236,14 +157,60 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     the usual interval that a law can have, and holds the truth as often or more often. Curves are refused that would
     have C10 so far below 0 that chance does it to less than one in 10,000 of the curves of a true law.
     """
+    sought, curves = _checked(curves, law, nu)
+    count = len(sought.names)
+    stress = np.concatenate([c.stress_mpa for c in curves])
+    size = float(np.sqrt(np.mean(stress**2)))
+
+    def modelled(values: FloatArray) -> FloatArray:
+        return np.concatenate([nominal_stress(sought.vector(values), c.stretch, c.mode) for c in curves])
+
+    optima: list[OptimizeResult] = []
+    for start in _starts(sought, modelled, stress):
+        scales = np.where(np.arange(count) < count - sought.exponents, np.maximum(np.abs(start), 1e-3 * size), 1.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            optimum = least_squares(
+                lambda v: np.nan_to_num((modelled(v) - stress) / size, nan=1e6, posinf=1e6, neginf=-1e6),
+                start, jac="3-point", x_scale=scales, xtol=1e-14, ftol=1e-14, gtol=1e-14,
+            )  # fmt: skip
+        optima.append(optimum)
+    best, others = _chosen(sought, optima, len(stress))
+    if sought.exponents and np.abs(best.x[-sought.exponents :]).max() > _MOST:
+        raise InputError(f"{law}: the best exponent is beyond {_MOST:g}; these curves cannot tell it. Use fewer terms.")
+    deviations = _deviations(best.x, best.jac, best.fun)
+    if deviations is None:
+        raise InputError(
+            f"{law}: its parameters cannot be told apart from these curves (singular); use a law with fewer."
+        )
+    values, parameters = _with_intervals(sought, best, deviations, curves, stress)
+    try:
+        material = sought.material(values, nu)
+    except InputError as unusable:
+        raise InputError(
+            f"The best fit is no law to compute with ({unusable}) Give points nearer to a stretch of 1, or use a law "
+            "with fewer parameters."
+        ) from unusable
+    residual = modelled(values) - stress
+    return Fit(
+        material,
+        parameters,
+        _r2(curves, residual),
+        float(np.sqrt(np.mean(residual**2))),
+        tuple(sought.material(o.x, nu) for o in others),
+        {mode: material.stable_range(mode) for mode in MODES},
+        {c.mode: (float(min(1.0, c.stretch.min())), float(max(1.0, c.stretch.max()))) for c in curves},
+    )
+
+
+def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[Curve]]:
+    """The law of that name, and the curves, one for each kind of test; or why they cannot be used."""
     named = {name.lower(): name for name in LAWS}
     if law.lower() not in named:
         raise InputError(f"No law '{law}' to fit; there are {', '.join(LAWS)}.")
     if not 0.0 <= nu <= HIGHEST_NU:
         raise InputError(f"Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {nu:g}.")
-    sought = LAWS[named[law.lower()]]
+    sought, curves = LAWS[named[law.lower()]], _by_mode(curves)
     count = len(sought.names)
-    curves = _by_mode(curves)
     stress = np.concatenate([c.stress_mpa for c in curves]) if curves else np.empty(0)
     stretch = np.concatenate([c.stretch for c in curves]) if curves else np.empty(0)
     apart = len(np.unique(np.round(stretch[np.abs(stretch - 1.0) > 1e-6], 9)))
@@ -257,67 +224,39 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
             "The stress has the sign opposite to the stretch: it must be above 0 in tension (stretch over 1) and below "
             "0 in compression (stretch under 1). A column of strain is not one of stretch: stretch = 1 + strain."
         )
-    size = float(np.sqrt(np.mean(stress**2)))
-    if size == 0.0:
+    if not stress.any():
         raise InputError("The stress is 0 at every point of the curves.")
+    return sought, curves
 
-    def modelled(values: FloatArray) -> FloatArray:
-        return np.concatenate([nominal_stress(sought.vector(values), c.stretch, c.mode) for c in curves])
 
-    optima: list[OptimizeResult] = []
-    for start in _starts(sought, modelled, stress):
-        scales = np.where(np.arange(count) < count - sought.exponents, np.maximum(np.abs(start), 1e-3 * size), 1.0)
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = least_squares(
-                lambda v: np.nan_to_num((modelled(v) - stress) / size, nan=1e6, posinf=1e6, neginf=-1e6),
-                start, jac="3-point", x_scale=scales, xtol=1e-14, ftol=1e-14, gtol=1e-14,
-            )  # fmt: skip
-        optima.append(found)
-    best, others = _chosen(sought, optima, len(stress))
-    values = best.x
-    if sought.exponents and np.abs(values[-sought.exponents :]).max() > _MOST:
-        raise InputError(f"{law}: the best exponent is beyond {_MOST:g}; these curves cannot tell it. Use fewer terms.")
-    deviations = _deviations(values, best.jac, best.fun)
-    if deviations is None:
-        raise InputError(
-            f"{law}: its parameters cannot be told apart from these curves (singular); use a law with fewer."
-        )
-    least = np.full(count, -np.inf)
-    freedom = len(stress) - count
+def _with_intervals(
+    law: _Law, best: OptimizeResult, deviations: FloatArray, curves: Sequence[Curve], stress: FloatArray
+) -> tuple[FloatArray, tuple[Parameter, ...]]:
+    """The best values, the first kept positive where the law is bounded, and their 95 % confidence intervals."""
+    values, least = best.x, np.full(len(best.x), -np.inf)
+    freedom = len(stress) - len(values)
     widths = student.ppf(0.975, freedom) * deviations
-    if sought.bounded:
+    if law.bounded:
         absurd = values[0] + student.isf(_ABSURD, freedom) * deviations[0] <= 0.0
         if values[0] <= widths[0] and not absurd:  # zero is in its interval: the curves leave it open
+            size = float(np.sqrt(np.mean(stress**2)))
             values = _not_softer(values, _softest(curves), best.jac * size, stress)
         least[0] = 0.0
-    try:
-        material = sought.material(values, nu)
-    except InputError as unusable:
-        raise InputError(
-            f"The best fit is no law to compute with ({unusable}) Give points nearer to a stretch of 1, or use a law "
-            "with fewer parameters."
-        ) from unusable
-    residual = modelled(values) - stress
-    ends = np.cumsum([0, *(len(c.stress_mpa) for c in curves)])
-    r2, reached = {}, {}
+    low, high = np.maximum(np.minimum(values, best.x) - widths, least), np.maximum(values, best.x) + widths
+    at_bound = (least > -np.inf) & (values > best.x)
+    return values, tuple(
+        Parameter(name, float(values[n]), float(low[n]), float(high[n]), bool(at_bound[n]))
+        for n, name in enumerate(law.names)
+    )
+
+
+def _r2(curves: Sequence[Curve], residual: FloatArray) -> dict[str, float]:
+    """Share of the stress' variance that the law explains, by kind of test."""
+    r2, ends = {}, np.cumsum([0, *(len(c.stress_mpa) for c in curves)])
     for curve, first, last in zip(curves, ends, ends[1:], strict=False):
         spread = float(((curve.stress_mpa - curve.stress_mpa.mean()) ** 2).sum())
         r2[curve.mode] = 1.0 - float((residual[first:last] ** 2).sum()) / spread if spread > 0 else float("nan")
-        reached[curve.mode] = (float(min(1.0, curve.stretch.min())), float(max(1.0, curve.stretch.max())))
-    low, high = np.maximum(np.minimum(values, best.x) - widths, least), np.maximum(values, best.x) + widths
-    at_bound = (least > -np.inf) & (values > best.x)
-    return Fit(
-        material,
-        tuple(
-            Parameter(name, float(values[n]), float(low[n]), float(high[n]), bool(at_bound[n]))
-            for n, name in enumerate(sought.names)
-        ),
-        r2,
-        float(np.sqrt(np.mean(residual**2))),
-        tuple(sought.material(o.x, nu) for o in others),
-        {mode: material.stable_range(mode) for mode in MODES},
-        reached,
-    )
+    return r2
 
 
 def _by_mode(curves: Sequence[Curve]) -> list[Curve]:

@@ -79,26 +79,26 @@ def isochoric(law: FloatArray, e: FloatArray, slope: FloatArray, curvature: Floa
 def along(law: FloatArray, strains: FloatArray, axes: FloatArray) -> FloatArray:
     """dWbar/dt (n,) MPa at e = t ``axes`` for each t of ``strains`` (n,)."""
     slope, curvature = np.empty(3), np.empty((3, 3))
-    found = np.empty(len(strains))
+    stress = np.empty(len(strains))
     for n in range(len(strains)):
         isochoric(law, strains[n] * axes, slope, curvature)
-        found[n] = slope[0] * axes[0] + slope[1] * axes[1] + slope[2] * axes[2]
-    return found
+        stress[n] = slope[0] * axes[0] + slope[1] * axes[1] + slope[2] * axes[2]
+    return stress
 
 
 @njit(cache=True, error_model="numpy")
 def least_stiffness(law: FloatArray, strains: FloatArray) -> FloatArray:
     """Least eigenvalue (n,) MPa of d2Wbar/de2 at e (n, 3), over changes that keep the volume: Drucker's condition."""
     slope, c = np.empty(3), np.empty((3, 3))
-    found = np.empty(len(strains))
+    stiffness = np.empty(len(strains))
     for n in range(len(strains)):
         isochoric(law, strains[n], slope, c)
         # Basis (1, -1, 0) / sqrt 2, (1, 1, -2) / sqrt 6; the rows of c sum to 0.
         a = 0.5 * (c[0, 0] + c[1, 1]) - c[0, 1]
         b = 1.5 * c[2, 2]
         mixed = np.sqrt(3.0) / 2.0 * (c[0, 0] - c[1, 1])
-        found[n] = 0.5 * (a + b) - np.sqrt(0.25 * (a - b) ** 2 + mixed**2)
-    return found
+        stiffness[n] = 0.5 * (a + b) - np.sqrt(0.25 * (a - b) ** 2 + mixed**2)
+    return stiffness
 
 
 @njit(cache=True, error_model="numpy")

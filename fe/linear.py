@@ -126,8 +126,8 @@ class _Pardiso:
     def solve(self, right: FloatArray) -> FloatArray:
         self._solver.set_phase(33)
         size = float(np.abs(right).max()) or 1.0  # no force is too small for single precision
-        found = self._solver._call_pardiso(self._matrix, np.ascontiguousarray(right / size, dtype=self._kind))
-        return size * np.asarray(found, dtype=np.float64)
+        solution = self._solver._call_pardiso(self._matrix, np.ascontiguousarray(right / size, dtype=self._kind))
+        return size * np.asarray(solution, dtype=np.float64)
 
     def close(self) -> None:
         self._solver.free_memory(everything=True)
@@ -157,10 +157,10 @@ class _NGSolve:
             self._inverse.Update()
 
     def solve(self, right: FloatArray) -> FloatArray:
-        given, found = self._matrix.CreateColVector(), self._matrix.CreateColVector()
+        given, answer = self._matrix.CreateColVector(), self._matrix.CreateColVector()
         given.FV().NumPy()[:] = right
-        found.data = self._inverse * given
-        solution = np.array(found.FV().NumPy())
+        answer.data = self._inverse * given
+        solution = np.array(answer.FV().NumPy())
         if not np.isfinite(solution).all():
             raise SingularError("The system cannot be factorised (NGSolve: a pivot is zero).")
         return solution
@@ -226,15 +226,15 @@ class Solver:
     def solve(self, data: FloatArray, right: FloatArray, tolerance: float) -> FloatArray:
         """Solve to a residual below ``tolerance`` times that of zero; 1e-8, where a factorisation is made for it."""
         if self._known:
-            found = self._iterated(data, right, tolerance)
-            if found is not None:
-                return found
+            solution = self._iterated(data, right, tolerance)
+            if solution is not None:
+                return solution
         if self._factors.rough:
             with suppress(SingularError):
                 self._factorise(data)
-                found = self._iterated(data, right, _FINE)
-                if found is not None:
-                    return found
+                solution = self._iterated(data, right, _FINE)
+                if solution is not None:
+                    return solution
             self._renew(rough=False)
         self._factorise(data)
         return self._factors.solve(right)

@@ -43,8 +43,8 @@ class Material:
         As `fe.hyperelastic` takes it: C10, C20, C30, mu_H, then pairs mu_q (initial shear modulus), alpha_q; MPa.
     nu : float
         Poisson's ratio at small strain.
-    told : str
-        Law and numbers, for people.
+    description : str
+        Model and parameters, in words.
 
     Raises
     ------
@@ -54,22 +54,22 @@ class Material:
 
     vector: FloatArray
     nu: float
-    told: str
+    description: str
     law: ClassVar[str] = "hyperelastic"
 
     def __post_init__(self) -> None:
         vector = frozen(self.vector, np.float64)
         object.__setattr__(self, "vector", vector)
         if not (np.isfinite(vector).all() and np.isfinite(self.nu)):
-            raise InputError(f"{self.told}: every number of a law must be finite.")
+            raise InputError(f"{self.description}: every number of a law must be finite.")
         if not 0.0 <= self.nu <= HIGHEST_NU:
             raise InputError(
-                f"{self.told}: Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {self.nu:g}. For tissue that "
-                "does not change its volume give 0.4999."
+                f"{self.description}: Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {self.nu:g}. For "
+                "incompressible tissue give 0.4999."
             )
         if not self.shear_modulus_mpa > 0.0:
             raise InputError(
-                f"{self.told}: the initial shear modulus must be positive, and is {_kpa(self.shear_modulus_mpa)}."
+                f"{self.description}: the initial shear modulus must be positive; it is {_kpa(self.shear_modulus_mpa)}."
             )
 
     @property
@@ -189,8 +189,8 @@ class Yeoh(Material):
     @classmethod
     def of(cls, c10_mpa: float, c20_mpa: float, c30_mpa: float = 0.0, nu: float = 0.4999) -> Yeoh:
         """From the coefficients of the polynomial, MPa."""
-        told = f"Yeoh, C10 {_kpa(c10_mpa)}, C20 {_kpa(c20_mpa)}, C30 {_kpa(c30_mpa)}, nu {nu:g}"
-        return cls(np.array([c10_mpa, c20_mpa, c30_mpa, 0.0]), nu, told)
+        description = f"Yeoh, C10 {_kpa(c10_mpa)}, C20 {_kpa(c20_mpa)}, C30 {_kpa(c30_mpa)}, nu {nu:g}"
+        return cls(np.array([c10_mpa, c20_mpa, c30_mpa, 0.0]), nu, description)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,3 +262,10 @@ class Ogden(Material):
     def from_febio(cls, c_mpa: npt.ArrayLike, m: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
         """W = sum c / m^2 (sum l^m - 3), so mu0 = c / 2."""
         return cls.of(0.5 * np.asarray(c_mpa), m, nu)
+
+
+def from_vector(description: str, vector_mpa: FloatArray, bulk_modulus_mpa: float) -> Material:
+    """A material from what `Material` tells of itself; Poisson's ratio, to ten digits, from the bulk modulus."""
+    (made,) = (one for one in (NeoHooke, Yeoh, Hencky, Ogden) if description.startswith(f"{one.law},"))
+    mu, K = Material(vector_mpa, 0.0, description).shear_modulus_mpa, bulk_modulus_mpa
+    return made(vector_mpa, round((3.0 * K - 2.0 * mu) / (6.0 * K + 2.0 * mu), 10), description)

@@ -23,7 +23,7 @@ _MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, besi
 def write_tet_mesh(path: Path, mesh: TetMesh, about: dict[str, object]) -> None:
     """Write a mesh as VTU, LPS mm: tetrahedra and named triangles, numbered in ``region``.
 
-    The names, and what is told ``about`` it, stand in a JSON file of the same name.
+    The names, and what is known ``about`` it, stand in a JSON file of the same name.
     """
     tissues = {name: number for number, name in enumerate(mesh.regions, start=1)}
     facets = {name: number for number, name in enumerate(mesh.facets, start=_FIRST_FACET)}
@@ -60,8 +60,8 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
     names: dict[str, str] = {}
     if _names_of(place).is_file():
         try:
-            told = json.loads(_names_of(place).read_text(encoding="utf-8"))["regions"]
-            names = {f"region {number}": str(name) for number, name in told.items()}
+            table = json.loads(_names_of(place).read_text(encoding="utf-8"))["regions"]
+            names = {f"region {number}": str(name) for number, name in table.items()}
         except (ValueError, KeyError, AttributeError, TypeError) as damaged:
             raise InputError(f"{_names_of(place)}: no table of regions in it ({damaged}).") from damaged
     mesh = read.tets

@@ -134,14 +134,14 @@ def mesh_labels(
     borders = borders_of(labels)
     lattice = None if finer is None else _lattice(labels, numbers[finer[0]], edge_mm, finer[1])
     points, cells = _limited(borders, edge_mm, _ENVELOPE * spacing, lattice, limit_s, watch)
-    found = labels_at(borders, points[cells].mean(axis=1))
-    body = np.isin(found, list(soft.values()))
+    cell_labels = labels_at(borders, points[cells].mean(axis=1))
+    body = np.isin(cell_labels, list(soft.values()))
     voxel_mm3 = labels.grid.voxel_volume_mm3
     volumes_mm3 = {number: voxel_mm3 * float((labels.labels == number).sum()) for number in numbers.values()}
-    _refuse_lost(numbers, soft, volumes_mm3, np.abs(signed_volumes(points[cells])), found)
-    points = with_volumes(points, cells, found, volumes_mm3, _FARTHEST * spacing)
-    points = without_slivers(points, cells[body], found[body])
-    mesh = _named(points, cells, found, soft, [numbers[b] for b in bones], labels)
+    _refuse_lost(numbers, soft, volumes_mm3, np.abs(signed_volumes(points[cells])), cell_labels)
+    points = with_volumes(points, cells, cell_labels, volumes_mm3, _FARTHEST * spacing)
+    points = without_slivers(points, cells[body], cell_labels[body])
+    mesh = _named(points, cells, cell_labels, soft, [numbers[b] for b in bones], labels)
     return mesh, _quality(mesh, labels, soft)
 
 
@@ -155,17 +155,21 @@ def self_test() -> str:
 
 
 def _refuse_lost(
-    numbers: dict[str, int], soft: dict[str, int], volumes_mm3: dict[int, float], of_cells: FloatArray, found: IntArray
+    numbers: dict[str, int],
+    soft: dict[str, int],
+    volumes_mm3: dict[int, float],
+    of_cells: FloatArray,
+    cell_labels: IntArray,
 ) -> None:
     """Refuse a mesh in which a region, bones included, is gone or lost a fifth of what its voxels hold."""
-    lost = [name for name, number in soft.items() if not (found == number).any()]
+    lost = [name for name, number in soft.items() if not (cell_labels == number).any()]
     if lost:
         raise MrstrainError(
             f"No cell is left of {', '.join(lost)}: smaller than the mesh can show. Ask for shorter edges, or give its "
             "label to a neighbour."
         )
     for name, number in numbers.items():
-        made, given = float(of_cells[found == number].sum()) / 1000.0, volumes_mm3[number] / 1000.0
+        made, given = float(of_cells[cell_labels == number].sum()) / 1000.0, volumes_mm3[number] / 1000.0
         if abs(made - given) > _MOST_LOST * given:
             raise MrstrainError(
                 f"{name} has {made:.2f} mL in the mesh and {given:.2f} mL in the label map: it is finer than the mesh "
@@ -256,15 +260,15 @@ def _lattice(labels: LabelMap, label: int, edge_mm: float, finer_mm: float) -> t
 
 
 def _named(
-    points: FloatArray, cells: IntArray, found: IntArray, soft: dict[str, int], bones: list[int], labels: LabelMap
+    points: FloatArray, cells: IntArray, cell_labels: IntArray, soft: dict[str, int], bones: list[int], labels: LabelMap
 ) -> TetMesh:
-    kept = np.isin(found, list(soft.values()))
-    body, tissue = cells[kept], found[kept]
+    kept = np.isin(cell_labels, list(soft.values()))
+    body, tissue = cells[kept], cell_labels[kept]
     faces = np.sort(np.concatenate([body[:, face] for face in FACES]), axis=1)
     _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
     outer = first[count == 1]
     triangles, owner = faces[outer], np.tile(tissue, 4)[outer]
-    bone_faces = np.sort(np.concatenate([cells[np.isin(found, bones)][:, face] for face in FACES]), axis=1)
+    bone_faces = np.sort(np.concatenate([cells[np.isin(cell_labels, bones)][:, face] for face in FACES]), axis=1)
     at_bone = _rows_in(triangles, bone_faces)
     free: BoolArray = np.logical_not(at_bone)
     cut = np.zeros(len(triangles), dtype=bool)

@@ -1,4 +1,4 @@
-"""A mesh with its laws, cut into elements: what is assembled, and what its states mean."""
+"""A mesh with its materials, cut into elements: what is assembled, and what its states mean."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CROWDED = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """A mesh with its laws, cut into elements.
+    """A mesh with its materials, cut into elements.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Model:
     vectors : (k, v)
         Laws, as `fe.hyperelastic` takes them.
     shear_mpa, bulk_mpa : (k,)
-        Initial moduli of the laws.
+        Initial moduli of the materials.
     law : (m,)
         Number of each cell's law.
     """
@@ -45,24 +45,24 @@ class Model:
     law: IntArray
 
     @classmethod
-    def of(cls, mesh: TetMesh, laws: Mapping[str, Material], element: Element) -> Model:
-        """The model of a mesh whose regions are those of ``laws``; each cell is in one of them."""
+    def of(cls, mesh: TetMesh, materials: Mapping[str, Material], element: Element) -> Model:
+        """The model of a mesh whose regions are those of ``materials``; each cell is in one of them."""
         law = np.full(len(mesh.cells), -1)
-        for number, region in enumerate(laws):
+        for number, region in enumerate(materials):
             law[mesh.regions[region]] = number
         assert (law >= 0).all()
         corners = mesh.points_mm[mesh.cells]
         jacobian = np.stack([corners[:, i] - corners[:, 0] for i in (1, 2, 3)], axis=2)
-        length = max(len(material.vector) for material in laws.values())
-        vectors = np.array([np.pad(m.vector, (0, length - len(m.vector))) for m in laws.values()])
+        length = max(len(material.vector) for material in materials.values())
+        vectors = np.array([np.pad(m.vector, (0, length - len(m.vector))) for m in materials.values()])
         return cls(
             element,
             Space.on(mesh, element.name, law),
             mesh.volumes_mm3,
             np.asarray(np.linalg.inv(jacobian), dtype=np.float64),
             vectors,
-            np.array([m.shear_modulus_mpa for m in laws.values()]),
-            np.array([m.bulk_modulus_mpa for m in laws.values()]),
+            np.array([m.shear_modulus_mpa for m in materials.values()]),
+            np.array([m.bulk_modulus_mpa for m in materials.values()]),
             law,
         )
 

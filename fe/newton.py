@@ -1,16 +1,16 @@
-"""Newton's method for one state of load: steps that keep every cell from folding, and a count of what they cost."""
+"""Newton's method for one increment of load: steps that keep every cell from folding, and a count of what they cost."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from dvc.arrays import FloatArray, IntArray
 from fe.assembly import Assembler
 from fe.linear import SingularError, Solver
-from fe.plate_rotation import Turning
+from fe.plate_rotation import Parallel
 
 _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at
@@ -21,7 +21,7 @@ _MOST_GROWTH = 3.0  # of the residual in one step
 # Steps in a row that hardly lowered the residual, after which each is measured before it is made; and no more are.
 _WANDERED, _LOST = 2, 12
 BALANCED, SMALL_MM = 5, 0.1
-"""So many steps in a row that end in balance, the last below this, count as found."""
+"""So many steps in a row that end in balance, the last below this, count as converged."""
 _SHARES = (1.0, 0.5, 0.25)
 _ROUGH, _INEXACT = 0.05, 1e-3  # residual of a linear solution that is not exact, far from equilibrium and near it
 
@@ -63,135 +63,164 @@ class Converged:
     iterations: int
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Imposed:
+    """What an increment imposes from outside.
+
+    Attributes
+    ----------
+    forces_n : (equations,)
+        External forces.
+    prescribed : (h,) int
+        Equations whose unknowns are prescribed.
+    moves_mm : (h,)
+        How far those go from the first guess.
+    """
+
+    forces_n: FloatArray
+    prescribed: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    moves_mm: FloatArray = field(default_factory=lambda: np.empty(0))
+
+
 def equilibrium(
     assembler: Assembler,
     solver: Solver,
     state: FloatArray,
-    outside: FloatArray,
-    held: IntArray,
-    moves: FloatArray,
+    imposed: Imposed,
     tolerance: Tolerance,
     changed: Callable[[FloatArray, FloatArray], bool] = lambda _state, _forces: False,
-    told: Callable[[str], None] = lambda _: None,
-    turning: Turning | None = None,
+    log: Callable[[str], None] = lambda _: None,
+    rotation: Parallel | None = None,
 ) -> Converged | None:
-    """Find the state in which internal forces balance those from outside.
+    """Find the state in which internal forces balance the external ones.
 
     Parameters
     ----------
     state : (unknowns,)
         First guess.
-    outside : (equations,)
-        Forces from outside, N.
-    held : (h,) int
-        Equations whose unknowns are prescribed.
-    moves : (h,)
-        How far those go from the first guess, mm.
+    imposed : Imposed
     tolerance : Tolerance
     changed : callable
         ``changed(state, forces)`` is asked once a state is near equilibrium, and again there: whether what the unknowns
         follow has changed, as where more of a surface touches. It may move the state to where that is so.
-    told : callable
+    log : callable
         Gets a line for each step.
-    turning : Turning, optional
-        A plate that turns.
+    rotation : Parallel, optional
+        Of the plate; by default it stays parallel.
 
     Returns
     -------
     Converged or None
         None if it does not converge; where forces alone are given, `fe.descent` may.
     """
-    now = state.copy()
-    left = moves.copy()
+    newton = _Newton(assembler, solver, imposed, rotation or Parallel())
     displacements = 3 * len(assembler.model.space.nodes_mm)
-    forces, residual, lowest = assembler.residual(now)
-    if not lowest > 0.0:
+    now, left = newton.at(state.copy()), imposed.moves_mm.copy()
+    if not now.lowest > 0.0:
         return None
-    wandering, balanced, balance, turn = 0, 0, 0.0, np.zeros(3)
-
-    def unbalanced(at: FloatArray, carried: FloatArray, rest: FloatArray) -> float:
-        of_forces = out_of_balance(outside - rest, assembler, held)
-        return of_forces if turning is None else float(np.hypot(of_forces, turning.missing_n(at, carried)))
-
+    wandering, balanced, balance = 0, 0, 0.0
     for iteration in range(1, tolerance.iterations + 1):
-        right = outside - residual
-        right[assembler.idle] = 0.0
-        before = unbalanced(now, forces, residual)
-        data = assembler.held(assembler.tangent(now), right, held, left)
         try:
-            solved = solver.solve(data, right, _ROUGH if balance > _NEAR else _INEXACT)
-            if turning is not None:
-                solved, turn = turning.solved(now, forces, data, solved, held, _INEXACT)
+            step = newton.step(now, left, _ROUGH if balance > _NEAR else _INEXACT)
         except SingularError as failure:
-            told(f"    {failure}")
+            log(f"    {failure}")
             return None
-        solved[held] = left  # exactly, though the solution may be rough
-        change = assembler.spread(solved)
-        if not np.isfinite(change).all():
+        bound = np.inf if left.any() or iteration == 1 else _MOST_GROWTH * now.unbalanced_n
+        share = newton.best_share(now, step) if wandering >= _WANDERED else 1.0
+        before, now, share = now, *newton.searched(now, step, share, bound)
+        if not share:
             return None
-        share = 1.0
-        if wandering >= _WANDERED:
-            share = _best_share(assembler, turning, now, change, turn, unbalanced)
-        bound = np.inf if left.any() or iteration == 1 else _MOST_GROWTH * before
-        while True:
-            tried = _ahead(turning, now, change, turn, share)
-            forces, residual, lowest = assembler.residual(tried)
-            after = unbalanced(tried, forces, residual)
-            if lowest > LEAST_VOLUME and after <= bound:
-                break
-            share *= 0.5
-            if share < _LEAST_SHARE:
-                return None
-        largest = float(np.abs((tried - now)[:displacements]).max())
-        now, left = tried, (1.0 - share) * left
-        balance = after / max(reaction(assembler, forces), 1e-9)
-        wandering = wandering + 1 if after > 0.5 * before and balance > tolerance.force else 0
-        told(f"    {iteration}: out of balance {balance:.1e}, step {largest:.1e} mm, least det F {lowest:.3f}")
+        largest = float(np.abs((now.state - before.state)[:displacements]).max())
+        left = (1.0 - share) * left
+        balance = now.unbalanced_n / max(reaction(assembler, now.forces), 1e-9)
+        slow = now.unbalanced_n > 0.5 * before.unbalanced_n and balance > tolerance.force
+        wandering = wandering + 1 if slow else 0
+        log(f"    {iteration}: out of balance {balance:.1e}, step {largest:.1e} mm, least det F {now.lowest:.3f}")
         if wandering >= _LOST:
             return None
         if left.any() or balance > _NEAR:
             continue
-        if changed(now, forces):
-            forces, residual, lowest = assembler.residual(now)
-            balanced = 0
+        if changed(now.state, now.forces):
+            now, balanced = newton.at(now.state), 0
             continue
         balanced = balanced + 1 if balance <= tolerance.force else 0
         if balanced and share == 1.0 and largest <= tolerance.step_mm:
-            return Converged(now, forces, iteration)
+            return Converged(now.state, now.forces, iteration)
         if balanced >= BALANCED and largest <= SMALL_MM:
-            told(f"    taken as found: {balanced} steps in a row ended in balance, the last of {largest:.1e} mm")
-            return Converged(now, forces, iteration)
+            log(f"    accepted: {balanced} steps in a row ended in balance, the last of {largest:.1e} mm")
+            return Converged(now.state, now.forces, iteration)
     return None
 
 
-def _ahead(turning: Turning | None, now: FloatArray, change: FloatArray, turn: FloatArray, share: float) -> FloatArray:
-    """The state after a share of a step."""
-    return now + share * change if turning is None else turning.ahead(now, share * change, share * turn)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Iterate:
+    """A state on the way to equilibrium: its forces by unknown and by equation, its least det F, what is missing."""
+
+    state: FloatArray
+    forces: FloatArray
+    residual: FloatArray
+    lowest: float
+    unbalanced_n: float
 
 
-def _best_share(
-    assembler: Assembler,
-    turning: Turning | None,
-    now: FloatArray,
-    change: FloatArray,
-    turn: FloatArray,
-    unbalanced: Callable[[FloatArray, FloatArray, FloatArray], float],
-) -> float:
-    """The share of a step, of a few, that leaves the least out of balance."""
-    left = {}
-    for share in _SHARES:
-        tried = _ahead(turning, now, change, turn, share)
-        forces, residual, lowest = assembler.residual(tried)
-        left[share] = unbalanced(tried, forces, residual) if lowest > LEAST_VOLUME else np.inf
-    return min(_SHARES, key=lambda share: left[share])
+@dataclass(frozen=True, slots=True, eq=False)
+class _Newton:
+    """Steps of Newton's method for one increment. A step is the change of all unknowns, and the plate's turn (3,)."""
+
+    assembler: Assembler
+    solver: Solver
+    imposed: Imposed
+    rotation: Parallel
+
+    def at(self, state: FloatArray) -> _Iterate:
+        forces, residual, lowest = self.assembler.residual(state)
+        of_forces = out_of_balance(self.imposed.forces_n - residual, self.assembler, self.imposed.prescribed)
+        of_moment = self.rotation.missing_n(state, forces)
+        return _Iterate(state, forces, residual, lowest, float(np.hypot(of_forces, of_moment)))
+
+    def step(self, now: _Iterate, left_mm: FloatArray, accuracy: float) -> tuple[FloatArray, FloatArray]:
+        """The step from an iterate, with ``left_mm`` (h,) of the prescribed moves still to be made."""
+        held = self.imposed.prescribed
+        right = self.imposed.forces_n - now.residual
+        right[self.assembler.idle] = 0.0
+        data = self.assembler.held(self.assembler.tangent(now.state), right, held, left_mm)
+        level = self.solver.solve(data, right, accuracy)
+        solved, turn = self.rotation.solved(now.state, now.forces, data, level, held, _INEXACT)
+        solved[held] = left_mm  # exactly, though the solution may be rough
+        change = self.assembler.spread(solved)
+        if not np.isfinite(change).all():
+            raise SingularError("The linear solution is not finite.")
+        return change, turn
+
+    def ahead(self, now: _Iterate, step: tuple[FloatArray, FloatArray], share: float) -> _Iterate:
+        """The iterate after a share of a step."""
+        change, turn = step
+        return self.at(self.rotation.ahead(now.state, share * change, share * turn))
+
+    def best_share(self, now: _Iterate, step: tuple[FloatArray, FloatArray]) -> float:
+        """The share of a step, of a few, that leaves the least out of balance."""
+        tried = {share: self.ahead(now, step, share) for share in _SHARES}
+        left = {share: at.unbalanced_n if at.lowest > LEAST_VOLUME else np.inf for share, at in tried.items()}
+        return min(_SHARES, key=lambda share: left[share])
+
+    def searched(
+        self, now: _Iterate, step: tuple[FloatArray, FloatArray], share: float, bound_n: float
+    ) -> tuple[_Iterate, float]:
+        """The iterate after a step, halved until no cell folds and the bound holds, and its share; 0 if none does."""
+        while share >= _LEAST_SHARE:
+            tried = self.ahead(now, step, share)
+            if tried.lowest > LEAST_VOLUME and tried.unbalanced_n <= bound_n:
+                return tried, share
+            share *= 0.5
+        return now, 0.0
 
 
-def out_of_balance(unbalanced: FloatArray, assembler: Assembler, held: IntArray | None = None) -> float:
+def out_of_balance(unbalanced: FloatArray, assembler: Assembler, prescribed: IntArray | None = None) -> float:
     """Norm of forces by equation (N), without those of unknowns that are prescribed."""
     balance = unbalanced.copy()
     balance[assembler.idle] = 0.0
-    if held is not None:
-        balance[held] = 0.0
+    if prescribed is not None:
+        balance[prescribed] = 0.0
     return float(np.linalg.norm(balance[assembler.force_equations]))
 
 

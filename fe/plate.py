@@ -33,7 +33,7 @@ class Plate:
         Whether it turns freely about its pivot, in all three axes, once it presses; if not, it stays parallel.
     pivot_mm : (3,), optional
         Point in front of which the pivot lies on the plate's face at the start, LPS; by default the place on the
-        surface that is touched first. The pivot moves with the plate, and moments are told about it.
+        surface that is touched first. The pivot moves with the plate, and moments are given about it.
 
     Attributes
     ----------
@@ -63,8 +63,8 @@ class Plate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Hold:
-    """Which nodes hold to the plate, where on it, and how it is turned.
+class ContactStatus:
+    """Which nodes are in contact with the plate, where on it, and how it is turned.
 
     Attributes
     ----------
@@ -74,14 +74,14 @@ class Hold:
         From the pivot, along axes that turn with the plate; NaN where a node does not hold.
     rotation : (3, 3)
         Of those axes against the plate's axes at the start.
-    loose : bool
+    turns : bool
         Whether the plate turns freely now.
     """
 
     nodes: BoolArray
     places_mm: FloatArray
     rotation: FloatArray
-    loose: bool
+    turns: bool
 
 
 class Contact:
@@ -111,7 +111,8 @@ class Contact:
         if plate.pivot_mm is not None:
             over = np.asarray(plate.pivot_mm, dtype=np.float64) @ plate.axes
         self._pivot = np.array([face_mm, *over[1:]])
-        self.hold = Hold(np.zeros(len(surface), dtype=bool), np.full((len(surface), 3), np.nan), np.eye(3), False)
+        nowhere = np.full((len(surface), 3), np.nan)
+        self.status = ContactStatus(np.zeros(len(surface), dtype=bool), nowhere, np.eye(3), False)
         self._before = np.zeros_like(self._start)
         nearest = float(nodes_mm[:, 0].min())
         if nearest < face_mm - _BEYOND_MM:
@@ -123,12 +124,12 @@ class Contact:
     @property
     def held(self) -> IntArray:
         """Nodes that hold to the plate."""
-        return self.nodes[self.hold.nodes]
+        return self.nodes[self.status.nodes]
 
     @property
     def stays(self) -> bool:
         """Whether what touches stays where it does, on a plate that does not turn now."""
-        return self.plate.taped and not self.hold.loose
+        return self.plate.taped and not self.status.turns
 
     @property
     def followers(self) -> dict[int, IntArray]:
@@ -142,8 +143,8 @@ class Contact:
 
     def touch_first(self, state: FloatArray) -> None:
         """Move the plate to the surface: its lowest node holds, or its lowest nodes."""
-        self.hold = replace(
-            self.hold,
+        self.status = replace(
+            self.status,
             nodes=self._first,
             places_mm=np.where(self._first[:, None], (self._start - self._pivot) * [0.0, 1.0, 1.0], np.nan),
         )
@@ -155,19 +156,21 @@ class Contact:
 
     def centre_mm(self, state: FloatArray) -> FloatArray:
         """Where the pivot is, (3,) mm."""
-        hold = self.hold
-        found = (self._positions(state)[hold.nodes] - hold.places_mm[hold.nodes] @ hold.rotation.T).mean(axis=0)
+        status = self.status
+        centre = (self._positions(state)[status.nodes] - status.places_mm[status.nodes] @ status.rotation.T).mean(
+            axis=0
+        )
         if not self.plate.taped:
-            found[1:] = self._pivot[1:]
-        return np.asarray(found)
+            centre[1:] = self._pivot[1:]
+        return np.asarray(centre)
 
-    def travel_mm(self, state: FloatArray) -> FloatArray:
-        """How far the pivot has come from the plate's start, (3,) mm."""
+    def displacement_mm(self, state: FloatArray) -> FloatArray:
+        """Displacement of the pivot from the plate's start, (3,) mm."""
         return np.asarray(self.centre_mm(state) - self._pivot + [self.plate.gap_mm, 0.0, 0.0])
 
     def arms_mm(self, state: FloatArray) -> FloatArray:
         """From the pivot to each node that holds (k, 3), mm."""
-        return self._positions(state)[self.hold.nodes] - self.centre_mm(state)
+        return self._positions(state)[self.status.nodes] - self.centre_mm(state)
 
     def force_n(self, forces: FloatArray) -> FloatArray:
         """Force of the plate on the tissue (3,) N, from the internal forces of all unknowns."""
@@ -193,23 +196,23 @@ class Contact:
         bool
             Whether any node was taken or let go.
         """
-        hold, now, before = self.hold, self._seen_from_plate(state), self._before
-        new = (now[:, 0] <= 0.0) & ~hold.nodes
+        status, now, before = self.status, self._seen_from_plate(state), self._before
+        new = (now[:, 0] <= 0.0) & ~status.nodes
         pulled = np.zeros_like(new)
         place = now.copy()
         if self.plate.taped:
             closed = np.maximum(before[:, 0] - now[:, 0], 1e-12)
             place = before + np.clip(before[:, 0] / closed, 0.0, 1.0)[:, None] * (now - before)
         else:
-            pulled = hold.nodes & (forces[3 * self.nodes] < 0.0)
+            pulled = status.nodes & (forces[3 * self.nodes] < 0.0)
         place[:, 0] = 0.0
         if not (new.any() or pulled.any()):
             return False
-        put = self.centre_mm(state) + place[new] @ hold.rotation.T
+        put = self.centre_mm(state) + place[new] @ status.rotation.T
         state[_unknowns(self.nodes[new])] = put - self._start[new]
-        places = np.where(new[:, None], place, hold.places_mm)
+        places = np.where(new[:, None], place, status.places_mm)
         places[pulled] = np.nan
-        self.hold = replace(hold, nodes=(hold.nodes & ~pulled) | new, places_mm=places)
+        self.status = replace(status, nodes=(status.nodes & ~pulled) | new, places_mm=places)
         return True
 
     def _positions(self, state: FloatArray) -> FloatArray:
@@ -217,7 +220,7 @@ class Contact:
 
     def _seen_from_plate(self, state: FloatArray) -> FloatArray:
         """Positions (s, 3) from the pivot, along the axes that turn with the plate; past its face the first is < 0."""
-        return np.asarray((self._positions(state) - self.centre_mm(state)) @ self.hold.rotation)
+        return np.asarray((self._positions(state) - self.centre_mm(state)) @ self.status.rotation)
 
 
 def _unknowns(nodes: IntArray) -> IntArray:

@@ -25,7 +25,31 @@ from fe.plate import Contact
 _LEAST_ARM_MM = 1e-3
 
 
-class Turning:
+class Parallel:
+    """A plate that stays parallel: it has no unknowns of rotation."""
+
+    def missing_n(self, state: FloatArray, forces: FloatArray) -> float:
+        """What its moment is off, N; nothing, as it takes up any."""
+        return 0.0
+
+    def solved(
+        self,
+        state: FloatArray,
+        forces: FloatArray,
+        data: FloatArray,
+        level: FloatArray,
+        held: IntArray,
+        accuracy: float,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Change of every equation, ``level`` as it is, and the turn (3,), none."""
+        return level, np.zeros(3)
+
+    def ahead(self, state: FloatArray, change: FloatArray, turn: FloatArray) -> FloatArray:
+        """The state after a change of all unknowns."""
+        return state + change
+
+
+class Turning(Parallel):
     """A plate that turns until its moment about the pivot is the one given.
 
     Parameters
@@ -41,7 +65,7 @@ class Turning:
     def __init__(self, contact: Contact, assembler: Assembler, solver: Solver, moment_nmm: FloatArray) -> None:
         self._contact, self._assembler, self._solver = contact, assembler, solver
         self._moment = moment_nmm
-        self._rotation = contact.hold.rotation
+        self._rotation = contact.status.rotation
         self._arms, self._on_plate = np.empty((0, 3)), np.empty((0, 3), dtype=int)
 
     def missing_n(self, state: FloatArray, forces: FloatArray) -> float:
@@ -76,7 +100,7 @@ class Turning:
         SingularError
             If what is on the plate does not hold it.
         """
-        self._rotation = self._contact.hold.rotation
+        self._rotation = self._contact.status.rotation
         self._arms = self._contact.arms_mm(state)
         self._on_plate = 3 * self._contact.held[:, None] + np.arange(3)
         ways = np.zeros((len(state), 3))
@@ -102,5 +126,5 @@ class Turning:
         turned = Rotation.from_rotvec(turn).as_matrix()
         tried = state + change
         tried[self._on_plate] += self._arms @ (turned - np.eye(3)).T
-        self._contact.hold = replace(self._contact.hold, rotation=turned @ self._rotation)
+        self._contact.status = replace(self._contact.status, rotation=turned @ self._rotation)
         return np.asarray(tried)

@@ -1,4 +1,4 @@
-"""Sets of material laws, tissue by tissue: seven published ones, and the user's own in the same form."""
+"""Material parameter sets, tissue by tissue: seven published ones, and the user's own in the same form."""
 
 from __future__ import annotations
 
@@ -48,20 +48,20 @@ _TO_MPA = {"_mpa": 1.0, "_kpa": 1e-3}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaterialSet:
-    """Laws of the tissues of one study.
+    """A material parameter set: a constitutive model with its parameters for each tissue.
 
     Attributes
     ----------
     name, title, source : str
         Short name, who proposed it, and where the numbers are printed.
-    laws : mapping of tissue to Material
-        "all" where one law serves every tissue.
+    materials : mapping of tissue to Material
+        "all" where one serves every tissue.
     """
 
     name: str
     title: str
     source: str
-    laws: Mapping[str, Material]
+    materials: Mapping[str, Material]
 
     def for_regions(self, regions: Iterable[str]) -> tuple[dict[str, Material], tuple[str, ...]]:
         """The law of each region of a mesh, and a sentence for each region that has none of its own.
@@ -76,16 +76,16 @@ class MaterialSet:
 
         Examples
         --------
-        >>> laws, notes = material_set("friedman").for_regions(["fat", "skin", "muscle"])
-        >>> laws["muscle"] is laws["fat"], notes
+        >>> materials, notes = material_set("friedman").for_regions(["fat", "skin", "muscle"])
+        >>> materials["muscle"] is materials["fat"], notes
         (True, ("friedman has no law for muscle; fat's is used.",))
         """
-        found: dict[str, Material] = {}
+        by_region: dict[str, Material] = {}
         notes = []
-        known = {tissue.casefold(): law for tissue, law in self.laws.items()}
+        known = {tissue.casefold(): law for tissue, law in self.materials.items()}
         for region in regions:
-            if WHOLE in self.laws:
-                found[region] = self.laws[WHOLE]
+            if WHOLE in self.materials:
+                by_region[region] = self.materials[WHOLE]
                 continue
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
             name = next((t for t in tried if t.casefold() in known), None)
@@ -93,12 +93,12 @@ class MaterialSet:
                 instead = f", nor one for {' or '.join(tried[1:])} to put in its place" if tried[1:] else ""
                 raise InputError(
                     f"The set {self.name} has no law for the region '{region}'{instead}; it has "
-                    f"{', '.join(self.laws)}. Add it to the set in a file of your own, or rename the region."
+                    f"{', '.join(self.materials)}. Add it to the set in a file of your own, or rename the region."
                 )
-            found[region] = known[name.casefold()]
+            by_region[region] = known[name.casefold()]
             if name != region:
                 notes.append(f"{self.name} has no law for {region}; {name}'s is used.")
-        return found, tuple(notes)
+        return by_region, tuple(notes)
 
 
 def published_names() -> list[str]:
@@ -116,7 +116,7 @@ def material_set(name: str | Path) -> MaterialSet:
 
     Examples
     --------
-    >>> material_set("erdemir").laws["all"].told
+    >>> material_set("erdemir").materials["all"].description
     'Ogden, mu0 56.09 kPa, alpha 6.82, nu 0.49'
     """
     if str(name).endswith(".toml"):
@@ -147,7 +147,7 @@ def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
     return _parsed(str(path), text)
 
 
-def as_toml(name: str, title: str, laws: Mapping[str, Material]) -> str:
+def as_toml(name: str, title: str, materials: Mapping[str, Material]) -> str:
     """A set as text in the form that `read_material_sets` takes; Ogden's numbers in the convention of Abaqus.
 
     Examples
@@ -165,17 +165,17 @@ def as_toml(name: str, title: str, laws: Mapping[str, Material]) -> str:
     """
     key = json.dumps(name) if not re.fullmatch(r"[\w-]+", name, re.ASCII) else name
     lines = [f"[{key}]", f"title = {json.dumps(title)}"]
-    for tissue, law in laws.items():
+    for tissue, law in materials.items():
         at = json.dumps(tissue) if not re.fullmatch(r"[\w-]+", tissue, re.ASCII) else tissue
         lines += ["", f"[{key}.{at}]", f'law = "{_NAMES[type(law)]}"']
-        lines += [f"{k} = {v}" for k, v in _told(law).items()]
+        lines += [f"{k} = {v}" for k, v in _numbers_of(law).items()]
     return "\n".join(lines) + "\n"
 
 
 _NAMES: Mapping[type[Material], str] = {NeoHooke: "neo-Hooke", Yeoh: "Yeoh", Hencky: "linear elastic", Ogden: "Ogden"}
 
 
-def _told(law: Material) -> dict[str, object]:
+def _numbers_of(law: Material) -> dict[str, object]:
     """The numbers of a law as a file has them."""
     c10, c20, c30, hencky = law.vector[:OGDEN].tolist()
     given: dict[type[Material], dict[str, object]] = {
@@ -198,11 +198,11 @@ def _published() -> dict[str, MaterialSet]:
 
 def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
     try:
-        told = tomllib.loads(text)
+        tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as failure:
         raise InputError(f"{where}: not a TOML file: {failure}.") from failure
     sets = {}
-    for name, content in told.items():
+    for name, content in tables.items():
         if not isinstance(content, dict):
             raise InputError(
                 f"{where}: '{name}' stands outside any set; a file starts with the set's name in brackets."
@@ -211,8 +211,8 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
         tissues = {key: value for key, value in content.items() if key not in head}
         if not tissues:
             raise InputError(f"{where}: the set '{name}' has no tissue; add [{name}.fat] with a law.")
-        laws = {tissue: _law(f"{where}, {name}.{tissue}", given) for tissue, given in tissues.items()}
-        sets[name] = MaterialSet(name, str(head["title"]), str(head["source"]), MappingProxyType(laws))
+        materials = {tissue: _law(f"{where}, {name}.{tissue}", given) for tissue, given in tissues.items()}
+        sets[name] = MaterialSet(name, str(head["title"]), str(head["source"]), MappingProxyType(materials))
     if not sets:
         raise InputError(f"{where}: no material set in it.")
     return sets
@@ -238,7 +238,7 @@ def _law(where: str, given: object) -> Material:
             raise InputError(f"{where}: '{bare}' is given twice.")
         values[argument] = _numbers(where, key, value, scale or 1.0, several=law == "Ogden" and bare != "nu")
     needed = {f"{name}_mpa": f"{name}_kpa" for name in form.stresses} | {name: name for name in form.plain}
-    missing = [told for name, told in needed.items() if name not in values and told[:-4] not in form.optional]
+    missing = [key for name, key in needed.items() if name not in values and key[:-4] not in form.optional]
     if missing:
         raise InputError(f"{where}: {law} needs {', '.join(missing)}.")
     try:

@@ -1,4 +1,4 @@
-"""A simulation and its results: a `Deformation`, VTU files for ParaView, tables by region."""
+"""Results of a load: stress, volume, figures by region; VTU files for ParaView and tables, written and read back."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
-from dvc.deformation.nodal import OnMesh
-from dvc.deformation.strain import StrainField
 from dvc.mesh import TetMesh
 from dvc.trust.regions import SHEAR_THRESHOLDS, volume_above
+from fe.load_path import PlateState
 from fe.materials import Material
 from fe.model import CROWDED
-from fe.simulate import State
+from fe.solution import LoadState
 
 _SHARES = (0.5, 0.9, 0.99)
 _AXES = ("normal", "shear", "third")
 _VECTORS = {
-    "travel_mm": "travel_{}_mm",
+    "displacement_mm": "travel_{}_mm",
     "force_n": "force_{}_n",
     "turn_deg": "turn_{}_deg",
     "moment_nmm": "moment_{}_nmm",
@@ -32,21 +31,16 @@ _VECTORS = {
 """Vectors of a plate's state, and what the columns are called that hold their components."""
 
 
-def deformation(mesh: TetMesh, state: State) -> OnMesh:
-    """The simulated deformation at any point of the mesh."""
-    return OnMesh(mesh, state.u_mm)
-
-
-def cauchy_stress(state: State, mesh: TetMesh, laws: Mapping[str, Material]) -> FloatArray:
-    """Cauchy stress of each cell (m, 3, 3), MPa, LPS: the law's deviator, and the mean of the cell's pressures."""
+def cauchy_stress(state: LoadState, mesh: TetMesh, materials: Mapping[str, Material]) -> FloatArray:
+    """Cauchy stress of each cell (m, 3, 3), MPa, LPS: the law's deviator, and the cell's mean pressure."""
     F = np.eye(3) + state.gradients
     stress = np.empty_like(F)
-    for region, law in laws.items():
+    for region, law in materials.items():
         cells = mesh.regions[region]
         kirchhoff = law.stress(F[cells]) @ F[cells].transpose(0, 2, 1)
         deviator = kirchhoff - np.trace(kirchhoff, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
         volume = np.linalg.det(F[cells])[:, None, None]
-        stress[cells] = deviator / volume + state.pressure_mpa[cells].mean(axis=1)[:, None, None] * np.eye(3)
+        stress[cells] = deviator / volume + state.pressure_mpa[cells][:, None, None] * np.eye(3)
     return stress
 
 
@@ -69,15 +63,15 @@ def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
     return np.asarray(np.bincount(nodes, np.repeat(mesh.volumes_mm3 * jacobian, 4)) / before)
 
 
-def volume_share_off(mesh: TetMesh, state: State, laws: Mapping[str, Material], by: float) -> float:
+def volume_share_off(mesh: TetMesh, state: LoadState, materials: Mapping[str, Material], by: float) -> float:
     """Share of the volume where det F of nodal patches is further than ``by`` from what the law asks for, 1 + p / K.
 
     Mean over a cell's nodes. A law of low bulk modulus K may well give way; what is counted here is the mesh's error.
     """
     asked = np.empty(len(mesh.cells))
-    for region, law in laws.items():
+    for region, law in materials.items():
         cells = mesh.regions[region]
-        asked[cells] = state.pressure_mpa[cells].mean(axis=1) / law.bulk_modulus_mpa
+        asked[cells] = state.pressure_mpa[cells] / law.bulk_modulus_mpa
     jacobian = np.linalg.det(np.eye(3) + state.gradients) - asked
     off = np.abs(patch_volumes(mesh, jacobian) - 1.0)[mesh.cells].mean(axis=1) > by
     return float(mesh.volumes_mm3[off].sum() / mesh.volumes_mm3.sum())
@@ -125,12 +119,12 @@ class RegionFigures:
     crowded_share: float
 
 
-def region_figures(mesh: TetMesh, state: State, laws: Mapping[str, Material]) -> list[RegionFigures]:
+def region_figures(mesh: TetMesh, state: LoadState, materials: Mapping[str, Material]) -> list[RegionFigures]:
     """Figures of each region under a load."""
-    strain = StrainField.from_gradient(state.gradients)
-    stress = equivalent_stress(cauchy_stress(state, mesh, laws))
+    strain = state.strain
+    stress = equivalent_stress(cauchy_stress(state, mesh, materials))
     rows = []
-    for region, law in laws.items():
+    for region, law in materials.items():
         cells = mesh.regions[region]
         volumes = mesh.volumes_mm3[cells]
         shear = strain.max_shear[cells]
@@ -191,8 +185,8 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
     write_whole(path, text.getvalue())
 
 
-def write_curve_csv(path: Path, states: Sequence[State]) -> None:
-    """Write every state of equilibrium: the plate's travel, force, turn and moment along its axes, and its contact."""
+def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
+    """Write every converged increment: the plate's displacement, force, turn and moment along its axes, its contact."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     columns = [name.format(axis) for name in _VECTORS.values() for axis in _AXES]
@@ -204,13 +198,24 @@ def write_curve_csv(path: Path, states: Sequence[State]) -> None:
     write_whole(path, text.getvalue())
 
 
-def write_state(path: Path, mesh: TetMesh, state: State, laws: Mapping[str, Material]) -> None:
+def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
+    """The plate at every converged increment of each load, as `write_curve_csv` wrote it, with eight digits."""
+    curves: dict[str, list[PlateState]] = {}
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            vectors = [np.array([float(row[name.format(axis)]) for axis in _AXES]) for name in _VECTORS.values()]
+            plate = PlateState(vectors[0], vectors[1], vectors[2], vectors[3], float(row["contact_area_mm2"]))
+            curves.setdefault(row["load"], []).append(plate)
+    return curves
+
+
+def write_state(path: Path, mesh: TetMesh, state: LoadState, materials: Mapping[str, Material]) -> None:
     """Write a load's results as VTU: LPS mm and MPa, on the undeformed mesh (warp by ``displacement_mm``).
 
     At nodes: displacement, and det F of the patch around each. In cells: number of the region, F, Green-Lagrange
     strain, its maximal shear, det F, pressure (positive in tension) and Cauchy stress.
     """
-    strain = StrainField.from_gradient(state.gradients)
+    strain = state.strain
     region = np.zeros(len(mesh.cells), dtype=np.int64)
     for number, name in enumerate(mesh.regions, start=1):
         region[mesh.regions[name]] = number
@@ -220,10 +225,17 @@ def write_state(path: Path, mesh: TetMesh, state: State, laws: Mapping[str, Mate
         "green_lagrange": strain.green_lagrange.reshape(-1, 9),
         "max_shear": strain.max_shear,
         "jacobian": strain.jacobian,
-        "pressure_mpa": state.pressure_mpa.mean(axis=1),
-        "cauchy_stress_mpa": cauchy_stress(state, mesh, laws).reshape(-1, 9),
+        "pressure_mpa": state.pressure_mpa,
+        "cauchy_stress_mpa": cauchy_stress(state, mesh, materials).reshape(-1, 9),
     }
     point = {"displacement_mm": state.u_mm, "patch_jacobian": patch_volumes(mesh, strain.jacobian)}
     written = meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], point, {name: [v] for name, v in cell.items()})
     with whole_file(path) as part:
         meshio.vtu.write(part, written, binary=True)
+
+
+def read_state(path: Path) -> tuple[meshio.Mesh, FloatArray, FloatArray, FloatArray]:
+    """A file of `write_state`: its mesh, displacements (n, 3) mm, H = F - I (m, 3, 3), mean pressures (m,) MPa."""
+    read = meshio.read(path)
+    cells = {name: blocks[0] for name, blocks in read.cell_data.items()}
+    return read, read.point_data["displacement_mm"], cells["F"].reshape(-1, 3, 3) - np.eye(3), cells["pressure_mpa"]

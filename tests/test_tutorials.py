@@ -15,7 +15,7 @@ from sybil.parsers.markdown import PythonCodeBlockParser
 
 from dvc.io.images.labels import read_labels
 from dvc.io.images.write import write_mask
-from fe.mesh_file import write_tet_mesh
+from fe import write_tet_mesh
 from mrstrain.cli.app import app
 from mrstrain.studies.file import read_study
 from mrstrain.truth.phantom import phantom
@@ -121,6 +121,11 @@ def test_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
     follow("material.md", tmp_path, monkeypatch)
+
+
+def test_simulate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
+    follow("simulate.md", tmp_path, monkeypatch)
 
 
 @pytest.mark.full_size

@@ -81,7 +81,7 @@ def slices(
     defined. Where the measurement does not reach a node, it is drawn with the displacement of the nearest one. Letters
     name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
-    return slice_sheet(found.mesh, slice_panels(found, measured, displacements), axes, point_mm)
+    return png_bytes(slice_sheet(found.mesh, slice_panels(found, measured, displacements), axes, point_mm))
 
 
 def slice_panels(found: Mapped, measured: Deformation, displacements: Mapping[str, FloatArray]) -> list[Slice]:

@@ -19,20 +19,17 @@ from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, MrstrainError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import TetMesh, outer_faces
+from fe import BONE, LoadState, LoadStep, Material, Tolerance, check_materials
 from fe.assembly import Assembler
 from fe.elements import element
 from fe.linear import Solver
-from fe.materials import Material
 from fe.model import Model
-from fe.newton import Tolerance, equilibrium
-from fe.simulate import LoadStep, State, check_laws
-from fe.surface_sets import BONE
+from fe.newton import Imposed, equilibrium
 from validate.mapping import filled_from_nearest
 
 _FIRST_STEP, _LEAST_STEP = 0.25, 1.0 / 64.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _FAR_MM, _FEW = 3.0, 0.01
-_NO_EQUATION = np.empty(0, dtype=np.int64)
 
 
 def outside(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
@@ -75,7 +72,7 @@ def driven(
     *,
     threads: int = 1,
     tell: Callable[[str], None] = lambda _: None,
-) -> State:
+) -> LoadState:
     """The state of a mesh whose outside goes where a measurement puts it.
 
     Parameters
@@ -94,7 +91,7 @@ def driven(
 
     Returns
     -------
-    State
+    LoadState
         Without a plate; ``reached`` below 1 where the last steps found no balance.
 
     Raises
@@ -102,7 +99,7 @@ def driven(
     InputError
         As `outside`, or if a cell has not one law.
     """
-    check_laws(mesh, laws)
+    check_materials(mesh, laws)
     began = time.monotonic()
     nodes, u = outside(mesh, measured)
     guess = _everywhere(mesh, measured)
@@ -118,9 +115,7 @@ def driven(
             share = min(1.0, done + step)
             tried = state.copy()
             tried[:count] += (share - done) * guess.ravel()
-            found = equilibrium(
-                assembler, solver, tried, np.zeros(assembler.size), _NO_EQUATION, np.empty(0), Tolerance(), told=tell
-            )
+            found = equilibrium(assembler, solver, tried, Imposed(np.zeros(assembler.size)), Tolerance(), log=tell)
             if found is None:
                 step *= _SHRINK
                 continue
@@ -131,13 +126,13 @@ def driven(
         solver.close()
     if done == 0.0:
         raise MrstrainError(f"{load}: the model finds no balance with its outside where it was measured.")
-    return State(
+    return LoadState(
         load=LoadStep(load, float("nan")),
         reached=done,
         u_mm=state[:count].reshape(-1, 3),
-        pressure_mpa=model.pressures(state),
+        pressure_mpa=model.pressures(state).mean(axis=1),
         gradients=model.gradients(state),
-        on_plate=_NO_EQUATION,
+        on_plate=np.empty(0, dtype=np.int64),
         curve=(),
         iterations=iterations,
         seconds=time.monotonic() - began,

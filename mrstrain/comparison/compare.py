@@ -16,7 +16,7 @@ from dvc.io.images.labels import read_labels
 from dvc.report.page import Picture, Section, write_report
 from dvc.report.viewer import Viewer
 from dvc.trust.verdict import Verdict
-from fe.mesh_file import read_tet_mesh
+from fe import read_tet_mesh
 from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import Reading, model_files
 from mrstrain.comparison.page import closing_sections, page_sections, pictures_of, shown, viewer_of

@@ -9,13 +9,17 @@ from pathlib import Path
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.worker import usable_cores
-from fe.mesh_file import read_tet_mesh
-from fe.published import material_set
-from fe.result import region_figures, write_regions_csv, write_state
-from fe.simulate import check_laws
+from fe import (
+    check_materials,
+    clear_simulation,
+    material_set,
+    read_tet_mesh,
+    region_figures,
+    write_regions_csv,
+    write_state,
+)
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
 from mrstrain.measurement.measured_folder import measurements_in
-from mrstrain.models.simulate import clear
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 from validate.measured_boundary import driven, outside, write_boundary
@@ -84,7 +88,7 @@ def drive(
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
-        check_laws(read, region_laws)
+        check_materials(read, region_laws)
     found = measurements_in(Path(dvc), loads)
     loose = [m.load for m in found if m.aligned_on == "none"]
     if loose:
@@ -99,7 +103,7 @@ def drive(
     make_output(target)
     for folder in (target / BOUNDARY, *folders.values()):
         make_output(folder)
-        clear(folder)
+        clear_simulation(folder)
     own = [Path(s) for s in sets if str(s).endswith(".toml")]
     record = provenance(
         "drive",
@@ -144,7 +148,7 @@ def drive(
         write_json(
             folders[one.name] / "simulation.json",
             {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": one.name,
-             "laws": {region: law.told for region, law in region_laws.items()}} | record,
+             "laws": {region: law.description for region, law in region_laws.items()}} | record,
         )  # fmt: skip
     tell("drive", "simulating", 1.0)
     return Driven(target, complete, tuple(lines))

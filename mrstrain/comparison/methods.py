@@ -10,7 +10,7 @@ from typing import Any
 from dvc.io.images.read import format_of
 from dvc.registration.engines import methods_of
 from dvc.report.viewer import NIIVUE
-from fe.simulate import LoadStep
+from fe import LoadStep
 from validate.curves import DRAWS
 from validate.location_intervals import DRAWS as LOCATED
 
@@ -231,7 +231,7 @@ def _solver(record: Record) -> str:
         if made
         else ""
     )
-    loads = _listed([f"{step['name']} {LoadStep(**step).told}" for path in given["paths"] for step in path])
+    loads = _listed([f"{step['name']} {LoadStep(**step)}" for path in given["paths"] for step in path])
     axes = {load: told.get("plate_axes_lps") for load, told in record.get("outcome", {}).items()}
     if any(own != first for own in axes.values() for first in axes.values()):
         loads += "".join(

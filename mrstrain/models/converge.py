@@ -5,28 +5,21 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.io.images.labels import read_labels
-from fe import figures
-from fe.convergence import Limit, extrapolated, size_mm
-from fe.mesh_file import read_tet_mesh
-from fe.published import material_set
-from fe.simulate import LoadStep
-from fe.surface_sets import BONE
+from fe import BONE, Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
 from mrstrain.models.loads import LOADS
 from mrstrain.models.mesh import mesh as make_mesh
-from mrstrain.models.simulate import simulate
+from mrstrain.models.simulate import Progress, simulate
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import file_hash, provenance, write_json
-
-Told = Callable[[str, str, float], None]
 
 _FEWEST = 3
 
@@ -54,7 +47,7 @@ class Converged:
         lines = ["Size of the cells, mm: " + ", ".join(f"{s:.2f}" for s in self.sizes_mm)]
         for row in self.rows:
             values = ", ".join(f"{v:.4g}" for v in row.values)
-            limit, tends = row.limit, "no limit can be told"
+            limit, tends = row.limit, "no limit can be determined"
             if np.isfinite(limit.limit):
                 tends = f"tends to {limit.limit:.4g} (order {limit.order:.1f}), the finest is off by {limit.error:+.1%}"
             lines.append(f"{row.load}, {row.figure}: {values}; {tends}")
@@ -74,7 +67,7 @@ def converge(
     plate_normal: Sequence[float] = (0.0, 0.0, -1.0),
     shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
     workers: int | None = None,
-    progress: Told | None = None,
+    progress: Progress | None = None,
 ) -> Converged:
     """Mesh a label map with several edge lengths, simulate the same loads on each, and extrapolate.
 
@@ -119,8 +112,8 @@ def converge(
                 labels, out=place, edge_mm=edge, names=names, bones=bones,
                 watch=lambda share, edge=edge: tell(f"{edge:g} mm", "meshing", share),  # type: ignore[misc]
             )  # fmt: skip
-    sizes = [size_mm(read_tet_mesh(place)) for place in places.values()]
-    extrapolated(np.array(sizes), np.array(sizes))  # refuses sizes that tell nothing, before anything is simulated
+    sizes = [cell_size_mm(read_tet_mesh(place)) for place in places.values()]
+    extrapolate(np.array(sizes), np.array(sizes))  # refuses sizes that tell nothing, before anything is simulated
     for edge, place in places.items():
         made = simulate(
             place, out=target / f"simulated-{edge:g}", sets=[material], loads=loads, plate_normal=plate_normal,
@@ -131,14 +124,7 @@ def converge(
             raise MrstrainError(
                 f"With edges of {edge:g} mm not every load was reached: {' '.join(made.summary()[:-1])}"
             )
-        found = {}
-        for state in made.sets[0].states:
-            found[state.load.name, "plate travel, mm"] = float(np.hypot(*state.travel_mm[:2]))
-        for figure in made.sets[0].figures:
-            if figure.region == region:
-                for percent, value in ((50, figure.shear_p50), (90, figure.shear_p90), (99, figure.shear_p99)):
-                    found[figure.load, f"maximal shear of {region}, p{percent}"] = value
-        values.append(found)
+        values.append(_followed(made.sets[0], region))
     rows = tuple(
         Row(load, figure, tuple(v[load, figure] for v in values), _limit(sizes, [v[load, figure] for v in values]))
         for load, figure in values[0]
@@ -147,8 +133,21 @@ def converge(
     return Converged(target, tuple(sizes), rows)
 
 
+def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], float]:
+    """What is followed from mesh to mesh, by load and figure: the plate's way, and percentiles of a region's shear."""
+    values = {
+        (state.load.name, "plate travel, mm"): float(np.hypot(*state.plate_displacement_mm[:2]))
+        for state in simulation.states
+    }
+    for row in simulation.regions:
+        if row.region == region:
+            for percent, value in ((50, row.shear_p50), (90, row.shear_p90), (99, row.shear_p99)):
+                values[row.load, f"maximal shear of {region}, p{percent}"] = value
+    return values
+
+
 def _limit(sizes: Sequence[float], values: Sequence[float]) -> Limit:
-    return extrapolated(np.array(sizes), np.array(values))
+    return extrapolate(np.array(sizes), np.array(values))
 
 
 def _plain(row: dict[str, object]) -> dict[str, object]:
@@ -165,9 +164,9 @@ def _is_of(place: Path, inputs: dict[str, Path], bones: Sequence[str]) -> bool:
         return False
     hashes = {role: [file_hash(path)] for role, path in inputs.items()}
     try:
-        told = json.loads(about.read_text(encoding="utf-8"))
-        known = {role: [f["sha256"] for f in files] for role, files in told["inputs"].items()}
-        return bool(known == hashes and told["parameters"]["bones"] == list(bones))
+        record = json.loads(about.read_text(encoding="utf-8"))
+        known = {role: [f["sha256"] for f in files] for role, files in record["inputs"].items()}
+        return bool(known == hashes and record["parameters"]["bones"] == list(bones))
     except (ValueError, KeyError, TypeError, AttributeError):  # not what `mesh` writes
         return False
 
@@ -187,8 +186,7 @@ def _write(
     curves = {f"{r.load}, {r.figure}": (r.values, r.limit) for r in rows if np.isfinite(r.limit.limit)}
     (target / "convergence.png").unlink(missing_ok=True)
     if curves:
-        with whole_file(target / "convergence.png") as part:
-            part.write_bytes(figures.convergence(sizes, curves))
+        figures.write_figure(target / "convergence.png", figures.convergence(sizes, curves))
     write_json(
         target / "convergence.json", {"sizes_mm": list(sizes), "rows": [_plain(asdict(r)) for r in rows]} | record
     )

@@ -9,13 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import whole_file, write_whole
-from fe import figures
-from fe.fitting import Fit, read_curves
-from fe.fitting import fit as fit_law
+import fe
+from dvc.atomic_files import write_whole
+from fe import Fit, Material, Ogden, as_toml, figures, read_curves
 from fe.hyperelastic import OGDEN
-from fe.materials import Material, Ogden
-from fe.published import as_toml
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 
@@ -27,25 +24,25 @@ class Fitted:
     """What `fit` gave, and the folder it is in."""
 
     out: Path
-    found: Fit
+    fit: Fit
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
-        found = self.found
-        lines = [found.material.told]
-        for p in found.parameters:
+        fitted = self.fit
+        lines = [fitted.material.description]
+        for p in fitted.parameters:
             scale, unit = (1.0, "") if p.name.startswith("alpha") else (1000.0, " kPa")
             lines.append(
                 f"  {p.name} {scale * p.value:.4g}{unit}, 95 % from {scale * p.low:.4g} to {scale * p.high:.4g}"
             )
-        lines.append("R2 " + ", ".join(f"{mode} {r2:.4f}" for mode, r2 in found.r2.items()))
-        for mode, (low, high) in found.reached.items():
-            stable = found.stable[mode]
+        lines.append("R2 " + ", ".join(f"{mode} {r2:.4f}" for mode, r2 in fitted.r2.items()))
+        for mode, (low, high) in fitted.reached.items():
+            stable = fitted.stable[mode]
             lines.append(
                 f"{mode}: measured at stretches {low:.3g} to {high:.3g}, stable from {stable[0]:.3g} to {stable[1]:.3g}"
             )
-        lines += _in_programs(found.material)
-        for p in found.parameters:
+        lines += _in_programs(fitted.material)
+        for p in fitted.parameters:
             if p.at_bound:
                 lines.append(
                     f"These curves do not determine {p.name}: alone they would have it lower than a law may have it, "
@@ -56,9 +53,9 @@ class Fitted:
                 lines.append(
                     f"These curves do not determine {p.name}: its interval holds 0. Take a law with fewer parameters."
                 )
-        if not found.stable_where_measured:
+        if not fitted.stable_where_measured:
             lines.append("NOT stable (Drucker) at every stretch measured: take another law, or simulate less strain.")
-        lines += [f"These curves cannot tell it from: {other.told}" for other in found.others]
+        lines += [f"These curves cannot tell it from: {other.description}" for other in fitted.others]
         return [*lines, f"Results: {self.out}"]
 
 
@@ -67,14 +64,14 @@ def _in_programs(law: Material) -> list[str]:
     if not isinstance(law, Ogden):
         return []
     pairs = law.vector[OGDEN:].reshape(-1, 2).tolist()
-    told = {
+    numbers = {
         "ANSYS (mu, alpha)": [(2000.0 * mu / alpha, alpha) for mu, alpha in pairs],
         "Abaqus, CalculiX (mu, alpha)": [(1000.0 * mu, alpha) for mu, alpha in pairs],
         "FEBio (c, m)": [(2000.0 * mu, alpha) for mu, alpha in pairs],
     }
     return [
         f"  as {program}: " + "; ".join(f"{first:.4g} kPa, {second:.4g}" for first, second in values)
-        for program, values in told.items()
+        for program, values in numbers.items()
     ]
 
 
@@ -92,9 +89,9 @@ def fit(
     Parameters
     ----------
     curve : path
-        As `fe.fitting.read_curves` takes it: stretch, and nominal or true stress in kPa or MPa.
+        As `fe.read_curves` takes it: stretch, and nominal or true stress in kPa or MPa.
     law : str
-        A name of `fe.fitting.LAWS`.
+        A name of `fe.LAWS`.
     out : path
         Gets ``fit.json``, ``fit.csv`` (measured and fitted), ``fit.png``, and ``material.toml`` with the law.
     test : str, optional
@@ -111,19 +108,22 @@ def fit(
     """
     path, target = Path(curve), Path(out)
     curves = read_curves(path, test)
-    found = fit_law(curves, law, nu)
+    fitted = fe.fit(curves, law, nu)
     refuse_touching_inputs(target, _FILES, [path])
     make_output(target)
     given = {"law": law, "test": test, "nu": nu, "tissue": tissue}
     record = provenance("fit", {"curve": path}, given)
-    told = asdict(found) | {"material": found.material.told, "others": [o.told for o in found.others]}
+    content = asdict(fitted) | {
+        "material": fitted.material.description,
+        "others": [o.description for o in fitted.others],
+    }
     write_json(
         target / "fit.json",
-        told
+        content
         | {
             "mu_of_ogden": "initial shear modulus of the term, MPa (Abaqus' convention)",
-            "in_programs": [line.strip() for line in _in_programs(found.material)],
-            "stable_where_measured": found.stable_where_measured,
+            "in_programs": [line.strip() for line in _in_programs(fitted.material)],
+            "stable_where_measured": fitted.stable_where_measured,
             "provenance": record,
         },
     )
@@ -131,14 +131,13 @@ def fit(
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["test", "stretch", "nominal_stress_kpa", "fitted_kpa"])
     for c in curves:
-        fitted = 1000.0 * found.material.nominal_stress(c.stretch, c.mode)
-        for row in np.column_stack([c.stretch, 1000.0 * c.stress_mpa, fitted]):
+        modelled = 1000.0 * fitted.material.nominal_stress(c.stretch, c.mode)
+        for row in np.column_stack([c.stretch, 1000.0 * c.stress_mpa, modelled]):
             writer.writerow([c.mode, *(f"{v:.8g}" for v in row)])
     write_whole(target / "fit.csv", text.getvalue())
-    with whole_file(target / "fit.png") as part:
-        part.write_bytes(figures.stress_stretch(curves, found))
+    figures.write_figure(target / "fit.png", figures.stress_stretch(curves, fitted))
     source = f"{law} fitted to {path.name}"
-    if at_bound := [p.name for p in found.parameters if p.at_bound]:
+    if at_bound := [p.name for p in fitted.parameters if p.at_bound]:
         source += f", which does not determine {', '.join(at_bound)}"
-    write_whole(target / "material.toml", as_toml(path.stem, source, {tissue: found.material}))
-    return Fitted(target, found)
+    write_whole(target / "material.toml", as_toml(path.stem, source, {tissue: fitted.material}))
+    return Fitted(target, fitted)

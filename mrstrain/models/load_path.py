@@ -1,84 +1,74 @@
-"""One path of loads, simulated in a worker: each load's files are there as soon as it is reached."""
+"""One path of loads, solved in a worker: each load's files are there as soon as it is reached."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
-from dvc.mesh import TetMesh
-from fe.load_stages import Kept
-from fe.materials import Material
-from fe.plate import Plate
-from fe.restart import ENDING, fingerprint, read_kept, write_kept
-from fe.result import write_state
-from fe.simulate import LoadStep, State
-from fe.simulate import simulate as solve
+from fe import Checkpoint, LoadState, LoadStep, Observer, Problem, SolverOptions, solve, write_state
+from fe.restart import ENDING, fingerprint, read_checkpoint, write_checkpoint
 
-_EVERY_S = 30.0  # at most so often is a state on the way to a load written, to go on from
+_EVERY_S = 30.0  # at most so often is an increment on the way to a load written, to resume from
 
 
-def simulated_path(
-    mesh: TetMesh,
-    laws: Mapping[str, Material],
-    plate: Plate,
-    path: Sequence[LoadStep],
-    fixed: Sequence[str],
-    element: str,
-    folder: Path,
-    share: Path,
-    threads: int,
-    limit_s: float,
-) -> list[State]:
-    """Run one path in a worker: each load's files are written as soon as it is there, and each step's line in the log.
+def solve_in_folder(problem: Problem, options: SolverOptions, folder: Path, share: Path) -> list[LoadState]:
+    """Solve one path, resuming what an earlier run in the folder came to if that was made from the same.
 
-    It goes on from where an earlier run came to, if that was made from the same.
+    ``share`` is a file that holds the share that is done.
     """
-    log = folder / f"log-{path[0].name}.txt"
-    write_whole(log, "")
+    files = _Files(problem, folder, share)
+    return solve(problem, options, files, files.earlier())
 
-    def tell(line: str) -> None:
+
+class _Files(Observer):
+    """Files of a path in its folder: a load's results and checkpoint when it is reached, a log of each step."""
+
+    def __init__(self, problem: Problem, folder: Path, share: Path) -> None:
+        self._problem, self._folder, self._share = problem, folder, share
+        self._log = folder / f"log-{problem.loads[0].name}.txt"
+        self._made_from = {load.name: fingerprint(problem, n) for n, load in enumerate(problem.loads, start=1)}
+        self._last = time.monotonic()
+        write_whole(self._log, "")
+
+    def earlier(self) -> list[Checkpoint]:
+        """Where the first loads came to in an earlier run; the last may have been on its way."""
+        kept: list[Checkpoint] = []
+        for load in self._problem.loads:
+            checkpoint = read_checkpoint(self._checkpoint_of(load), self._made_from[load.name])
+            if checkpoint is None:
+                break
+            self.log(f"{load.name}: {checkpoint.reached:.0%} of it was there from an earlier run")
+            kept.append(checkpoint)
+            if checkpoint.reached < 1.0:
+                break
+        return kept
+
+    def log(self, line: str) -> None:
         try:
             # closed each time: there to be read meanwhile, and after a kill
-            with log.open("a", encoding="utf-8") as file:
+            with self._log.open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
         except OSError as error:
-            raise OutputError(f"{log}: cannot be written ({error.strerror or error}). Has the disk room?") from error
+            raise OutputError(
+                f"{self._log}: cannot be written ({error.strerror or error}). Has the disk room?"
+            ) from error
 
-    made_from = {
-        load.name: fingerprint(mesh, laws, plate, path[: n + 1], fixed, element) for n, load in enumerate(path)
-    }
-    earlier: list[Kept] = []
-    for load in path:
-        found = read_kept(folder / f"{load.name}{ENDING}", made_from[load.name])
-        if found is None:
-            break
-        tell(f"{load.name}: {found.reached:.0%} of it was there from an earlier run")
-        earlier.append(found)
-        if found.reached < 1.0:
-            break
-    last = time.monotonic()
+    def progress(self, done: float) -> None:
+        part = self._share.with_suffix(".part")
+        part.write_text(f"{done:.4f}")
+        part.replace(self._share)
 
-    def settled(load: LoadStep, kept: Kept) -> None:
-        nonlocal last
-        if time.monotonic() - last > _EVERY_S:
-            write_kept(folder / f"{load.name}{ENDING}", kept, made_from[load.name])
-            last = time.monotonic()
+    def converged(self, load: LoadStep, checkpoint: Checkpoint) -> None:
+        if time.monotonic() - self._last > _EVERY_S:
+            write_checkpoint(self._checkpoint_of(load), checkpoint, self._made_from[load.name])
+            self._last = time.monotonic()
 
-    def keep(state: State) -> None:
-        if state.kept is not None and len(state.kept.curve) > 1:
-            write_kept(folder / f"{state.load.name}{ENDING}", state.kept, made_from[state.load.name])
-            write_state(folder / f"{state.load.name}.vtu", mesh, state, laws)
+    def ended(self, state: LoadState) -> None:
+        if state.checkpoint is not None and len(state.curve) > 1:
+            write_checkpoint(self._checkpoint_of(state.load), state.checkpoint, self._made_from[state.load.name])
+            write_state(self._folder / f"{state.load.name}.vtu", self._problem.mesh, state, self._problem.materials)
 
-    return solve(
-        mesh, laws, plate, path, fixed=fixed, formulation=element, threads=threads, tell=tell, keep=keep,
-        settled=settled, earlier=earlier, limit_s=limit_s, progress=lambda done: _replaced(share, f"{done:.4f}"),
-    )  # fmt: skip
-
-
-def _replaced(path: Path, text: str) -> None:
-    part = path.with_suffix(".part")
-    part.write_text(text)
-    part.replace(path)
+    def _checkpoint_of(self, load: LoadStep) -> Path:
+        return self._folder / f"{load.name}{ENDING}"

@@ -1,15 +1,13 @@
-"""Loads of a simulation: the published experiment's, those that a user types, and the paths on which they lie."""
+"""Loads of a simulation: the published experiment's, and those that a user types."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Mapping, Sequence
-from types import MappingProxyType
 
 import numpy as np
 
 from dvc.errors import InputError
-from fe.simulate import LoadStep
+from fe import LoadStep
 
 Vector = tuple[float, float, float]
 
@@ -21,47 +19,16 @@ LOADS = (
 )
 """The published experiment's."""
 
-_ALIKE: Mapping[str, Hashable] = MappingProxyType({})
-
-
-def paths_of(loads: Sequence[LoadStep], towards: Mapping[str, Hashable] = _ALIKE) -> list[tuple[LoadStep, ...]]:
-    """Loads by path: pressed alike and sheared to the same side, by force or by travel, in the order of the shear.
-
-    A load without shear lies on the path of the first that is pressed like it and sheared. ``towards`` has the loads
-    that go in directions of their own; only those of the same directions lie on one path.
-
-    Examples
-    --------
-    >>> [" ".join(load.name for load in path) for path in paths_of(LOADS)]
-    ['Load1', 'Load2 Load4 Load3']
-    """
-    names = [load.name for load in loads]
-    if not names or len(set(names)) < len(names):
-        raise InputError(f"Loads are needed, each with a name of its own; got {', '.join(names) or 'none'}.")
-
-    def pressed(load: LoadStep) -> tuple[float, bool, Hashable]:
-        return float(load.goal.values[0]), bool(load.goal.travels[0]), towards.get(load.name)
-
-    def key(load: LoadStep) -> tuple[Hashable, ...]:
-        like = next((x for x in loads if x.sheared and pressed(x) == pressed(load)), load)
-        shear = load if load.sheared else like
-        return *pressed(load), bool(shear.goal.travels[1]), bool(shear.goal.values[1] < 0.0)
-
-    return [
-        tuple(sorted((x for x in loads if key(x) == one), key=lambda x: (x.sheared, abs(float(x.goal.values[1])))))
-        for one in dict.fromkeys(key(load) for load in loads)
-    ]
-
 
 def load_named(text: str) -> LoadStep:
-    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR; each a force in N, or, with mm after it, the plate's travel.
+    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR; each a force in N, or, with mm after it, the plate's displacement.
 
     Examples
     --------
-    >>> load_named("Load3=15,45").told
-    '15 N normal, 45 N shear'
-    >>> load_named("Load3=15,8mm").told
-    '15 N normal, 8 mm shear'
+    >>> print(load_named("Load3=15,45"))
+    15 N normal, 45 N shear
+    >>> print(load_named("Load3=15,8mm"))
+    15 N normal, 8 mm shear
     """
     name, _, asked = text.partition("=")
     found = [re.fullmatch(r"\s*([^\s]+?)\s*(mm|N)?\s*", part) for part in asked.split(",")]
@@ -75,8 +42,8 @@ def load_named(text: str) -> LoadStep:
             raise ValueError("not finite numbers")
     except ValueError as failure:
         raise InputError(
-            "A load is NAME=NORMAL or NAME=NORMAL,SHEAR in N, such as Load3=15,45, or the plate's travel in mm, such "
-            f"as Load3=15,8mm; got '{text}'."
+            "A load is NAME=NORMAL or NAME=NORMAL,SHEAR in N, such as Load3=15,45, or the plate's displacement in mm, "
+            f"such as Load3=15,8mm; got '{text}'."
         ) from failure
     if not name.strip() or not re.fullmatch(r"[\w. -]+", name.strip()):
         raise InputError(f"A load needs a name of letters, digits, dots, blanks or dashes; got '{name}'.")

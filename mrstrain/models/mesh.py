@@ -6,15 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from dvc.atomic_files import whole_file
 from dvc.errors import InputError, OutputError
 from dvc.io.images.labels import read_labels
 from dvc.mesh import TetMesh
-from fe import figures
-from fe.mesh_file import write_tet_mesh
-from fe.meshing import MeshQuality, mesh_labels
-from fe.plate import Plate
-from fe.surface_sets import BONE, SKIN
+from fe import BONE, SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
 from mrstrain.records.inputs import is_bones_name, make_output
 from mrstrain.records.provenance import provenance
 
@@ -85,7 +80,7 @@ def mesh(
     out : path
         The mesh, ending in .vtu; beside it a .json with names and quality, and a .png.
     edge_mm, bones, finer, limit_s, watch
-        As in `fe.meshing.mesh_labels`.
+        As in `fe.mesh_labels`.
 
     Raises
     ------
@@ -106,6 +101,5 @@ def mesh(
     record = provenance("mesh", inputs, {"edge_mm": edge_mm, "bones": list(bones), "finer": finer})
     write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
     plate = Plate(_INFERIOR, _FORWARD)
-    with whole_file(target.with_suffix(".png")) as part:
-        part.write_bytes(figures.mesh_slice(made, plate))
+    figures.write_figure(target.with_suffix(".png"), figures.mesh_slice(made, plate))
     return Meshed(target, made, quality)

@@ -18,12 +18,7 @@ from dvc.io.images.read import read_image
 from dvc.mesh import TetMesh
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.worker import usable_cores
-from fe.meshing import check_meshing
-from fe.plate import Plate
-from fe.published import MaterialSet, material_set
-from fe.simulate import LoadStep, check_loads
-from fe.simulate import check as check_simulation
-from fe.surface_sets import fixed_facets
+from fe import LoadStep, MaterialSet, Plate, Problem, check_loads, check_meshing, fixed_facets, material_set
 from mrstrain.comparison.model_files import Reading, model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.register import REPEAT
@@ -254,7 +249,7 @@ def _on_mesh(
         if chosen is None:
             continue
         for plate, steps in loads:
-            found.tried(check_simulation, mesh, chosen[0], plate, steps, fixed_facets(mesh, fixed))
+            found.tried(Problem, mesh, chosen[0], plate, steps, fixed_facets(mesh, fixed))
 
 
 def _meshing(study: Study, found: _Findings) -> None:

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dvc.errors import InputError
-from fe.published import MaterialSet, material_set
-from fe.surface_sets import BONE
+from fe import BONE, MaterialSet, material_set
 from mrstrain.measurement.engines import engine_of
 from mrstrain.records.provenance import file_hash
 from mrstrain.studies.file import Load, Study
@@ -23,7 +22,7 @@ def refuse_other_laws(studies: Sequence[Study]) -> None:
     Raises
     ------
     InputError
-        Naming set and studies, or as from `fe.published.material_set`.
+        Naming set and studies, or as from `fe.material_set`.
     """
     seen: dict[str, tuple[str, MaterialSet]] = {}
     for study in studies:
@@ -38,7 +37,7 @@ def refuse_other_laws(studies: Sequence[Study]) -> None:
 
 
 def _same_laws(one: MaterialSet, other: MaterialSet) -> bool:
-    laws, others = ({tissue.casefold(): law for tissue, law in of.laws.items()} for of in (one, other))
+    laws, others = ({tissue.casefold(): law for tissue, law in of.materials.items()} for of in (one, other))
     return laws.keys() == others.keys() and all(
         law.nu == others[tissue].nu
         and law.vector.shape == others[tissue].vector.shape

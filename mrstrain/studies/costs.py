@@ -12,10 +12,8 @@ from dvc.io.images.labels import read_labels
 from dvc.io.images.read import read_image
 from dvc.mesh import TetMesh
 from dvc.registration.engine import Cost
-from fe.mesh_file import read_tet_mesh
-from fe.simulate import LoadStep
+from fe import LoadStep, paths_of, read_tet_mesh
 from mrstrain.measurement.engines import engine_of
-from mrstrain.models.loads import paths_of
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.studies.file import Study
 from mrstrain.studies.plan import Stage, labels_to_mesh

@@ -104,7 +104,7 @@ class Images(_Part):
 
 
 class Load(_Part):
-    """One loaded image, and the plate's forces, N, or in their place its travels, mm; as in `fe.simulate.LoadStep`.
+    """One loaded image, and the plate's forces, N, or in their place its travels, mm; as in `fe.LoadStep`.
 
     Without either along the normal it is measured and not simulated. Directions, LPS, are those of the plate where none
     are given here.

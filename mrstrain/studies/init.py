@@ -12,7 +12,7 @@ import jinja2
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError, OutputError
 from dvc.io.images.dicom import is_dicom, is_multiframe
-from fe.published import published_names
+from fe import published_names
 from mrstrain.comparison.model_files import ENDINGS
 from mrstrain.models.loads import LOADS
 from mrstrain.records.inputs import IMAGE_ENDINGS as IMAGES

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dvc.errors import InputError
-from fe.published import material_set
-from fe.simulate import LoadStep
-from fe.surface_sets import BONE
+from fe import BONE, LoadStep, material_set
 from mrstrain.comparison.drive import ENDING
 from mrstrain.comparison.model_files import files_named
 from mrstrain.measurement.register import REPEAT

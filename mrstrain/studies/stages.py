@@ -89,7 +89,7 @@ def simulate(
     tell: Tell, *, out: str, mesh: str, material: str, loads: Sequence[Mapping[str, Any]], **options: Any
 ) -> Given:
     """One material set under all loads; as `mrstrain.simulate`."""
-    from fe.simulate import LoadStep
+    from fe import LoadStep
     from mrstrain.models.simulate import simulate as run
 
     steps = [LoadStep(**load) for load in loads]

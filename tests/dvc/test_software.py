@@ -24,6 +24,7 @@ import dvc.software
 import fe.assembly
 import phantoms.mri
 from dvc.software import distribution_versions, software_key
+from fe import Problem
 from fe.restart import fingerprint
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.plan import Stage
@@ -62,7 +63,7 @@ def change(copy: Path, module: ModuleType) -> None:
 
 
 def restart_key() -> str:
-    return fingerprint(dome((3, 4, 4)), LAWS, PLATE, LOADS, ["bone"], "P1")
+    return fingerprint(Problem(dome((3, 4, 4)), LAWS, PLATE, LOADS), len(LOADS))
 
 
 MEASURING = [

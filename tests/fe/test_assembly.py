@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from fe import Hencky, NeoHooke, Ogden, Tolerance, Yeoh
 from fe.assembly import Assembler
 from fe.elements import Space, element
 from fe.linear import SingularError, Solver, factors
-from fe.materials import Hencky, NeoHooke, Ogden, Yeoh
 from fe.model import Model
-from fe.newton import LEAST_VOLUME, Tolerance, equilibrium
+from fe.newton import LEAST_VOLUME, Imposed, equilibrium
 from tests.blocks import block
 
 needs_mkl = pytest.mark.skipif(
@@ -117,8 +117,8 @@ def test_patch(name: str) -> None:
         gradient = (np.eye(3) + share * (F - np.eye(3))) - np.eye(3)
         state[unknowns(np.flatnonzero(corners), 0, 1, 2)] = (nodes[corners] @ gradient.T).ravel()
         found = equilibrium(
-            assembler, Solver(assembler.indptr, assembler.indices), state, np.zeros(assembler.size),
-            np.empty(0, dtype=int), np.empty(0), Tolerance(force=1e-10, step_mm=1e-9, iterations=20),
+            assembler, Solver(assembler.indptr, assembler.indices), state, Imposed(np.zeros(assembler.size)),
+            Tolerance(force=1e-10, step_mm=1e-9, iterations=20),
         )  # fmt: skip
         assert found is not None
         state = found.state.copy()
@@ -146,7 +146,8 @@ def test_a_bar_pulled_and_pressed_has_the_laws_closed_form(name: str, law) -> No
         state = np.zeros(model.unknowns)
         for part in (0.5, 0.5):
             found = equilibrium(
-                assembler, solver, state, np.zeros(assembler.size), held, np.array([part * 4.0 * (stretch - 1.0)]),
+                assembler, solver, state,
+                Imposed(np.zeros(assembler.size), held, np.array([part * 4.0 * (stretch - 1.0)])),
                 Tolerance(force=1e-8, step_mm=1e-7, iterations=20),
             )  # fmt: skip
             assert found is not None
@@ -181,8 +182,9 @@ def test_no_step_folds_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(assembler, "residual", watched)
     found = equilibrium(
-        assembler, Solver(assembler.indptr, assembler.indices), np.zeros(model.unknowns), np.zeros(assembler.size),
-        np.array([assembler.own_equations]), np.array([-5.3]), Tolerance(), told=told.append,
+        assembler, Solver(assembler.indptr, assembler.indices), np.zeros(model.unknowns),
+        Imposed(np.zeros(assembler.size), np.array([assembler.own_equations]), np.array([-5.3])), Tolerance(),
+        log=told.append,
     )  # fmt: skip
     made = [float(line.rsplit(" ", 1)[1]) for line in told if "least det F" in line]
     assert min(tried) < 0.0

@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 from dvc.errors import InputError
 from dvc.images.image import LabelMap
 from dvc.io.images.write import write_labels
-from fe.convergence import extrapolated
-from fe.mesh_file import write_tet_mesh
+from fe import extrapolate, write_tet_mesh
 from mrstrain.cli.app import app
 from mrstrain.records.provenance import provenance
 from tests.fe.test_meshing import half_onion
@@ -21,7 +20,7 @@ from tests.fe.test_simulate import dome
 @pytest.mark.parametrize("order", [0.8, 1.0, 2.0])
 def test_a_known_order_and_limit(order: float) -> None:
     h = np.array([5.0, 3.0, 2.0, 1.5])
-    found = extrapolated(h, 7.0 - 0.2 * h**order)
+    found = extrapolate(h, 7.0 - 0.2 * h**order)
     assert found.limit == pytest.approx(7.0, abs=0.01)
     assert found.order == pytest.approx(order, abs=0.03)
     assert found.error == pytest.approx(-0.2 * 1.5**order / 7.0, rel=0.05)
@@ -30,29 +29,29 @@ def test_a_known_order_and_limit(order: float) -> None:
 def test_what_seems_to_converge_faster_than_it_can_is_not_called_converged() -> None:
     """The plate's travel on a heel, as `converge` found it: the last two meshes agree by chance."""
     h, travel = np.array([1.36, 1.12, 0.87, 0.70]), np.array([10.2547, 10.3734, 10.4355, 10.4373])
-    found = extrapolated(h, travel)
+    found = extrapolate(h, travel)
     assert found.order == 2.0
     assert found.limit == pytest.approx(10.526, abs=0.002)
     assert found.error == pytest.approx(-0.0084, abs=0.0003)  # a hundred times what the last two differ by
-    cubic = extrapolated(h, 7.0 - 0.2 * h**3)
+    cubic = extrapolate(h, 7.0 - 0.2 * h**3)
     assert cubic.order == 2.0
     assert abs(cubic.error) > 0.2 * 0.7**3 / 7.0
 
 
 def test_a_limit_that_is_passed_already_is_none() -> None:
     h, f = np.array([2.02, 1.73, 0.82, 0.71]), np.array([0.15, 1.68, 2.21, 3.63])  # steady, but scattered
-    assert np.isnan(extrapolated(h, f).limit)
+    assert np.isnan(extrapolate(h, f).limit)
 
 
 def test_no_limit_is_told_where_there_is_none() -> None:
     h = np.array([5.0, 4.0, 3.0, 2.0])
-    found = extrapolated(h, np.array([1.0, 1.2, 0.9, 1.1]))
+    found = extrapolate(h, np.array([1.0, 1.2, 0.9, 1.1]))
     assert found.scatter > 0.05
     assert np.isnan(found.limit)
-    assert np.isnan(extrapolated(h[1:], np.array([1.0, 1.1, 1.3])).limit)  # runs away: an order below 0.5
+    assert np.isnan(extrapolate(h[1:], np.array([1.0, 1.1, 1.3])).limit)  # runs away: an order below 0.5
     for sizes in (h[:2], np.array([2.0, 1.9, 1.8])):
         with pytest.raises(InputError, match=r"3 or more meshes, the coarsest 1\.5 times the size"):
-            extrapolated(sizes, sizes)
+            extrapolate(sizes, sizes)
 
 
 def test_meshes_are_made_once_and_simulated_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

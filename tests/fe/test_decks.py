@@ -12,13 +12,22 @@ import pytest
 
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
-from fe.decks import write_calculix, write_febio
-from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
+from fe import (
+    Hencky,
+    LoadState,
+    LoadStep,
+    Material,
+    NeoHooke,
+    Ogden,
+    Plate,
+    Yeoh,
+    cauchy_stress,
+    write_calculix,
+    write_febio,
+)
 from fe.model import Model
-from fe.plate import Plate
-from fe.result import cauchy_stress
-from fe.simulate import LoadStep, State, simulate
 from tests.blocks import block
+from tests.fe.solving import solved
 
 CCX = shutil.which("ccx")
 needs_calculix = pytest.mark.skipif(CCX is None, reason="CalculiX (ccx, Debian's calculix-ccx) is not installed")
@@ -112,9 +121,9 @@ def slab(count: tuple[int, int, int] = (3, 4, 4)) -> TetMesh:
     return TetMesh(box.points_mm, box.cells, {"skin": box.regions["layer 0"], "fat": fat}, facets)
 
 
-def states_of(mesh: TetMesh, laws: dict[str, Material], formulation: str) -> list[State]:
+def states_of(mesh: TetMesh, laws: dict[str, Material], element: str) -> list[LoadState]:
     loads = [LoadStep("pressed", 1.5), LoadStep("sheared", 1.5, 1.0)]
-    return simulate(mesh, laws, Plate([-1, 0, 0], [0, 1, 0]), loads, formulation=formulation)
+    return solved(mesh, laws, Plate([-1, 0, 0], [0, 1, 0]), loads, element=element)
 
 
 def calculix(deck: Path, nodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -225,13 +234,13 @@ def test_an_febio_deck_says_the_same(tmp_path: Path) -> None:
     plate = (root.findtext("Mesh/NodeSet[@name='plate']") or "").split(",")
     x = [float(n.text or "nan") for n in root.iterfind("MeshData/NodeData[@name='ux']/node")]
     assert len(x) == len(plate) > len(state.on_plate)
-    assert x == pytest.approx([state.travel_mm[0]] * len(x))
+    assert x == pytest.approx([state.plate_displacement_mm[0]] * len(x))
     domains = {d.get("name"): d.get("mat") for d in root.iterfind("MeshDomains/SolidDomain")}
     assert domains == {"E1SKIN": "M1SKIN", "E2FAT": "M2FAT"}
 
 
 @cache
-def pressed() -> tuple[TetMesh, dict[str, Material], State]:
+def pressed() -> tuple[TetMesh, dict[str, Material], LoadState]:
     """A slab of all three laws that decks are written for, under a load."""
     box, laws = slab(), {"skin": Yeoh.of(0.265, 1.923), "fat": Ogden.from_ansys(0.0034, 6.2), "core": NeoHooke.of(0.01)}
     half = len(box.regions["fat"]) // 2

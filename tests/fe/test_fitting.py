@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from dvc.errors import InputError
-from fe.fitting import LAWS, Curve, fit, read_curves
-from fe.materials import MODES, Material, NeoHooke, Ogden, Yeoh
-from fe.published import material_set
+from fe import LAWS, MODES, Curve, Material, NeoHooke, Ogden, Yeoh, fit, material_set, read_curves
 
 TABLE_2 = {"fat": ("Ogden", np.linspace(0.5, 1.0, 30)), "skin": ("Isihara", np.linspace(1.0, 1.5, 30)),
            "muscle": ("Yeoh", np.linspace(1.0, 1.4, 30))}  # fmt: skip
@@ -21,7 +19,7 @@ def curve_of(law: Material, stretch: np.ndarray, mode: str = "uniaxial", noise: 
 @pytest.mark.parametrize("tissue", TABLE_2)
 def test_curves_of_table_2_give_table_2_back(tissue: str) -> None:
     name, stretch = TABLE_2[tissue]
-    law = material_set("trebbi").laws[tissue]
+    law = material_set("trebbi").materials[tissue]
     found = fit([curve_of(law, stretch)], name)
     assert found.material.vector == pytest.approx(law.vector, rel=1e-9, abs=1e-12)
     assert found.r2["uniaxial"] == pytest.approx(1.0, abs=1e-12)
@@ -39,9 +37,9 @@ def test_two_terms_from_three_tests_at_once() -> None:
 @pytest.mark.parametrize(
     ("name", "law", "stretch", "mode", "noise"),
     [
-        ("Ogden", material_set("trebbi").laws["fat"], np.linspace(0.5, 1.0, 30), "uniaxial", 0.03),
-        ("Isihara", material_set("trebbi").laws["skin"], np.linspace(1.0, 1.5, 30), "pure shear", 0.03),
-        ("Yeoh", material_set("trebbi").laws["muscle"], np.linspace(1.0, 1.4, 30), "uniaxial", 0.001),
+        ("Ogden", material_set("trebbi").materials["fat"], np.linspace(0.5, 1.0, 30), "uniaxial", 0.03),
+        ("Isihara", material_set("trebbi").materials["skin"], np.linspace(1.0, 1.5, 30), "pure shear", 0.03),
+        ("Yeoh", material_set("trebbi").materials["muscle"], np.linspace(1.0, 1.4, 30), "uniaxial", 0.001),
         ("neo-Hooke", NeoHooke.of(0.02), np.linspace(0.8, 1.2, 12), "equibiaxial", 0.1),
     ],
 )
@@ -64,7 +62,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
 def test_a_curve_that_leaves_the_initial_stiffness_open_is_fitted_and_says_so() -> None:
     # At this noise the best C10 of table 2's muscle, 5 kPa, has a standard deviation of 30 kPa: half are below 0.
     random = np.random.default_rng(1)
-    muscle, stretch = material_set("trebbi").laws["muscle"], np.linspace(1.0, 1.4, 30)
+    muscle, stretch = material_set("trebbi").materials["muscle"], np.linspace(1.0, 1.4, 30)
     exact = curve_of(muscle, stretch)
     size = 0.03 * np.abs(exact.stress_mpa).max()
     tries, held, at_bound = 300, np.zeros(3), 0
@@ -93,7 +91,7 @@ def test_a_small_initial_stiffness_that_the_curve_tells_is_kept() -> None:
 
 def test_at_the_bound_the_rest_is_the_best_there_is() -> None:
     stretch = np.linspace(1.0, 1.4, 30)
-    exact = curve_of(material_set("trebbi").laws["muscle"], stretch)
+    exact = curve_of(material_set("trebbi").materials["muscle"], stretch)
     noise = np.random.default_rng(0).normal(0.0, 0.03 * exact.stress_mpa.max(), 30)
     noisy = exact.stress_mpa + noise
     found = fit([Curve("uniaxial", stretch, noisy)], "Yeoh")
@@ -112,7 +110,7 @@ def test_at_the_bound_the_rest_is_the_best_there_is() -> None:
 
 def test_exponents_that_one_test_leaves_open_are_named() -> None:
     random = np.random.default_rng(3)
-    fat = material_set("trebbi").laws["fat"]
+    fat = material_set("trebbi").materials["fat"]
     stretch = np.linspace(0.5, 1.0, 30)
     exact = curve_of(fat, stretch)
     noisy = Curve(

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvc.errors import InputError
-from fe.materials import MODES, Hencky, Material, NeoHooke, Ogden, Yeoh
+from fe import MODES, Hencky, Material, NeoHooke, Ogden, Yeoh
 
 LAWS: dict[str, Material] = {
     "neo-Hooke": NeoHooke.of(0.1),

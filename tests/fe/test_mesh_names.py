@@ -12,8 +12,7 @@ import pytest
 from dvc.errors import InputError, MrstrainError
 from dvc.images.image import Grid, LabelMap
 from dvc.mesh import TetMesh
-from fe.mesh_file import read_tet_mesh, write_tet_mesh
-from fe.meshing import MeshQuality, mesh_labels
+from fe import MeshQuality, mesh_labels, read_tet_mesh, write_tet_mesh
 from mrstrain.models.mesh import Meshed
 from tests.blocks import block
 from tests.fe.test_simulate import dome

@@ -10,8 +10,8 @@ from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.images.image import Grid, LabelMap
 from dvc.io.images.write import write_labels
 from dvc.mesh import TetMesh
-from fe.mesh_file import read_tet_mesh, write_tet_mesh
-from fe.meshing import _guessed, mesh_labels
+from fe import mesh_labels, read_tet_mesh, write_tet_mesh
+from fe.meshing import _guessed
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.tissue_surfaces import borders_of, labels_at
 from mrstrain.models.mesh import Meshed

@@ -12,12 +12,12 @@ element has it exactly, with a pressure that is not zero. The whole border is mo
 import numpy as np
 import pytest
 
+from fe import NeoHooke, Tolerance
 from fe.assembly import Assembler
 from fe.elements import Element, element
 from fe.linear import Solver
-from fe.materials import NeoHooke
 from fe.model import Model
-from fe.newton import Tolerance, equilibrium
+from fe.newton import Imposed, equilibrium
 from tests.blocks import block
 
 LAW = NeoHooke.of(0.01, nu=0.4999)
@@ -79,9 +79,8 @@ def errors(kind: Element, count: int) -> tuple[float, float]:
     state = np.zeros(model.unknowns)
     state[3 * rim[:, None] + np.arange(3)] = exact(nodes[rim])[0]
     solver = Solver(assembler.indptr, assembler.indices)
-    none = np.empty(0, dtype=int)
     tolerance = Tolerance(force=1e-6, step_mm=1e-6 * SMALL)
-    found = equilibrium(assembler, solver, state, np.zeros(assembler.size), none, np.empty(0), tolerance)
+    found = equilibrium(assembler, solver, state, Imposed(np.zeros(assembler.size)), tolerance)
     solver.close()
     assert found is not None
     u = found.state[: 3 * len(nodes)].reshape(-1, 3)[model.space.cells]

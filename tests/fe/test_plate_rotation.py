@@ -7,10 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
-from fe.newton import Tolerance
-from fe.plate import Plate
-from fe.simulate import LoadStep, State, simulate
+from fe import LoadState, LoadStep, Plate, Tolerance
 from tests.blocks import block
+from tests.fe.solving import solved
 from tests.fe.test_simulate import ALONG, DOWN, LAWS
 
 EXACT = Tolerance(force=1e-9, step_mm=1e-8)
@@ -47,13 +46,15 @@ def mirrored() -> TetMesh:
     return TetMesh(points[used], number[cells], regions, facets)
 
 
-def pressed(mesh: TetMesh, turns: bool, loads: list[LoadStep] = LOADS, pivot: tuple = MIDDLE, **others) -> list[State]:
+def pressed(
+    mesh: TetMesh, turns: bool, loads: list[LoadStep] = LOADS, pivot: tuple = MIDDLE, **others
+) -> list[LoadState]:
     plate = Plate(others.pop("normal", DOWN), others.pop("shear", ALONG), turns=turns, pivot_mm=pivot)
-    return simulate(mesh, LAWS, plate, loads, tolerance=EXACT, **others)
+    return solved(mesh, LAWS, plate, loads, tolerance=EXACT, **others)
 
 
 @pytest.fixture(scope="module")
-def free() -> list[State]:
+def free() -> list[LoadState]:
     return pressed(wedge(0.15), True)
 
 
@@ -63,7 +64,7 @@ def test_a_small_load_is_reached_too() -> None:
     assert state.reached == 1.0
 
 
-def test_a_free_plate_carries_no_moment_and_a_locked_one_does(free: list[State]) -> None:
+def test_a_free_plate_carries_no_moment_and_a_locked_one_does(free: list[LoadState]) -> None:
     locked = pressed(wedge(0.15), False)
     for turned, level in zip(free, locked, strict=True):
         assert turned.reached == level.reached == 1.0
@@ -76,7 +77,7 @@ def test_a_free_plate_carries_no_moment_and_a_locked_one_does(free: list[State])
     assert free[0].plate.area_mm2 > 2.0 * locked[0].plate.area_mm2
 
 
-def test_the_plate_is_rigid(free: list[State]) -> None:
+def test_the_plate_is_rigid(free: list[LoadState]) -> None:
     mesh, axes = wedge(0.15), Plate(DOWN, ALONG).axes
     first, last = ((mesh.points_mm + state.u_mm)[free[0].on_plate] for state in free)
     assert len(first) > 20
@@ -97,12 +98,12 @@ def test_pressing_beside_the_middle_turns_the_plate_that_way() -> None:
 def test_a_mirrored_block_leaves_the_plate_level() -> None:
     state = pressed(mirrored(), True, LOADS[:1])[0]
     assert np.abs(state.plate.turn_deg[[0, 2]]).max() < 1e-6
-    assert abs(state.travel_mm[1]) < 1e-8
+    assert abs(state.plate_displacement_mm[1]) < 1e-8
     sheared = pressed(mirrored(), True)[1]
     assert abs(sheared.plate.turn_deg[2]) > 1.0  # what a shear above the bone does to it
 
 
-def test_another_frame_gives_the_same_turn(free: list[State]) -> None:
+def test_another_frame_gives_the_same_turn(free: list[LoadState]) -> None:
     turn = Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix()
     shift, mesh = np.array([3.0, -50.0, 20.0]), wedge(0.15)
     moved = TetMesh(mesh.points_mm @ turn.T + shift, mesh.cells, mesh.regions, mesh.facets)
@@ -114,22 +115,22 @@ def test_another_frame_gives_the_same_turn(free: list[State]) -> None:
         assert np.abs(other.u_mm @ turn - state.u_mm).max() < 1e-6
 
 
-def test_newtons_method_keeps_its_order_with_a_plate_that_turns(free: list[State]) -> None:
+def test_newtons_method_keeps_its_order_with_a_plate_that_turns(free: list[LoadState]) -> None:
     # Three steps of the force; the forces out of balance square from one iteration to the next.
     assert len(free[1].curve) == 4
     assert free[1].iterations <= 15
 
 
-def test_a_free_plate_that_is_moved(free: list[State]) -> None:
-    travel = free[0].travel_mm
+def test_a_free_plate_that_is_moved(free: list[LoadState]) -> None:
+    travel = free[0].plate_displacement_mm
     state = pressed(wedge(0.15), True, [LoadStep("in", normal_mm=float(travel[0]))])[0]
-    assert state.travel_mm[0] == pytest.approx(travel[0], abs=1e-9)
+    assert state.plate_displacement_mm[0] == pytest.approx(travel[0], abs=1e-9)
     assert np.abs(state.plate.moment_nmm).max() < 1e-7
     assert state.force_n[0] == pytest.approx(2.0, rel=0.1)  # other steps, so other places on the tape
 
 
 def test_quadratic_cells_turn_too() -> None:
-    state = pressed(wedge(0.15), True, LOADS[:1], formulation="P2")[0]
+    state = pressed(wedge(0.15), True, LOADS[:1], element="P2")[0]
     assert np.abs(state.plate.moment_nmm).max() < 1e-7
     assert state.plate.turn_deg[2] == pytest.approx(-8.0, abs=1.5)
 

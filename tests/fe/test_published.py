@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dvc.errors import InputError
-from fe.published import material_set, published_names, read_material_sets
+from fe import material_set, published_names, read_material_sets
 
 # Initial shear modulus (kPa) and Poisson's ratio by hand from the printed numbers.
 PRINTED = {
@@ -31,7 +31,7 @@ PRINTED = {
 
 
 def test_every_published_law_has_the_printed_modulus() -> None:
-    found = {(name, tissue): law for name in published_names() for tissue, law in material_set(name).laws.items()}
+    found = {(name, tissue): law for name in published_names() for tissue, law in material_set(name).materials.items()}
     assert found.keys() == PRINTED.keys()
     for key, (modulus_kpa, nu) in PRINTED.items():
         assert 1000 * found[key].shear_modulus_mpa == pytest.approx(modulus_kpa, rel=1e-12), key
@@ -43,7 +43,7 @@ def test_published_laws_are_stable_and_say_where_they_are_from(name: str) -> Non
     published = material_set(name)
     assert published.title
     assert "able" in published.source
-    for law in published.laws.values():
+    for law in published.materials.values():
         for mode in ("uniaxial", "equibiaxial", "pure shear"):
             low, high = law.stable_range(mode)
             assert low <= 0.5
@@ -73,7 +73,7 @@ def test_a_set_without_fat_refuses_a_region_it_cannot_serve(tmp_path: Path) -> N
 
 def test_regions_are_called_alike_in_any_case() -> None:
     laws, notes = material_set("luboz").for_regions(["SKIN", "Fat"])
-    assert laws["SKIN"] is material_set("luboz").laws["skin"]
+    assert laws["SKIN"] is material_set("luboz").materials["skin"]
     assert notes == ()
 
 
@@ -85,8 +85,8 @@ def test_own_sets_in_all_forms(tmp_path: Path) -> None:
     )
     sets = read_material_sets(file)
     assert sets["one"].title == "Ours"
-    assert sets["one"].laws["fat"].shear_modulus_mpa == pytest.approx(0.012)
-    assert sets["two"].laws["skin"].vector.tolist() == pytest.approx([0.2, 1.0, 0.03, 0.0])
+    assert sets["one"].materials["fat"].shear_modulus_mpa == pytest.approx(0.012)
+    assert sets["two"].materials["skin"].vector.tolist() == pytest.approx([0.2, 1.0, 0.03, 0.0])
     with pytest.raises(InputError, match="holds 2 sets"):
         material_set(file)
 

@@ -16,14 +16,11 @@ import pytest
 from typer.testing import CliRunner
 
 from dvc.mesh import TetMesh
-from fe.load_stages import Kept
-from fe.materials import NeoHooke
-from fe.mesh_file import write_tet_mesh
-from fe.plate import Plate
-from fe.restart import fingerprint, read_kept, write_kept
-from fe.simulate import LoadStep, State, simulate
+from fe import Checkpoint, LoadState, LoadStep, NeoHooke, Plate, Problem, write_tet_mesh
+from fe.restart import fingerprint, read_checkpoint, write_checkpoint
 from mrstrain.cli.app import app
 from mrstrain.studies import stages
+from tests.fe.solving import Notebook, solved
 from tests.fe.test_simulate import ALONG, DOWN, LAWS, dome
 
 PLATE = Plate(DOWN, ALONG, turns=True)
@@ -32,23 +29,21 @@ GIVEN = ["--load", "a=2", "--load", "b=2,1", "--load", "c=2,2", "--set", "luboz"
 GIVEN += ["--shear-direction", "0", "1", "0", "--workers", "1"]
 
 
-def run(loads: list[LoadStep] = LOADS, **others) -> tuple[list[State], list[str], list[tuple[str, Kept]]]:
-    told: list[str] = []
-    way: list[tuple[str, Kept]] = []
-    settled = lambda load, kept: way.append((load.name, kept))  # noqa: E731
-    states = simulate(dome((3, 4, 4)), LAWS, PLATE, loads, tell=told.append, settled=settled, **others)
-    return states, told, way
+def run(loads: list[LoadStep] = LOADS, **others) -> tuple[list[LoadState], list[str], list[tuple[str, Checkpoint]]]:
+    heard = Notebook()
+    states = solved(dome((3, 4, 4)), LAWS, PLATE, loads, observer=heard, **others)
+    return states, heard.lines, heard.increments
 
 
 @pytest.fixture(scope="module")
-def whole() -> tuple[list[State], list[str], list[tuple[str, Kept]]]:
+def whole() -> tuple[list[LoadState], list[str], list[tuple[str, Checkpoint]]]:
     return run()
 
 
 def test_going_on_from_a_load_ends_where_an_uncut_run_ends(whole, tmp_path: Path) -> None:
     states, told, _ = whole
-    write_kept(tmp_path / "a.npz", states[0].kept, "this")
-    again, lines, _ = run(earlier=[read_kept(tmp_path / "a.npz", "this")])
+    write_checkpoint(tmp_path / "a.npz", states[0].checkpoint, "this")
+    again, lines, _ = run(earlier=[read_checkpoint(tmp_path / "a.npz", "this")])
     for state, other in zip(states, again, strict=True):
         assert np.abs(other.u_mm - state.u_mm).max() < 1e-9
         assert np.abs(other.pressure_mpa - state.pressure_mpa).max() < 1e-9
@@ -68,7 +63,7 @@ def test_going_on_from_the_middle_of_a_load(whole, load: str) -> None:
     on_way = [kept for name, kept in way if name == load and kept.reached < 1.0]
     kept = on_way[len(on_way) // 2]
     assert 0.0 < kept.reached < 1.0
-    again, lines, _ = run(earlier=[kept] if load == "a" else [states[0].kept, kept])
+    again, lines, _ = run(earlier=[kept] if load == "a" else [states[0].checkpoint, kept])
     assert len(lines) < len(told)
     for state, other in zip(states, again, strict=True):
         assert other.reached == 1.0
@@ -79,14 +74,14 @@ def test_going_on_from_the_middle_of_a_load(whole, load: str) -> None:
 def test_a_path_whose_time_is_over_ends_where_it_stands_and_goes_on(
     whole, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("fe.simulate.time", SimpleNamespace(monotonic=count().__next__))
+    monkeypatch.setattr("fe.solution.time", SimpleNamespace(monotonic=count().__next__))
     cut, _, _ = run(limit_s=2)  # asked before every step: two are made
     assert [state.load.name for state in cut] == ["a"]
     assert cut[0].out_of_time
     assert 0.0 < cut[0].reached < 1.0
     assert cut[0].force_n[0] == pytest.approx(2.0 * cut[0].reached, rel=0.01)
-    write_kept(tmp_path / "a.npz", cut[0].kept, "this")
-    on, _, _ = run(earlier=[read_kept(tmp_path / "a.npz", "this")])
+    write_checkpoint(tmp_path / "a.npz", cut[0].checkpoint, "this")
+    on, _, _ = run(earlier=[read_checkpoint(tmp_path / "a.npz", "this")])
     for state, other in zip(whole[0], on, strict=True):
         assert (other.reached, other.out_of_time, state.out_of_time) == (1.0, False, False)
         assert other.force_n == pytest.approx(state.force_n, abs=2e-3)
@@ -99,17 +94,17 @@ def test_a_path_cut_while_the_plate_approaches_ends_where_an_uncut_one_does(
 ) -> None:
     plate = Plate(DOWN, ALONG, turns=turns)
 
-    def going(**others) -> State:
-        return simulate(dome((3, 4, 4)), LAWS, plate, LOADS[:1], **others)[0]
+    def going(**others) -> LoadState:
+        return solved(dome((3, 4, 4)), LAWS, plate, LOADS[:1], **others)[0]
 
     whole = going()
     with monkeypatch.context() as clock:
-        clock.setattr("fe.simulate.time", SimpleNamespace(monotonic=count().__next__))
+        clock.setattr("fe.solution.time", SimpleNamespace(monotonic=count().__next__))
         cut = going(limit_s=steps)
     assert cut.out_of_time
     assert 0.0 <= cut.reached < 1.0
-    on = going(earlier=[cut.kept])
-    assert on.travel_mm[0] == pytest.approx(whole.travel_mm[0], abs=2e-3)
+    on = going(earlier=[cut.checkpoint])
+    assert on.plate_displacement_mm[0] == pytest.approx(whole.plate_displacement_mm[0], abs=2e-3)
     assert np.abs(on.u_mm - whole.u_mm).max() < 0.01 * np.abs(whole.u_mm).max()
 
 
@@ -140,7 +135,7 @@ def test_what_was_made_from_something_else_is_not_used(whole, tmp_path: Path) ->
     mesh = dome((3, 4, 4))
 
     def made_from(mesh: TetMesh = mesh, laws=LAWS, plate: Plate = PLATE, loads=LOADS, element: str = "P1") -> str:
-        return fingerprint(mesh, laws, plate, loads, ["bone"], element)
+        return fingerprint(Problem(mesh, laws, plate, loads, element=element), len(loads))
 
     shifted = TetMesh(mesh.points_mm + 1e-9, mesh.cells, mesh.regions, mesh.facets)
     less = TetMesh(mesh.points_mm, mesh.cells, mesh.regions, mesh.facets | {"bone": mesh.facets["bone"][1:]})
@@ -150,22 +145,23 @@ def test_what_was_made_from_something_else_is_not_used(whole, tmp_path: Path) ->
         made_from(laws=LAWS | {"skin": NeoHooke.of(0.2, nu=0.499)}),
         made_from(plate=Plate(DOWN, ALONG, turns=True, pivot_mm=[0, 1, 0])),
         made_from(plate=Plate(DOWN, ALONG)),
-        made_from(plate=Plate(DOWN, ALONG, taped=False)),
         made_from(plate=Plate(DOWN, ALONG, turns=True, gap_mm=0.5)),
         made_from(loads=[LoadStep("a", 2.0), LoadStep("b", 2.0, 1.1)]),
         made_from(loads=[LoadStep("a", 2.0), LoadStep("b", 2.0, shear_mm=1.0)]),
         made_from(element="P2"),
     ]
     assert len({made_from(), *others}) == len(others) + 1
+    slides = Plate(DOWN, ALONG, taped=False)  # and so carries no shear
+    assert made_from(plate=slides, loads=LOADS[:1]) != made_from(plate=Plate(DOWN, ALONG), loads=LOADS[:1])
     renamed = [LoadStep("x", 2.0), LoadStep("b", 2.0, 1.0)]
     assert made_from(dome((3, 4, 4)), loads=renamed) == made_from()
     place = tmp_path / "a.restart.npz"
-    write_kept(place, whole[0][0].kept, made_from())
-    assert read_kept(place, made_from()) is not None
-    assert read_kept(place, others[0]) is None
-    assert read_kept(tmp_path / "b.restart.npz", made_from()) is None
+    write_checkpoint(place, whole[0][0].checkpoint, made_from())
+    assert read_checkpoint(place, made_from()) is not None
+    assert read_checkpoint(place, others[0]) is None
+    assert read_checkpoint(tmp_path / "b.restart.npz", made_from()) is None
     place.write_bytes(place.read_bytes()[:-200])
-    assert read_kept(place, made_from()) is None
+    assert read_checkpoint(place, made_from()) is None
 
 
 def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:

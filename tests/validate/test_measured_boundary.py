@@ -16,8 +16,7 @@ from dvc.deformation.protocol import Affine
 from dvc.errors import InputError
 from dvc.io.result_folder import write_displacement
 from dvc.mesh import TetMesh, outer_faces
-from fe.materials import NeoHooke, Ogden
-from fe.mesh_file import write_tet_mesh
+from fe import NeoHooke, Ogden, write_tet_mesh
 from mrstrain.cli.app import app
 from tests.blocks import block
 from tests.validate.test_comparison import labels

@@ -11,17 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from dvc.deformation.protocol import Deformation
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
+from fe import LoadStep, Plate, Problem, paths_of, published_names, read_tet_mesh, write_tet_mesh
 from fe.figures import _along_plate
-from fe.mesh_file import read_tet_mesh, write_tet_mesh
-from fe.published import published_names
-from fe.result import deformation, patch_volumes, volume_percentiles
-from fe.simulate import LoadStep, simulate
+from fe.result import patch_volumes, volume_percentiles
 from mrstrain.cli.app import app
-from mrstrain.models.loads import load_named, paths_of
+from mrstrain.models.loads import load_named
 from mrstrain.models.simulate import simulate as run
 from tests.blocks import block
 from tests.fe.test_mesh_names import abaqus, ansys
@@ -313,16 +310,6 @@ def test_the_dashed_line_lies_on_the_tissue_that_a_plate_from_elsewhere_presses(
     assert _along_plate(mesh, state, state.plate_axes[:, [1, 0, 2]], np.zeros(3)) is None
 
 
-def test_a_simulation_is_a_deformation() -> None:
-    mesh = dome((3, 4, 4))
-    state = press(mesh, PRESS)[0]
-    field = deformation(mesh, state)
-    assert isinstance(field, Deformation)
-    u, H = field.evaluate(mesh.centroids_mm)
-    assert np.abs(u - state.u_mm[mesh.cells].mean(axis=1)).max() < 1e-12
-    assert np.abs(H - state.gradients).max() < 1e-9
-
-
 def test_the_area_under_the_plate_is_that_of_its_faces() -> None:
     mesh = block_under_plate()
     bound = LoadStep("in", normal_mm=0.5)
@@ -353,15 +340,9 @@ def test_the_mesh_may_come_from_elsewhere(tmp_path: Path) -> None:
     read = read_tet_mesh(tmp_path / "dome.inp")  # the set of all elements is left out
     assert set(read.regions) == {"fat", "skin"}
     with pytest.raises(InputError, match="no facets 'bone'; it has none"):
-        simulate(read, {"fat": FAT, "skin": FAT}, _plate(), [LoadStep("a", 1.0)])
+        Problem(read, {"fat": FAT, "skin": FAT}, Plate(DOWN, [0.0, 1.0, 0.0]), [LoadStep("a", 1.0)])
 
 
 def _rows(numbers: str) -> list[str]:
     each = numbers.split(", ")
     return [", ".join(each[start : start + 16]) + "," for start in range(0, len(each), 16)]
-
-
-def _plate():
-    from fe.plate import Plate
-
-    return Plate(DOWN, [0.0, 1.0, 0.0])

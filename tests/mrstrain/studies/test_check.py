@@ -13,7 +13,7 @@ from dvc.images.image import Grid, Image, LabelMap
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_labels
 from dvc.mesh import TetMesh
-from fe.mesh_file import write_tet_mesh
+from fe import write_tet_mesh
 from mrstrain.studies import costs, stages
 from mrstrain.studies.check import check, wrong_with
 from mrstrain.studies.file import read_study

@@ -1,8 +1,8 @@
-"""The way of a plate against tissue: from one equilibrium to the next, in steps as large as converge."""
+"""A plate pressed against tissue: from one converged increment to the next, in steps as large as converge."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,10 +14,12 @@ from fe.assembly import Assembler
 from fe.descent import descend
 from fe.elements import edges_of
 from fe.linear import Solver
+from fe.load_step import PlateTarget
 from fe.model import Model
-from fe.newton import Converged, Tolerance, equilibrium
-from fe.plate import Contact, Hold, Plate
-from fe.plate_rotation import Turning
+from fe.newton import Converged, Imposed, Tolerance, equilibrium
+from fe.plate import Contact, ContactStatus
+from fe.plate_rotation import Parallel, Turning
+from fe.problem import Problem
 from fe.surface_sets import SKIN
 
 _FIRST_STEP = 0.25
@@ -32,37 +34,12 @@ _ENOUGH = (0.2, 0.4, 0.6, 0.8)  # shares of the normal load up to which the plat
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Goal:
-    """What the plate is to reach along each of its three axes: a force, or a travel.
-
-    Attributes
-    ----------
-    values : (3,)
-        Forces in N, travels in mm.
-    travels : (3,) bool
-        Along which axes a travel is given.
-    """
-
-    values: FloatArray
-    travels: BoolArray
-
-    @property
-    def sheared(self) -> bool:
-        """Whether it asks for a force or a travel across the normal."""
-        return bool(self.values[1:].any() or self.travels[1:].any())
-
-    def unsheared(self) -> Goal:
-        """The same along the normal, without a force across it."""
-        return Goal(self.values * [1.0, 0.0, 0.0], self.travels & [True, False, False])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PlateState:
     """A plate in equilibrium; vectors along its axes at the start.
 
     Attributes
     ----------
-    travel_mm : (3,)
+    displacement_mm : (3,)
         Of its pivot, from its start.
     force_n : (3,)
         On the tissue.
@@ -74,7 +51,7 @@ class PlateState:
         Of the surface that holds to it, as it is now: of faces with all their corners on the plate.
     """
 
-    travel_mm: FloatArray
+    displacement_mm: FloatArray
     force_n: FloatArray
     turn_deg: FloatArray
     moment_nmm: FloatArray
@@ -87,66 +64,70 @@ class PlateState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Standing:
-    """An equilibrium with all that it takes to go on from it.
+class Increment:
+    """A converged increment, with all that it takes to go on from it.
 
     Attributes
     ----------
     unknowns : (unknowns,)
         Displacements, along the plate's axes, and pressures.
     plate : PlateState
-    hold : Hold
+    contact : ContactStatus
     """
 
     unknowns: FloatArray
     plate: PlateState
-    hold: Hold
+    contact: ContactStatus
 
 
-class Path:
-    """The state on its way, and what moves it; vectors along the plate's axes.
+class LoadPath:
+    """The body under a load that grows, increment by increment; vectors along the plate's axes.
+
+    Parameters
+    ----------
+    model : Model
+    mesh : TetMesh
+        That of the model, along the plate's axes.
+    problem : Problem
+        Its plate and what is fixed.
+    threads, tolerance
+        As in `fe.solution.SolverOptions`.
 
     Attributes
     ----------
     state : (unknowns,)
     plate : PlateState
     curve : list of PlateState
-        Every equilibrium so far.
+        The plate at every converged increment so far.
     iterations : int
         Newton steps so far.
+    log, is_over, on_converged : callable
+        Gets a line for each step; says whether to stop where it is; called at each increment that can be resumed from.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        mesh: TetMesh,
-        plate: Plate,
-        fixed: Sequence[str],
-        threads: int,
-        tolerance: Tolerance,
-        tell: Callable[[str], None],
-        over: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self.model, self.tolerance, self.tell = model, tolerance, tell
-        self.over = over  # whether to stop where it stands
-        self.settled: Callable[[], None] = lambda: None  # called at each equilibrium from which one can go on
-        held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in fixed]))
+    def __init__(self, model: Model, mesh: TetMesh, problem: Problem, threads: int, tolerance: Tolerance) -> None:
+        self.model, self.tolerance = model, tolerance
+        self.log: Callable[[str], None] = lambda _: None
+        self.is_over: Callable[[], bool] = lambda: False
+        self.on_converged: Callable[[], None] = lambda: None
+        held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in problem.fixed]))
         touching = np.setdiff1d(_nodes_on(model, mesh, SKIN), held)
-        self.contact = Contact(plate, model.space.nodes_mm, touching)
+        self.contact = Contact(problem.plate, model.space.nodes_mm, touching)
         self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), self.contact.may_follow)
         self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
         self.extent_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
         self.state = np.zeros(model.unknowns)
         self._faces = mesh.facets[SKIN]
-        self.plate = PlateState(np.array([plate.gap_mm, 0.0, 0.0]), np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
+        start_mm = np.array([problem.plate.gap_mm, 0.0, 0.0])
+        self.plate = PlateState(start_mm, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
         self.curve = [self.plate]
         self.iterations = 0
 
-    def reached(self, goal: Goal) -> FloatArray:
-        """What is reached (3,) of what a goal asks for."""
-        return np.where(goal.travels, self.plate.travel_mm, self.plate.force_n)
+    def reached(self, target: PlateTarget) -> FloatArray:
+        """What is reached (3,) of what a target asks for."""
+        return np.where(target.displaced, self.plate.displacement_mm, self.plate.force_n)
 
-    def approach(self, goal: Goal) -> bool:
+    def approach(self, target: PlateTarget) -> bool:
         """Touch, move on to a part of the normal load asked for, and let a plate go that turns.
 
         Until then it stays level, as a plate on a node or two would tip over; and if it cannot be let go there, it is
@@ -156,13 +137,14 @@ class Path:
             self.contact.touch_first(self.state)
         start = np.array([self.contact.plate.gap_mm, 0.0, 0.0])
         for share in _ENOUGH:
-            if goal.travels[0]:
-                part = start + share * (goal.values - start)
-                if part[0] > self.plate.travel_mm[0] and not self.raise_to(Goal(part, goal.travels).unsheared()):
+            if target.displaced[0]:
+                part = start + share * (target.values - start)
+                part_target = PlateTarget(part, target.displaced).unsheared()
+                if part[0] > self.plate.displacement_mm[0] and not self.raise_to(part_target):
                     return False
             else:
-                self._push(share * goal.values[0], goal.values[0])
-            if self.over():
+                self._push(share * target.values[0], target.values[0])
+            if self.is_over():
                 return False
             if not self.contact.plate.turns or self._let_go():
                 return True
@@ -173,73 +155,73 @@ class Path:
 
         A plate that is held less sinks in further; one that comes back out instead tips over on too few nodes.
         """
-        level, force, moment = self.standing, self.plate.force_n, self.plate.moment_nmm
-        self.contact.hold = replace(self.contact.hold, loose=True)
-        gap_mm, level_mm = self.contact.plate.gap_mm, level.plate.travel_mm[0]
+        level, force, moment = self.increment, self.plate.force_n, self.plate.moment_nmm
+        self.contact.status = replace(self.contact.status, turns=True)
+        gap_mm, level_mm = self.contact.plate.gap_mm, level.plate.displacement_mm[0]
         least_mm = gap_mm + _TIPPING * (level_mm - gap_mm)
         left, step = 1.0, 0.5
-        while left > 0.0 and step > _LEAST_STEP and not self.over():
-            kept = self.standing
+        while left > 0.0 and step > _LEAST_STEP and not self.is_over():
+            last = self.increment
             least = max(0.0, left - step)
             if self._go(np.zeros(3, dtype=bool), force, least * moment):
-                if self.plate.travel_mm[0] < least_mm:
+                if self.plate.displacement_mm[0] < least_mm:
                     break
                 left, step = least, step * _GROWTH
-                self._told(f"{1.0 - left:.0%} let go")
+                self._log(f"{1.0 - left:.0%} let go")
             else:
-                self._back(kept)
+                self._back(last)
                 step *= _SHRINK
         if left > 0.0:
             self._back(level)
         return left == 0.0
 
-    def raise_to(self, goal: Goal) -> bool:
-        """Go on from what is to the goal, in steps as large as converge; whether it is there.
+    def raise_to(self, target: PlateTarget) -> bool:
+        """Go on from what is to the target, in steps as large as converge; whether it is there.
 
         Where Newton's method does not get on under forces, it goes on downhill (`fe.descent`), with a plate on
-        tape that does not turn. A travel goes on in steps so small that what touches does so in its order.
+        tape that does not turn. A displacement goes on in steps so small that nodes touch in their order.
         """
-        before = self.reached(goal)
-        way = goal.values - before
-        largest = _MOST_APPROACH_MM / max(float(np.abs(way[goal.travels]).max(initial=0.0)), 1e-12)
+        before = self.reached(target)
+        way = target.values - before
+        largest = _MOST_APPROACH_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
         done, step, downhill = 0.0, _FIRST_STEP, False
         least = min(_LEAST_STEP, 0.01 * largest)
-        while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.over():
+        while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.is_over():
             step = min(step, largest)
             share = min(1.0, done + step)
-            kept = self.standing
-            if self._go(goal.travels, before + share * way, downhill=downhill):
+            last = self.increment
+            if self._go(target.displaced, before + share * way, downhill=downhill):
                 done, step = share, step if downhill else step * _GROWTH
-                self._told(f"{done:.0%} of the way")
-                self.settled()
+                self._log(f"{done:.0%} of the way")
+                self.on_converged()
                 continue
-            self._back(kept)
+            self._back(last)
             step *= _SHRINK
-            if step < _SOFT_STEP and not (downhill or goal.travels.any()) and self.contact.stays:
+            if step < _SOFT_STEP and not (downhill or target.displaced.any()) and self.contact.stays:
                 downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0
 
     def _push(self, enough_n: float, most_n: float) -> None:
         """Move the plate along its normal until its force is enough, or no more can be had; never past the most."""
-        farthest = self.plate.travel_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
+        farthest = self.plate.displacement_mm[0] + float(np.ptp(self.model.space.nodes_mm[:, 0]))
         step, growth = _APPROACH_MM, _GROWTH
-        while self.plate.force_n[0] < enough_n and step > _LEAST_APPROACH_MM and not self.over():
-            if farthest - self.plate.travel_mm[0] < step:
+        while self.plate.force_n[0] < enough_n and step > _LEAST_APPROACH_MM and not self.is_over():
+            if farthest - self.plate.displacement_mm[0] < step:
                 break
-            kept = self.standing
-            aim = np.array([self.plate.travel_mm[0] + step, *self.plate.force_n[1:]])
+            last = self.increment
+            aim = np.array([self.plate.displacement_mm[0] + step, *self.plate.force_n[1:]])
             if self._go(_ALONG_NORMAL, aim) and self.plate.force_n[0] < most_n:
                 step = min(growth * step, _MOST_APPROACH_MM)
-                self._told("moved")
-                self.settled()
+                self._log("moved")
+                self.on_converged()
             else:
-                self._back(kept)
+                self._back(last)
                 step, growth = _SHRINK * step, 1.0
 
     def _go(
-        self, travels: BoolArray, aim: FloatArray, moment_nmm: FloatArray | float = 0.0, *, downhill: bool = False
+        self, displaced: BoolArray, aim: FloatArray, moment_nmm: FloatArray | float = 0.0, *, downhill: bool = False
     ) -> bool:
-        """Find equilibrium at travels (mm) along some of the plate's axes, and under forces (N) along the others.
+        """Find equilibrium at displacements (mm) along some of the plate's axes, and under forces (N) along the others.
 
         A plate that turns freely also takes up a moment (3,), N mm. ``downhill`` is by `fe.descent`: under forces
         alone, and a plate that does not turn.
@@ -248,39 +230,31 @@ class Path:
         contact.begin(self.state)
         equations = self.assembler.own_equations + np.arange(3)
         outside = np.zeros(self.assembler.size)
-        outside[equations] = np.where(travels, 0.0, aim)
+        outside[equations] = np.where(displaced, 0.0, aim)
         self.assembler.share(contact.followers)
         if downhill:
-            found = self._descended(outside)
+            converged = self._descended(outside)
         else:
-            turning = None
-            if contact.hold.loose:
-                turning = Turning(contact, self.assembler, self.solver, np.broadcast_to(moment_nmm, 3))
-            found = equilibrium(
-                self.assembler,
-                self.solver,
-                self.state,
-                outside,
-                equations[travels],
-                (aim - self.plate.travel_mm)[travels],
-                self.tolerance,
-                self._changed,
-                self.tell,
-                turning,
+            rotation = Parallel()
+            if contact.status.turns:
+                rotation = Turning(contact, self.assembler, self.solver, np.broadcast_to(moment_nmm, 3))
+            imposed = Imposed(outside, equations[displaced], (aim - self.plate.displacement_mm)[displaced])
+            converged = equilibrium(
+                self.assembler, self.solver, self.state, imposed, self.tolerance, self._changed, self.log, rotation
             )
-        if found is None:
+        if converged is None:
             return False
-        travel = contact.travel_mm(found.state)
-        if np.abs(travel - [contact.plate.gap_mm, 0.0, 0.0]).max() > self.extent_mm:
-            self.tell("the plate would have moved farther than the body is large")
+        moved = contact.displacement_mm(converged.state)
+        if np.abs(moved - [contact.plate.gap_mm, 0.0, 0.0]).max() > self.extent_mm:
+            self.log("the plate would have moved farther than the body is large")
             return False
-        self.state = found.state
-        self.iterations += found.iterations
+        self.state = converged.state
+        self.iterations += converged.iterations
         self.plate = PlateState(
-            travel,
-            contact.force_n(found.forces),
-            np.degrees(Rotation.from_matrix(contact.hold.rotation).as_rotvec()),
-            contact.moment_nmm(found.state, found.forces),
+            moved,
+            contact.force_n(converged.forces),
+            np.degrees(Rotation.from_matrix(contact.status.rotation).as_rotvec()),
+            contact.moment_nmm(converged.state, converged.forces),
             self._area_mm2(),
         )
         self.curve.append(self.plate)
@@ -295,9 +269,8 @@ class Path:
             return touched
 
         return descend(
-            self.assembler, self.solver, self.state, outside, self.tolerance, changed, self.tell, self.extent_mm,
-            self.over,
-        )  # fmt: skip
+            self.assembler, self.solver, self.state, outside, self.tolerance, changed, self.log, self.is_over
+        )
 
     def _area_mm2(self) -> float:
         """Area of the faces of which every corner holds to the plate, as they are now."""
@@ -313,27 +286,29 @@ class Path:
         return True
 
     @property
-    def standing(self) -> Standing:
-        """Where it is now."""
-        return Standing(self.state, self.plate, self.contact.hold)
+    def increment(self) -> Increment:
+        """The increment that it is at."""
+        return Increment(self.state, self.plate, self.contact.status)
 
-    def stand(self, where: Standing) -> None:
-        """Go to where it, or another on the same model, has been before; the curve stays as it is."""
-        self.state, self.plate, self.contact.hold = where.unknowns, where.plate, where.hold
+    def resume(self, where: Increment) -> None:
+        """Go to an increment of this path, or of another on the same model; the curve stays as it is."""
+        self.state, self.plate, self.contact.status = where.unknowns, where.plate, where.contact
 
-    def _back(self, where: Standing) -> None:
+    def _back(self, where: Increment) -> None:
         """Take steps back that were made since."""
         while self.curve[-1] is not where.plate:
             self.curve.pop()
-        self.stand(where)
+        self.resume(where)
 
-    def _told(self, what: str) -> None:
+    def _log(self, what: str) -> None:
         plate = self.plate
-        travel, force, turn = (
-            ", ".join(f"{v:.3f}" for v in x) for x in (plate.travel_mm, plate.force_n, plate.turn_deg)
+        moved, force, turn = (
+            ", ".join(f"{v:.3f}" for v in x) for x in (plate.displacement_mm, plate.force_n, plate.turn_deg)
         )
-        turned = f", turned {turn} degrees" if self.contact.hold.loose else ""
-        self.tell(f"{what}: travel {travel} mm, force {force} N, {len(self.contact.held)} nodes on the plate{turned}")
+        turned = f", turned {turn} degrees" if self.contact.status.turns else ""
+        self.log(
+            f"{what}: displacement {moved} mm, force {force} N, {len(self.contact.held)} nodes on the plate{turned}"
+        )
 
 
 def _nodes_on(model: Model, mesh: TetMesh, facets: str) -> IntArray:

@@ -1,0 +1,386 @@
+"""A simulation: what a material parameter set gave under its loads, as arrays, as files, as a picture."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dvc.arrays import FloatArray
+from dvc.atomic_files import write_whole
+from dvc.deformation.nodal import OnMesh
+from dvc.errors import InputError
+from dvc.mesh import TetMesh
+from fe.decks import write_calculix, write_febio
+from fe.elements import DESCRIPTIONS
+from fe.load_step import LoadStep
+from fe.materials import MODES, Material
+from fe.model import CROWDED
+from fe.plate import Plate
+from fe.problem import Problem, problems_of
+from fe.published import MaterialSet
+from fe.result import (
+    RegionFigures,
+    cauchy_stress,
+    region_figures,
+    volume_share_off,
+    write_curve_csv,
+    write_regions_csv,
+    write_state,
+)
+from fe.simulation_files import RECORD, read_parts
+from fe.solution import LoadState, Observer, SolverOptions, solve
+from fe.surface_sets import BONE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_FAR = 0.05  # det F of a patch further from 1 than this is counted
+_MUCH = 0.05  # share of the volume above which that is noted
+_CROWD = 0.01  # share of a region's volume, squeezed flat, above which that is noted
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """What a material parameter set gave under its loads.
+
+    Attributes
+    ----------
+    materials : MaterialSet
+        Its models are those of the mesh's regions.
+    mesh : TetMesh
+        Undeformed, LPS mm.
+    paths : tuple of tuple of LoadStep
+        The loads asked for, each path in the order in which they are reached from one another.
+    states : tuple of LoadState
+        In that order; the last of a path that could not go on has ``reached`` below 1.
+    fixed : tuple of str
+        Surface sets that did not move.
+    element : str
+        As in `fe.elements`.
+    turns : bool
+        Whether the plate turned freely.
+    remarks : tuple of str
+        What was assumed.
+    regions : tuple of RegionFigures
+        Strain, stress and volume of each region under each load.
+    """
+
+    materials: MaterialSet
+    mesh: TetMesh
+    paths: tuple[tuple[LoadStep, ...], ...]
+    states: tuple[LoadState, ...]
+    fixed: tuple[str, ...] = (BONE,)
+    element: str = "P1"
+    turns: bool = False
+    remarks: tuple[str, ...] = ()
+    regions: tuple[RegionFigures, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        rows = [row for state in self.states for row in region_figures(self.mesh, state, self.materials.materials)]
+        object.__setattr__(self, "regions", tuple(rows))
+
+    @classmethod
+    def of(cls, materials: MaterialSet, problems: Sequence[Problem], states: Sequence[LoadState]) -> Simulation:
+        """The simulation that solved these problems, one for each path, with the states in which their loads ended."""
+        first = problems[0]
+        by_region, remarks = materials.for_regions(first.mesh.regions)
+        return cls(
+            replace(materials, materials=by_region), first.mesh, tuple(tuple(one.loads) for one in problems),
+            tuple(states), tuple(first.fixed), first.element, first.plate.turns, remarks,
+        )  # fmt: skip
+
+    @property
+    def name(self) -> str:
+        """Name of the material parameter set."""
+        return self.materials.name
+
+    @property
+    def loads(self) -> tuple[LoadStep, ...]:
+        """The loads asked for."""
+        return tuple(load for path in self.paths for load in path)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every load was reached, with materials that are stable at the strain reached."""
+        return len(self.states) == len(self.loads) and not self._unstable and all(s.reached == 1.0 for s in self.states)
+
+    @property
+    def timed_out(self) -> bool:
+        """Whether all that it lacks is what its limit of time did not let it reach."""
+        ended = all(state.reached == 1.0 or state.out_of_time for state in self.states)
+        return not self.complete and not self._unstable and ended
+
+    @property
+    def _unstable(self) -> list[RegionFigures]:
+        return [row for row in self.regions if row.stable_share < 1.0]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was assumed, and what is not to be trusted."""
+        reached = {state.load.name for state in self.states}
+        return (
+            *self.remarks,
+            *(
+                f"{row.load}: the law of {row.region} is not stable (Drucker) in {1.0 - row.stable_share:.1%} of its "
+                "volume."
+                for row in self._unstable
+            ),
+            *(
+                f"{row.load}: {row.crowded_share:.1%} of {row.region} is squeezed below det F {CROWDED:g}, where the "
+                "solver holds cells open; the law bears no pressure above its bulk modulus "
+                f"({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa)."
+                for row in self.regions
+                if row.crowded_share > _CROWD
+            ),
+            *(
+                f"{state.load.name}: its time was over at {state.reached:.0%} of the load; given more, it goes on from "
+                "there."
+                if len(state.curve) > 1
+                else f"{state.load.name}: its time was over before the first equilibrium."
+                for state in self.states
+                if state.out_of_time
+            ),
+            *(
+                f"{load.name} was not tried: the load before it was not reached."
+                for load in self.loads
+                if load.name not in reached
+            ),
+            *(
+                f"{state.load.name}: det F of nodal patches is over 5 % off what the law asks for in {share:.0%} of "
+                "the volume; a finer mesh keeps volume better."
+                for state in self.states
+                if (share := self._share_off(state)) > _MUCH
+            ),
+        )
+
+    def _share_off(self, state: LoadState) -> float:
+        return volume_share_off(self.mesh, state, self.materials.materials, _FAR)
+
+    def state(self, load: str) -> LoadState:
+        """The state in which a load ended.
+
+        Raises
+        ------
+        InputError
+            If no load of that name was simulated.
+        """
+        for state in self.states:
+            if state.load.name == load:
+                return state
+        there = ", ".join(state.load.name for state in self.states)
+        raise InputError(f"No load '{load}' was simulated; there are {there or 'none'}.")
+
+    def deformation(self, load: str) -> OnMesh:
+        """The deformation under a load, at any point of the mesh."""
+        return OnMesh(self.mesh, self.state(load).u_mm)
+
+    def cauchy_stress(self, load: str) -> FloatArray:
+        """Cauchy stress of each cell (m, 3, 3) under a load, MPa, LPS."""
+        return cauchy_stress(self.state(load), self.mesh, self.materials.materials)
+
+    def __str__(self) -> str:
+        lines = []
+        for state in self.states:
+            shear = "; ".join(
+                f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}"
+                for row in self.regions
+                if row.load == state.load.name
+            )
+            force = f"{state.force_n[0]:.1f} N and {state.force_n[1]:.1f} N of shear"
+            part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached ({force});"
+            moved = state.plate_displacement_mm
+            lines.append(
+                f"{self.name}, {state.load.name}:{part} plate {moved[0]:.2f} mm in, {moved[1]:.2f} mm along; max. "
+                f"shear strain, median / 90th percentile: {shear}"
+            )
+        return "\n".join([*lines, *(f"{self.name}: {note}" for note in self.notes)])
+
+    def plot(self, loads: Sequence[str] | None = None) -> Figure:
+        """Maximum shear strain on a slice through the bone's lowest point, a panel for each load; all by default."""
+        from fe.figures import sagittal_slice
+
+        return sagittal_slice(self.mesh, self.states if loads is None else [self.state(name) for name in loads])
+
+    def _repr_html_(self) -> str:
+        from dvc.report.sheet import png_bytes
+
+        picture = base64.b64encode(png_bytes(self.plot())).decode("ascii")
+        ended = sum(state.reached == 1.0 for state in self.states)
+        title = f"{self.name}: {ended} of {len(self.loads)} loads reached"
+        names = list(self.materials.materials)
+        rows = [
+            ["load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N"]
+            + [f"{name}, max. shear strain p50 / p90" for name in names]
+        ]
+        for state in self.states:
+            numbers = (*state.plate_displacement_mm[:2], *state.force_n[:2])
+            mine = [row for row in self.regions if row.load == state.load.name]
+            rows.append(
+                [state.load.name, str(state.load), f"{state.reached:.0%}", *(f"{value:.2f}" for value in numbers)]
+                + [f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in mine]
+            )
+        table = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        notes = "".join(f"<li>{html.escape(note)}</li>" for note in self.notes)
+        return (
+            f"<div><strong>{html.escape(title)}</strong><table>{table}</table><ul>{notes}</ul>"
+            f'<img style="max-width: 100%" alt="Maximum shear strain" src="data:image/png;base64,{picture}"></div>'
+        )
+
+    def parameters(self) -> dict[str, object]:
+        """Materials, loads and element as they stand in ``simulation.json``."""
+        turns = "let go to turn about its pivot once it presses" if self.turns else "rotation locked"
+        return {
+            "set": self.name,
+            "title": self.materials.title,
+            "source": self.materials.source,
+            "laws": {
+                region: {
+                    "law": material.description,
+                    "vector_mpa": material.vector.tolist(),
+                    "bulk_modulus_mpa": material.bulk_modulus_mpa,
+                    "stable_stretches": {mode: material.stable_range(mode) for mode in MODES},
+                }
+                for region, material in self.materials.materials.items()
+            },
+            "region_numbers_in_vtu": {number: name for number, name in enumerate(self.materials.materials, start=1)},
+            "paths": [[asdict(load) for load in path] for path in self.paths],
+            "plate": "rigid; moved to the tissue, then to the forces and travels asked for, no force along the third "
+            f"axis; {turns}",
+            "element": f"{self.element}: {DESCRIPTIONS[self.element]}",
+        }
+
+    def write(self, folder: Path | str, *, record: Mapping[str, object] | None = None, fields: bool = True) -> None:
+        """Write it into a folder that exists, as `mrstrain.simulate` does.
+
+        Parameters
+        ----------
+        folder : path
+            Gets ``LOAD.vtu`` for each load, ``curve.csv`` (force and displacement of the plate), ``regions.csv``,
+            ``simulation.json`` and pictures.
+        record : mapping, optional
+            Provenance to stand in ``simulation.json``, with "parameters" that contain `parameters` and "fixed".
+        fields : bool
+            Whether to write the VTU files.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be written.
+        """
+        from fe import figures
+
+        place = Path(folder)
+        for state in self.states:
+            if fields and len(state.curve) > 1:
+                write_state(place / f"{state.load.name}.vtu", self.mesh, state, self.materials.materials)
+        write_regions_csv(place / "regions.csv", self.regions)
+        write_curve_csv(place / "curve.csv", self.states)
+        parameters = {"fixed": list(self.fixed), "turns": self.turns} | self.parameters()
+        content = {"outcome": {s.load.name: self._outcome(s) for s in self.states}, "notes": list(self.notes)}
+        text = json.dumps(content | dict(record or {"parameters": parameters}), indent=2, allow_nan=False)
+        write_whole(place / RECORD, text + "\n")
+        figures.write_figure(place / "slices.png", self.plot())
+        figures.write_figure(place / "force_travel.png", figures.force_displacement(self.states))
+
+    def write_decks(self, folder: Path | str) -> None:
+        """Write each load as decks with quadratic tetrahedra: ``LOAD.inp`` for CalculiX, ``LOAD.feb`` for FEBio 4.
+
+        Raises
+        ------
+        InputError
+            If one of the two does not have the constitutive model of a region.
+        """
+        given = self.mesh, self.materials.materials
+        for state in self.states:
+            stem = Path(folder) / state.load.name
+            write_calculix(Path(f"{stem}.inp"), *given, state, fixed=self.fixed, quadratic=True)
+            write_febio(Path(f"{stem}.feb"), *given, state, fixed=self.fixed, quadratic=True)
+
+    def _outcome(self, state: LoadState) -> dict[str, object]:
+        assert state.plate_axes is not None
+        plate = state.plate
+        return {
+            "reached": state.reached,
+            "out_of_time": state.out_of_time,
+            "stable_share": min(row.stable_share for row in self.regions if row.load == state.load.name),
+            "plate_axes_lps": state.plate_axes.tolist(),
+            "plate_travel_mm": plate.displacement_mm.tolist(),
+            "plate_force_n": plate.force_n.tolist(),
+            "plate_turn_deg": plate.turn_deg.tolist(),
+            "plate_moment_nmm": plate.moment_nmm.tolist(),
+            "contact_area_mm2": plate.area_mm2,
+            "contact_pressure_mpa": plate.pressure_mpa if plate.area_mm2 > 0.0 else None,
+            "nodes_on_plate": len(state.on_plate),
+            "iterations": state.iterations,
+            "seconds": round(state.seconds, 1),
+            "volume_share_with_patch_det_f_off_by_5_percent": self._share_off(state),
+        }
+
+    @classmethod
+    def read(cls, folder: Path | str, mesh: TetMesh | None = None) -> Simulation:
+        """Read what `write` or `mrstrain.simulate` has written.
+
+        Parameters
+        ----------
+        folder : path
+        mesh : TetMesh, optional
+            The one simulated, for its surface sets, which the files do not hold. Without it, outer faces that did not
+            move are called as what was fixed, or "bone", and the rest of the outside "skin".
+
+        Raises
+        ------
+        InputError
+            If it is no folder of a simulation, a file is damaged, or the mesh is another.
+
+        Notes
+        -----
+        Plate states on the way to a load have the eight digits of ``curve.csv``; all else is as it was computed.
+        """
+        read = cls(**read_parts(Path(folder), mesh))
+        return replace(
+            read, remarks=tuple(note for note in read.remarks if note not in replace(read, remarks=()).notes)
+        )
+
+
+def simulate(
+    mesh: TetMesh,
+    materials: MaterialSet | Mapping[str, Material],
+    plate: Plate | Mapping[str, Plate],
+    loads: Sequence[LoadStep],
+    *,
+    fixed: Sequence[str] = (BONE,),
+    element: str = "P1",
+    options: SolverOptions | None = None,
+    observer: Observer | None = None,
+) -> Simulation:
+    """Simulate a rigid plate that presses and shears soft tissue.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+        LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed.
+    materials : MaterialSet, or mapping of region to Material
+    plate : Plate, or mapping of load to Plate
+    loads : sequence of LoadStep
+        Those with the same normal force lie on one path, in the order of their shear (`fe.paths_of`).
+    fixed : sequence of str
+        Surface sets that do not move.
+    element : {"P1", "MINI", "P2"}
+        As in `fe.elements`.
+    options : SolverOptions, optional
+    observer : Observer, optional
+        Hears how each path gets on.
+
+    Raises
+    ------
+    InputError
+        As `fe.Problem`; before anything is computed.
+    """
+    chosen = materials if isinstance(materials, MaterialSet) else MaterialSet("materials", "", "", dict(materials))
+    problems = problems_of(mesh, chosen.for_regions(mesh.regions)[0], plate, loads, fixed, element)
+    return Simulation.of(chosen, problems, [s for one in problems for s in solve(one, options, observer)])

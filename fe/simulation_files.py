@@ -1,0 +1,116 @@
+"""Files of a simulation read back, and removed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dvc.arrays import FloatArray, IntArray
+from dvc.errors import InputError
+from dvc.mesh import TetMesh, outer_faces
+from fe.load_path import PlateState
+from fe.load_step import LoadStep
+from fe.materials import from_vector
+from fe.published import MaterialSet
+from fe.result import read_curve_csv, read_state
+from fe.solution import LoadState
+from fe.surface_sets import BONE, SKIN
+
+RECORD = "simulation.json"
+_TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
+
+
+def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
+    """What a `fe.Simulation` is made of, from its folder; all notes are among its remarks.
+
+    Raises
+    ------
+    InputError
+        If it is no folder of a simulation, a file is damaged, or the mesh is another.
+    """
+    try:
+        return _parts(place, mesh)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as failure:
+        raise InputError(
+            f"{place}: no folder of a simulation, or a file in it is damaged ({type(failure).__name__}: {failure}). "
+            f"It needs {RECORD}, curve.csv and a VTU file for each load, as `mrstrain simulate` writes them."
+        ) from failure
+
+
+def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
+    content = json.loads((place / RECORD).read_text(encoding="utf-8"))
+    given, outcome = content["parameters"], content["outcome"]
+    paths = tuple(tuple(LoadStep(**load) for load in path) for path in given["paths"])
+    loads = {load.name: load for path in paths for load in path}
+    curves = read_curve_csv(place / "curve.csv")
+    files = {name: read_state(path) for name in outcome if (path := place / f"{name}.vtu").is_file()}
+    first, u_mm, _, _ = next(iter(files.values()))
+    cells = first.cells_dict["tetra"].astype(np.int64)
+    if mesh is None:
+        number = first.cell_data["region"][0]
+        regions = {name: np.flatnonzero(number == int(n)) for n, name in given["region_numbers_in_vtu"].items()}
+        mesh = TetMesh(first.points, cells, regions, _surfaces(cells, u_mm, given["fixed"]))
+    elif not (np.array_equal(mesh.points_mm, first.points) and np.array_equal(mesh.cells, cells)):
+        raise InputError(f"{place}: the mesh given is not the one that was simulated.")
+    undeformed = first, np.zeros_like(first.points), np.zeros((len(cells), 3, 3)), np.zeros(len(cells))
+    states = []
+    for name, at in outcome.items():  # no file: its time was over before the first equilibrium
+        _, u_mm, gradients, pressure_mpa = files.get(name, undeformed)
+        moved, force, turn, moment = (
+            np.array(at[f"plate_{key}"]) for key in ("travel_mm", "force_n", "turn_deg", "moment_nmm")
+        )
+        plate = PlateState(moved, force, turn, moment, at["contact_area_mm2"])
+        state = LoadState(
+            loads[name], at["reached"], u_mm, pressure_mpa, gradients, np.empty(0, dtype=np.int64),
+            (*curves[name][:-1], plate), at["iterations"], at["seconds"],
+            out_of_time=at["out_of_time"], plate_axes=np.array(at["plate_axes_lps"]),
+        )  # fmt: skip
+        states.append(replace(state, on_plate=_on_plate(mesh, state, at["nodes_on_plate"])))
+    materials = {
+        region: from_vector(law["law"], np.array(law["vector_mpa"]), law["bulk_modulus_mpa"])
+        for region, law in given["laws"].items()
+    }
+    return {
+        "materials": MaterialSet(given["set"], given["title"], given["source"], materials),
+        "mesh": mesh,
+        "paths": paths,
+        "states": tuple(states),
+        "fixed": tuple(given["fixed"]),
+        "element": given["element"].split(":")[0],
+        "turns": given["turns"],
+        "remarks": tuple(content["notes"]),
+    }
+
+
+def _surfaces(cells: IntArray, u_mm: FloatArray, fixed: Sequence[str]) -> dict[str, IntArray]:
+    """Outer faces, divided by whether their nodes moved."""
+    faces = outer_faces(cells)
+    still = (u_mm[faces] == 0.0).all(axis=(1, 2))
+    return {fixed[0] if len(fixed) == 1 else BONE: faces[still], SKIN: faces[~still]}
+
+
+def _on_plate(mesh: TetMesh, state: LoadState, count: int) -> IntArray:
+    """The nodes on the plate, in number known: no other node of the skin lies as far along its normal."""
+    assert state.plate_axes is not None
+    skin = np.unique(mesh.facets[SKIN])
+    towards = state.plate_axes @ Rotation.from_rotvec(state.plate.turn_deg, degrees=True).as_matrix()[:, 0]
+    height = (mesh.points_mm + state.u_mm)[skin] @ towards
+    return np.sort(skin[np.argsort(height, kind="stable")[:count]])
+
+
+def clear_simulation(folder: Path) -> None:
+    """Remove what an earlier simulation wrote by its own list, so that nothing old stands beside what is new."""
+    try:
+        loads = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["outcome"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    of_loads = [f"{load}{ending}" for load in loads for ending in (".vtu", ".inp", ".feb")]
+    logs = [f"log-{load}.txt" for load in loads]
+    for name in (*of_loads, *logs, *_TABLES, RECORD):
+        (folder / name).unlink(missing_ok=True)

@@ -1,0 +1,143 @@
+"""A simulation as an object: its arrays, its files and back, its picture and its words."""
+
+import base64
+import io
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+import fe
+from dvc.deformation.protocol import Deformation
+from dvc.errors import InputError
+from tests.fe.test_simulate import ALONG, DOWN, FAT, LAWS, dome
+
+LOADS = [fe.LoadStep("pressed", 2.0), fe.LoadStep("sheared", 2.0, 1.0), fe.LoadStep("in", normal_mm=1.0)]
+WEAK = {"skin": fe.NeoHooke.of(0.067, nu=0.495), "fat": fe.NeoHooke.of(0.01, nu=0.49)}
+
+
+@pytest.fixture(scope="module")
+def simulation() -> fe.Simulation:
+    sets = fe.MaterialSet("mine", "Ours", "measured & fitted", LAWS)
+    return fe.simulate(dome((3, 4, 4)), sets, fe.Plate(DOWN, ALONG, turns=True), LOADS, fixed=("bone",))
+
+
+@pytest.fixture(scope="module")
+def unreached() -> fe.Simulation:
+    loads = [LOADS[0], fe.LoadStep("far <too> much", 2.0, 300.0), fe.LoadStep("never", 2.0, 400.0)]
+    return fe.simulate(dome((3, 4, 4)), WEAK, fe.Plate(DOWN, ALONG), loads)
+
+
+def test_it_holds_displacement_strain_stress_and_forces_as_arrays(simulation: fe.Simulation) -> None:
+    cells = len(simulation.mesh.cells)
+    assert [[load.name for load in path] for path in simulation.paths] == [["pressed", "sheared"], ["in"]]
+    assert simulation.complete
+    state = simulation.state("sheared")
+    assert state.force_n == pytest.approx([2.0, 1.0, 0.0], abs=2e-3)
+    assert state.u_mm.shape == simulation.mesh.points_mm.shape
+    assert simulation.cauchy_stress("sheared").shape == state.strain.green_lagrange.shape == (cells, 3, 3)
+    assert simulation.state("in").plate_displacement_mm[0] == pytest.approx(1.0)
+    field = simulation.deformation("sheared")
+    assert isinstance(field, Deformation)
+    u, H = field.evaluate(simulation.mesh.centroids_mm)
+    assert np.abs(u - state.u_mm[simulation.mesh.cells].mean(axis=1)).max() < 1e-12
+    assert np.abs(H - state.gradients).max() < 1e-9
+    with pytest.raises(InputError, match="No load 'Sheared' was simulated; there are pressed, sheared, in"):
+        simulation.state("Sheared")
+
+
+@pytest.mark.parametrize("with_mesh", [True, False])
+def test_it_comes_back_from_its_folder_as_it_was(simulation: fe.Simulation, tmp_path: Path, with_mesh: bool) -> None:
+    simulation.write(tmp_path)
+    read = fe.Simulation.read(tmp_path, simulation.mesh if with_mesh else None)
+    assert (read.name, read.materials.source, read.element, read.turns) == ("mine", "measured & fitted", "P1", True)
+    assert (read.paths, read.fixed) == (simulation.paths, ("bone",))
+    assert (read.notes, read.complete) == (simulation.notes, True)
+    for was, state in zip(simulation.states, read.states, strict=True):
+        assert np.array_equal(state.u_mm, was.u_mm)
+        assert np.array_equal(state.pressure_mpa, was.pressure_mpa)
+        assert np.abs(state.gradients - was.gradients).max() < 1e-15
+        assert state.on_plate.tolist() == sorted(was.on_plate)
+        assert state.plate.turn_deg.tolist() == was.plate.turn_deg.tolist()
+        assert state.plate.moment_nmm.tolist() == was.plate.moment_nmm.tolist()
+        assert len(state.curve) == len(was.curve)
+        assert state.curve[1].force_n == pytest.approx(was.curve[1].force_n, rel=1e-7, abs=1e-7)
+    for region, material in simulation.materials.materials.items():
+        again = read.materials.materials[region]
+        assert type(again) is type(material)
+        assert again.bulk_modulus_mpa == pytest.approx(material.bulk_modulus_mpa, rel=1e-9)
+        assert (again.vector.tolist(), str(again.description)) == (material.vector.tolist(), material.description)
+        assert set(read.mesh.facets) == {"bone", "skin"}
+        assert np.array_equal(np.unique(read.mesh.facets["bone"]), np.unique(simulation.mesh.facets["bone"]))
+    (tmp_path / "again").mkdir()
+    read.write(tmp_path / "again")
+    assert (tmp_path / "again" / "regions.csv").read_text() == (tmp_path / "regions.csv").read_text()
+    curve, was = (
+        np.genfromtxt(folder / "curve.csv", delimiter=",", skip_header=1, usecols=range(1, 15))
+        for folder in (tmp_path / "again", tmp_path)
+    )
+    assert curve == pytest.approx(was, rel=1e-7, abs=1e-12, nan_ok=True)
+    assert str(read) == str(simulation)
+
+
+def test_what_was_not_reached_comes_back_and_is_marked_everywhere(unreached: fe.Simulation, tmp_path: Path) -> None:
+    share = unreached.state("far <too> much").reached
+    assert 0.0 < share < 1.0
+    assert not unreached.complete
+    unreached.write(tmp_path)
+    read = fe.Simulation.read(tmp_path)
+    assert (read.complete, read.timed_out) == (False, False)
+    assert read.state("far <too> much").reached == share
+    for words in (str(unreached), str(read)):
+        assert f"far <too> much: ONLY {share:.0%} of the load was reached" in words
+        assert "never was not tried" in words
+    shown = unreached._repr_html_()
+    assert "1 of 3 loads reached" in shown
+    assert "far &lt;too&gt; much" in shown
+    assert "<too>" not in shown
+
+
+def test_a_notebook_shows_a_picture_and_a_table(simulation: fe.Simulation) -> None:
+    shown = simulation._repr_html_()
+    assert "mine: 3 of 3 loads reached" in shown
+    assert shown.count("<tr>") == 1 + len(LOADS)
+    state, row = simulation.state("sheared"), next(r for r in simulation.regions if r.load == "sheared")
+    assert f"<td>{state.plate_displacement_mm[0]:.2f}</td><td>{state.plate_displacement_mm[1]:.2f}</td>" in shown
+    assert f"<td>{row.shear_p50:.3f} / {row.shear_p90:.3f}</td>" in shown
+    picture = re.search(r"data:image/png;base64,([^\"]+)", shown)
+    assert picture
+    pixels = imread(io.BytesIO(base64.b64decode(picture[1])))
+    assert len(np.unique(pixels.reshape(-1, pixels.shape[2]), axis=0)) > 50
+
+
+def test_its_plot_has_a_panel_for_each_load(simulation: fe.Simulation) -> None:
+    titles = [axes.get_title() for axes in simulation.plot().axes]
+    assert [t.split(":")[0] for t in titles if t] == ["pressed", "sheared", "in"]
+    (one,) = [axes for axes in simulation.plot(["sheared"]).axes if axes.get_title()]
+    assert one.get_title() == "sheared: 2 N normal, 1 N shear"
+    (cells,) = [c for c in one.collections if c.get_array() is not None]
+    assert cells.get_array().max() <= simulation.state("sheared").strain.max_shear.max()
+    assert cells.get_array().max() > 0.1
+
+
+def test_what_is_no_simulation_is_refused(simulation: fe.Simulation, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no folder of a simulation.*needs simulation\.json, curve\.csv and a VTU"):
+        fe.Simulation.read(tmp_path)
+    simulation.write(tmp_path)
+    with pytest.raises(InputError, match="the mesh given is not the one that was simulated"):
+        fe.Simulation.read(tmp_path, dome((2, 2, 2)))
+    told = json.loads((tmp_path / "simulation.json").read_text())
+    del told["outcome"]["in"]["plate_force_n"]
+    (tmp_path / "simulation.json").write_text(json.dumps(told))
+    with pytest.raises(InputError, match="KeyError: 'plate_force_n'"):
+        fe.Simulation.read(tmp_path)
+
+
+def test_materials_may_be_given_by_region() -> None:
+    soft = {"skin": FAT, "fat": FAT}
+    done = fe.simulate(dome((2, 3, 3)), soft, fe.Plate(DOWN, ALONG), [fe.LoadStep("a", normal_mm=0.2)])
+    assert done.complete
+    assert done.materials.materials == soft
