@@ -99,7 +99,7 @@ class TetMesh:
             if len(index) == 0:
                 raise InputError(f"{name!r} is empty. Leave it out, or check how the mesh was made.")
 
-        tets = _positively_ordered(points, tets)
+        tets = _positively_ordered(points, tets, ids)
         used = np.zeros(len(points), dtype=bool)
         used[tets] = True
         if not used.all():
@@ -143,8 +143,8 @@ class TetMesh:
 def outer_faces(cells: IntArray) -> IntArray:
     """Faces (k, 3) of tetrahedra (m, 4) that belong to one of them alone, by their nodes in rising order."""
     faces = np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
-    found, times = np.unique(faces, axis=0, return_counts=True)
-    return np.asarray(found[times == 1])
+    different, times = np.unique(faces, axis=0, return_counts=True)
+    return np.asarray(different[times == 1])
 
 
 def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
@@ -240,8 +240,8 @@ def signed_volumes(corners: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("...j,...j->...", a, np.cross(b, c)) / 6.0)
 
 
-def _positively_ordered(points: FloatArray, cells: IntArray) -> IntArray:
-    """Give every cell a positive volume, or refuse; see the notes of TetMesh."""
+def _positively_ordered(points: FloatArray, cells: IntArray, node_ids: IntArray) -> IntArray:
+    """Give every cell a positive volume, or refuse, naming nodes by ``node_ids``; see the notes of TetMesh."""
     volumes = signed_volumes(points[cells])
     longest = np.max([np.linalg.norm(points[cells[:, i]] - points[cells[:, j]], axis=1) for i, j in _EDGES], axis=0)
     flat = np.abs(volumes) <= _DEGENERATE * longest**3
@@ -249,7 +249,7 @@ def _positively_ordered(points: FloatArray, cells: IntArray) -> IntArray:
         first = int(np.argmax(flat))
         raise GeometryError(
             f"{np.count_nonzero(flat)} of {len(cells)} tetrahedra are degenerate (no volume); the first is "
-            f"cell {first}, nodes {cells[first].tolist()}, {volumes[first]:.3g} mm3. Mend the mesh where it "
+            f"cell {first}, nodes {node_ids[cells[first]].tolist()}, {volumes[first]:.3g} mm3. Mend the mesh where it "
             "was made: remove or remesh them."
         )
     negative = volumes < 0
@@ -262,7 +262,7 @@ def _positively_ordered(points: FloatArray, cells: IntArray) -> IntArray:
             raise GeometryError(
                 f"{np.count_nonzero(negative)} of {len(cells)} tetrahedra are inverted (negative volume), "
                 f"and {np.count_nonzero(overlapping)} overlap a neighbour across a common face, the first of "
-                f"them cell {first}, nodes {cells[first].tolist()}: the mesh folds over itself. Mend it "
+                f"them cell {first}, nodes {node_ids[cells[first]].tolist()}: the mesh folds over itself. Mend it "
                 "where it was made."
             )
     _log.warning(

@@ -96,13 +96,13 @@ def _found(place: Path, series: str | None) -> tuple[Grid, list[Frame]]:
 
 
 def _frames_in(folder: Path) -> list[Frame]:
-    found, parts, skipped = [], [], 0
+    frames, parts, skipped = [], [], 0
     for path in sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")):
         header = _header(path) if is_dicom(path) else None
         if header is None:
             skipped += 1
             continue
-        found += _frames(path, header)
+        frames += _frames(path, header)
         parts += _concatenation(path, header)
     for (_, total), held in Counter(parts).items():
         if held != total:
@@ -110,9 +110,9 @@ def _frames_in(folder: Path) -> list[Frame]:
                 f"{folder}: an image that was stored in {total} files, of which {held} are here. Export the "
                 "whole series."
             )
-    if skipped and found:
+    if skipped and frames:
         _log.info("%s: %d files that are no DICOM images left out", folder, skipped)
-    return found
+    return frames
 
 
 def _frames_of_one(path: Path) -> list[Frame]:

@@ -86,10 +86,10 @@ def _group(name: str, *groups: Any) -> Any | None:
 
 
 def _frame(path: Path, header: Any, number: int, groups: tuple[Any, Any], dimensions: list[str], scaled: bool) -> Frame:
-    found = {name: (_group(macro, *groups) or {}).get(name) for macro, name in _PLACE}
+    place = {name: (_group(macro, *groups) or {}).get(name) for macro, name in _PLACE}
     scaling = _group(_SCALING, *groups) or {}
     slope, intercept = scaling.get("RescaleSlope"), scaling.get("RescaleIntercept")
-    missing = [name for name, value in found.items() if value is None]
+    missing = [name for name, value in place.items() if value is None]
     if scaled:
         missing += [name for name, v in (("RescaleSlope", slope), ("RescaleIntercept", intercept)) if v is None]
     refuse_missing(path, missing, f" in the functional groups of frame {number}")
@@ -97,7 +97,7 @@ def _frame(path: Path, header: Any, number: int, groups: tuple[Any, Any], dimens
         path,
         header,
         number=number,
-        place=found,
+        place=place,
         scaling=(slope, intercept),
         shows=_shown(header, groups),
         labels=_labels(_group("FrameContentSequence", *groups), dimensions),
@@ -111,9 +111,9 @@ def _shown(header: Any, groups: tuple[Any, Any]) -> tuple[Any, Any, str]:
     if echo_time is None:
         echo_time = next((c.get("EchoTime") for c in converted if c.get("EchoTime") is not None), None)
     echoes = next((c.get("EchoNumbers") for c in converted if c.get("EchoNumbers") is not None), None)
-    told: Any = next((t for name in _FRAME_TYPES if (t := _group(name, *groups)) is not None), {})
-    image_type = several(told.get("FrameType")) or several(header.get("ImageType"))
-    component = told.get("ComplexImageComponent") or header.get("ComplexImageComponent")
+    frame_type: Any = next((t for name in _FRAME_TYPES if (t := _group(name, *groups)) is not None), {})
+    image_type = several(frame_type.get("FrameType")) or several(header.get("ImageType"))
+    component = frame_type.get("ComplexImageComponent") or header.get("ComplexImageComponent")
     return echo_time, echoes, "/".join(str(k) for k in (*image_type[2:], *several(component)))
 
 

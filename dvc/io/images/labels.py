@@ -326,15 +326,15 @@ def _csv_names(lines: list[str]) -> list[tuple[int, str] | None]:
         name_at = head.index("label")
     if label_at is None or name_at is None or label_at == name_at:
         return [None]
-    found: list[tuple[int, str] | None] = []
+    entries: list[tuple[int, str] | None] = []
     for row in rows[1:]:
         value = row[label_at].strip() if len(row) > max(label_at, name_at) else ""
-        found.append((int(value), row[name_at].strip()) if value.isdigit() else None)
-    return found
+        entries.append((int(value), row[name_at].strip()) if value.isdigit() else None)
+    return entries
 
 
 def _table_name(line: str) -> tuple[int, str] | None:
     snap = re.fullmatch(r'(\d+)(?:\s+[\d.]+){6}\s+"(.*)"', line)
     slicer = re.fullmatch(r"(\d+)\s+(\S.*?)(?:\s+[\d.]+){4}", line)
-    found = snap or slicer
-    return (int(found[1]), found[2].strip()) if found else None
+    match = snap or slicer
+    return (int(match[1]), match[2].strip()) if match else None

@@ -188,10 +188,10 @@ def _checked_values(path: Path, values: Float32Array, allow_missing: bool) -> Fl
         raise ImageFileError(f"{path}: no voxel has a finite value.")
     if missing:
         first = tuple(int(n) for n in np.unravel_index(int(np.argmin(finite)), values.shape))
-        found = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
+        problem = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
         if not allow_missing:
-            raise InputError(f"{path}: {found}. Repair the image, or have those voxels left out (allow_missing).")
-        _log.warning("%s: %s; taken as missing", path, found)
+            raise InputError(f"{path}: {problem}. Repair the image, or have those voxels left out (allow_missing).")
+        _log.warning("%s: %s; taken as missing", path, problem)
         values = np.where(finite, values, np.float32(np.nan))
         low, high = np.nanmin(values), np.nanmax(values)
     else:

@@ -103,31 +103,31 @@ class StoredVolume:
             with self.path.open("rb") as file:
                 file.seek(self.file_start + self.stream_start)
                 got = self.stream_start + file.readinto(raw.data) + self.stream_rest
-            found = max(on_disk, got) if got == expected else got
+            available = max(on_disk, got) if got == expected else got
         else:
-            found = 0
+            available = 0
             for block in expanded(self.path, self.file_start):
-                low = max(self.stream_start - found, 0)
-                high = min(self.stream_start + raw.size - found, len(block))
+                low = max(self.stream_start - available, 0)
+                high = min(self.stream_start + raw.size - available, len(block))
                 if low < high:
-                    at = found + low - self.stream_start
+                    at = available + low - self.stream_start
                     raw[at : at + high - low] = np.frombuffer(block, np.uint8)[low:high]
-                found += len(block)
-        if found < expected:
-            raise ImageFileError(_cut_short(self.path, expected, found, False))
-        if found > expected + _TRAILING:
+                available += len(block)
+        if available < expected:
+            raise ImageFileError(_cut_short(self.path, expected, available, False))
+        if available > expected + _TRAILING:
             raise ImageFileError(
-                f"{self.path}: the header describes {expected} bytes of voxels, the file holds {found}: "
+                f"{self.path}: the header describes {expected} bytes of voxels, the file holds {available}: "
                 "header and voxels do not belong together. Export the image again."
             )
         return raw
 
 
-def _cut_short(path: Path, expected: int, found: int, compressed: bool) -> str:
+def _cut_short(path: Path, expected: int, available: int, compressed: bool) -> str:
     coded = " compressed" if compressed else ""
     return (
         f"{path}: the file is cut short: the header needs {expected} bytes of voxels, the file holds "
-        f"{found}{coded} bytes. Copy or export it again."
+        f"{available}{coded} bytes. Copy or export it again."
     )
 
 

@@ -97,8 +97,8 @@ def _format(line: str) -> list[int]:
 
 
 def _columns(line: str, width: int, count: int | None = None) -> list[int]:
-    whole = len(line.rstrip()) // width if count is None else count
-    return [int(line[i * width : (i + 1) * width]) for i in range(whole)]
+    columns = len(line.rstrip()) // width if count is None else count
+    return [int(line[i * width : (i + 1) * width]) for i in range(columns)]
 
 
 def _add_types(lines: _Lines, types: dict[str, str]) -> None:

@@ -159,9 +159,9 @@ def _checked(raw: RawMesh, unit: str, frame: str) -> MeshFile:
         blocks.append(CellBlock(kind, frozen(index, np.int64)))
     volumes = [block for block in blocks if block.shape in _VOLUMES]
     if not volumes:
-        found = ", ".join(sorted({block.kind for block in blocks})) or "no cells at all"
+        kinds = ", ".join(sorted({block.kind for block in blocks})) or "no cells at all"
         raise ImageFileError(
-            f"{path} holds no volume cells (found: {found}). Results are given in the tissue: hand over the "
+            f"{path} holds no volume cells (found: {kinds}). Results are given in the tissue: hand over the "
             "volume mesh, not its surface."
         )
     check_extent(points[np.unique(np.concatenate([block.nodes.ravel() for block in volumes]))])

@@ -68,8 +68,8 @@ def write_on_mesh(
 
     def own(data: Mapping[str, FloatArray], rows: int, what: str) -> dict[str, FloatArray]:
         converted = {}
-        for given, values in data.items():
-            name, array = _in_own_frame(mesh, given, np.asarray(values, dtype=np.float64), rows, what)
+        for own_name, values in data.items():
+            name, array = _in_own_frame(mesh, own_name, np.asarray(values, dtype=np.float64), rows, what)
             undefined[name] = int(np.count_nonzero(np.isnan(array.reshape(rows, -1)).any(axis=1)))
             converted[name] = array
         return converted
@@ -77,14 +77,14 @@ def write_on_mesh(
     at_nodes = own(point_data, len(mesh.points_mm), "node")
     in_cells = own(cell_data, mesh.cell_count, "cell")
     ends = np.cumsum([len(block.nodes) for block in mesh.blocks])[:-1]
-    whole = meshio.Mesh(
+    results = meshio.Mesh(
         _own_points(mesh),
         [(block.kind, block.nodes) for block in mesh.blocks],
         point_data={"node": mesh.node_ids, **at_nodes},
         cell_data={name: np.split(array, ends) for name, array in in_cells.items()},
     )
     with whole_file(path) as part, silenced():
-        meshio.vtu.write(part, whole, binary=True)
+        meshio.vtu.write(part, results, binary=True)
         if verdict is not None:
             _add_verdict(part, verdict)
     return undefined

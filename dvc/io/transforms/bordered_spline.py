@@ -37,8 +37,8 @@ def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
             own=spline.borders.own.astype(np.int16),
             rest=spline.borders.rest,
             reach_mm=spline.borders.reach_mm,
-            control=_told(spline.control),
-            voxels=_told(spline.borders.grid),
+            control=_rows_of(spline.control),
+            voxels=_rows_of(spline.borders.grid),
         )
 
 
@@ -77,7 +77,7 @@ def _between(grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Interface
     if (
         known is None
         or (known.rest, known.reach_mm) != (rest, reach_mm)
-        or not np.array_equal(_told(known.grid), _told(grid))
+        or not np.array_equal(_rows_of(known.grid), _rows_of(grid))
         or not np.array_equal(known.own, own)
     ):
         known = Interfaces.between(grid, own, rest, reach_mm)
@@ -85,7 +85,7 @@ def _between(grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Interface
     return known
 
 
-def _told(grid: Grid) -> FloatArray:
+def _rows_of(grid: Grid) -> FloatArray:
     """A grid in rows of three numbers: shape, spacing, origin, and the three of its direction."""
     return np.vstack([grid.shape, grid.spacing_mm, grid.origin_mm, grid.direction])
 

@@ -43,7 +43,7 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
     place = Path(path)
     if not place.is_file():
         raise InputError(f"{place}: no such displacement image. Check the path.")
-    told = {frame, _frame_beside(place)} - {None}
+    declared = {frame, _frame_beside(place)} - {None}
     try:
         stored = read_header(place, vectors=True)
         if stored.unit != "mm":
@@ -51,7 +51,7 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
         known, values = _frame_of_header(place), stored.load()
     except OSError as failure:
         raise ImageFileError(f"{place}: not readable as a displacement image ({failure}).") from failure
-    frames = sorted(str(f) for f in told | ({known} - {None}))
+    frames = sorted(str(f) for f in declared | ({known} - {None}))
     if len(frames) != 1 or frames[0] not in ("LPS", "RAS"):
         raise ImageFileError(
             f"{place}: the components' frame must be LPS or RAS, and told alike wherever it is told; "
@@ -71,12 +71,12 @@ def _frame_beside(path: Path) -> str | None:
     if not beside.is_file():
         return None
     try:
-        told = json.loads(beside.read_text(encoding="utf-8"))
-        frame, unit = told.get("frame"), told.get("unit", "mm")
+        header = json.loads(beside.read_text(encoding="utf-8"))
+        frame, unit = header.get("frame"), header.get("unit", "mm")
     except (OSError, ValueError, AttributeError) as failure:
         raise ImageFileError(f"{beside}: not readable as a JSON object ({failure}).") from failure
-    if unit != "mm" or told.get("configuration", "reference") != "reference":
-        raise ImageFileError(f"{beside}: a displacement in mm on the reference configuration is needed; got {told}.")
+    if unit != "mm" or header.get("configuration", "reference") != "reference":
+        raise ImageFileError(f"{beside}: a displacement in mm on the reference configuration is needed; got {header}.")
     return None if frame is None else str(frame)
 
 

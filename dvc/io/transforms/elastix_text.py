@@ -33,8 +33,8 @@ def parse_parameters(text: str) -> dict[str, tuple[str, ...]]:
     {'Metric': ('AdvancedNormalizedCorrelation',), 'Size': ('4', '5', '6')}
     """
     parameters: dict[str, tuple[str, ...]] = {}
-    for number, whole in enumerate(text.split("\n"), start=1):
-        line = whole.split("//", maxsplit=1)[0].replace("\t", " ").strip()
+    for number, text_line in enumerate(text.split("\n"), start=1):
+        line = text_line.split("//", maxsplit=1)[0].replace("\t", " ").strip()
         if not line:
             continue
         shown = line if len(line) < 80 else line[:77] + "..."

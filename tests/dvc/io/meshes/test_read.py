@@ -245,6 +245,15 @@ def test_what_carries_no_tissue_in_an_abaqus_file_is_left_out(tmp_path: Path, ca
     assert "elements of type SPRINGA carry no tissue" in caplog.text
 
 
+def test_a_cell_without_volume_is_named_by_the_files_numbers_of_its_nodes(tmp_path: Path) -> None:
+    path = tmp_path / "heel.inp"
+    points, cells = block()
+    cells[3, 0] = cells[3, 1]
+    write_abaqus(path, points, cells)
+    with pytest.raises(GeometryError, match=rf"cell 3, nodes \[{', '.join(str(TAGS[n]) for n in cells[3])}\]"):
+        read_mesh(path)
+
+
 H = np.array([[0.02, 0.30, -0.01], [0.05, -0.10, 0.04], [-0.03, 0.20, 0.07]])
 MOVED = Affine(np.eye(3) + H, np.array([1.0, -2.0, 3.0]))
 CASES = [("mm", 1.0, "LPS", (1, 1, 1)), ("mm", 1.0, "RAS", (-1, -1, 1)), ("m", 1e-3, "RAS", (-1, -1, 1))]
