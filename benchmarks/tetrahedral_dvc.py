@@ -43,7 +43,7 @@ from fe.materials import NeoHooke
 from fe.mesh_file import read_tet_mesh
 from fe.published import material_set
 from mrstrain.records.provenance import versions
-from phantoms.accuracy_run import distances_mm
+from phantoms import distances_mm
 from validate.fe_result import read_result
 
 GAIN_MM, VOLUME, NU = 10.0, 300.0, 0.45

@@ -12,7 +12,7 @@ import numpy as np
 from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, figures_of, widened
-from phantoms.accuracy_run import Samples
+from phantoms.accuracy_run import ErrorSamples
 from phantoms.error_tables import SOFT, by_condition, of_tissue
 
 _KNOTS = np.array([0.005, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5])
@@ -53,12 +53,12 @@ class CoverageRow:
     figures_within: float
 
 
-def fit_error_model(runs: Sequence[Samples], parameters: str, source: str) -> ErrorModel:
+def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) -> ErrorModel:
     """Fit the error of the maximal shear, as `register` uses it, to all motions but waves.
 
     Parameters
     ----------
-    runs : sequence of Samples
+    runs : sequence of ErrorSamples
         Of one preset.
     parameters : str
         The preset's text.
@@ -79,7 +79,7 @@ def fit_error_model(runs: Sequence[Samples], parameters: str, source: str) -> Er
     return ErrorModel(Path(presets.pop()).name, digest, tables, source)
 
 
-def coverage_rows(runs: Sequence[Samples]) -> list[CoverageRow]:
+def coverage_rows(runs: Sequence[ErrorSamples]) -> list[CoverageRow]:
     """Judge the error model on heels that it has not seen: each heel by a model fitted to all others.
 
     The motions are those that it has seen. Conditions with one heel alone have no rows.
@@ -112,7 +112,7 @@ class _Judgement:
     scores: FloatArray
 
 
-def _judgements(runs: Sequence[Samples]) -> list[_Judgement]:
+def _judgements(runs: Sequence[ErrorSamples]) -> list[_Judgement]:
     """Of runs of one condition; empty with one heel alone."""
     seeds = sorted({r.case.seed for r in runs})
     if len(seeds) < 2:
@@ -129,7 +129,7 @@ def _widening(judgements: Sequence[_Judgement]) -> float:
     return max(1.0, float(np.quantile(np.concatenate([j.scores for j in judgements]), 0.95)))
 
 
-def _judged(run: Samples, tissue: str, table: ErrorTable) -> _Judgement | None:
+def _judged(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Judgement | None:
     kept = of_tissue(run, tissue)
     if np.count_nonzero(kept) < _FEW:
         return None
@@ -149,7 +149,7 @@ def _judged(run: Samples, tissue: str, table: ErrorTable) -> _Judgement | None:
     return _Judgement(run.case.motion, tissue, left, np.abs(left) < 1.96 * sd, scores)
 
 
-def _table(runs: Sequence[Samples]) -> ErrorTable:
+def _table(runs: Sequence[ErrorSamples]) -> ErrorTable:
     tissues = (*SOFT, POOLED)
     pooled = _filled(_moments(runs, POOLED, None))
     whole = {tissue: _cells(runs, tissue, pooled) for tissue in tissues}
@@ -164,7 +164,7 @@ def _table(runs: Sequence[Samples]) -> ErrorTable:
     )
 
 
-def _cells(runs: Sequence[Samples], tissue: str, pooled: _Moments) -> list[_Moments]:
+def _cells(runs: Sequence[ErrorSamples], tissue: str, pooled: _Moments) -> list[_Moments]:
     """Moments by distance to bone and shear found.
 
     Cells with few samples lean on their tissue's mean over all distances, and this on that of all soft tissue.
@@ -173,7 +173,7 @@ def _cells(runs: Sequence[Samples], tissue: str, pooled: _Moments) -> list[_Mome
     return [_leaning(_moments(runs, tissue, k), own) for k in range(len(_BONE_MM))]
 
 
-def _of_run(run: Samples, tissue: str, whole: Sequence[_Moments]) -> list[_Moments]:
+def _of_run(run: ErrorSamples, tissue: str, whole: Sequence[_Moments]) -> list[_Moments]:
     """Moments of one run alone; cells with few samples lean on those of all runs."""
     return [_leaning(_moments([run], tissue, k), parent) for k, parent in enumerate(whole)]
 
@@ -185,7 +185,7 @@ def _rows(cells: Sequence[_Moments]) -> FloatArray:
     return np.stack([mean, np.sqrt(np.maximum(square - mean**2, 1e-10))])
 
 
-def _moments(runs: Sequence[Samples], tissue: str, bone_bin: int | None) -> _Moments:
+def _moments(runs: Sequence[ErrorSamples], tissue: str, bone_bin: int | None) -> _Moments:
     """Number, mean and mean square of the errors by shear found; every sample counts the same."""
     ends = [*_BONE_MM, np.inf]
     count, total, square = (np.zeros(len(_KNOTS)) for _ in range(3))
@@ -218,7 +218,7 @@ def _leaning(own: _Moments, parent: _Moments) -> _Moments:
     return own[0] + _PRIOR, mean, weight * own[2] + (1 - weight) * parent[2]
 
 
-def _correlation_mm(runs: Sequence[Samples]) -> float:
+def _correlation_mm(runs: Sequence[ErrorSamples]) -> float:
     mean = np.mean([r.correlation for r in runs], axis=0)
     lags = np.concatenate([[0.0], runs[0].lag_mm])
     values = np.concatenate([[1.0], mean])

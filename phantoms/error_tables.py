@@ -10,7 +10,7 @@ import numpy as np
 
 from dvc.arrays import BoolArray, Float32Array
 from dvc.trust.error_model import POOLED
-from phantoms.accuracy_run import RIGID, Samples
+from phantoms.accuracy_run import RIGID, ErrorSamples
 from phantoms.anatomy import TISSUES
 
 SOFT = tuple(name for name in TISSUES.values() if name not in RIGID)
@@ -30,7 +30,7 @@ class ErrorRow:
         Such as "0.8" or "0.8 x 0.8 x 1.6".
     snr : float
     labels_off : int
-        As in `phantoms.accuracy_run.Case`.
+        As in `phantoms.accuracy_run.AccuracyCase`.
     motion, tissue : str
     by : {"all", "distance to bone, mm", "distance to a border, mm", "true maximal shear"}
     low, high : float
@@ -105,7 +105,7 @@ class RunRow:
     shear_rmse: float
 
 
-def run_rows(runs: Sequence[Samples]) -> list[RunRow]:
+def run_rows(runs: Sequence[ErrorSamples]) -> list[RunRow]:
     """Tell of each run, with the root mean square error of the maximal shear in its soft tissue."""
     rows = []
     for run in runs:
@@ -116,7 +116,7 @@ def run_rows(runs: Sequence[Samples]) -> list[RunRow]:
     return rows
 
 
-def error_rows(runs: Sequence[Samples]) -> list[ErrorRow]:
+def error_rows(runs: Sequence[ErrorSamples]) -> list[ErrorRow]:
     """Errors by condition, labels, motion and tissue: over all, by distance to bone, to a border, and by true strain.
 
     Waves are left out: they have rows of their own (`resolution_rows`).
@@ -133,7 +133,7 @@ def error_rows(runs: Sequence[Samples]) -> list[ErrorRow]:
     return rows
 
 
-def floor_rows(runs: Sequence[Samples]) -> list[FloorRow]:
+def floor_rows(runs: Sequence[ErrorSamples]) -> list[FloorRow]:
     """Apparent strain of the pairs without strain, by condition and tissue."""
     rows = []
     for (preset, voxel, snr), some in by_condition(runs):
@@ -147,7 +147,7 @@ def floor_rows(runs: Sequence[Samples]) -> list[FloorRow]:
     return rows
 
 
-def resolution_rows(runs: Sequence[Samples]) -> list[ResolutionRow]:
+def resolution_rows(runs: Sequence[ErrorSamples]) -> list[ResolutionRow]:
     """Share of a sinusoidal strain that is recovered, by condition, tissue and wavelength, rising."""
     rows = []
     for (preset, voxel, snr), some in by_condition(runs):
@@ -181,7 +181,7 @@ def wavelength_recovered(rows: Sequence[ResolutionRow], share: float) -> float:
     return float(lengths[i] + part * (lengths[i + 1] - lengths[i]))
 
 
-def by_condition(runs: Sequence[Samples]) -> Iterator[tuple[tuple[str, str, float], list[Samples]]]:
+def by_condition(runs: Sequence[ErrorSamples]) -> Iterator[tuple[tuple[str, str, float], list[ErrorSamples]]]:
     """Runs of equal preset, voxel and noise, with these three as tables name them."""
     conditions = dict.fromkeys((r.case.preset, r.case.spacing_mm, r.case.snr) for r in runs)
     for preset, spacing, snr in conditions:
@@ -191,15 +191,17 @@ def by_condition(runs: Sequence[Samples]) -> Iterator[tuple[tuple[str, str, floa
         yield (preset, voxel, snr), alike
 
 
-def of_tissue(run: Samples, name: str) -> BoolArray:
+def of_tissue(run: ErrorSamples, name: str) -> BoolArray:
     """Which samples lie in a tissue; "soft tissue" is all of SOFT."""
     numbers = [n for n, tissue in TISSUES.items() if tissue == name or (name == POOLED and tissue in SOFT)]
     return np.isin(run.tissue, numbers)
 
 
-def _bins(runs: Sequence[Samples], tissue: Sequence[BoolArray]) -> Iterator[tuple[str, float, float, list[BoolArray]]]:
+def _bins(
+    runs: Sequence[ErrorSamples], tissue: Sequence[BoolArray]
+) -> Iterator[tuple[str, float, float, list[BoolArray]]]:
     yield "all", float("nan"), float("nan"), list(tissue)
-    ways: Mapping[str, tuple[Callable[[Samples], Float32Array], tuple[float, ...]]] = {
+    ways: Mapping[str, tuple[Callable[[ErrorSamples], Float32Array], tuple[float, ...]]] = {
         "distance to bone, mm": (lambda r: r.to_bone_mm, BONE_BINS_MM),
         "distance to a border, mm": (lambda r: r.to_border_mm, BORDER_BINS_MM),
         "true maximal shear": (lambda r: r.true_shear, SHEAR_BINS),
@@ -217,7 +219,7 @@ def _bins(runs: Sequence[Samples], tissue: Sequence[BoolArray]) -> Iterator[tupl
 def _row(
     condition: tuple[str, str, float, int],
     place: tuple[str, str, str, float, float],
-    runs: Sequence[Samples],
+    runs: Sequence[ErrorSamples],
     kept: Sequence[BoolArray],
 ) -> ErrorRow | None:
     pairs = list(zip(runs, kept, strict=True))

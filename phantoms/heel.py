@@ -114,7 +114,7 @@ def heel_pair(
         raise InputError(f"The load must lie between 0 and 1.5; got {load}.")
     heel = Heel(seed)
     grid = centred_grid(shape, spacing_mm)
-    foot = default_motion() if foot_motion is None else foot_motion
+    foot = default_foot_motion() if foot_motion is None else foot_motion
     flow = pressed(heel, load) if motion is None else motion
     labels = labels_of(heel, grid)
     bone = labels.region("bone")
@@ -172,7 +172,7 @@ def labels_of(heel: Heel, grid: Grid) -> LabelMap:
     return LabelMap(grid, heel.tissue_at(grid.points().reshape(-1, 3)).reshape(grid.shape), TISSUES)
 
 
-def badly_drawn(labels: LabelMap, voxels: int) -> LabelMap:
+def misdrawn(labels: LabelMap, voxels: int) -> LabelMap:
     """A label map whose bones and skin are drawn too large by so many voxels or, below zero, too small.
 
     They grow into the softer tissue beside them, or that into them; the body stays as large as it is.
@@ -195,14 +195,14 @@ def labels_to_mesh(heel: Heel, labels: LabelMap) -> LabelMap:
     return LabelMap(labels.grid, np.where(kept, labels.labels, 0), labels.names)
 
 
-def drawn_motion(seed: int, number: int) -> RigidMotion:
+def random_foot_motion(seed: int, number: int) -> RigidMotion:
     """Draw the foot's motion before an acquisition: up to 3 degrees about and 2 mm along each axis."""
     random = np.random.default_rng([seed, 3, number])
     turn = Rotation.from_rotvec(random.uniform(-3.0, 3.0, 3), degrees=True).as_matrix()
     return RigidMotion.about(np.array([0.0, 5.0, 0.0]), turn, random.uniform(-2.0, 2.0, 3))
 
 
-def default_motion() -> RigidMotion:
+def default_foot_motion() -> RigidMotion:
     """Return the foot's motion between scans when none is asked for: 3.7 degrees, 2.9 mm."""
     turn = Rotation.from_rotvec([2.5, -1.5, 2.2], degrees=True).as_matrix()
     return RigidMotion.about(np.array([0.0, 5.0, 0.0]), turn, np.array([1.6, -2.0, 1.4]))

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-Told = Callable[[str, str, float], None]
+OnProgress = Callable[[str, str, float], None]
 """``told(case, stage, fraction)``: what is being done for which case, and how far it is."""
 
 ALL = "all"
@@ -21,7 +21,7 @@ _LINE_OF_ALL_EVERY_S, _BETWEEN_ENDS_S = 60.0, 1.0
 
 
 @contextmanager
-def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[Told]:
+def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[OnProgress]:
     """Show progress on standard error; standard output stays for results. An interrupt is told in a line.
 
     Parameters
@@ -45,7 +45,7 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[To
 
 
 @contextmanager
-def _bars(console: Console, of_all: bool) -> Iterator[Told]:
+def _bars(console: Console, of_all: bool) -> Iterator[OnProgress]:
     """A bar for each case that is under way: a terminal has few lines, and what does not fit is cut off."""
     bars: dict[str, TaskID] = {}
     with Progress(
@@ -73,7 +73,7 @@ def _bars(console: Console, of_all: bool) -> Iterator[Told]:
         yield told
 
 
-def _lines() -> Told:
+def _lines() -> OnProgress:
     began: dict[tuple[str, str], float] = {}
     told_at: dict[tuple[str, str], float] = {}
 
@@ -90,7 +90,7 @@ def _lines() -> Told:
     return told
 
 
-def _lines_of_all() -> Told:
+def _lines_of_all() -> OnProgress:
     began = told_at = time.monotonic()
     last_stage, last_fraction = "begun", 0.0
 

@@ -20,9 +20,7 @@ from mrstrain.studies.plan import REGISTRATION
 from mrstrain.studies.run import REPORT, Ran, run
 from mrstrain.studies.true_error import TABLE, read_errors, write_errors
 from mrstrain.truth.phantom import phantom
-from phantoms.anatomy import Heel
-from phantoms.heel import heel_grid, labels_of, labels_to_mesh, under_load
-from phantoms.tissue_error import TissueError, errors_by_tissue
+from phantoms import Heel, TissueError, errors_by_tissue, heel_grid, labels_of, labels_to_mesh, under_load
 
 Told = Callable[[str, str, float], None]
 

@@ -13,7 +13,7 @@ from dvc.atomic_files import write_whole
 from dvc.report.page import Section, Table
 from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import Outcome
-from phantoms.tissue_error import TissueError
+from phantoms import TissueError
 
 TABLE = "error.csv"
 _MADE = "registered_utc"

@@ -19,17 +19,7 @@ from dvc.io.result_folder import write_maps
 from dvc.trust.regions import region_statistics, write_regions_csv
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.provenance import provenance, write_json
-from phantoms.anatomy import Heel
-from phantoms.heel import (
-    LOADS,
-    covering,
-    drawn_motion,
-    heel_grid,
-    labels_of,
-    labels_to_mesh,
-    scan,
-    under_load,
-)
+from phantoms import LOADS, Heel, covering, heel_grid, labels_of, labels_to_mesh, random_foot_motion, scan, under_load
 
 Told = Callable[[str, str, float], None]
 
@@ -156,7 +146,7 @@ def phantom(
         writing.append(pool.submit(write_labels, target / "tissues_to_mesh.nii.gz", labels_to_mesh(heel, labels)))
         acquisitions = {"Load0-again": _AGAIN} | {load: 1 + list(LOADS).index(load) for load in motions}
         for name, number in acquisitions.items():
-            foot = moved[name] = drawn_motion(seed, number)
+            foot = moved[name] = random_foot_motion(seed, number)
             where = covering(grid, foot.apply(bone.points()))
             step()
             keep(name, scan(heel, where, motions.get(name), foot, snr=snr, number=number))

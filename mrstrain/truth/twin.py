@@ -10,7 +10,7 @@ from mrstrain.measurement.results import Case, write_measured
 from mrstrain.measurement.strain import read_deformation
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import write_json
-from phantoms.twin import loaded_twin
+from phantoms import synthetic_warp
 
 _TRUTH = Path("truth") / "twin"
 _IMAGE = "twin.nii.gz"
@@ -82,7 +82,7 @@ def twin(
     refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], given.files)
     measured = given.measured(_TRUTH.name)
     make_output(target)
-    made = loaded_twin(subject.reference, measured.tissue, given.whole, near=measured.bone_motion, seed=seed)
+    made = synthetic_warp(subject.reference, measured.tissue, given.whole, near=measured.bone_motion, seed=seed)
     write_image(target / _IMAGE, made.image)
     (target / _TRUTH).parent.mkdir(exist_ok=True)
     case = write_measured(target / _TRUTH, measured, given.record)

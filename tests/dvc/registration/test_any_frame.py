@@ -13,8 +13,7 @@ from dvc.io.transforms.elastix_text import parse_parameters
 from dvc.registration.elastix.presets import Preset
 from dvc.registration.gauss_newton.fit import GaussNewton
 from dvc.registration.register import Registration, Settings, register
-from phantoms.anatomy import Heel
-from phantoms.heel import scan
+from phantoms import Heel, scan
 from tests.quick import QUICK
 
 OURS = Settings(gauss_newton=GaussNewton(bending=4.0, volume=300.0))

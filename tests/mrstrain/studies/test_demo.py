@@ -23,7 +23,7 @@ from mrstrain.studies.run import Ran, run
 from mrstrain.studies.stages import Given
 from mrstrain.studies.true_error import read_errors, write_errors
 from mrstrain.truth.phantom import phantom
-from phantoms.tissue_error import TissueError
+from phantoms import TissueError
 
 demonstration = import_module("mrstrain.studies.demo")  # the package has a function of that name
 

@@ -22,7 +22,7 @@ from mrstrain.studies.plan import plan
 from mrstrain.studies.run import Ran, report, run
 from mrstrain.studies.stages import Given
 from mrstrain.studies.true_error import TABLE, write_errors
-from phantoms.tissue_error import TissueError
+from phantoms import TissueError
 from tests.mrstrain.comparison.test_methods import measured
 
 STUDY = """

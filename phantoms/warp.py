@@ -2,7 +2,7 @@
 
 What is known of an own image is its voxels, noise and all. Carried through a deformation as they are, noise would move
 with the tissue, and a registration would follow it as if it were texture. So the noise is taken out before, and drawn
-anew after. What that costs is told at `loaded_twin`.
+anew after. What that costs is told at `synthetic_warp`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FEW = 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Twin:
+class SyntheticWarp:
     """A made loaded image.
 
     Attributes
@@ -48,7 +48,7 @@ class Twin:
     shown: float
 
 
-def loaded_twin(
+def synthetic_warp(
     reference: Image,
     tissue: Mask,
     whole: Deformation,
@@ -59,7 +59,7 @@ def loaded_twin(
     onto: Grid | None = None,
     noisier: float = 1.0,
     beyond_missing: bool = False,
-) -> Twin:
+) -> SyntheticWarp:
     """Form the image of tissue after a deformation.
 
     I1(x) = D(phi^-1(x)) b(x) with Rician noise, where D is the unloaded image without its noise (non-local means),
@@ -135,10 +135,10 @@ def loaded_twin(
     if beyond_missing:
         came_from = (near or RigidMotion.identity()).inverse().apply(grid.points().reshape(-1, 3))
         values[~reference.grid.contains(came_from).reshape(grid.shape)] = np.nan
-    return Twin(Image(grid, values), float(noise), in_view)
+    return SyntheticWarp(Image(grid, values), float(noise), in_view)
 
 
-def found_back(whole: Deformation, points_mm: FloatArray, start_mm: FloatArray) -> FloatArray:
+def material_points(whole: Deformation, points_mm: FloatArray, start_mm: FloatArray) -> FloatArray:
     """Points X (n, 3) mm that a deformation moves to given points x (n, 3) mm; NaN where none is found.
 
     Newton's method on X + u(X) = x from ``start_mm`` (n, 3); where it leaves the deformation's domain or does not come
@@ -209,7 +209,7 @@ def _carried(clean: Image, tissue: Mask, whole: Deformation, near: RigidMotion, 
         if back is not None:
             X = x[some] + back.displacement(x[some])
         else:
-            X = found_back(whole, x[some], home[moved.query(x[some])[1]])
+            X = material_points(whole, x[some], home[moved.query(x[some])[1]])
         inside = np.flatnonzero(np.isfinite(X).all(axis=1))
         inside = inside[_in_mask(tissue, X[inside])]
         at = clean.grid.indices_of(X[inside]).T
