@@ -50,7 +50,7 @@ from phantoms.heel import (
 from phantoms.motions import Bending, ShearWave, compressed, sheared, stretched
 from phantoms.mri import acquire, sensitivity
 from phantoms.tissue_error import TissueError, errors_by_tissue
-from phantoms.warp import SyntheticWarp, material_points, synthetic_warp
+from phantoms.warp import Acquisition, SyntheticWarp, material_points, synthetic_warp
 
 if TYPE_CHECKING:
     from phantoms import figures
@@ -62,6 +62,7 @@ __all__ = [
     "SOFT",
     "TISSUES",
     "AccuracyCase",
+    "Acquisition",
     "Bending",
     "Border",
     "CoverageRow",

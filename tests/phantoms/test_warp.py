@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from dvc.io.transforms.read import read_transform
 from dvc.io.transforms.write import write_elastix_transform
 from mrstrain.cli.app import app
 from phantoms import (
+    Acquisition,
     ShearWave,
     heel_grid,
     labels_of,
@@ -77,10 +79,12 @@ def test_twin_shows_the_motion(unloaded: tuple[Image, Mask], heel, exact: bool) 
     motion, foot = under_load(heel, "Load1"), random_foot_motion(2, 1)
     whole = Composed([motion, foot])
     if exact:
-        made = synthetic_warp(image, body, whole, near=foot, seed=5)
+        made = synthetic_warp(image, body, whole, Acquisition(seed=5), near=foot)
     else:
         u = whole.displacement(image.grid.points().reshape(-1, 3)).reshape(*image.grid.shape, 3)
-        made = synthetic_warp(image, body, Within(SampledDisplacement(image.grid, u), body), near=foot, seed=5)
+        made = synthetic_warp(
+            image, body, Within(SampledDisplacement(image.grid, u), body), Acquisition(seed=5), near=foot
+        )
     real = scan(heel, image.grid, motion, foot, snr=None, number=7)
     inside = real.values > 200.0
 
@@ -102,7 +106,7 @@ def test_noise_does_not_move_with_the_tissue(unloaded: tuple[Image, Mask], heel)
     clean = scan(heel, image.grid, snr=None, number=0)
     noise = (image.values - clean.values)[body.inside]
     still = Affine(np.eye(3), np.zeros(3))
-    made = synthetic_warp(image, body, still, seed=5, shading=False)
+    made = synthetic_warp(image, body, still, Acquisition(seed=5, bias_field=False))
     left = (made.image.values - clean.values)[body.inside]
     assert (noise @ left) / (noise @ noise) < 0.5
     assert left.std() < 3.0 * noise.std()
@@ -115,7 +119,7 @@ def test_a_transform_as_register_writes_it_will_do(unloaded: tuple[Image, Mask],
     bspline = BSpline(control, np.random.default_rng(0).normal(scale=0.8, size=(3, *control.shape)))
     foot = random_foot_motion(2, 1)
     path = write_elastix_transform(tmp_path, bspline, foot, image.grid)[-1]
-    made = synthetic_warp(image, body, read_transform(path), near=foot, seed=1)
+    made = synthetic_warp(image, body, read_transform(path), Acquisition(seed=1), near=foot)
     assert made.shown > 0.9
     points = body.points()[::97]
     moved = points + read_transform(path).displacement(points)
@@ -129,7 +133,7 @@ def test_a_transform_as_register_writes_it_will_do(unloaded: tuple[Image, Mask],
 def test_the_skin_keeps_its_partial_volume(unloaded: tuple[Image, Mask]) -> None:
     """At rest the twin's rim, air included, is that of the unloaded scan; cut at the mask it would be dark outside."""
     image, body = unloaded
-    made = synthetic_warp(image, body, Affine(np.eye(3), np.zeros(3)), seed=5, shading=False)
+    made = synthetic_warp(image, body, Affine(np.eye(3), np.zeros(3)), Acquisition(seed=5, bias_field=False))
     rim = binary_dilation(body.inside) & ~body.inside
     assert image.values[rim].mean() > 2.0 * made.noise_sd
     assert made.image.values[rim].mean() == pytest.approx(image.values[rim].mean(), rel=0.25)
@@ -138,17 +142,17 @@ def test_the_skin_keeps_its_partial_volume(unloaded: tuple[Image, Mask]) -> None
 def test_what_no_image_can_show_is_refused(unloaded: tuple[Image, Mask]) -> None:
     image, body = unloaded
     with pytest.raises(InputError, match="folds"):
-        synthetic_warp(image, body, Affine(np.diag([-1.0, 1.0, 1.0]), np.zeros(3)), seed=1)
+        synthetic_warp(image, body, Affine(np.diag([-1.0, 1.0, 1.0]), np.zeros(3)), Acquisition(seed=1))
     with pytest.raises(InputError, match="field of view"):
-        synthetic_warp(image, body, RigidMotion(np.eye(3), np.array([90.0, 0.0, 0.0])), seed=1)
+        synthetic_warp(image, body, RigidMotion(np.eye(3), np.array([90.0, 0.0, 0.0])), Acquisition(seed=1))
     other = Mask(Grid(body.grid.shape, body.grid.spacing_mm, body.grid.origin_mm + 1.0), body.inside)
     with pytest.raises(InputError, match="not on the unloaded image"):
-        synthetic_warp(image, other, RigidMotion.identity(), seed=1)
+        synthetic_warp(image, other, RigidMotion.identity(), Acquisition(seed=1))
     part = np.zeros(body.grid.shape, dtype=bool)
     part[:20] = True
     few = Within(Affine(np.eye(3), np.zeros(3)), Mask(body.grid, part))
     with pytest.raises(InputError, match=r"half|defined"):
-        synthetic_warp(image, body, few, seed=1)
+        synthetic_warp(image, body, few, Acquisition(seed=1))
 
 
 def test_command_writes_the_twin_and_its_truth(unloaded: tuple[Image, Mask], heel, tmp_path: Path) -> None:
@@ -175,10 +179,10 @@ def test_command_writes_the_twin_and_its_truth(unloaded: tuple[Image, Mask], hee
 def test_where_the_unloaded_image_did_not_look_the_twin_has_no_value(unloaded: tuple[Image, Mask]) -> None:
     image, body = unloaded
     foot = RigidMotion(np.eye(3), np.array([0.0, 0.0, -3.0 * SPACING]))  # the leg's end comes into view
-    given = {"near": foot, "seed": 1, "onto": image.grid}
-    missing = ~np.isfinite(synthetic_warp(image, body, foot, beyond_missing=True, **given).image.values)
+    own = Acquisition(seed=1, grid=image.grid)
+    missing = ~np.isfinite(synthetic_warp(image, body, foot, own, near=foot, beyond_missing=True).image.values)
     assert missing[..., -3:].all()
     assert not missing[..., :-3].any()
-    assert np.isfinite(synthetic_warp(image, body, foot, **given).image.values).all()
-    noisier = synthetic_warp(image, body, foot, noisier=2.0, **given)
+    assert np.isfinite(synthetic_warp(image, body, foot, own, near=foot).image.values).all()
+    noisier = synthetic_warp(image, body, foot, replace(own, noise_factor=2.0), near=foot)
     assert noisier.noise_sd == pytest.approx(2.0 * noise_sd(image, body), rel=1e-3)
