@@ -117,10 +117,6 @@ def test_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("preset.md", tmp_path, monkeypatch)
 
 
-def test_phantom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    follow("phantom.md", tmp_path, monkeypatch)
-
-
 def test_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
     follow("material.md", tmp_path, monkeypatch)

@@ -7,6 +7,8 @@ import inspect
 from pathlib import Path
 
 import pytest
+from sybil import Sybil
+from sybil.parsers.markdown import PythonCodeBlockParser
 
 import phantoms
 
@@ -40,3 +42,10 @@ def test_nobody_passes_by_the_front_door() -> None:
         if alias.name in phantoms.__all__
     ]
     assert past == []
+
+
+def test_the_page_does_what_it_says() -> None:
+    examples = list(Sybil(parsers=[PythonCodeBlockParser()]).parse(ROOT / "docs" / "python" / "phantoms.md").examples())
+    assert any("assert" in example.parsed for example in examples)
+    for example in examples:
+        example.evaluate()
