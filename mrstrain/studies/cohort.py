@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.report.page import Picture, Section, Table, write_report
 from dvc.trust.verdict import worst
@@ -19,6 +17,7 @@ from mrstrain.measurement.register import REPEAT
 from mrstrain.records.inputs import make_output
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.tables import write_csv
 from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
 from mrstrain.studies.file import FILE, read_study
 from mrstrain.studies.plan import COMPARISON
@@ -198,16 +197,9 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
 
 def _write_tables(target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[Standing]) -> None:
     first = next(row for rows in areas.values() for row in rows)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["subject", *first])
-    writer.writerows([subject, *row.values()] for subject, rows in areas.items() for row in rows)
-    write_whole(target / "cohort.csv", text.getvalue())
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([f.name for f in fields(Standing)])
-    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in astuple(s)] for s in ranking)
-    write_whole(target / "ranking.csv", text.getvalue())
+    rows_of_all = ([subject, *row.values()] for subject, rows in areas.items() for row in rows)
+    write_csv(target / "cohort.csv", ["subject", *first], rows_of_all)
+    write_csv(target / "ranking.csv", [f.name for f in fields(Standing)], map(astuple, ranking))
 
 
 def _write_page(

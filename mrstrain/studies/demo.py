@@ -88,10 +88,6 @@ def demo(
     workers, progress
         As in `mrstrain.run`.
 
-    Returns
-    -------
-    Demonstration
-
     Raises
     ------
     OutputError

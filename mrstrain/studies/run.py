@@ -152,7 +152,7 @@ def run_studies(
             "Give one of the two."
         )
     planned = _planned(studies, only, force)
-    total = _TotalProgress(progress or (lambda *_: None), sum(len(one.pipeline.stages) for one in planned))
+    total = _TotalProgress(progress or (lambda *_: None), sum(len(pipeline.stages) for pipeline, _ in planned))
 
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
@@ -161,46 +161,40 @@ def run_studies(
 
     logs: dict[str, Log] = {}
     on_disk: dict[int, tuple[int, float]] = {}
-    pipelines = {f"{one.study.study.name}: " if len(studies) > 1 else "": one.pipeline for one in planned}
+    prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
+    pipelines = {prefix: pipeline for prefix, (pipeline, _) in zip(prefixes, planned, strict=True)}
     with ExitStack() as stack:
-        for prefix, one in zip(pipelines, planned, strict=True):
-            study, left = one.study, one.to_do
+        for prefix, study, (pipeline, left) in zip(prefixes, studies, planned, strict=True):
             stack.enter_context(_alone(study.out))
             voxels, cells = _sizes(study, left)
             _refuse_small_disk(study, left, voxels, on_disk)
             total.seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
             log = stack.enter_context(_log(study.out / LOG))
-            log(f"Study '{study.study.name}': {len(one.pipeline.stages)} stages, {len(left)} of them to do")
+            log(f"Study '{study.study.name}': {len(pipeline.stages)} stages, {len(left)} of them to do")
             logs[prefix] = total.also(log, prefix)
         run_all(pipelines, pool, logs)
         total.report(ALL, total.stages, 1.0)
-        runs = [StudyRun(one.study, one.pipeline.in_order()) for one in planned]
-        for prefix, run_of_one in zip(pipelines, runs, strict=True):
-            study = run_of_one.study
-            write_run_report(study.out / REPORT, study, run_of_one.outcomes)
+        runs = []
+        for prefix, study in zip(prefixes, studies, strict=True):
+            runs.append(StudyRun(study, pipelines[prefix].in_order()))
+            write_run_report(study.out / REPORT, study, runs[-1].outcomes)
             logs[prefix](f"Report: {study.study.out}/{REPORT}")
     return runs
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _PlannedStudy:
-    study: Study
-    pipeline: Pipeline
-    to_do: list[Stage]
-
-
-def _planned(studies: Sequence[Study], only: Sequence[str], force: Sequence[str]) -> list[_PlannedStudy]:
-    """Plan studies; refuse all that cannot be run."""
+def _planned(studies: Sequence[Study], only: Sequence[str], force: Sequence[str]) -> list[tuple[Pipeline, list[Stage]]]:
+    """Pipeline of each study and the stages to do; what cannot be run is refused."""
     stages_of = [plan(study) for study in studies]
     for stages in stages_of:
         refuse_unknown(stages, only, force)
     refuse_missing(stages_of)
-    planned = []
-    for study, stages in zip(studies, stages_of, strict=True):
-        pipeline = Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
-        planned.append(_PlannedStudy(study, pipeline, pipeline.to_do()))
-    refuse_wrong(studies, [one.to_do for one in planned])
-    return planned
+    pipelines = [
+        Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
+        for study, stages in zip(studies, stages_of, strict=True)
+    ]
+    to_do = [pipeline.to_do() for pipeline in pipelines]
+    refuse_wrong(studies, to_do)
+    return list(zip(pipelines, to_do, strict=True))
 
 
 @dataclass(slots=True, eq=False)
@@ -275,7 +269,7 @@ def report(study: Path | str | Study) -> StudyRun:
 
 def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = ()) -> dict[str, str]:
     """What `run` would do with each stage (`Pipeline.forecast`); parameters and errors as in `run`."""
-    return _planned([_read(study)], only, force)[0].pipeline.forecast()
+    return _planned([_read(study)], only, force)[0][0].forecast()
 
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:

@@ -3,42 +3,29 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
 
-from dvc.atomic_files import write_whole
 from dvc.report.page import Section, Table
+from mrstrain.records.tables import write_csv
 from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import StageOutcome
 from phantoms import TissueError
 
 TABLE = "error.csv"
 _MADE = "registered_utc"
+_HEADER = ("load", _MADE, *(f.name for f in fields(TissueError)))
 _FIGURES = ("true_p50", "true_p95", "shear_rmse", "shear_bias", "u_p50_mm", "u_p95_mm")
 _KINDS: Mapping[str, Callable[[str], Any]] = {"str": str, "int": int, "float": float}
-_COLUMNS = (
-    "load",
-    "tissue",
-    "true max. shear, median",
-    "p95",
-    "RMSE",
-    "bias",
-    "u error, median",
-    "u error, p95",
-)
+_COLUMNS = ("load", "tissue", "true max. shear, median", "p95", "RMSE", "bias", "u error, median", "u error, p95")
 
 
 def write_errors(path: Path, errors: Mapping[str, Sequence[TissueError]], outcomes: Mapping[str, StageOutcome]) -> None:
     """Write the error of each load by tissue, with the time at which its registration was made."""
-    table = io.StringIO()
-    writer = csv.DictWriter(table, ["load", _MADE, *(f.name for f in fields(TissueError))], lineterminator="\n")
-    writer.writeheader()
-    for load, of in errors.items():
-        writer.writerows({"load": load, _MADE: _made(outcomes, load)} | asdict(error) for error in of)
-    write_whole(path, table.getvalue())
+    rows = [(load, _made(outcomes, load), *map(str, astuple(one))) for load, of in errors.items() for one in of]
+    write_csv(path, _HEADER, rows)
 
 
 def read_errors(path: Path, outcomes: Mapping[str, StageOutcome]) -> dict[str, tuple[TissueError, ...]]:
@@ -57,7 +44,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
         return []
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    return rows if rows and {"load", _MADE, *(f.name for f in fields(TissueError))} <= set(rows[0]) else []
+    return rows if rows and set(_HEADER) <= set(rows[0]) else []
 
 
 def error_against_truth(study: Study, outcomes: Mapping[str, StageOutcome]) -> list[Section]:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.registration.register import AT_BORDERS, GAUSS_NEWTON, Settings
 from dvc.software import software_key
@@ -21,6 +18,7 @@ from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.tables import write_csv
 from mrstrain.truth.accuracy_page import write_accuracy_report
 from phantoms import (
     AccuracyCase,
@@ -150,10 +148,6 @@ def accuracy(
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
-    Returns
-    -------
-    AccuracyStudy
-
     Raises
     ------
     InputError
@@ -276,11 +270,15 @@ def _write(target: Path, runs: Sequence[ErrorSamples], failures: dict[str, str])
         target, tuple(error_rows(runs)), tuple(floor_rows(runs)), tuple(resolution_rows(runs)), failures
     )
     coverage = coverage_rows(runs)
-    _write_csv(target / "errors.csv", ErrorRow, study.errors)
-    _write_csv(target / "zero_strain.csv", FloorRow, study.floors)
-    _write_csv(target / "resolution.csv", ResolutionRow, study.resolution)
-    _write_csv(target / "coverage.csv", CoverageRow, coverage)
-    _write_csv(target / "runs.csv", RunRow, run_rows(runs))
+    tables: dict[str, tuple[type[Any], Sequence[Any]]] = {
+        "errors": (ErrorRow, study.errors),
+        "zero_strain": (FloorRow, study.floors),
+        "resolution": (ResolutionRow, study.resolution),
+        "coverage": (CoverageRow, coverage),
+        "runs": (RunRow, run_rows(runs)),
+    }
+    for name, (kind, rows) in tables.items():
+        write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], map(astuple, rows))
     presets = {preset: Settings.of(preset).text for preset in dict.fromkeys(r.case.preset for r in runs)}
     for preset, parameters in presets.items():
         some = [r for r in runs if r.case.preset == preset and r.case.keeps_volume and r.case.wavelength_mm is None]
@@ -313,13 +311,3 @@ def _source(runs: Sequence[ErrorSamples]) -> str:
         off = ", ".join(f"{by:+d}" for by in sorted({r.case.labels_off for r in runs}))
         source += f", bones and skin in label maps too large by {off} voxels"
     return source
-
-
-def _write_csv(path: Path, kind: type, rows: Sequence[Any]) -> None:
-    """Write rows of one dataclass, with a header even where there is none."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [f.name for f in fields(kind)], lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(row).items()})
-    write_whole(path, text.getvalue())

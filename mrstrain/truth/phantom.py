@@ -86,10 +86,6 @@ def phantom(
     **shape
         ``size``, ``pad_mm``, ``skin_mm`` and ``lobule_mm`` of the heel; see `phantoms.Heel`.
 
-    Returns
-    -------
-    PhantomFiles
-
     Raises
     ------
     InputError
@@ -114,7 +110,7 @@ def phantom(
     parameters |= {name: getattr(heel, name) for name in HeelShape.__annotations__}
     parameters["loads_press_shear_slide_mm"] = {load: LOADS[load] for load in motions}
     record = provenance("phantom", {}, parameters)
-    images, foot_motions = _write_images(target, _Scanner(heel, grid, snr), motions, record, progress)
+    images, foot_motions = _write_images(target, heel, grid, snr, motions, record, progress)
     record["foot_motion"] = {
         name: {"rotation": m.rotation.tolist(), "translation_lps_mm": m.translation_mm.tolist()}
         for name, m in foot_motions.items()
@@ -123,24 +119,16 @@ def phantom(
     return PhantomFiles(target, images)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scanner:
-    """A heel, the grid of its unloaded image, and the signal-to-noise ratio of all images."""
-
-    heel: Heel
-    grid: Grid
-    snr: float | None
-
-
 def _write_images(
     target: Path,
-    scanner: _Scanner,
+    heel: Heel,
+    grid: Grid,
+    snr: float | None,
     motions: Mapping[str, Motion],
     record: dict[str, object],
     progress: OnProgress | None,
 ) -> tuple[dict[str, Path], dict[str, RigidMotion]]:
     """Write all images and the truth; paths of the images and motions of the foot, by name."""
-    heel, grid = scanner.heel, scanner.grid
     labels = labels_of(heel, grid)
     bone, body = labels.region("bone"), Mask(grid, labels.labels > 0)
     images: dict[str, Path] = {}
@@ -160,7 +148,7 @@ def _write_images(
             writes.append(pool.submit(write_image, images[name], image))
 
         step()
-        write("Load0", scan(heel, grid, snr=scanner.snr, number=0))
+        write("Load0", scan(heel, grid, snr=snr, number=0))
         writes.append(pool.submit(write_mask, target / "calcaneus.nii.gz", bone))
         writes.append(pool.submit(write_labels, target / "tissues.nii.gz", labels))
         writes.append(pool.submit(write_labels, target / "tissues_to_mesh.nii.gz", labels_to_mesh(heel, labels)))
@@ -169,7 +157,7 @@ def _write_images(
             foot = foot_motions[name] = random_foot_motion(heel.seed, number)
             loaded_grid = covering(grid, foot.apply(bone.points()))
             step()
-            write(name, scan(heel, loaded_grid, motions.get(name), foot, snr=scanner.snr, number=number))
+            write(name, scan(heel, loaded_grid, motions.get(name), foot, snr=snr, number=number))
             if name in motions:
                 step()
                 maps = strain_maps(motions[name], body)
