@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -280,17 +280,6 @@ def under_load(heel: Heel, load: str) -> Motion:
         raise InputError(f"No load '{load}'; there are {', '.join(LOADS)}.")
     press, shear, slide = LOADS[load]
     return Composed([sliding(heel, slide), under_plate(heel, press_mm=press, shear_mm=shear)])
-
-
-def loaded_signal(heel: Heel, motion: Motion, foot_motion: RigidMotion) -> Callable[[FloatArray], FloatArray]:
-    """Noise-free signal of the heel after both motions, as a function of points (n, 3) LPS mm."""
-    back, home = motion.inverse(), foot_motion.inverse()
-
-    def signal(points_mm: FloatArray) -> FloatArray:
-        x = home.apply(points_mm)
-        return heel.intensity_at(x + back.displacement(x))
-
-    return signal
 
 
 def octants(heel: Heel, grid: Grid, motion: Motion | None, foot_motion: RigidMotion) -> FloatArray:

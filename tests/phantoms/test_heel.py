@@ -23,7 +23,7 @@ from phantoms import (
     pressed,
     under_load,
 )
-from phantoms.heel import loaded_signal, octants
+from phantoms.heel import octants
 
 COARSE = {"shape": (40, 45, 42), "spacing_mm": 2.5}
 
@@ -46,6 +46,17 @@ def test_signal_moves_with_the_tissue(heel: Heel, load: str) -> None:
     assert np.mean(np.abs(after - before) < 1e-4 * scale) > 0.9995
     shifted = loaded_signal(heel, flow, motion)(motion.apply(X + flow.displacement(X)) + 0.05)
     assert np.mean(np.abs(shifted - before) < 1e-4 * scale) < 0.5
+
+
+def loaded_signal(heel, motion, foot_motion):
+    """Noise-free signal of the heel after both motions, as a function of points (n, 3) mm."""
+    back, home = motion.inverse(), foot_motion.inverse()
+
+    def signal(points_mm):
+        x = home.apply(points_mm)
+        return heel.intensity_at(x + back.displacement(x))
+
+    return signal
 
 
 def test_voxels_are_carried_back_with_their_shape(heel: Heel) -> None:
