@@ -27,7 +27,7 @@ from dvc.registration.elastix import run as elastix
 from dvc.registration.elastix.presets import read_parameter_file
 from dvc.registration.rigid_fit import RigidFit
 from mrstrain.records.provenance import versions
-from phantoms.heel import HeelPair, heel_pair
+from phantoms import HeelPair, heel_pair
 
 RIGID = Path(__file__).with_name("bone_rigid.txt")
 

@@ -23,7 +23,7 @@ from dvc.io.images.write import write_image, write_labels
 from mrstrain.records.provenance import versions
 from mrstrain.studies.file import read_study
 from mrstrain.studies.run import run_studies
-from phantoms.heel import heel_pair
+from phantoms import heel_pair
 from tests.quick import QUICK
 
 STUDY = """[study]

@@ -31,9 +31,7 @@ from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInt
 from dvc.registration.register import Settings, register
 from dvc.worker import Worker
 from mrstrain.records.provenance import versions
-from phantoms.accuracy_run import distances_mm, motion_named
-from phantoms.anatomy import Heel
-from phantoms.heel import HeelPair, heel_pair, pressed
+from phantoms import Heel, HeelPair, distances_mm, heel_pair, motion_named, pressed
 
 ENGINES = {
     "elastix, heel-mr": Settings.of("heel-mr"),

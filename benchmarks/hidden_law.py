@@ -34,11 +34,18 @@ from mrstrain import run, simulate
 from mrstrain.measurement.measured_folder import spline_in
 from mrstrain.models.loads import LOADS
 from mrstrain.records.provenance import versions
-from phantoms.accuracy_run import distances_mm
-from phantoms.anatomy import Heel
-from phantoms.heel import covering, drawn_motion, heel_grid, labels_of, labels_to_mesh, scan
-from phantoms.tissue_error import errors_by_tissue
-from phantoms.twin import found_back
+from phantoms import (
+    Heel,
+    covering,
+    distances_mm,
+    errors_by_tissue,
+    heel_grid,
+    labels_of,
+    labels_to_mesh,
+    material_points,
+    random_foot_motion,
+    scan,
+)
 from validate.comparison import ALL_LOADS, compare, total
 from validate.extrapolation import carried_on
 from validate.fe_result import read_result
@@ -147,7 +154,7 @@ def images(work: Path, heel: Heel, labels: LabelMap, hidden: Path, seed: int) ->
     study.mkdir(exist_ok=True)
     if not (study / f"{LOADS[-1].name}.nii.gz").is_file():
         write_image(study / "Load0.nii.gz", scan(heel, grid, snr=SNR, number=0))
-        foot = drawn_motion(seed, 100)
+        foot = random_foot_motion(seed, 100)
         bone = labels.region("bone")
         again = covering(grid, foot.apply(bone.points()))
         write_image(study / "Load0-again.nii.gz", scan(heel, again, None, foot, snr=SNR, number=100))
@@ -155,7 +162,7 @@ def images(work: Path, heel: Heel, labels: LabelMap, hidden: Path, seed: int) ->
         write_labels(study / "to_mesh.nii.gz", labels_to_mesh(heel, labels))
         for number, load in enumerate(LOADS, start=1):
             moved = as_motion(truth(hidden, load.name, labels), labels)
-            foot = drawn_motion(seed, number)
+            foot = random_foot_motion(seed, number)
             where = covering(grid, foot.apply(bone.points()))
             write_image(study / f"{load.name}.nii.gz", scan(heel, where, moved, foot, snr=SNR, number=number))
             print(load.name, "imaged", flush=True)
@@ -194,7 +201,7 @@ def as_motion(there: SampledDisplacement, labels: LabelMap) -> Moved:
     x = grid.points().reshape(-1, 3)
     u = evaluate_on_grid(there, grid, np.ones(grid.shape, dtype=bool))[0]
     start = x - u
-    back = found_back(there, x, start) - x
+    back = material_points(there, x, start) - x
     lost = ~np.isfinite(back).all(axis=1)  # at the grid's rim, far from the heel
     back[lost] = -u[lost]
     return Moved(there, SampledDisplacement(grid, back.reshape(*grid.shape, 3)))

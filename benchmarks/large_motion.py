@@ -21,9 +21,17 @@ from dvc.io.images.write import write_image, write_labels
 from mrstrain.measurement.measured_folder import spline_in
 from mrstrain.measurement.register import register
 from mrstrain.records.provenance import versions
-from phantoms.anatomy import Heel
-from phantoms.heel import centred_grid, drawn_motion, labels_of, pressed, scan, sliding, under_plate
-from phantoms.tissue_error import errors_by_tissue
+from phantoms import (
+    Heel,
+    centred_grid,
+    errors_by_tissue,
+    labels_of,
+    pressed,
+    random_foot_motion,
+    scan,
+    sliding,
+    under_plate,
+)
 
 SEED, SNR = 9300, 25.0
 SHAPE, SPACING_MM = (126, 140, 132), 0.8
@@ -58,7 +66,7 @@ def main() -> None:
             for number, part in enumerate((0.5, 1.0), start=1):
                 image = work / f"{name}-{part * size:g}.nii.gz"
                 if not image.is_file():
-                    foot = drawn_motion(SEED, number)
+                    foot = random_foot_motion(SEED, number)
                     write_image(image, scan(heel, grid, motion(heel, part * size), foot, snr=SNR, number=number))
                 images.append(image)
             for chain in (False, True):

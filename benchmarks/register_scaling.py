@@ -27,7 +27,7 @@ from dvc.images.resample import carry
 from dvc.io.images.labels import fit_mask
 from dvc.io.images.write import write_image, write_labels, write_mask
 from mrstrain.records.provenance import versions
-from phantoms.heel import HeelPair, heel_pair
+from phantoms import HeelPair, heel_pair
 
 
 def divided(grid: Grid, count: int) -> Grid:

@@ -27,7 +27,7 @@ from dvc.registration.register import Settings, register
 from dvc.worker import Worker, usable_cores
 from mrstrain.records.provenance import versions
 from mrstrain.truth.phantom import phantom
-from phantoms.heel import HeelPair, heel_pair
+from phantoms import HeelPair, heel_pair
 
 RIGID = Path(__file__).with_name("bone_rigid.txt")
 RESULT = {"WriteResultImage": ("true",)}

@@ -29,8 +29,7 @@ from dvc.registration.elastix.presets import Preset
 from dvc.registration.register import Settings, register
 from dvc.worker import Worker, usable_cores
 from mrstrain.records.provenance import versions
-from phantoms.heel import HeelPair, heel_pair
-from phantoms.tissue_error import errors_by_tissue
+from phantoms import HeelPair, errors_by_tissue, heel_pair
 
 MARGIN_MM = 4.0
 

@@ -42,7 +42,7 @@ from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
 from dvc.registration.register import Settings, register
 from fe import NeoHooke, material_set, read_tet_mesh
 from mrstrain.records.provenance import versions
-from phantoms.accuracy_run import distances_mm
+from phantoms import distances_mm
 from validate.fe_result import read_result
 
 GAIN_MM, VOLUME, NU = 10.0, 300.0, 0.45

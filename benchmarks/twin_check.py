@@ -23,7 +23,7 @@ from dvc.io.images.read import read_image
 from dvc.trust.error_model import read_error_model, to_surface_mm
 from mrstrain import phantom, register
 from mrstrain.records.provenance import versions, write_json
-from phantoms.accuracy_run import RIGID
+from phantoms import RIGID
 
 HEELS = ((1, 6.0, "Load1"), (2, 12.0, "Load1"), (3, 6.0, "Load3"))
 """Seed, width of the fat's lobules (mm) and load."""

@@ -1,7 +1,7 @@
 """A heel defined in space: which tissue lies at a point, and its proton-density signal there.
 
-Right foot, LPS mm: x to medial, toes toward -y, sole toward -z. Every shape is a closed form and every
-texture a hash of the seed and of lattice coordinates, so that a point has the same signal at any voxel size.
+Right foot, LPS mm: x to medial, toes toward -y, sole toward -z. Shapes are closed forms, and textures are hashes of the
+seed and of lattice coordinates, so that a point has the same signal at any voxel size.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from dvc.errors import InputError
 from phantoms.bodies import EllipsoidUnion, distance
 
 TISSUES: Mapping[int, str] = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "ankle"}
-"""Label numbers and names. "bone" is the calcaneus; "ankle" is the other bones, at rest with it."""
+"""Label numbers and names. "bone" is the calcaneus; "ankle" are the other bones, which move with it."""
 
 FAT_SIGNAL = 675.0
-"""Mean signal of fat with its septa, arbitrary units: the level that SNR refers to."""
+"""Mean signal of fat and its septa, arbitrary units; the SNR refers to it."""
 
 _BONE, _FAT, _MUSCLE, _SKIN, _TENDON, _ANKLE = 1, 2, 3, 4, 5, 6
 _LOBULE_SIGNAL, _MARROW_SIGNAL, _MUSCLE_SIGNAL, _SKIN_SIGNAL = 900.0, 760.0, 400.0, 300.0
 _TENDON_SIGNAL, _CORTEX_SIGNAL = 110.0, 60.0
-_EDGE_MM = 0.6  # tissues blend over this far to either side of a border, so that samples every 0.4 mm see all of it
+_EDGE_MM = 0.6  # half width of the blend at an interface, so that samples every 0.4 mm resolve it
 
 # Centre (mm), semi-axes (mm), turns about x, y, z (degrees).
 _CALCANEUS = (
@@ -79,25 +79,25 @@ _Shapes = tuple[tuple[_Triple, _Triple, _Triple], ...]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heel:
-    """A right heel, seeded: shapes vary by about 1 mm from one seed to another, textures altogether.
+    """A right heel drawn from a seed: shapes differ by about 1 mm between seeds, textures completely.
 
     Parameters
     ----------
     seed : int
         0 or more.
     size : float
-        Factor on all shapes; 1 is a calcaneus 67 mm long.
+        Scale factor of all shapes; at 1 the calcaneus is 67 mm long.
     pad_mm : float
-        Tissue below the calcaneus' lowest point, skin included, mm at size 1; about, since shapes vary.
+        Approximate thickness of the tissue below the calcaneus, skin included, mm at size 1.
     skin_mm, cortex_mm : float
-        Thickness of the skin and of the bones' cortical rim, mm.
+        Thickness of the skin and of the cortical rim of bones, mm.
     lobule_mm : float
-        Mean width of the fat's lobules, mm; fibrous septa divide them.
+        Mean width of fat lobules, which are divided by fibrous septa, mm.
 
     Raises
     ------
     InputError
-        If the seed is negative, or a length is out of its range: size 0.7 to 1.3, pad 10 to 26 mm, skin 1 to 4 mm,
+        If the seed is negative or a number is out of its range: size 0.7 to 1.3, pad 10 to 26 mm, skin 1 to 4 mm,
         cortex 0.5 to 3 mm, lobules 2 to 12 mm.
 
     Examples

@@ -75,7 +75,7 @@ class EllipsoidUnion:
         return cls(centres, 0.5 * (forms + forms.transpose(0, 2, 1)), sharpness)
 
     def distance(self, points_mm: FloatArray) -> FloatArray:
-        """Distance to the surface to first order, (n,) mm, negative inside; exact on the surface itself."""
+        """First-order distance of points (n, 3) mm to the surface, (n,) mm; negative inside, exact on the surface."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         return np.asarray(_distances(points, self.centres_mm, self.forms, self.sharpness))
 
@@ -105,7 +105,7 @@ def distance(x, y, z, centres, forms, sharpness):  # type: ignore[no-untyped-def
         s0 += weight * (A[0, 0] * a + A[0, 1] * b + A[0, 2] * c)
         s1 += weight * (A[0, 1] * a + A[1, 1] * b + A[1, 2] * c)
         s2 += weight * (A[0, 2] * a + A[1, 2] * b + A[2, 2] * c)
-    # deep inside, Q falls below zero; the distance there is only known to be large
+    # deep inside, Q falls below zero, and the distance is known only to be large
     Q = max(least - np.log(total) / sharpness, 0.25)
     slope = np.sqrt(s0 * s0 + s1 * s1 + s2 * s2) / total  # half the gradient of Q
     root = np.sqrt(Q)

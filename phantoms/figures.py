@@ -1,4 +1,4 @@
-"""Figures of an accuracy study, each as PNG bytes; what a figure's docstring says is its caption."""
+"""Figures of an accuracy study, each as PNG bytes; the docstring of each function is the caption."""
 
 from __future__ import annotations
 
@@ -14,41 +14,40 @@ _MARKS = ("o", "s", "^", "D", "v", "P")
 
 
 def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
-    """Root mean square error (lines) and bias (dashes) of the maximal shear over the middle of each bin, by tissue.
+    """Root mean square error (lines) and bias (dashes) of the max. shear over the middle of each bin, by tissue.
 
-    All motions with strain together, weighted by their number of voxels. The outermost bin has no far end and is
-    drawn at one and a half times its near one; bins of fewer than 200 samples are left out.
+    All motions with strain together, weighted by their number of samples. The outermost bin is open and drawn at one
+    and a half times its lower limit; bins of fewer than 200 samples are left out.
     """
     figure, (axes,) = chart(1)
     for number, tissue in enumerate(SOFT):
-        mine = [r for r in rows if r.tissue == tissue and r.by == by and r.motion != "still"]
-        lows = sorted({r.low for r in mine})
+        of_tissue = [r for r in rows if r.tissue == tissue and r.by == by and r.motion != "still"]
         at, rmse, bias = [], [], []
-        for low in lows:
-            some = [r for r in mine if r.low == low]
-            weight = np.array([r.samples for r in some], dtype=np.float64)
+        for low in sorted({r.low for r in of_tissue}):
+            of_bin = [r for r in of_tissue if r.low == low]
+            weight = np.array([r.samples for r in of_bin], dtype=np.float64)
             if weight.sum() < 200:
                 continue
-            high = some[0].high
+            high = of_bin[0].high
             at.append(0.5 * (low + high) if np.isfinite(high) else 1.5 * low)
-            rmse.append(float(np.sqrt(np.average([r.shear_rmse**2 for r in some], weights=weight))))
-            bias.append(float(np.average([r.shear_bias for r in some], weights=weight)))
+            rmse.append(float(np.sqrt(np.average([r.shear_rmse**2 for r in of_bin], weights=weight))))
+            bias.append(float(np.average([r.shear_bias for r in of_bin], weights=weight)))
         if not at:
             continue
         colour = REGION_COLOURS[number % len(REGION_COLOURS)]
         axes.plot(at, rmse, color=colour, marker=_MARKS[number], linewidth=1.8, label=tissue)
         axes.plot(at, bias, color=colour, linestyle="--", marker=".", linewidth=1.2)
     axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
-    label_axes(axes, by, "error of the maximal shear")
+    label_axes(axes, by, "error of the max. shear")
     if axes.get_legend_handles_labels()[0]:  # a small study may have no bin that is large enough
         axes.legend(fontsize=9, frameon=False)
     return png_bytes(figure)
 
 
 def resolution(rows: Sequence[ResolutionRow]) -> bytes:
-    """Share of a sinusoidal shear that is recovered, by its wavelength; grey lines at 50 % and 90 %.
+    """Fraction of a sinusoidal shear that is recovered, by wavelength; grey lines at 50 % and 90 %.
 
-    Shear along the foot that varies through the pad's thickness, largest 0.2; no foot motion.
+    Shear along the foot that varies through the thickness of the pad, at most 0.2; no rigid motion of the foot.
     """
     figure, (axes,) = chart(1)
     for number, condition in enumerate(dict.fromkeys(_of_tissue(r) for r in rows)):
@@ -61,15 +60,15 @@ def resolution(rows: Sequence[ResolutionRow]) -> bytes:
         axes.axhline(share, color="#9aa5b1", linewidth=0.8)
     axes.set_ylim(0.0, 1.1)
     axes.set_xlim(left=0.0)
-    label_axes(axes, "wavelength of the strain, mm", "share recovered")
+    label_axes(axes, "wavelength of the strain, mm", "fraction recovered")
     axes.legend(fontsize=9, frameon=False)
     return png_bytes(figure)
 
 
 def trade_off(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], tissue: str) -> bytes:
-    """Noise against spatial resolution. Lower left is better.
+    """Noise against spatial resolution; lower left is better.
 
-    Noise is the apparent maximal shear without strain (median), resolution the wavelength of which 90 % is recovered.
+    Noise is the median apparent max. shear of an unloaded pair, resolution the wavelength at which 90 % is recovered.
     """
     figure, (axes,) = chart(1)
     for number, condition in enumerate(dict.fromkeys(_condition(r) for r in rows)):
@@ -84,7 +83,7 @@ def trade_off(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow], tissue:
             )
     axes.set_xlim(left=0.0)
     axes.set_ylim(bottom=0.0)
-    label_axes(axes, "wavelength recovered to 90 %, mm", f"apparent maximal shear\nwithout strain, {tissue}")
+    label_axes(axes, "wavelength recovered to 90 %, mm", f"apparent max. shear\nwithout load, {tissue}")
     return png_bytes(figure)
 
 

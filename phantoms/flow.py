@@ -1,7 +1,7 @@
-"""Flows of soft tissue around bone and, where wanted, inside a skin, with exact gradient and inverse.
+"""Flows of soft tissue around constrained bone and, optionally, inside a constrained skin; exact gradient and inverse.
 
-A flow carries every point for one unit of time along a stationary velocity v. Where div v = 0, volume is
-kept, as it is unless a flow is asked not to. Following the same velocity backwards is the inverse map.
+A flow carries every point along a stationary velocity v for one unit of time. It is isochoric where div v = 0, which is
+the default. The inverse follows the same velocity backwards.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dvc.errors import InputError
 from phantoms.bodies import EllipsoidUnion
 
 _BLOCK = 256
-_NOTHING = 27.0  # exp(-27) = 2e-12: beyond, a rise has ended
+_NOTHING = 27.0  # exp(-27) = 2e-12: a rise is complete beyond
 
 
 @njit(cache=True)
@@ -202,22 +202,22 @@ def _carry(points, rest, skin, window, plate, pivot, keeps, steps, gradient):  #
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Border:
-    """A surface behind which tissue is at rest.
+    """A surface behind which tissue is constrained.
 
     Parameters
     ----------
     body : EllipsoidUnion
-        The body with that surface.
+        Body with that surface.
     ramp : float
-        Thickness of the layer over which motion rises from it, in units of the body's radius.
+        Thickness of the layer over which the motion rises, in units of the body's radius.
     order : {2, 3}
         The velocity's potential rises as 1 - exp(-t^order), t = 0 at the surface and 1 at the end of the ramp.
-        With 3 the strain is zero at the surface; with 2 it jumps there: tissue shears right up to it.
+        With 3 the strain is zero at the surface; with 2 it is discontinuous: tissue is sheared right up to it.
 
     Raises
     ------
     InputError
-        If the ramp is not positive or the order is another.
+        If the ramp is not positive or the order is not 2 or 3.
     """
 
     body: EllipsoidUnion
@@ -229,7 +229,7 @@ class Border:
             raise InputError(f"A border needs ramp > 0 and order 2 or 3; got {self.ramp} and {self.order}.")
 
     def _numbers(self) -> tuple[FloatArray, FloatArray]:
-        """Of each ellipsoid its centre and its form's xx, xy, xz, yy, yz, zz; then sharpness, ramp and order."""
+        """Per ellipsoid its centre and its form's xx, xy, xz, yy, yz, zz, (n, 9); then sharpness, ramp and order."""
         body = self.body
         upper = body.forms[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         parts = np.ascontiguousarray(np.concatenate([body.centres_mm, upper], axis=1))
@@ -241,34 +241,35 @@ _NO_BORDER = (np.zeros((0, 9)), np.ones(3))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flow:
-    """A flow, by default incompressible, that moves what lies near a plate with it, around a body at rest.
+    """A flow, by default isochoric, that carries tissue near a plate with it, around a constrained body.
 
     The velocity is v = curl(psi a), a(x) = c x (x - o) / 2, of which curl a = c:
 
         v = psi c + [c (grad psi . r) - r (grad psi . c)] / 2,   r = x - o,
 
-    so that div v = 0 exactly, v = c where psi = 1 and v = 0 where psi = 0; a flow that need not keep volume has
-    v = psi c alone, and div v = c . grad psi: tissue shrinks before what moves and swells behind. psi is the
-    product of a rise from the body at rest (`Border`), of another from the inner surface of a skin at rest, if there is
-    one, and of a Gaussian window around the sole, which ends the motion upward and forward. Points follow v for one
-    unit of time by Runge-Kutta 4 with fixed steps; F follows dF/dt = (grad v) F by the same scheme, which makes it the
+    so that div v = 0 exactly, v = c where psi = 1 and v = 0 where psi = 0. A flow that changes volume has v = psi c and
+    div v = c . grad psi: tissue is compressed in front of the moving part and expanded behind it. psi is the product of
+    a rise from the constrained body (`Border`), another from the inner surface of a constrained skin, if there is one,
+    and a Gaussian window around the sole, which ends the motion upward and forward. Points follow v for one unit of
+    time by Runge-Kutta 4 with fixed steps; F follows dF/dt = (grad v) F by the same scheme, so that it is the
     derivative of the discrete map itself. No point crosses a border, so u and F are exact up to it on either side.
 
     Parameters
     ----------
     plate_mm : (3,)
-        c, the plate's displacement, LPS mm.
+        c, plate displacement, LPS mm.
     pivot_mm : (3,)
-        o, the middle of the plate's contact, LPS mm.
+        o, centre of the plate contact, LPS mm.
     rest : Border
-        Inside its body nothing moves.
+        Nothing moves inside its body.
     centre_mm, width_mm : (3,)
-        Of the window, LPS mm: its middle, and its standard deviation along each axis.
+        Centre of the window and its standard deviation along each axis, LPS mm.
     skin : Border, optional
-        Outside its body nothing moves.
+        Nothing moves outside its body.
     steps : int
         Runge-Kutta steps.
     keeps_volume : bool
+        Whether the flow is isochoric.
 
     Raises
     ------

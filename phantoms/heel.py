@@ -1,8 +1,8 @@
-"""A heel under a plate: its motions under Load0 to Load4, and its images, of which the strain is known exactly."""
+"""A heel under a plate: its motions under Load1 to Load4, and its MR images, with exactly known strain."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -27,10 +27,10 @@ LOADS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
         "Load4": (1.4, 1.5, 1.5),
     }
 )
-"""Of each load: how far the plate presses, how far it shears, and how far the pad slides inside its skin, mm at size 1.
+"""Indentation and shear displacement of the plate, and sliding of the pad inside its skin, of each load; mm at size 1.
 
-Chosen for the shear that finite-element models of the heel gave for 140 N, 15 N, 15 + 45 N and 15 + 12 N: in the fat
-around the calcaneus a median and a 90th percentile of about .20 / .40, .05 / .09, .13 / .35, .06 / .13.
+Chosen for the max. shear of finite-element models of the heel under 140 N, 15 N, 15 + 45 N and 15 + 12 N: a median and
+90th percentile of about .20 / .40, .05 / .09, .13 / .35, .06 / .13 in the fat around the calcaneus.
 """
 
 _PRESS_MM = 7.5
@@ -47,24 +47,24 @@ _STIFF = ("bone", "ankle", "skin")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeelPair:
-    """Images of one heel with the truth about what happened between them.
+    """Images of one heel and the true motion between them.
 
     Parameters
     ----------
     reference : Image
         Unloaded.
     loaded : Image
-        Under load, the foot moved: tissue at X lies at ``foot_motion.apply(X + u(X))``.
+        Under load, after a rigid motion of the foot: tissue at X lies at ``foot_motion.apply(X + u(X))``.
     repeat : Image
-        Unloaded again, the foot moved by the same motion, with other noise and coil sensitivity.
+        Unloaded again, after the same rigid motion, with its own noise and bias field.
     labels : LabelMap
-        Tissues on the reference's grid, by voxel centre.
+        Tissue at each voxel centre of the reference.
     bone : Mask
-        The calcaneus on the reference's grid.
+        The calcaneus, on the reference grid.
     deformation : Motion
-        u relative to the bone, and its gradient, in the reference's configuration, LPS mm.
+        u relative to the bone and its gradient, reference configuration, LPS mm.
     foot_motion : RigidMotion
-        From the reference's frame to the loaded and the repeated scan, LPS mm.
+        Rigid motion of the foot from the reference to the loaded and the repeat scan, LPS mm.
     """
 
     reference: Image
@@ -86,35 +86,37 @@ def heel_pair(
     foot_motion: RigidMotion | None = None,
     loaded_grid: Grid | None = None,
 ) -> HeelPair:
-    """Images of a heel without load, under a load, and without load again.
+    """Images of a heel: unloaded, loaded, and unloaded again.
 
     Parameters
     ----------
     seed : int
-        Of shapes, textures, noise and sensitivities; 0 or more.
+        Seed of shapes, textures, noise and bias fields; 0 or more.
     shape, spacing_mm
-        Of the reference's grid, centred just below the calcaneus's middle. Spacing in mm, one or three.
+        Voxels along each axis, and voxel size in mm (one or three), of a grid centred just below the middle of the
+        calcaneus.
     snr : float or None
-        Fat's signal over the noise's standard deviation; None for no noise.
+        Signal of fat over the standard deviation of the noise; None for images without noise.
     load : float
-        Factor on the plate's motion; 1 is a press of 7.5 mm with a shear of 5 mm forward.
+        Factor on the plate displacement; 1 is an indentation of 7.5 mm with a forward shear of 5 mm.
     motion : Motion, optional
-        Of tissue relative to bone, instead of that smooth load; it belongs to the heel of this seed.
+        Motion of tissue relative to bone in place of that smooth load, for the heel of this seed.
     foot_motion : RigidMotion
-        Of the whole foot between scans; a few degrees and mm by default.
+        Rigid motion of the foot between scans; a few degrees and mm by default.
     loaded_grid : Grid
-        Of the loaded and repeated image. By default the reference's, extended where the bone would leave it.
+        Grid of the loaded and the repeat image; by default that of the reference, extended where the bone would leave
+        it.
 
     Raises
     ------
     InputError
-        If the seed is negative, the load negative or beyond 1.5, or the SNR or the grid out of range.
+        If the seed is negative, the load is outside 0 to 1.5, or the SNR or the grid is out of range.
     """
     if not 0.0 <= load <= 1.5:
         raise InputError(f"The load must lie between 0 and 1.5; got {load}.")
     heel = Heel(seed)
     grid = centred_grid(shape, spacing_mm)
-    foot = default_motion() if foot_motion is None else foot_motion
+    foot = default_foot_motion() if foot_motion is None else foot_motion
     flow = pressed(heel, load) if motion is None else motion
     labels = labels_of(heel, grid)
     bone = labels.region("bone")
@@ -139,23 +141,23 @@ def scan(
     snr: float | None,
     number: int,
 ) -> Image:
-    """Image of a heel after a motion of its tissue and then one of the whole foot.
+    """MR image of a heel after a motion of its tissue, followed by a rigid motion of the foot.
 
-    The image is I(y) = I0(phi^-1(R^T (y - t))), where I0 is the anatomy's closed form: nothing that has been
-    sampled is ever resampled. Noise and coil sensitivity are the acquisition's own.
+    I(y) = I0(phi^-1(R^T (y - t))), where I0 is the closed form of the anatomy, so that no sampled image is ever
+    resampled. Each acquisition has its own noise and bias field.
 
     Parameters
     ----------
     heel : Heel
     grid : Grid
-        Of the image, LPS mm.
+        Grid of the image, LPS mm.
     motion : Motion, optional
-        Of tissue relative to bone; none for an unloaded heel.
+        Motion of tissue relative to bone; none for an unloaded heel.
     foot_motion : RigidMotion, optional
     snr : float or None
-        Fat's signal over the noise's standard deviation; None for no noise.
+        Signal of fat over the standard deviation of the noise; None for an image without noise.
     number : int
-        Of the acquisition: with the heel's seed it draws noise and sensitivity.
+        Acquisition number; together with the heel's seed it determines noise and bias field.
 
     Raises
     ------
@@ -168,58 +170,58 @@ def scan(
 
 
 def labels_of(heel: Heel, grid: Grid) -> LabelMap:
-    """Tissues by voxel centre."""
+    """Tissue of a heel at each voxel centre of a grid."""
     return LabelMap(grid, heel.tissue_at(grid.points().reshape(-1, 3)).reshape(grid.shape), TISSUES)
 
 
-def badly_drawn(labels: LabelMap, voxels: int) -> LabelMap:
-    """A label map whose bones and skin are drawn too large by so many voxels or, below zero, too small.
+def misdrawn(labels: LabelMap, voxels: int) -> LabelMap:
+    """Return a label map with bones and skin too large by a number of voxels or, below zero, too small.
 
-    They grow into the softer tissue beside them, or that into them; the body stays as large as it is.
+    They grow into the adjacent softer tissue, or it into them; the outline of the body is unchanged.
     """
     stiff = np.isin(labels.labels, [number for number, name in labels.names.items() if name in _STIFF])
     soft = (labels.labels > 0) & ~stiff
-    growing, yielding = (stiff, soft) if voxels > 0 else (soft, stiff)
-    moved = binary_dilation(growing, iterations=abs(voxels)) & yielding if voxels else np.zeros_like(stiff)
+    growing, shrinking = (stiff, soft) if voxels > 0 else (soft, stiff)
+    changed = binary_dilation(growing, iterations=abs(voxels)) & shrinking if voxels else np.zeros_like(stiff)
     nearest = distance_transform_edt(~growing, return_distances=False, return_indices=True)
-    return LabelMap(labels.grid, np.where(moved, labels.labels[tuple(nearest)], labels.labels), labels.names)
+    return LabelMap(labels.grid, np.where(changed, labels.labels[tuple(nearest)], labels.labels), labels.names)
 
 
 def labels_to_mesh(heel: Heel, labels: LabelMap) -> LabelMap:
-    """The part that a finite-element model takes: sole and heel, 75 to 100 mL of soft tissue at size 1, and its bone.
+    """Part of a label map for a finite-element model: sole and heel, 75 to 100 mL of soft tissue at size 1, and bone.
 
-    Below a plane through the calcaneus' middle and behind one through its front.
+    The truncation surfaces are a horizontal plane through the middle of the calcaneus and a vertical one at its front.
     """
     points = labels.grid.points()
     kept = (points[..., 2] < 0.0) & (points[..., 1] > -20.0 * heel.size)
     return LabelMap(labels.grid, np.where(kept, labels.labels, 0), labels.names)
 
 
-def drawn_motion(seed: int, number: int) -> RigidMotion:
-    """Draw the foot's motion before an acquisition: up to 3 degrees about and 2 mm along each axis."""
+def random_foot_motion(seed: int, number: int) -> RigidMotion:
+    """Draw the rigid motion of the foot before an acquisition: up to 3 degrees about and 2 mm along each axis."""
     random = np.random.default_rng([seed, 3, number])
     turn = Rotation.from_rotvec(random.uniform(-3.0, 3.0, 3), degrees=True).as_matrix()
     return RigidMotion.about(np.array([0.0, 5.0, 0.0]), turn, random.uniform(-2.0, 2.0, 3))
 
 
-def default_motion() -> RigidMotion:
-    """Return the foot's motion between scans when none is asked for: 3.7 degrees, 2.9 mm."""
+def default_foot_motion() -> RigidMotion:
+    """Return the default rigid motion of the foot between scans: 3.7 degrees, 2.9 mm."""
     turn = Rotation.from_rotvec([2.5, -1.5, 2.2], degrees=True).as_matrix()
     return RigidMotion.about(np.array([0.0, 5.0, 0.0]), turn, np.array([1.6, -2.0, 1.4]))
 
 
 def pressed(heel: Heel, load: float = 1.0) -> Flow:
-    """Return the flow of a heel under a plate moving up and forward, smooth everywhere, its bones at rest."""
+    """Return the smooth flow of a heel under a plate that moves up 7.5 mm and forward 5 mm, times ``load``."""
     return under_plate(heel, press_mm=load * _PRESS_MM, shear_mm=load * _SHEAR_MM)
 
 
 def under_plate(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
     """Return the smooth flow of a heel under a plate that moves up by ``press_mm`` and forward by ``shear_mm``.
 
-    Both are of a heel of size 1, and grow with it.
+    Its bones are constrained. Both displacements are those of a heel of size 1 and scale with the heel.
     """
     bones = heel.skeleton
-    # merged softly, which makes the body larger: the bones stay inside, and motion rises around them smoothly
+    # a soft union is larger, so that the bones lie inside it and the motion rises smoothly around them
     rest = EllipsoidUnion(bones.centres_mm, bones.forms, sharpness=1.25)
     return Flow(
         heel.size * np.array([0.0, -shear_mm, press_mm]),
@@ -232,14 +234,14 @@ def under_plate(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
 
 
 def sliding(heel: Heel, shear_mm: float) -> Flow:
-    """Return the flow of the heel pad alone, along a skin and a bone that are both at rest.
+    """Return the flow of the heel pad between constrained bone and constrained skin.
 
-    Its strain jumps at either border: fat shears right up to them. ``shear_mm`` is about how far tissue moves in the
-    middle of the pad of a heel of size 1, and grows with it.
+    Strain is discontinuous at both interfaces: fat is sheared right up to them. ``shear_mm`` is roughly the
+    displacement in the middle of the pad of a heel of size 1, and scales with the heel.
     """
     return Flow(
         heel.size * np.array([0.0, _SLIDE * shear_mm, 0.0]),
-        # far above, so that the potential is about the same all over the pad, and tissue circulates around it
+        # far above the pad, where the potential is then nearly uniform, so that tissue circulates around it
         pivot_mm=heel.size * np.array([0.0, 14.0, 50.0]),
         rest=Border(heel.skeleton, ramp=0.6, order=2),
         skin=Border(heel.flesh, ramp=0.2, order=2),
@@ -252,8 +254,8 @@ def sliding(heel: Heel, shear_mm: float) -> Flow:
 def swelling(heel: Heel) -> Flow:
     """Return a flow of the heel pad that changes its volume: det F from about 0.91 to 1.17, smoothly over 20 to 40 mm.
 
-    Its bones are at rest, and volume does not change in or at them. Tissue below the calcaneus is carried forward and a
-    little down: what lies before it is drained, what lies behind and above it is fuller.
+    Bones are constrained, and volume does not change in or at them. Tissue below the calcaneus is carried forward and
+    slightly down, which compresses the tissue in front of it and expands that behind and above it.
     """
     bones = heel.skeleton
     return Flow(
@@ -267,12 +269,12 @@ def swelling(heel: Heel) -> Flow:
 
 
 def under_load(heel: Heel, load: str) -> Motion:
-    """Return the motion of a heel under one of LOADS: the pad slides inside its skin, and the plate moves all.
+    """Return the motion of a heel under one of LOADS: the pad slides inside its skin, then the plate moves all tissue.
 
     Raises
     ------
     InputError
-        If there is no such load.
+        If the load is unknown.
     """
     if load not in LOADS:
         raise InputError(f"No load '{load}'; there are {', '.join(LOADS)}.")
@@ -280,22 +282,11 @@ def under_load(heel: Heel, load: str) -> Motion:
     return Composed([sliding(heel, slide), under_plate(heel, press_mm=press, shear_mm=shear)])
 
 
-def loaded_signal(heel: Heel, motion: Motion, foot_motion: RigidMotion) -> Callable[[FloatArray], FloatArray]:
-    """Noise-free signal of the heel after both motions, as a function of points (n, 3) mm."""
-    back, home = motion.inverse(), foot_motion.inverse()
-
-    def signal(points_mm: FloatArray) -> FloatArray:
-        x = home.apply(points_mm)
-        return heel.intensity_at(x + back.displacement(x))
-
-    return signal
-
-
 def octants(heel: Heel, grid: Grid, motion: Motion | None, foot_motion: RigidMotion) -> FloatArray:
-    """The heel's signal in the octants of a grid's voxels, (ni, nj, nk, 2, 2, 2), after both motions.
+    """Signal of the heel in the octants of a grid's voxels, (ni, nj, nk, 2, 2, 2), after both motions.
 
-    Each voxel's centre is carried back exactly; its octants are spread along the edges that the voxel has
-    there, which to first order are columns of F^-1 R^T times the spacing.
+    The centre of each voxel is mapped back exactly. Its octants are placed along the mapped edges of the voxel, to
+    first order the columns of F^-1 R^T times the spacing.
     """
     home = foot_motion.inverse()
     edges = home.rotation @ (np.asarray(grid.direction) * grid.spacing_mm)
@@ -315,12 +306,12 @@ def octants(heel: Heel, grid: Grid, motion: Motion | None, foot_motion: RigidMot
 
 
 def _may_show(heel: Heel, grid: Grid, back: Motion | None, home: RigidMotion) -> BoolArray:
-    """Voxels that may hold tissue: near some that do, on every fourth of the grid's planes along each axis."""
+    """Voxels (ni, nj, nk) that may show tissue, judged on every fourth of the grid's planes along each axis."""
     planes = [np.arange(0, n + _COARSE - 1, _COARSE) for n in grid.shape]
     corners = home.apply(grid.points_at(np.stack(np.meshgrid(*planes, indexing="ij"), axis=-1).astype(np.float64)))
     x = corners.reshape(-1, 3)
     at = x if back is None else x + back.displacement(x)
-    # A voxel is at most half a cell's diagonal from the nearest corner; a factor of two allows for stretch.
+    # A voxel is within half a cell diagonal of the nearest corner; a factor of two allows for stretch.
     diagonal = _COARSE * float(np.linalg.norm(grid.spacing_mm))
     shown = (heel.outline.distance(at) < diagonal + 1.0).reshape([len(p) for p in planes])
     for axis, n in enumerate(grid.shape):
@@ -329,7 +320,7 @@ def _may_show(heel: Heel, grid: Grid, back: Motion | None, home: RigidMotion) ->
 
 
 def centred_grid(shape: tuple[int, int, int], spacing_mm: float | Sequence[float]) -> Grid:
-    """Grid around the calcaneus; spacing in mm, one or three."""
+    """Grid around the calcaneus, LPS mm; spacing in mm, one or three."""
     spacing = np.asarray(spacing_mm, dtype=np.float64)
     if spacing.shape not in {(), (3,)}:
         raise InputError(f"Voxel spacing must be one length or three, mm; got {spacing_mm}.")
@@ -338,12 +329,12 @@ def centred_grid(shape: tuple[int, int, int], spacing_mm: float | Sequence[float
 
 
 def heel_grid(spacing_mm: float | Sequence[float], size: float = 1.0) -> Grid:
-    """Grid that holds the heel of a size, 101 x 112 x 106 mm at size 1.
+    """Grid that covers a heel of the given size, 101 x 112 x 106 mm at size 1.
 
     Raises
     ------
     InputError
-        If the spacing is not one length or three between 0.3 and 4 mm, or needs more than 512 voxels along an axis.
+        If the spacing is not one or three lengths between 0.3 and 4 mm, or needs more than 512 voxels along an axis.
     """
     spacing = np.asarray(spacing_mm, dtype=np.float64)
     if spacing.shape not in {(), (3,)} or not ((spacing >= _FINEST_MM) & (spacing <= _COARSEST_MM)).all():
@@ -360,7 +351,7 @@ def heel_grid(spacing_mm: float | Sequence[float], size: float = 1.0) -> Grid:
 
 
 def covering(grid: Grid, points_mm: FloatArray) -> Grid:
-    """Return the grid, extended by whole voxels where points come closer than a margin to its border."""
+    """Return the grid, extended by whole voxels where points (n, 3) mm come closer than 4 mm to its border."""
     if len(points_mm) == 0:
         return grid
     indices = grid.indices_of(points_mm)

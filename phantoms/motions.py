@@ -1,6 +1,6 @@
-"""Motions of closed form, with exact gradient and inverse: to see what a method does with a strain it should know.
+"""Closed-form motions with exact gradient and inverse, defined in all space, bone included.
 
-Each is defined in all space, bone included. Frame LPS mm; reference configuration.
+Frame LPS, lengths in mm, reference configuration.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ def compressed(axis: int, stretch: float, centre_mm: FloatArray) -> Affine:
 
 
 def sheared(direction: FloatArray, normal: FloatArray, amount: float, centre_mm: FloatArray) -> Affine:
-    """Simple shear F = I + amount d (x) n, d and n unit vectors at right angles.
+    """Simple shear F = I + amount d (x) n, d and n orthogonal unit vectors.
 
     Raises
     ------
     InputError
-        If d and n are no unit vectors at right angles.
+        If d and n are not orthogonal unit vectors.
     """
     d, n = _frame(direction, normal)
     return _about(np.eye(3) + amount * np.outer(d, n), centre_mm)
@@ -80,26 +80,26 @@ def _frame(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShearWave:
-    """Shear that varies as a cosine: u = (peak L / 2 pi) sin(2 pi n . X / L + phase) d.
+    """Simple shear whose amount varies as a cosine: u = (peak L / 2 pi) sin(2 pi n . X / L + phase) d.
 
-    H = peak cos(2 pi n . X / L + phase) d (x) n: simple shear everywhere, det F = 1, for d and n at right angles. Since
+    H = peak cos(2 pi n . X / L + phase) d (x) n: simple shear everywhere, det F = 1, for orthogonal d and n. Since
     n . x = n . X, the inverse is the same wave with the opposite sign.
 
     Parameters
     ----------
     direction, normal : (3,)
-        d and n, unit vectors at right angles.
+        d and n, orthogonal unit vectors.
     wavelength_mm : float
         L, mm.
     peak : float
-        Largest H_dn, no unit; the maximal shear there is peak sqrt(4 + peak^2) / 4, about half of it.
+        Largest H_dn, dimensionless; the max. shear there is peak sqrt(4 + peak^2) / 4, about half of it.
     phase : float
         Radians.
 
     Raises
     ------
     InputError
-        If the wavelength is not positive, or the directions are no unit vectors at right angles.
+        If the wavelength is not positive, or the directions are not orthogonal unit vectors.
     """
 
     direction: FloatArray
@@ -136,24 +136,24 @@ class ShearWave:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bending:
-    """A block bent to an arc without change of volume, in the plane of its length and its thickness.
+    """Isochoric bending of a block to an arc, in the plane of its length and its thickness.
 
-    With Y along the length and Z along the thickness from the centre, R the radius of the fibre that keeps its length:
-    r = sqrt(R^2 + 2 R Z), theta = Y / R; y = r sin(theta), z = r cos(theta) - R. The third coordinate is kept.
-    Principal stretches are R / r and r / R: det F = 1.
+    With Y along the length and Z along the thickness from the centre, R the radius of the fibre whose length is
+    unchanged: r = sqrt(R^2 + 2 R Z), theta = Y / R; y = r sin(theta), z = r cos(theta) - R. The third coordinate is
+    kept. Principal stretches are R / r and r / R: det F = 1.
 
     Parameters
     ----------
     centre_mm : (3,)
-        LPS mm; stays where it is.
+        Fixed point, LPS mm.
     length, thickness : (3,)
-        Unit vectors at right angles; the block bends away from ``thickness``.
+        Orthogonal unit vectors; the block bends away from ``thickness``.
     radius_mm : float
         R, mm.
 
     Notes
     -----
-    Undefined (NaN) where Z <= -R / 2. One arc: unique for |Y| < pi R.
+    Undefined (NaN) where Z <= -R / 2; one-to-one for |Y| < pi R.
 
     References
     ----------

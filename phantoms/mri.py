@@ -1,4 +1,4 @@
-"""What a scanner makes of a noise-free signal: point spread, coil sensitivity, Rician noise."""
+"""MR image formation from a noise-free signal: point spread, receive field (bias field), Rician noise."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from dvc.arrays import Float32Array, FloatArray
 from dvc.errors import InputError
 from dvc.images.image import Grid, Image
 
-_FULL = 0.6  # of the highest frequency: up to here k-space is taken as it is, from here on it fades to nothing
+_FULL = 0.6  # of the highest frequency, from which on k-space is tapered to zero
 _BIAS = 0.2
-_LARGEST_MM = 1.6  # a voxel's octants, 0.8 mm apart, still see the smooth edges of the anatomy (1.1 % of fat's signal)
+_LARGEST_MM = 1.6  # octants 0.8 mm apart still resolve the smooth edges of the anatomy (to 1.1 % of the signal of fat)
 _CHUNK = 200_000
 
 
@@ -28,22 +28,22 @@ def acquire(
 ) -> Image:
     """Magnitude image of a noise-free signal.
 
-    The signal is sampled at half the spacing of `sampled_by`, the voxels' own up to 1.6 mm. Of its spatial
-    frequencies those are kept that the voxels can carry, the highest faded out as a scanner's filter does against
-    ringing: k-space holds nothing finer, so the image has no aliasing. It is multiplied by a smooth coil sensitivity
-    between 0.8 and 1.2, and given Rician noise: |s + n1 + i n2|, n1 and n2 normal with sigma = reference_signal / snr.
+    The signal is sampled at half the spacing of `sampled_by`. Only spatial frequencies that the voxels can represent
+    are kept, the highest tapered as by a scanner's filter against ringing, so the image has no aliasing. It is
+    multiplied by a smooth receive field between 0.8 and 1.2, and given Rician noise: |s + n1 + i n2|, n1 and n2 normal
+    with standard deviation ``reference_signal / snr``.
 
     Parameters
     ----------
     signal : function of points (n, 3) LPS mm returning (n,), or array (ni, nj, nk, 2, 2, 2)
-        An array holds the signal in the eight octants of each voxel of ``sampled_by(grid)``: at a quarter of each edge
-        before and behind the centre.
+        An array holds the signal in the eight octants of each voxel of ``sampled_by(grid)``, a quarter of each edge to
+        either side of the centre.
     snr : float or None
         Signal-to-noise ratio at ``reference_signal``; None for an image without noise.
     seed : int
-        Of the noise.
+        Seed of the noise.
     bias_seed : int or None
-        Of the coil sensitivity; None for a uniform one.
+        Seed of the receive field; None for a uniform one.
 
     Raises
     ------
@@ -93,9 +93,9 @@ def _octants(signal: Callable[[FloatArray], FloatArray], grid: Grid) -> FloatArr
 
 
 def _seen(octants: Float32Array, shape: tuple[int, int, int]) -> Float32Array:
-    """Voxels of a shape (ni, nj, nk) over the octants' fine grid, without the frequencies that they cannot carry.
+    """Average the octants to voxels (ni, nj, nk), without frequencies that these cannot represent.
 
-    By cosine transforms, which take what lies outside for a mirror image: the foot leaves the field of view.
+    By cosine transforms, which continue the signal as a mirror image, because the foot leaves the field of view.
     """
     ni, nj, nk = octants.shape[:3]
     values = octants.transpose(0, 3, 1, 4, 2, 5).reshape(2 * ni, 2 * nj, 2 * nk)
@@ -111,9 +111,9 @@ def _seen(octants: Float32Array, shape: tuple[int, int, int]) -> Float32Array:
 
 
 def sensitivity(grid: Grid, seed: int) -> Float32Array:
-    """Draw a smooth multiplicative field (ni, nj, nk) of mean about 1, within 1 +- 0.2.
+    """Draw a smooth receive field (ni, nj, nk), between 0.8 and 1.2 with a mean of about 1.
 
-    A random sum of the nine cosine products of first and second order over the grid's box.
+    A random sum of the nine cosine products of first and second order over the grid.
     """
     random = np.random.default_rng(seed)
     along = [(np.arange(n) + 0.5) / n for n in grid.shape]

@@ -15,19 +15,19 @@ from dvc.images.image import LabelMap
 
 @dataclass(frozen=True, slots=True)
 class TissueError:
-    """Error in one tissue, over its voxels; reference configuration, displacement in mm, shear without unit.
+    """Error in one tissue over its voxels; reference configuration, displacement in mm, max. shear dimensionless.
 
     Attributes
     ----------
     tissue : str
     voxels : int
-        Voxels scored.
+        Voxels compared.
     true_p50, true_p95 : float
-        Percentiles of the true maximal shear (E_1 - E_3) / 2.
+        Percentiles of the true maximum shear strain (E_1 - E_3) / 2.
     shear_rmse, shear_bias, shear_error_p95 : float
-        Root mean square and mean of found minus true maximal shear; 95th percentile of its absolute value.
+        Root mean square and mean of measured minus true max. shear; 95th percentile of its absolute value.
     u_p50_mm, u_p95_mm : float
-        Percentiles of the length of the difference between found and true displacement.
+        Percentiles of the length of the difference between measured and true displacement.
     folded : int
         Voxels with det F <= 0.
     """
@@ -45,18 +45,18 @@ class TissueError:
 
 
 def errors_by_tissue(
-    labels: LabelMap, truth: Deformation, found: Deformation, where: BoolArray
+    labels: LabelMap, truth: Deformation, measured: Deformation, where: BoolArray
 ) -> tuple[TissueError, ...]:
-    """Compare two deformations in the voxels of each tissue; a tissue without a scored voxel is left out.
+    """Compare two deformations in the voxels of each tissue; tissues without such a voxel are left out.
 
     Parameters
     ----------
     labels : LabelMap
         Tissues on the reference grid.
-    truth, found : Deformation
+    truth, measured : Deformation
         u and grad u in the reference configuration, LPS mm.
     where : (ni, nj, nk) bool
-        Voxels to score; of these, those count where ``found`` is defined.
+        Voxels to compare, as far as ``measured`` is defined there.
 
     Raises
     ------
@@ -64,16 +64,18 @@ def errors_by_tissue(
         If ``where`` is not on the labels' grid.
     """
     if where.shape != labels.grid.shape:
-        raise GeometryError(f"The voxels to score have shape {where.shape}; the labels' grid has {labels.grid.shape}.")
+        raise GeometryError(
+            f"The voxels to compare have shape {where.shape}; the labels' grid has {labels.grid.shape}."
+        )
     inside = where & (labels.labels > 0)
-    U, true_H = evaluate_on_grid(truth, labels.grid, inside)
-    u, H = evaluate_on_grid(found, labels.grid, inside)
-    true, measured = StrainField.from_gradient(true_H), StrainField.from_gradient(H)
-    error = measured.max_shear - true.max_shear
-    distance = np.linalg.norm(u - U, axis=1)
+    true_u, true_H = evaluate_on_grid(truth, labels.grid, inside)
+    u, H = evaluate_on_grid(measured, labels.grid, inside)
+    true, strain = StrainField.from_gradient(true_H), StrainField.from_gradient(H)
+    error = strain.max_shear - true.max_shear
+    distance = np.linalg.norm(u - true_u, axis=1)
     rows = []
     for number, tissue in labels.names.items():
-        kept = (labels.labels[inside] == number) & measured.valid
+        kept = (labels.labels[inside] == number) & strain.valid
         if not kept.any():
             continue
         rows.append(
@@ -87,7 +89,7 @@ def errors_by_tissue(
                 shear_error_p95=float(np.percentile(np.abs(error[kept]), 95)),
                 u_p50_mm=float(np.median(distance[kept])),
                 u_p95_mm=float(np.percentile(distance[kept], 95)),
-                folded=int(np.count_nonzero(measured.jacobian[kept] <= 0)),
+                folded=int(np.count_nonzero(strain.jacobian[kept] <= 0)),
             )
         )
     return tuple(rows)

@@ -36,7 +36,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def heel():
-    from phantoms.anatomy import Heel
+    from phantoms import Heel
 
     return Heel(seed=1)
 
@@ -80,7 +80,7 @@ def tiny_pair(made_once):
 
 def _kept(made_once, name: str, **size):
     """A pair of images, made by one worker and read by the others."""
-    from phantoms.heel import heel_pair
+    from phantoms import heel_pair
 
     folder = made_once(name, lambda place: (place / "pair").write_bytes(pickle.dumps(heel_pair(3, load=0.6, **size))))
     return pickle.loads((folder / "pair").read_bytes())

@@ -19,8 +19,7 @@ from fe import write_tet_mesh
 from mrstrain.cli.app import app
 from mrstrain.studies.file import read_study
 from mrstrain.truth.phantom import phantom
-from phantoms.anatomy import Heel
-from phantoms.heel import under_load
+from phantoms import Heel, under_load
 from tests.fe.test_simulate import dome
 from tests.quick import QUICK
 

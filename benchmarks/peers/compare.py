@@ -35,7 +35,7 @@ from dvc.errors import MrstrainError
 from dvc.io.transforms.displacement_image import read_displacement
 from dvc.io.transforms.read import read_transform
 from mrstrain.records.provenance import versions
-from phantoms.heel import HeelPair
+from phantoms import HeelPair
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).parent

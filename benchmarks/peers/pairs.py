@@ -11,9 +11,7 @@ from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import carry, fill_missing
 from dvc.images.shading import without_shading
 from dvc.io.images.write import write_image, write_labels, write_mask
-from phantoms.accuracy_run import motion_named
-from phantoms.anatomy import Heel
-from phantoms.heel import HeelPair, heel_pair
+from phantoms import Heel, HeelPair, heel_pair, motion_named
 
 # Air left around the body: more than tissue moves, so that its true place is inside the aligned image as well.
 MARGIN_MM = 10.0

@@ -38,7 +38,7 @@ def phantom(
     """Images of a synthetic heel under Load0 to Load4, with their exactly known strain."""
     from mrstrain.records.progress import live
     from mrstrain.truth.phantom import phantom as run
-    from phantoms.heel import LOADS
+    from phantoms import LOADS
 
     with live() as progress:
         made = run(

@@ -20,7 +20,7 @@ from mrstrain.measurement.measured_folder import measurements_in
 from mrstrain.measurement.register import register
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
-from phantoms.twin import loaded_twin
+from phantoms import Acquisition, synthetic_warp
 from validate.extrapolation import LEVELLED, carried_on
 from validate.fe_result import FeResult
 from validate.mapping import filled_from_nearest
@@ -129,7 +129,7 @@ def level(
                 f"{load}: where the model's cells are nearly flat it was smoothed before it moved the image, by over "
                 f"{_APART_MM:g} mm in {share:.0%} of its cells."
             )
-        made[load] = loaded_twin(subject.reference, body, field, seed=seed)
+        made[load] = synthetic_warp(subject.reference, body, field, Acquisition(seed))
     for folder in (target, target / name, target / work, target / work / "images"):
         make_output(folder)
     for load in results:  # of an earlier run

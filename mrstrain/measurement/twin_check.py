@@ -17,7 +17,7 @@ from dvc.images.tissue import tissue_mask
 from dvc.registration.register import Registration, register
 from dvc.worker import Worker
 from mrstrain.records.inputs import Subject
-from phantoms.twin import loaded_twin
+from phantoms import Acquisition, synthetic_warp
 
 _FOLDED = 1e-3
 
@@ -62,14 +62,12 @@ def twin_check(
     tell("making the twin", 0.0)
     motion, seed = found.alignment.motion, found.settings.seed
     try:
-        twin = loaded_twin(
+        twin = synthetic_warp(
             found.reference,
             found.tissue,
             found.total,
+            Acquisition(seed, found.loaded.grid, noise_factor=_noisier(found)),
             near=motion,
-            seed=seed,
-            onto=found.loaded.grid,
-            noisier=_noisier(found),
             beyond_missing=True,
         ).image
         tell("making the twin", 1.0)

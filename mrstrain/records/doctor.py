@@ -1,7 +1,7 @@
-"""Whether this machine and this environment are fit for a run.
+"""Checks whether this machine and environment are suitable for a run.
 
-Nothing of ours is imported here but the standard library: another distribution may own the name ``dvc`` or
-``validate``, and that is the first thing to find out.
+Only the standard library is imported here: another distribution may own the name ``dvc`` or ``validate``, which is the
+first thing to check.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
-# Distributions known to bring a top-level package of one of our names.
+# Distributions known to install a top-level package with one of our names.
 _RIVALS = {
     "dvc": ("dvc", "Data Version Control"),
     "configobj": ("validate", "ConfigObj"),
@@ -29,34 +29,34 @@ _NEEDED = (
     "matplotlib", "jinja2", "rich", "typer", "loky", "distributed", "filelock", "pydantic", "pytetwild", "pyvista",
     "vtk",
 )  # fmt: skip
-_ELASTIX = "0.25."  # the series that the parameters and their checks were written for
+_ELASTIX = "0.25."  # the series that parameters are checked against
 _OLDEST_PYTHON = (3, 11)
 _GIB = 1024**3
 _LEAST_MEMORY_GIB = 6.0  # a pair of 256^3 images
-_LEAST_DISK_GIB = 2.0  # one loaded image's results at that size
+_LEAST_DISK_GIB = 2.0  # results of one loaded image of that size
 
 
 class ForeignPackageError(ImportError):
-    """A package of one of our names that is not ours.
+    """A package with one of our names belongs to another distribution.
 
-    An ImportError and no `dvc.errors.MrstrainError`: `dvc.errors` may be not ours either.
+    An ImportError, not a `dvc.errors.MrstrainError`, because ``dvc`` may be the foreign package.
     """
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes
     ----------
     what : str
-        What was looked at.
+        What was checked.
     ok : bool
-        Whether it is as a run needs it.
+        Whether it meets the needs of a run.
     detail : str
-        What was found.
+        Version, size or place found.
     advice : str
-        What to do where it is not ok; empty otherwise.
+        What to do if it does not; empty otherwise.
     """
 
     what: str
@@ -68,35 +68,34 @@ class Finding:
 def examine(
     folder: str | os.PathLike[str] = ".", *, trials: Mapping[str, Callable[[], str]] | None = None
 ) -> list[Finding]:
-    """Look at all that a run depends on, and stop at nothing.
+    """Check everything that a run depends on; a failed check does not stop the others.
 
     Parameters
     ----------
     folder : path
-        Where results would be written; its disk is looked at. The nearest existing parent counts.
+        Folder for results; the disk of its nearest existing parent is checked.
     trials : mapping of str to callable, optional
-        By what each tries: does something small, and returns a line on how it went; raises where it
-        failed.
+        Short trial runs by name; each returns a line on how it went, or raises.
 
     Returns
     -------
     list of Finding
-        In the order in which they are best mended.
+        In the order in which problems are best solved.
     """
     findings = [_python(), _foreign(), *_packages(), _cores(), _memory(), _disk(Path(folder)), _temporary()]
     return [*findings, *(_tried(what, trial) for what, trial in (trials or {}).items())]
 
 
 def refuse_foreign_packages() -> None:
-    """Refuse to run where ``dvc``, ``validate`` or another of our packages is somebody else's.
+    """Refuse to run where ``dvc``, ``validate`` or another of our package names belongs to another distribution.
 
-    Takes a few milliseconds: the first line of every run.
+    Takes a few milliseconds, and is called first in every run.
 
     Raises
     ------
     ForeignPackageError
-        If one of the names resolves to a place that is not ours, or a distribution that writes into the same
-        folder is installed beside mrstrain (the later one of the two overwrote files of the other).
+        If one of the names resolves to a foreign location, or a distribution that installs into the same folder is
+        present (whichever was installed later overwrote files of the other).
     """
     reasons = _foreign_packages()
     if reasons:
@@ -196,7 +195,7 @@ def _memory() -> Finding:
 
 
 def usable_memory_bytes() -> int | None:
-    """Memory that this process may use: the machine's, or less where a container limits it."""
+    """Memory that this process may use, bytes: the machine's, or the limit of its container; None if unknown."""
     try:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
@@ -250,6 +249,6 @@ def _tried(what: str, trial: Callable[[], str]) -> Finding:
     try:
         return Finding(f"trial of {what}", True, trial())
     except Exception as error:
-        # whatever goes wrong in the worker is a finding here, and not the end of the examination
+        # whatever goes wrong in a trial is a finding and must not end the examination
         advice = "Reinstall mrstrain in an environment of its own; the line above is what the trial said."
         return Finding(f"trial of {what}", False, f"{type(error).__name__}: {error}", advice)

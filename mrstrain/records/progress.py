@@ -1,4 +1,4 @@
-"""Progress for people: live bars with time left in a terminal, a line now and then in a pipe."""
+"""Progress for people: live bars with the time left in a terminal, a line now and then in a pipe."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-Told = Callable[[str, str, float], None]
-"""``told(case, stage, fraction)``: what is being done for which case, and how far it is."""
+OnProgress = Callable[[str, str, float], None]
+"""``progress(case, stage, fraction)``: what is being done for which case, and how far it is (0 to 1)."""
 
 ALL = "all"
 """The case that stands for a whole study, or several."""
@@ -21,22 +21,23 @@ _LINE_OF_ALL_EVERY_S, _BETWEEN_ENDS_S = 60.0, 1.0
 
 
 @contextmanager
-def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[Told]:
-    """Show progress on standard error; standard output stays for results. An interrupt is told in a line.
+def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[OnProgress]:
+    """Show progress on standard error; standard output is for results. An interrupt is reported in a line.
 
     Parameters
     ----------
     of_all : bool
-        Whether the case "all" is told beside those that it is made of, as studies do. Its bar is then the first and
-        there from the start, and without a terminal its line is the only one: the cases' own are in the study's log.
+        Whether the case "all" is reported besides its parts, as studies do. Its bar is then the first and shown from
+        the start; without a terminal its line is the only one, because the cases have lines of their own in the study's
+        log.
     console : Console, optional
         Standard error by default.
     """
     console = console or Console(stderr=True)
     try:
         if console.is_terminal:
-            with _bars(console, of_all) as told:
-                yield told
+            with _bars(console, of_all) as progress:
+                yield progress
         else:
             yield _lines_of_all() if of_all else _lines()
     except KeyboardInterrupt:
@@ -45,8 +46,8 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[To
 
 
 @contextmanager
-def _bars(console: Console, of_all: bool) -> Iterator[Told]:
-    """A bar for each case that is under way: a terminal has few lines, and what does not fit is cut off."""
+def _bars(console: Console, of_all: bool) -> Iterator[OnProgress]:
+    """Show a bar for each case under way; finished ones are hidden, because lines beyond the terminal are cut off."""
     bars: dict[str, TaskID] = {}
     with Progress(
         TextColumn("{task.description}"),
@@ -56,56 +57,58 @@ def _bars(console: Console, of_all: bool) -> Iterator[Told]:
         TextColumn("left"),
         TimeRemainingColumn(),
         console=console,
-    ) as progress:
+    ) as display:
         stages: dict[str, str] = {}
         if of_all:
-            bars[ALL] = progress.add_task(ALL, total=1.0)
+            bars[ALL] = display.add_task(ALL, total=1.0)
 
-        def told(case: str, stage: str, fraction: float) -> None:
-            shown = case == ALL or fraction < 1.0
+        def progress(case: str, stage: str, fraction: float) -> None:
+            visible = case == ALL or fraction < 1.0
             if case not in bars:
-                bars[case] = progress.add_task(case, total=1.0, visible=shown)
+                bars[case] = display.add_task(case, total=1.0, visible=visible)
             if stages.get(case) != stage:
                 stages[case] = stage
-                progress.reset(bars[case], total=1.0, description=f"{case}: {stage}")
-            progress.update(bars[case], completed=fraction, visible=shown)
+                display.reset(bars[case], total=1.0, description=f"{case}: {stage}")
+            display.update(bars[case], completed=fraction, visible=visible)
 
-        yield told
+        yield progress
 
 
-def _lines() -> Told:
+def _lines() -> OnProgress:
+    """Print a line when a stage begins and ends, and every 15 s between."""
     began: dict[tuple[str, str], float] = {}
-    told_at: dict[tuple[str, str], float] = {}
+    printed_at: dict[tuple[str, str], float] = {}
 
-    def told(case: str, stage: str, fraction: float) -> None:
+    def progress(case: str, stage: str, fraction: float) -> None:
         key, now = (case, stage), time.monotonic()
         first = key not in began
         began.setdefault(key, now)
-        done = fraction >= 1.0 and told_at.get(key) != float("inf")
-        if not (first or done or now - told_at.get(key, now) >= _LINE_EVERY_S):
+        ended = fraction >= 1.0 and printed_at.get(key) != float("inf")
+        if not (first or ended or now - printed_at.get(key, now) >= _LINE_EVERY_S):
             return
-        told_at[key] = float("inf") if done else now
+        printed_at[key] = float("inf") if ended else now
         _print(case, stage, fraction, now - began[key])
 
-    return told
+    return progress
 
 
-def _lines_of_all() -> Told:
-    began = told_at = time.monotonic()
+def _lines_of_all() -> OnProgress:
+    """Print a line of the whole study when a stage ends, and every minute between."""
+    began = printed_at = time.monotonic()
     last_stage, last_fraction = "begun", 0.0
 
-    def told(case: str, stage: str, fraction: float) -> None:
-        nonlocal told_at, last_stage, last_fraction
+    def progress(case: str, stage: str, fraction: float) -> None:
+        nonlocal printed_at, last_stage, last_fraction
         now = time.monotonic()
-        ended = case == ALL and last_fraction < 1.0
-        if ended:
+        stage_ended = case == ALL and last_fraction < 1.0
+        if stage_ended:
             last_stage, last_fraction = stage, fraction
-        whole = ended and fraction >= 1.0
-        if whole or now - told_at >= (_BETWEEN_ENDS_S if ended else _LINE_OF_ALL_EVERY_S):
-            told_at = now
+        all_ended = stage_ended and fraction >= 1.0
+        if all_ended or now - printed_at >= (_BETWEEN_ENDS_S if stage_ended else _LINE_OF_ALL_EVERY_S):
+            printed_at = now
             _print(ALL, last_stage, last_fraction, now - began)
 
-    return told
+    return progress
 
 
 def _print(case: str, stage: str, fraction: float, spent_s: float) -> None:

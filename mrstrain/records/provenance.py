@@ -1,4 +1,4 @@
-"""What a result was made from: versions, kind of machine, parameters, seeds, hashes. No name of a person or a host."""
+"""Provenance of a result: versions, kind of machine, parameters, seeds, hashes; no name of a person or a host."""
 
 from __future__ import annotations
 
@@ -18,9 +18,7 @@ from dvc.worker import usable_cores
 from mrstrain.records.doctor import usable_memory_bytes
 
 _BLOCK = 1 << 20
-
-
-_NAMED = re.compile(
+_REFERENCE = re.compile(
     rb'^\s*(?:ElementDataFile\s*=|data file:|\(InitialTransformParameter\w*\s+"|\(TransformFileName\s+")'
     rb'\s*([^"\r\n]+)',
     re.MULTILINE | re.IGNORECASE,
@@ -28,12 +26,12 @@ _NAMED = re.compile(
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file and of the files that it names; of a folder, of its files' names and contents in order.
+    """SHA-256 of a file and the files that it refers to; of a folder, of the names and contents of its files in order.
 
-    Headers name the file of their voxels (.mhd, .nhdr), elastix transforms their initial transform.
+    Headers (.mhd, .nhdr) refer to the file of their voxels, elastix transforms to their initial transform.
     """
     digest = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else _with_named(path)
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else _with_referenced(path)
     for file in files:
         if path.is_dir():
             digest.update(str(file.relative_to(path)).encode())
@@ -43,29 +41,28 @@ def file_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _with_named(path: Path) -> list[Path]:
-    found, waiting = [path], [path]
-    while waiting:
-        file = waiting.pop()
+def _with_referenced(path: Path) -> list[Path]:
+    files = [path]
+    for file in files:  # grows while it is read
         if file.suffix.lower() not in (".mhd", ".nhdr", ".txt"):
             continue
-        for name in _NAMED.findall(file.read_bytes()[:_BLOCK]):
-            told = Path(name.decode(errors="replace").strip())
-            named = next((p for p in (file.parent / told, file.parent / told.name) if p.is_file()), file)
-            if named.is_file() and named not in found:
-                found.append(named)
-                waiting.append(named)
-    return found
+        for name in _REFERENCE.findall(file.read_bytes()[:_BLOCK]):
+            place = Path(name.decode(errors="replace").strip())
+            candidates = (file.parent / place, file.parent / place.name)
+            referenced = next((p for p in candidates if p.is_file()), file)
+            if referenced not in files:
+                files.append(referenced)
+    return files
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that figures depend on."""
+    """Versions of Python, the system, and the packages that results depend on."""
     here = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
     return here | distribution_versions()
 
 
 def machine() -> dict[str, object]:
-    """The kind of machine that this is: processor, cores and memory that may be used."""
+    """Kind of machine: processor, and the cores and memory that may be used."""
     memory = usable_memory_bytes()
     return {
         "processor": _processor(),
@@ -75,26 +72,26 @@ def machine() -> dict[str, object]:
 
 
 def _processor() -> str:
-    try:  # where Linux has its name; `platform` has none there
-        told = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
+    try:  # on Linux, where `platform` does not know the name
+        model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
     except OSError:
-        told = None
-    return told[1].strip() if told else platform.processor() or platform.machine()
+        model = None
+    return model[1].strip() if model else platform.processor() or platform.machine()
 
 
 def provenance(
     command: str, inputs: Mapping[str, Path | list[Path]], parameters: Mapping[str, object]
 ) -> dict[str, object]:
-    """A record to be kept beside a result.
+    """Provenance record that is written beside a result.
 
     Parameters
     ----------
     command : str
         Name of the command or function.
     inputs : mapping
-        Role to file or files; only file names and hashes are kept.
+        File or files by role; only file names and hashes are recorded.
     parameters : mapping
-        Everything else that the result depends on, as plain values.
+        All other values that the result depends on, as plain values.
     """
     files: dict[str, list[dict[str, str]]] = {}
     for role, given in inputs.items():
@@ -111,22 +108,23 @@ def provenance(
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write JSON whole or not at all; NaN is refused, as JSON has none."""
+    """Write JSON atomically; NaN is refused, because JSON has none."""
     write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
-def without_folders(told: Any, home: Path) -> Any:
-    """Values without the place of a study: paths in its folder from there, files outside by their names alone.
+def without_folders(value: Any, home: Path) -> Any:
+    """Values without the location of a study: paths are relative to its folder ``home``, or bare names outside it.
 
-    A study that is moved as a whole so stays the same; and folders may name a patient, so one outside is "a folder".
+    The values of a study that is moved as a whole are then unchanged. A folder outside may name a patient, so it
+    becomes "a folder".
     """
-    if isinstance(told, Mapping):
-        return {key: without_folders(value, home) for key, value in told.items()}
-    if isinstance(told, list | tuple):
-        return [without_folders(value, home) for value in told]
-    if not isinstance(told, str):
-        return told
-    place = Path(os.path.normpath(home / told))
+    if isinstance(value, Mapping):
+        return {key: without_folders(one, home) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_folders(one, home) for one in value]
+    if not isinstance(value, str):
+        return value
+    place = Path(os.path.normpath(home / value))
     if not place.is_relative_to(home):
         return "a folder" if place.is_dir() else place.name
-    return place.relative_to(home).as_posix() if os.path.isabs(told) else told
+    return place.relative_to(home).as_posix() if os.path.isabs(value) else value

@@ -1,4 +1,4 @@
-"""Where stages run: a Dask cluster, of this machine's cores by default, or one that is there already."""
+"""Where stages run: a Dask cluster, by default of this machine's cores, or an existing one."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from dvc.errors import InputError, MrstrainError
 from dvc.software import software_key
 from dvc.worker import usable_cores
 from mrstrain.studies import stages
-from mrstrain.studies.stages import Given
+from mrstrain.studies.stages import StageResult
 
 _TELL_EVERY_S = 1.0
 _CONNECT_S, _WORKERS_S = 10.0, 60.0
-_LOOK_EVERY_S, _ALONE_S = 5.0, 120.0
+_LOOK_EVERY_S, _LOST_S = 5.0, 120.0
 _SETTINGS = {
     "distributed.worker.daemon": False,  # a stage starts processes of its own
     "distributed.scheduler.allowed-failures": 1,  # a stage that ends two workers is at fault itself
@@ -37,7 +37,7 @@ _SETTINGS = {
 }
 
 
-class Cluster:
+class StageRunner:
     """Runs stages, several at once; made by `cluster`."""
 
     def __init__(self, client: Client, watch: Callable[[str, str, float], None]) -> None:
@@ -47,33 +47,28 @@ class Cluster:
         self._finished: queue.Queue[Future[Any]] = queue.Queue()
         client.subscribe_topic(self._topic, lambda event: watch(*event[1]))
 
-    @property
-    def slots(self) -> int:
-        """Stages that run at once."""
-        return sum(self._client.nthreads().values())
-
     def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path) -> None:
-        """Start a stage as soon as a worker is free, and nobody else holds its lock."""
+        """Start a stage as soon as a worker is free and its lock is not held."""
         key = f"{name.replace(' ', '-')}-{uuid.uuid4().hex}"
         future = self._client.submit(_run, self._topic, name, function, dict(arguments), str(lock), key=key, pure=False)
         self._under_way[future] = name
         future.add_done_callback(self._finished.put)
 
-    def next(self) -> tuple[str, Given | str, float]:
-        """Wait for the next stage to end: its name, what it gave or why it failed, and the seconds it took."""
-        alone_since: float | None = None
+    def next(self) -> tuple[str, StageResult | str, float]:
+        """Wait for the next stage to end: its name, its result or why it failed, and the time it took, seconds."""
+        lost_since: float | None = None
         while True:
             try:
                 future = self._finished.get(timeout=_LOOK_EVERY_S)
                 break
             except queue.Empty:
                 left = self._client.status == "running" and self._client.nthreads()
-                alone_since = None if left else alone_since or time.monotonic()
-                if alone_since is not None and time.monotonic() - alone_since > _ALONE_S:
+                lost_since = None if left else lost_since or time.monotonic()
+                if lost_since is not None and time.monotonic() - lost_since > _LOST_S:
                     future = next(iter(self._under_way))
                     return self._under_way.pop(future), "No worker and no scheduler is left that could run it.", 0.0
         name = self._under_way.pop(future, "")
-        if not name:  # given up before
+        if not name:  # abandoned before
             return self.next()
         if future.status == "finished":
             outcome, seconds = future.result()
@@ -99,7 +94,7 @@ def cluster(
     *,
     scheduler: str | None = None,
     workers: int | None = None,
-) -> Iterator[Cluster]:
+) -> Iterator[StageRunner]:
     """A cluster of this machine's cores, or the one at an address; its stages end with it.
 
     Parameters
@@ -107,16 +102,16 @@ def cluster(
     watch : callable
         ``watch(stage, what, fraction)``.
     places : sequence of Path
-        Folders of results, which every worker has to see.
+        Folders of results, which every worker must be able to see.
     scheduler : str, optional
         Address of a scheduler, such as tcp://node1:8786.
     workers : int, optional
-        Of the local cluster; by default one for each core.
+        Workers of the local cluster; by default one for each core.
 
     Raises
     ------
     InputError
-        If the scheduler cannot be reached, has no workers, or they are not fit.
+        If the scheduler cannot be reached, has no workers, or its workers are unsuitable.
     """
     logging.getLogger("distributed").setLevel(logging.ERROR)  # stages have a log of their own
     with dask.config.set(_SETTINGS):
@@ -128,7 +123,7 @@ def cluster(
                 ) as local,
                 Client(local) as client,
             ):  # fmt: skip
-                yield Cluster(client, watch)
+                yield StageRunner(client, watch)
             return
         try:
             client = Client(scheduler, timeout=_CONNECT_S)
@@ -144,11 +139,11 @@ def cluster(
                     f"The scheduler at {scheduler} has no workers after {_WORKERS_S:.0f} s; see docs/cluster.md."
                 ) from none
             _refuse_unfit(client, scheduler, places)
-            made = Cluster(client, watch)
+            runner = StageRunner(client, watch)
             try:
-                yield made
+                yield runner
             finally:
-                client.cancel(list(made._under_way))
+                client.cancel(list(runner._under_way))
 
 
 def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
@@ -192,22 +187,22 @@ def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:
     return software_key("mrstrain"), multiprocessing.current_process().daemon, seen
 
 
-def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: str) -> tuple[Given | str, float]:
-    """Run a stage in a worker, alone; errors come back as sentences."""
-    began, told = time.monotonic(), -_TELL_EVERY_S
+def _run(topic: str, name: str, function: str, arguments: dict[str, Any], lock: str) -> tuple[StageResult | str, float]:
+    """Run a stage in a worker, under its lock; errors are returned as sentences."""
+    began, reported = time.monotonic(), -_TELL_EVERY_S
     worker = get_worker()
 
     def tell(what: str, fraction: float) -> None:
-        nonlocal told
+        nonlocal reported
         now = time.monotonic()
-        if fraction >= 1.0 or now - told >= _TELL_EVERY_S:
-            told = now
+        if fraction >= 1.0 or now - reported >= _TELL_EVERY_S:
+            reported = now
             worker.log_event(topic, (name, what, float(fraction)))
 
     tell("begun", 0.0)
     try:
         with FileLock(lock):
-            outcome: Given | str = getattr(stages, function)(tell, **arguments)
+            outcome: StageResult | str = getattr(stages, function)(tell, **arguments)
     except MrstrainError as error:
         outcome = str(error)
     except Exception:

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.report.page import Picture, Section, Table, write_report
-from dvc.trust.verdict import Verdict, worst
+from dvc.trust.verdict import worst
 from mrstrain.measurement.page import flat, said
 from mrstrain.measurement.register import REPEAT
 from mrstrain.records.inputs import make_output
+from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.tables import write_csv
 from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
 from mrstrain.studies.file import FILE, read_study
 from mrstrain.studies.plan import COMPARISON
-from mrstrain.studies.run import Ran, Told, run_studies
+from mrstrain.studies.run import StudyRun, run_studies
 from validate import figures
 from validate.cohort import Standing, standings
 from validate.comparison import NOTHING
@@ -39,7 +39,7 @@ class Cohort:
     ----------
     out : Path
         With ``report.html``, ``cohort.csv`` (areas of every subject, model and load) and ``ranking.csv``.
-    ran : tuple of Ran
+    ran : tuple of StudyRun
         The studies, in the order given.
     ranking : tuple of Standing
         The models over all loads, the nearest first; empty where no subject has a result of all.
@@ -48,7 +48,7 @@ class Cohort:
     """
 
     out: Path
-    ran: tuple[Ran, ...]
+    ran: tuple[StudyRun, ...]
     ranking: tuple[Standing, ...]
     notes: tuple[str, ...]
 
@@ -75,7 +75,7 @@ def cohort(
     out: Path | str,
     scheduler: str | None = None,
     workers: int | None = None,
-    progress: Told | None = None,
+    progress: OnProgress | None = None,
 ) -> Cohort:
     """Run the studies of many subjects, and rank the models over them.
 
@@ -128,7 +128,7 @@ def cohort(
     return Cohort(target, tuple(ran), ranking, tuple(notes))
 
 
-def _uncounted(one: Ran) -> str:
+def _uncounted(one: StudyRun) -> str:
     """Why a study's areas are not ranked over; empty where they are.
 
     A table may be there all the same: an earlier run's, of other inputs, where `compare` was not run now.
@@ -136,7 +136,7 @@ def _uncounted(one: Ran) -> str:
     compared = one.outcomes.get("compare")
     if compared is None:
         return "its study compares no model ([models] sets, results)."
-    return "" if compared.whole else f"compare {compared.words}. {compared.reason}".rstrip()
+    return "" if compared.complete else f"compare {compared.status}. {compared.reason}".rstrip()
 
 
 def _areas(out: Path) -> list[dict[str, str]]:
@@ -145,28 +145,17 @@ def _areas(out: Path) -> list[dict[str, str]]:
         return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
 
 
-def _doubts(ran: Sequence[Ran]) -> list[str]:
+def _doubts(ran: Sequence[StudyRun]) -> list[str]:
     """Of each subject, the registrations that are not to be trusted and yet count in its areas."""
     notes = []
     for one in ran:
-        doubted = [load for load, v in _registered(one).items() if v.level == "distrust" and load != REPEAT]
+        doubted = [load for load, v in one.verdicts.items() if v.level == "distrust" and load != REPEAT]
         if doubted:
             notes.append(
                 f"{one.study.study.name}: the registration of {', '.join(doubted)} is not to be trusted, and counts in "
                 "its areas and in the ranking. Mend it, or leave this subject out."
             )
     return notes
-
-
-def _registered(one: Ran) -> dict[str, Verdict]:
-    """Verdict on each registration of a study that has one."""
-    return {
-        name.removeprefix("register "): section.verdict
-        for name, outcome in one.outcomes.items()
-        if outcome.record is not None and name.startswith("register ")
-        for section in outcome.record.given.sections
-        if section.verdict is not None
-    }
 
 
 def _judged(model: str) -> bool:
@@ -208,21 +197,14 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
 
 def _write_tables(target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[Standing]) -> None:
     first = next(row for rows in areas.values() for row in rows)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["subject", *first])
-    writer.writerows([subject, *row.values()] for subject, rows in areas.items() for row in rows)
-    write_whole(target / "cohort.csv", text.getvalue())
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([f.name for f in fields(Standing)])
-    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in astuple(s)] for s in ranking)
-    write_whole(target / "ranking.csv", text.getvalue())
+    rows_of_all = ([subject, *row.values()] for subject, rows in areas.items() for row in rows)
+    write_csv(target / "cohort.csv", ["subject", *first], rows_of_all)
+    write_csv(target / "ranking.csv", [f.name for f in fields(Standing)], map(astuple, ranking))
 
 
 def _write_page(
     path: Path,
-    ran: Sequence[Ran],
+    ran: Sequence[StudyRun],
     shares: Mapping[str, Mapping[str, float]],
     ranking: Sequence[Standing],
     notes: Sequence[str],
@@ -252,8 +234,8 @@ def _write_page(
     drawn = Picture("Distribution over subjects", said(figures.over_subjects), figures.over_subjects(shares, order))
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for one in ran:
-        failed = [f"{o.stage}: {o.words}. {o.reason}" for o in one.outcomes.values() if o.record is None]
-        verdicts = list(_registered(one).values())
+        failed = [f"{o.stage}: {o.status}. {o.reason}" for o in one.outcomes.values() if o.record is None]
+        verdicts = list(one.verdicts.values())
         verdict = worst(verdicts) if verdicts else None
         sections.append(Section(one.study.study.name, verdict, paragraphs=tuple(f"Not whole: {why}" for why in failed)))
     write_report(path, "Models over subjects", None, sections, [], flat(record))

@@ -1,9 +1,8 @@
-"""`demo`: a heel phantom whose strain is known, taken through a whole study, with the error told by tissue."""
+"""`demo`: a heel phantom of known strain, taken through a whole study, with the error by tissue."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,18 +12,15 @@ from dvc.io.images.labels import read_labels, read_mask
 from dvc.io.images.write import write_labels
 from mrstrain.measurement.measured_folder import spline_in
 from mrstrain.models.loads import LOADS
+from mrstrain.records.progress import OnProgress
 from mrstrain.studies.file import FILE
 from mrstrain.studies.page import write_run_report
-from mrstrain.studies.pipeline import Outcome
+from mrstrain.studies.pipeline import StageOutcome
 from mrstrain.studies.plan import REGISTRATION
-from mrstrain.studies.run import REPORT, Ran, run
+from mrstrain.studies.run import REPORT, StudyRun, run
 from mrstrain.studies.true_error import TABLE, read_errors, write_errors
 from mrstrain.truth.phantom import phantom
-from phantoms.anatomy import Heel
-from phantoms.heel import heel_grid, labels_of, labels_to_mesh, under_load
-from phantoms.tissue_error import TissueError, errors_by_tissue
-
-Told = Callable[[str, str, float], None]
+from phantoms import Heel, TissueError, errors_by_tissue, heel_grid, labels_of, labels_to_mesh, under_load
 
 _SETS = ("trebbi", "luboz", "akrami")
 _ALL_SETS = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")
@@ -60,10 +56,10 @@ shear_n = {shear_n}
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
-    """What `demo` gave: lines for a person, the report's path last, and whether every stage has a result.
+class Demonstration:
+    """Result of `demo`: its summary, the report's path last, and whether every stage has a result.
 
-    One that nothing but a limit of time ended has one.
+    A stage that was ended only by its time limit counts as one that has.
     """
 
     lines: tuple[str, ...]
@@ -76,46 +72,42 @@ def demo(
     seed: int = 1,
     full: bool = False,
     workers: int | None = None,
-    progress: Told | None = None,
-) -> Shown:
+    progress: OnProgress | None = None,
+) -> Demonstration:
     """Make a heel phantom under four loads, run its study, and compare the measurement with the truth.
 
     Parameters
     ----------
     out : path
-        A study's folder: the phantom's images and truth, ``study.toml``, ``results`` and ``error.csv``. Run again in
-        the same folder, it goes on where it stopped.
+        The study's folder: images and truth of the phantom, ``study.toml``, ``results`` and ``error.csv``. A second
+        run in the same folder resumes.
     seed : int
-        Of the phantom.
+        Seed of the phantom.
     full : bool
-        The published size: all seven material sets on some 75,000 tetrahedra; else three on a coarser mesh.
+        The published size: all seven material sets on some 75,000 tetrahedra; otherwise three on a coarser mesh.
     workers, progress
         As in `mrstrain.run`.
-
-    Returns
-    -------
-    Shown
 
     Raises
     ------
     OutputError
-        If the folder holds another phantom, or files of somebody's own.
+        If the folder holds another phantom, or other files that would be replaced.
     """
     target = Path(out)
     _make(target, seed, full, progress)
-    ran = run(target, workers=workers, progress=progress)
-    errors = _errors(target, seed, ran, read_errors(target / TABLE, ran.outcomes))
-    write_errors(target / TABLE, errors, ran.outcomes)
-    write_run_report(target / "results" / REPORT, ran.study, ran.outcomes)
-    return Shown(tuple(_told(errors, ran)), all(_reached(outcome) for outcome in ran.outcomes.values()))
+    done = run(target, workers=workers, progress=progress)
+    errors = _errors(target, seed, done, read_errors(target / TABLE, done.outcomes))
+    write_errors(target / TABLE, errors, done.outcomes)
+    write_run_report(target / "results" / REPORT, done.study, done.outcomes)
+    return Demonstration(tuple(_summary(errors, done)), all(_reached(outcome) for outcome in done.outcomes.values()))
 
 
-def _make(target: Path, seed: int, full: bool, progress: Told | None) -> None:
-    """Write the phantom and its study file, if they are not there."""
-    made = target / "phantom.json"
+def _make(target: Path, seed: int, full: bool, progress: OnProgress | None) -> None:
+    """Write the phantom and its study file where they do not exist yet."""
+    record = target / "phantom.json"
     heel = Heel(seed)
-    if made.is_file():
-        old = json.loads(made.read_text(encoding="utf-8"))["parameters"]["seed"]
+    if record.is_file():
+        old = json.loads(record.read_text(encoding="utf-8"))["parameters"]["seed"]
         if old != seed:
             raise OutputError(f"{target} holds the phantom of seed {old}; choose another --out for seed {seed}.")
     else:
@@ -126,7 +118,7 @@ def _make(target: Path, seed: int, full: bool, progress: Told | None) -> None:
     texts = {size: _text(seed, size) for size in (False, True)}
     study = target / FILE
     if study.exists() and study.read_text(encoding="utf-8") not in texts.values():
-        return  # changed by a person: theirs is run
+        return  # changed by the user, and run as it is
     if not full:
         grid = heel_grid(_COARSE_MM, heel.size)
         write_labels(target / f"{_COARSE}.nii.gz", labels_to_mesh(heel, labels_of(heel, grid)))
@@ -134,7 +126,7 @@ def _make(target: Path, seed: int, full: bool, progress: Told | None) -> None:
 
 
 def _text(seed: int, full: bool) -> str:
-    """The study file of one size."""
+    """Text of the study file, full or reduced."""
     loads = "".join(_LOAD.format(name=load.name, normal_n=load.normal_n, shear_n=load.shear_n or 0.0) for load in LOADS)
     return _STUDY.format(
         seed=seed, loads=loads, edge_mm=2.8 if full else 4.0, to_mesh="tissues_to_mesh" if full else _COARSE,
@@ -143,53 +135,42 @@ def _text(seed: int, full: bool) -> str:
 
 
 def _errors(
-    target: Path, seed: int, ran: Ran, known: dict[str, tuple[TissueError, ...]]
+    target: Path, seed: int, done: StudyRun, known: dict[str, tuple[TissueError, ...]]
 ) -> dict[str, tuple[TissueError, ...]]:
-    """Error of each load by tissue, where its result is valid; those that are known are not computed again."""
+    """Error of each load by tissue, where its strain is valid; ``known`` errors are not computed again."""
     labels = read_labels(target / "tissues.nii.gz", target / "tissues.csv")
     heel = Heel(seed)
     errors = {}
-    for load in ran.study.loads:
-        folder = ran.study.out / REGISTRATION / load
+    for load in done.study.loads:
+        folder = done.study.out / REGISTRATION / load
         if load in known:
             errors[load] = known[load]
             continue
-        if ran.outcomes[f"register {load}"].record is None:
+        if done.outcomes[f"register {load}"].record is None:
             continue
-        found = spline_in(folder)
         valid = read_mask(folder / "valid.nii.gz").inside
-        errors[load] = errors_by_tissue(labels, under_load(heel, load), found, valid)
+        errors[load] = errors_by_tissue(labels, under_load(heel, load), spline_in(folder), valid)
     return errors
 
 
-def _reached(outcome: Outcome) -> bool:
-    """Whether a stage gave all that was asked of it, or all that its limit of time allowed."""
-    timed_out = outcome.record is not None and outcome.record.given.timed_out and not outcome.reason
-    return outcome.whole or timed_out
+def _reached(outcome: StageOutcome) -> bool:
+    """Whether a stage has a complete result, or one that only its time limit cut short."""
+    timed_out = outcome.record is not None and outcome.record.result.timed_out and not outcome.reason
+    return outcome.complete or timed_out
 
 
-def _why(outcome: Outcome) -> str:
-    """A stage that is not whole, and what is said of it."""
-    partly = [] if outcome.record is None else [line for line in outcome.record.given.lines if "ONLY" in line]
-    return f"{outcome.stage}: {outcome.words}. {outcome.reason or ' '.join(partly)}"
-
-
-def _told(errors: dict[str, tuple[TissueError, ...]], ran: Ran) -> list[str]:
-    fat = {load: e for load, of in errors.items() for e in of if e.tissue == "fat"}
-    told = ", ".join(f"{load} {e.shear_rmse:.3f} of {e.true_p95:.2f}" for load, e in fat.items())
-    verdicts = {
-        name.removeprefix("register "): section.verdict.words
-        for name, outcome in ran.outcomes.items()
-        if outcome.record is not None
-        for section in outcome.record.given.sections
-        if name.startswith("register ") and section.verdict is not None
-    }
+def _summary(errors: dict[str, tuple[TissueError, ...]], done: StudyRun) -> list[str]:
+    fat = {load: e for load, rows in errors.items() for e in rows if e.tissue == "fat"}
     lines = [
-        "Verdicts on the registrations: " + ", ".join(f"{load} {words.lower()}" for load, words in verdicts.items()),
-        f"Error of the maximal shear in fat (root mean square, of the true 95th percentile): {told}",
+        "Verdicts on the registrations: " + ", ".join(f"{load} {v.words.lower()}" for load, v in done.verdicts.items()),
+        "Error of the max. shear in fat (root mean square, of the true 95th percentile): "
+        + ", ".join(f"{load} {e.shear_rmse:.3f} of {e.true_p95:.2f}" for load, e in fat.items()),
     ]
-    compared = ran.outcomes["compare"].record
-    if compared is not None:
-        lines += [line for line in compared.given.lines if line.startswith(("All loads", "Nearest over"))]
-    lines += [_why(outcome) for outcome in ran.outcomes.values() if not outcome.whole]
-    return [*lines, f"Report: {ran.study.out / REPORT}"]
+    comparison = done.outcomes["compare"].record
+    if comparison is not None:
+        lines += [line for line in comparison.result.lines if line.startswith(("All loads", "Nearest over"))]
+    for outcome in done.outcomes.values():
+        if not outcome.complete:
+            partly = [] if outcome.record is None else [line for line in outcome.record.result.lines if "ONLY" in line]
+            lines.append(f"{outcome.stage}: {outcome.status}. {outcome.reason or ' '.join(partly)}")
+    return [*lines, f"Report: {done.study.out / REPORT}"]

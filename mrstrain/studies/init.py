@@ -1,4 +1,4 @@
-"""`init`: a study file, written from what a folder holds."""
+"""`init`: writes a study file from the files in a folder."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _LOADED = re.compile(r"load[ _-]?[1-9]\d*|loaded", re.IGNORECASE)
 _LABELS = re.compile(r"label|tissue|seg", re.IGNORECASE)
 _TO_MESH = re.compile(r"to[ _-]?mesh", re.IGNORECASE)
 _BONE = re.compile(r"calcaneus|calcaneum|bone", re.IGNORECASE)
-_VARIANT = "-as-published"  # a set in another reading of its numbers
-_SOFTEST = "friedman"  # takes hours, so it is for whoever asks for it
+_VARIANT = "-as-published"  # suffix of sets with an alternative reading of the published numbers
+_SOFTEST = "friedman"  # takes hours, so it has to be named explicitly
 _ROLES = {
     "labels": "the label map", "mesh_labels": "the label map to be meshed", "bone_mask": "the bone",
     "repeat": "the repeat scan", "load": "the load of that name",
@@ -35,8 +35,8 @@ _TABLES = (".csv", ".txt", ".label", ".ctbl")
 
 
 @dataclass(slots=True)
-class Found:
-    """What a folder holds, by the role that its names suggest; names relative to it."""
+class StudyInputs:
+    """Files of a folder by the role that their names suggest; names relative to the folder."""
 
     load0: str | None = None
     repeat: str | None = None
@@ -47,23 +47,23 @@ class Found:
     mesh_labels: str | None = None
     mesh_names: str | None = None
     results: list[str] = field(default_factory=list)
-    passed_over: dict[str, str] = field(default_factory=dict)  # images without a role, and why
+    unused: dict[str, str] = field(default_factory=dict)  # images and folders, and why they are not used
 
 
 @dataclass(frozen=True, slots=True)
-class Begun:
-    """What `init` wrote."""
+class NewStudy:
+    """The study file that `init` wrote, and the files that it names."""
 
     path: Path
-    found: Found
+    inputs: StudyInputs
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
-        found = self.found
+        """Summary, a few lines: what was found and what is left to do."""
+        found = self.inputs
         lines = [f"Load0: {found.load0 or 'NOT FOUND'}", f"Loads: {', '.join(found.loads.values()) or 'NONE FOUND'}"]
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
-        lines += [f"NOT USED: {name}, {why}" for name, why in found.passed_over.items()]
+        lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
         todo = (
             "Put the forces in"
             if found.load0 and found.loads and found.labels
@@ -72,22 +72,22 @@ class Begun:
         return [*lines, f"Study file: {self.path}. {todo}; then: mrstrain check {self.path.parent}"]
 
 
-def init(folder: Path | str, *, name: str = "Subject 01") -> Begun:
-    """Write a study file with comments from the files in a folder.
+def init(folder: Path | str, *, name: str = "Subject 01") -> NewStudy:
+    """Write a commented study file from the files in a folder.
 
     Parameters
     ----------
     folder : path
-        With the images, the label map and its names, and perhaps results of other codes in folders of their own.
+        Holds the images, the label map and its names, and results of other codes, if any, in subfolders.
     name : str
-        Of the study, in its report; nothing that names a patient. Each of a cohort has its own.
+        Name of the study in its report; must not identify a patient, and must be unique in a cohort.
 
     Raises
     ------
     InputError
-        If there is no such folder, or two files seem to be the unloaded image.
+        If the folder does not exist, or two files seem to be the unloaded image.
     OutputError
-        If it has a study file already.
+        If it already has a study file.
     """
     place = Path(folder)
     if not place.is_dir():
@@ -104,11 +104,11 @@ def init(folder: Path | str, *, name: str = "Subject 01") -> Begun:
     forces = {load.name: (load.normal_n, load.shear_n) for load in LOADS}
     sets = [name for name in published_names() if not name.endswith(_VARIANT) and name != _SOFTEST]
     write_whole(target, template.render(found=found, name=name, forces=forces, sets=sets))
-    return Begun(target, found)
+    return NewStudy(target, found)
 
 
-def _look(place: Path) -> Found:
-    found = Found()
+def _look(place: Path) -> StudyInputs:
+    found = StudyInputs()
     images = sorted(p.name for p in place.iterdir() if p.name.lower().endswith(IMAGES) and _is_volume(p))
     folders = sorted(p for p in place.iterdir() if p.is_dir())
     images += [p.name for p in folders if _holds_dicom(p)]
@@ -117,7 +117,7 @@ def _look(place: Path) -> Found:
         if role == "load":
             taken = found.loads.setdefault(_stem(name), name)
         elif role is None:
-            found.passed_over[name] = "whose name tells no role"
+            found.unused[name] = "whose name tells no role"
             continue
         else:
             taken = getattr(found, role) or name
@@ -125,7 +125,7 @@ def _look(place: Path) -> Found:
         if taken != name and role == "load0":
             raise InputError(f"{place}: both {taken} and {name} seem to be the unloaded image; rename one.")
         if taken != name:
-            found.passed_over[name] = f"since {taken} is taken for {_ROLES[role]}"
+            found.unused[name] = f"since {taken} is taken for {_ROLES[role]}"
     found.names = _table(place, found.labels)
     found.mesh_names = _table(place, found.mesh_labels)
     for inside in folders:
@@ -134,29 +134,29 @@ def _look(place: Path) -> Found:
         if any((inside / (load + ending)).is_file() for load in found.loads for ending in ENDINGS):
             found.results.append(inside.name)
         elif _role(inside.name) is not None:
-            found.passed_over[inside.name] = "a folder without a DICOM image in it"
+            found.unused[inside.name] = "a folder without a DICOM image in it"
     return found
 
 
 def _is_volume(path: Path) -> bool:
-    """Whether a file may be an image by itself; one of DICOM may be a slice."""
+    """Whether a file may be a whole image; a DICOM file may be a single slice."""
     try:
         return path.is_file() and (path.suffix.lower() != ".dcm" or is_multiframe(path))
-    except OSError:  # not to be read: none that could be used
+    except OSError:  # unreadable, so of no use
         return False
 
 
 def _holds_dicom(folder: Path) -> bool:
-    """Whether a folder's files are DICOM images, by a name or by what the first of them hold."""
+    """Whether a folder holds DICOM images, by a file name or the content of the first files."""
     try:
         files = sorted(p for p in folder.iterdir() if p.is_file())
         return any(p.suffix.lower() == ".dcm" for p in files) or any(is_dicom(p) for p in files[:_LOOKED_AT])
-    except OSError:  # not to be read: none that could be used
+    except OSError:  # unreadable, so of no use
         return False
 
 
 def _role(stem: str) -> str | None:
-    """What an image's name suggests that it is, as a field of `Found`, or "load"; None where it suggests nothing."""
+    """Role that an image's name suggests: a field of `StudyInputs`, or "load"; None without one."""
     if _LABELS.search(stem):
         return "mesh_labels" if _TO_MESH.search(stem) else "labels"
     if _BONE.search(stem):
@@ -172,7 +172,7 @@ def _stem(name: str) -> str:
 
 
 def _table(place: Path, image: str | None) -> str | None:
-    """The table of names that is called as a label map."""
+    """The table of label names with the name of a label map."""
     if image is None:
         return None
     return next((_stem(image) + e for e in _TABLES if (place / (_stem(image) + e)).is_file()), None)

@@ -1,4 +1,4 @@
-"""What a study has finished: a record of each stage, from what and with which outcome, in files that outlive a kill."""
+"""Records of the finished stages of a study: what each was made from and its result, in files that survive a kill."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from dvc.atomic_files import write_whole
 from dvc.software import software_key
 from mrstrain.records.provenance import file_hash, without_folders
 from mrstrain.studies.plan import Stage
-from mrstrain.studies.stages import Given
+from mrstrain.studies.stages import StageResult
 
 
-class Record(BaseModel):
-    """A finished stage.
+class StageRecord(BaseModel):
+    """Record of a finished stage.
 
     Attributes
     ----------
     stage : str
     key : str
-        Hash of all that it was made from.
+        Hash of everything that it was made from.
     made_utc : str
     seconds : float
     files : dict
-        What it made, below the study's results, with the size in bytes.
-    given : Given
+        Files that it made, relative to the study's results, with their sizes in bytes.
+    result : StageResult
     made_from : dict
         Hashes of its input files by their names, and its arguments.
     """
@@ -47,12 +47,12 @@ class Record(BaseModel):
     made_utc: str
     seconds: float
     files: dict[str, int]
-    given: Given
+    result: StageResult
     made_from: dict[str, Any] = {}
 
     @property
     def identity(self) -> str:
-        """What stages that build on it are made from: it made anew is another, even of the same inputs."""
+        """Identity for the stages that build on it: a result that is made again has another, even from equal inputs."""
         return hashlib.sha256(f"{self.key} {self.made_utc}".encode()).hexdigest()
 
 
@@ -74,12 +74,12 @@ class Ledger:
 
     def impersonal(self, text: str, stage: Stage) -> str:
         """A text without folders above the study, a stage's files and the home folder: they may name a person."""
-        told = [place for file in stage.files for place in (file.parent, *([file] if file.is_dir() else []))]
-        told += [Path(os.path.normpath(place)) for place in told]
-        outside = [place for place in told if not Path(os.path.normpath(place)).is_relative_to(self.home)]
+        folders = [place for file in stage.files for place in (file.parent, *([file] if file.is_dir() else []))]
+        folders += [Path(os.path.normpath(place)) for place in folders]
+        outside = [place for place in folders if not Path(os.path.normpath(place)).is_relative_to(self.home)]
         shortened = {place: ("", "a folder") for place in outside}
         shortened |= {Path.home(): (f"~{os.sep}", "~"), self.home: ("", ".")}
-        for place in sorted(shortened, key=lambda one: -len(str(one))):  # what lies in another first
+        for place in sorted(shortened, key=lambda one: -len(str(one))):  # inner folders first
             if place != place.parent:
                 within, alone = shortened[place]
                 begin = rf"(?<![\w.-]){re.escape(str(place))}"
@@ -88,12 +88,12 @@ class Ledger:
         return text
 
     def made_from(self, stage: Stage, arguments: Mapping[str, object]) -> dict[str, Any]:
-        """Hashes of a stage's input files, and its arguments without folders: a study that is moved stays finished."""
+        """Hashes of a stage's input files, and its arguments without folders, so that a moved study stays finished."""
         files = [[without_folders(str(path), self.home), self._hash(path)] for path in stage.files]
         return {"files": files, "arguments": without_folders(arguments, self.home)}
 
-    def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, Record]) -> str:
-        """Hash of what a stage would be made from now; ``built_on`` are the stages whose results it reads."""
+    def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, StageRecord]) -> str:
+        """Hash of what a stage would be made from now; ``built_on`` are records of the stages that it reads."""
         content = {
             "stage": stage.name,
             "called": [path.name for path in stage.files],
@@ -106,26 +106,26 @@ class Ledger:
     def _hash(self, path: Path) -> str:
         if path.is_dir():
             return file_hash(path)
-        told = path.stat()
-        at = (str(path), told.st_size, told.st_mtime_ns)
-        if at not in self._hashes:
-            self._hashes[at] = file_hash(path)
-        return self._hashes[at]
+        state = path.stat()
+        version = (str(path), state.st_size, state.st_mtime_ns)
+        if version not in self._hashes:
+            self._hashes[version] = file_hash(path)
+        return self._hashes[version]
 
-    def finished(self, stage: Stage) -> Record | None:
-        """The record of a stage whose results are all there, whatever it was made from."""
+    def finished(self, stage: Stage) -> StageRecord | None:
+        """The record of a stage whose files all exist, whatever it was made from; None for any other."""
         try:
-            record = Record.model_validate_json(self._place(stage.name).read_bytes())
+            record = StageRecord.model_validate_json(self._place(stage.name).read_bytes())
         except (OSError, ValidationError):
             return None
-        there = all(
+        intact = all(
             (self.out / name).is_file() and (self.out / name).stat().st_size == size
             for name, size in record.files.items()
         )
-        return record if there else None
+        return record if intact else None
 
     def forget(self, stage: Stage, reason: str = "") -> None:
-        """Take a stage as not finished, and note why; what it had made stays for it to go on from."""
+        """Mark a stage as not finished, and note why; its files stay, so that it can resume."""
         self._place(stage.name).unlink(missing_ok=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         if reason:
@@ -134,18 +134,18 @@ class Ledger:
             self._reason(stage.name).unlink(missing_ok=True)
 
     def reason(self, stage: Stage) -> str:
-        """Why a stage has no result; empty where it was never run."""
+        """Why a stage has no result; empty if it was never run."""
         try:
             return self._reason(stage.name).read_text(encoding="utf-8")
         except OSError:
             return ""
 
     def lock(self, stage: Stage) -> Path:
-        """A file that whoever runs the stage holds locked: a run that was killed may still be at it on a cluster."""
+        """Lock file of a stage while it runs: a worker of a killed run may still be at work on a cluster."""
         return self.folder / f"{stage.name}.lock"
 
     def remove(self, stage: Stage, reason: str = "") -> None:
-        """Forget a stage and remove what it had made."""
+        """Mark a stage as not finished and remove its files."""
         self.forget(stage, reason)
         for place in stage.gives:
             if place.is_dir():
@@ -153,18 +153,19 @@ class Ledger:
             else:
                 place.unlink(missing_ok=True)
 
-    def keep(self, stage: Stage, key: str, made_from: Mapping[str, Any], given: Given, seconds: float) -> Record:
+    def keep(
+        self, stage: Stage, key: str, made_from: Mapping[str, Any], result: StageResult, seconds: float
+    ) -> StageRecord:
         """Record that a stage is finished."""
-        found = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
-        files = {p.relative_to(self.out).as_posix(): p.stat().st_size for p in found if p.is_file()}
-        made = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-        record = Record(
+        made = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
+        files = {p.relative_to(self.out).as_posix(): p.stat().st_size for p in made if p.is_file()}
+        record = StageRecord(
             stage=stage.name,
             key=key,
-            made_utc=made,
+            made_utc=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
             seconds=round(seconds, 1),
             files=files,
-            given=given,
+            result=result,
             made_from=dict(made_from),
         )
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -1,66 +1,65 @@
-"""Runs the stages of a study: what is finished is not done again, what fails leaves the others to finish."""
+"""Runs the stages of a study: finished stages are reused, and a failed stage does not stop the others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from dvc.errors import MrstrainError
-from mrstrain.studies.ledger import Ledger, Record
+from mrstrain.studies.ledger import Ledger, StageRecord
 from mrstrain.studies.plan import Stage
-from mrstrain.studies.stages import Given
+from mrstrain.studies.stages import StageResult
 
 if TYPE_CHECKING:
-    from mrstrain.studies.cluster import Cluster
+    from mrstrain.studies.cluster import StageRunner
 
-Tell = Callable[[str], None]
-
-_OUT_OF_DATE = "Made from other inputs than the study names now."
+Log = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class StageOutcome:
     """How a stage ended.
 
     Attributes
     ----------
     stage : str
-    record : Record or None
-        What it made; None where it has no result.
+    record : StageRecord or None
+        Record of its result; None without one.
     reason : str
-        Why it has none, or is no result of what the study says now.
-    again : bool
-        Whether it was there already.
-    asked : bool
-        Whether it was among those that might be run.
+        Why there is no result, or why it does not match the study any more.
+    reused : bool
+        Whether the result existed already.
+    requested : bool
+        Whether the stage was among those that may be run.
     """
 
     stage: str
-    record: Record | None
+    record: StageRecord | None
     reason: str = ""
-    again: bool = False
-    asked: bool = True
+    reused: bool = False
+    requested: bool = True
 
     @property
     def left_out(self) -> bool:
-        """Whether it has no result for the reason alone that it was not asked for."""
-        return not self.asked and self.words == "not run"
+        """Whether it has no result only because it was not requested."""
+        return not self.requested and self.status == "not run"
 
     @property
-    def whole(self) -> bool:
-        """Whether there is a result, complete, and of what the study says now."""
-        return self.record is not None and self.record.given.complete and not self.reason
+    def complete(self) -> bool:
+        """Whether there is a complete result that matches the study as it is now."""
+        return self.record is not None and self.record.result.complete and not self.reason
 
     @property
-    def words(self) -> str:
-        """In a word or two, for a table."""
+    def status(self) -> str:
+        """Status in a word or two, for tables and the log."""
         if self.record is None:
             return "not run" if self.reason.startswith("Not run") else "FAILED"
         if self.reason:
             return "OUT OF DATE"
-        return "in part" if not self.record.given.complete else "there already" if self.again else "done"
+        return "in part" if not self.record.result.complete else "there already" if self.reused else "done"
 
 
 class Pipeline:
@@ -69,12 +68,12 @@ class Pipeline:
     Parameters
     ----------
     stages : sequence of Stage
-        Each behind those that it waits for.
+        Each after those that it waits for.
     ledger : Ledger
     only : sequence of str
-        Names or kinds of stages that may be run; all where empty. Others are taken as they are.
+        Names or kinds of stages that may be run; all where empty. The others are taken as they are.
     force : sequence of str
-        Names or kinds of stages that are made anew.
+        Names or kinds of stages that are run even if they are finished.
     """
 
     def __init__(
@@ -82,202 +81,207 @@ class Pipeline:
     ) -> None:
         self.stages, self.ledger = tuple(stages), ledger
         self._only, self._force = tuple(only), tuple(force)
-        self.outcomes: dict[str, Outcome] = {}
+        self.outcomes: dict[str, StageOutcome] = {}
         self._keys: dict[str, tuple[str, Mapping[str, Any]]] = {}
         self._waiting = {stage.name: stage for stage in stages}
 
-    def in_order(self) -> dict[str, Outcome]:
+    def in_order(self) -> dict[str, StageOutcome]:
         """Outcomes in the order of the stages."""
         return {stage.name: self.outcomes[stage.name] for stage in self.stages}
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its stages."""
+        """Names of the stages."""
         return tuple(stage.name for stage in self.stages)
 
+    def _requested(self, stage: Stage) -> bool:
+        return not self._only or _named(stage, self._only)
+
+    def _forced(self, stage: Stage) -> bool:
+        return _named(stage, self._force)
+
+    def _origin(
+        self, stage: Stage, records: Mapping[str, StageRecord]
+    ) -> tuple[Mapping[str, Any], str, Mapping[str, Any]]:
+        """Arguments of a stage, and key and origin (`Ledger.made_from`) of the result that it would have now."""
+        arguments = _arguments(stage, records.keys())
+        made_from = self.ledger.made_from(stage, arguments)
+        built_on = {name: records[name] for name in stage.before if name in records}
+        return arguments, self.ledger.key(stage, made_from, built_on), made_from
+
     def settle(self) -> list[tuple[Stage, Mapping[str, Any]]]:
-        """Take every stage as far as it goes without work; return those that have to be run now, with arguments."""
+        """Advance every stage as far as possible without work; return those to be run now, with their arguments."""
         ready = []
-        moved = True
-        while moved:
-            moved = False
+        advanced = True
+        while advanced:
+            advanced = False
             for stage in list(self._waiting.values()):
                 if any(name not in self.outcomes for name in stage.before):
                     continue
                 del self._waiting[stage.name]
-                moved = True
+                advanced = True
                 try:
-                    work = self._settled(stage)
+                    settled = self._settled(stage)
                 except (OSError, MrstrainError) as failure:  # an input that is gone, or may not be read
                     reason = self.ledger.impersonal(str(failure), stage)
-                    self.outcomes[stage.name] = Outcome(stage.name, None, reason, asked=self._asked(stage))
-                    continue
-                if work is not None:
-                    ready.append((stage, work))
+                    settled = StageOutcome(stage.name, None, reason, requested=self._requested(stage))
+                if isinstance(settled, StageOutcome):
+                    self.outcomes[stage.name] = settled
+                else:
+                    ready.append((stage, settled))
         return ready
 
-    def _settled(self, stage: Stage) -> Mapping[str, Any] | None:
-        """Give the arguments of a stage that has to be run now; None for one whose outcome is known."""
-        there = {name for name, outcome in self.outcomes.items() if outcome.record is not None}
-        lacking, asked = _lacking(stage, there), self._asked(stage)
-        if lacking:
-            self.outcomes[stage.name] = Outcome(stage.name, None, f"Not run: {lacking}", asked=asked)
-            return None
-        arguments = self._arguments(stage)
-        made_from = self.ledger.made_from(stage, arguments)
-        built_on = {name: r for name in stage.before if (r := self.outcomes[name].record) is not None}
-        key = self.ledger.key(stage, made_from, built_on)
+    def _settled(self, stage: Stage) -> StageOutcome | Mapping[str, Any]:
+        """Outcome of a stage that need not be run, or the arguments of one that has to be run now."""
+        records = {name: outcome.record for name, outcome in self.outcomes.items() if outcome.record is not None}
+        requested = self._requested(stage)
+        missing = _missing(stage, records.keys())
+        if missing:
+            return StageOutcome(stage.name, None, f"Not run: {missing}", requested=requested)
+        arguments, key, made_from = self._origin(stage, records)
         kept = self.ledger.finished(stage)
-        same = kept is not None and kept.key == key
-        if not asked:
-            reason = self._why_not(stage) if kept is None else self._built_on_old(stage) if same else _OUT_OF_DATE
-            self.outcomes[stage.name] = Outcome(stage.name, kept, reason, again=True, asked=False)
-        elif kept is not None and same and not kept.given.retry and not _among(stage, self._force, default=False):
-            self.outcomes[stage.name] = Outcome(stage.name, kept, self._built_on_old(stage), again=True)
-        else:
-            self._keys[stage.name] = key, made_from
-            return arguments
-        return None
+        current = kept is not None and kept.key == key
+        if kept is None and not requested:
+            reason = self.ledger.reason(stage) or "Not run: it has no result, and is not among those asked for."
+        elif current or not requested:
+            reason = self._outdated_inputs(stage) if current else "Made from other inputs than the study names now."
+        if not requested or (kept is not None and current and not kept.result.retry and not self._forced(stage)):
+            return StageOutcome(stage.name, kept, reason, reused=True, requested=requested)
+        self._keys[stage.name] = key, made_from
+        return arguments
 
-    def _asked(self, stage: Stage) -> bool:
-        return _among(stage, self._only, default=True)
-
-    def _built_on_old(self, stage: Stage) -> str:
-        """Which results that it reads are out of date, so that it is too; empty where none is."""
-        old = [name for name in stage.before if self.outcomes[name].words == "OUT OF DATE"]
-        return f"Built on {', '.join(old)}, out of date." if old else ""
-
-    def _why_not(self, stage: Stage) -> str:
-        return self.ledger.reason(stage) or "Not run: it has no result, and is not among those asked for."
+    def _outdated_inputs(self, stage: Stage) -> str:
+        """Which results that a stage reads are out of date, so that it is too; empty where none is."""
+        outdated = [name for name in stage.before if self.outcomes[name].status == "OUT OF DATE"]
+        return f"Built on {', '.join(outdated)}, out of date." if outdated else ""
 
     def forecast(self) -> dict[str, str]:
         """What a run would do with each stage, without doing it.
 
-        "done already", "run", "left out", or "cannot be run" and what for.
+        "done already", "run", "left out", or "cannot be run" and why.
         """
-        told: dict[str, str] = {}
-        kept = {stage.name: self.ledger.finished(stage) for stage in self.stages}
-        there: set[str] = set()
+        forecast: dict[str, str] = {}
+        records: dict[str, StageRecord] = {}
+        available: set[str] = set()
         for stage in self.stages:
-            anew = any(told[name] == "run" for name in stage.before)
-            record = kept[stage.name]
-            lacking = _lacking(stage, there)
-            if lacking:
-                told[stage.name] = f"cannot be run: {lacking}" if self._asked(stage) else "left out"
+            record = self.ledger.finished(stage)
+            missing = _missing(stage, available)
+            if missing:
+                forecast[stage.name] = f"cannot be run: {missing}" if self._requested(stage) else "left out"
                 continue
-            if not self._asked(stage):
-                told[stage.name] = "left out"
-            elif anew or record is None or _among(stage, self._force, default=False):
-                told[stage.name] = "run"
+            if not self._requested(stage):
+                forecast[stage.name] = "left out"
+            elif record is None or self._forced(stage) or any(forecast[name] == "run" for name in stage.before):
+                forecast[stage.name] = "run"
             else:
-                some = {
-                    argument: [value for name, value in of.items() if name in there]
-                    for argument, of in {**stage.some, **stage.perhaps}.items()
-                }
-                built_on = {name: r for name in stage.before if name in there and (r := kept[name]) is not None}
-                made_from = self.ledger.made_from(stage, {**stage.arguments, **some})
-                same = record.key == self.ledger.key(stage, made_from, built_on) and not record.given.retry
-                told[stage.name] = "done already" if same else "run"
-            if record is not None or told[stage.name] == "run":
-                there.add(stage.name)
-        return told
+                current = record.key == self._origin(stage, records)[1] and not record.result.retry
+                forecast[stage.name] = "done already" if current else "run"
+            if record is not None:
+                records[stage.name] = record
+            if record is not None or forecast[stage.name] == "run":
+                available.add(stage.name)
+        return forecast
 
     def to_do(self) -> list[Stage]:
         """The stages that a run would work on."""
         forecast = self.forecast()
         return [stage for stage in self.stages if forecast[stage.name] == "run"]
 
-    def _arguments(self, stage: Stage) -> Mapping[str, Any]:
-        there = {
-            argument: [value for name, value in of.items() if self.outcomes[name].record is not None]
-            for argument, of in {**stage.some, **stage.perhaps}.items()
-        }
-        return {**stage.arguments, **there}
-
-    def start(self, cluster: Callable[[], Cluster], tell: Tell, prefix: str = "") -> None:
-        """Settle what can be, tell it, and hand what has to be run to the cluster."""
+    def start(self, runner: Callable[[], StageRunner], log: Log, prefix: str = "") -> None:
+        """Settle what can be settled, log it, and hand the stages that have to be run to the cluster."""
         before = set(self.outcomes)
         ready = self.settle()
         for name, outcome in self.outcomes.items():
             if name not in before:
-                tell(f"{name}: {outcome.words}" + (f". {outcome.reason}" if outcome.reason else ""))
+                log(f"{name}: {outcome.status}" + (f". {outcome.reason}" if outcome.reason else ""))
         for stage, arguments in ready:
             try:
-                if stage.goes_on and not _among(stage, self._force, default=False):
+                if stage.goes_on and not self._forced(stage):
                     self.ledger.forget(stage)
                 else:
                     self.ledger.remove(stage)
                 for place in stage.gives:
                     place.parent.mkdir(parents=True, exist_ok=True)
             except (OSError, MrstrainError) as failure:
-                self.end(stage.name, str(failure), 0.0, tell)
+                self.end(stage.name, str(failure), 0.0, log)
                 continue
-            cluster().begin(prefix + stage.name, stage.kind, arguments, self.ledger.lock(stage))
+            runner().begin(prefix + stage.name, stage.kind, arguments, self.ledger.lock(stage))
 
-    def end(self, name: str, outcome: Given | str, seconds: float, tell: Tell) -> None:
-        """Record how a stage ended that was handed to the cluster."""
+    def end(self, name: str, result: StageResult | str, seconds: float, log: Log) -> None:
+        """Record how a stage ended that was handed to the cluster: its result, or why it failed."""
         stage = next(stage for stage in self.stages if stage.name == name)
-        if isinstance(outcome, str):
-            outcome = self.ledger.impersonal(outcome, stage)
-        else:
-            outcome = replace(outcome, lines=tuple(self.ledger.impersonal(line, stage) for line in outcome.lines))
         try:
-            if isinstance(outcome, str):
-                # what an earlier run or half of this one left is no result of these inputs
-                (self.ledger.forget if stage.goes_on else self.ledger.remove)(stage, outcome)
-                self.outcomes[stage.name] = Outcome(stage.name, None, outcome)
-            else:
-                key, made_from = self._keys[stage.name]
-                record = self.ledger.keep(stage, key, made_from, outcome, seconds)
-                self.outcomes[stage.name] = Outcome(stage.name, record, self._built_on_old(stage))
+            outcome = self._recorded(stage, result, seconds)
         except (OSError, MrstrainError) as failure:
-            self.outcomes[stage.name] = Outcome(stage.name, None, self.ledger.impersonal(str(failure), stage))
-        one = self.outcomes[stage.name]
-        tell(f"{stage.name}: {one.words} after {seconds:.0f} s" + (f". {one.reason}" if one.reason else ""))
-        if one.record is not None:
-            for line in one.record.given.lines:
-                tell(f"    {line}")
+            outcome = StageOutcome(name, None, self.ledger.impersonal(str(failure), stage))
+        self.outcomes[name] = outcome
+        log(f"{name}: {outcome.status} after {seconds:.0f} s" + (f". {outcome.reason}" if outcome.reason else ""))
+        for line in () if outcome.record is None else outcome.record.result.lines:
+            log(f"    {line}")
+
+    def _recorded(self, stage: Stage, result: StageResult | str, seconds: float) -> StageOutcome:
+        if isinstance(result, str):
+            reason = self.ledger.impersonal(result, stage)
+            # what an earlier run or half of this one left is no result of these inputs
+            (self.ledger.forget if stage.goes_on else self.ledger.remove)(stage, reason)
+            return StageOutcome(stage.name, None, reason)
+        result = replace(result, lines=tuple(self.ledger.impersonal(line, stage) for line in result.lines))
+        record = self.ledger.keep(stage, *self._keys[stage.name], result, seconds)
+        return StageOutcome(stage.name, record, self._outdated_inputs(stage))
 
 
-def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], tell: Mapping[str, Tell]) -> None:
+def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Mapping[str, Log]) -> None:
     """Run what is left of several studies on one cluster.
 
     Parameters
     ----------
     pipelines : mapping of str to Pipeline
-        By a prefix of their stages' names, which tells one study's from another's.
+        By the prefix that tells one study's stage names from another's.
     pool : callable
-        Gives a context with a `Cluster`; asked for only where there is work.
-    tell : mapping
-        Of the same prefixes: gets a line for each stage that ends.
+        Gives a context with a `StageRunner`; called only if there is work.
+    logs : mapping
+        By the same prefixes: called with a line for each stage that ends.
     """
     with ExitStack() as stack:
-        made: list[Cluster] = []
+        runners: list[StageRunner] = []
 
-        def cluster() -> Cluster:
-            if not made:
-                made.append(stack.enter_context(pool()))
-            return made[0]
+        def runner() -> StageRunner:
+            if not runners:
+                runners.append(stack.enter_context(pool()))
+            return runners[0]
 
         for prefix, pipeline in pipelines.items():
-            pipeline.start(cluster, tell[prefix], prefix)
-        while made and made[0].busy:
-            full, given, seconds = made[0].next()
-            prefix = next(p for p in pipelines if full.startswith(p) and full[len(p) :] in pipelines[p].names)
-            pipelines[prefix].end(full[len(prefix) :], given, seconds, tell[prefix])
-            pipelines[prefix].start(cluster, tell[prefix], prefix)
+            pipeline.start(runner, logs[prefix], prefix)
+        while runners and runners[0].busy:
+            full_name, result, seconds = runners[0].next()
+            prefix, name = next(
+                (p, full_name[len(p) :])
+                for p in pipelines
+                if full_name.startswith(p) and full_name[len(p) :] in pipelines[p].names
+            )
+            pipelines[prefix].end(name, result, seconds, logs[prefix])
+            pipelines[prefix].start(runner, logs[prefix], prefix)
 
 
-def _lacking(stage: Stage, there: Set[str]) -> str:
-    """Which result a stage cannot do without, of those that are there; empty where it can be run."""
+def _arguments(stage: Stage, available: AbstractSet[str]) -> Mapping[str, Any]:
+    """Arguments of a stage, with what the available stages that it may build on are listed with."""
+    chosen = {
+        argument: [value for name, value in by_stage.items() if name in available]
+        for argument, by_stage in {**stage.some, **stage.perhaps}.items()
+    }
+    return {**stage.arguments, **chosen}
+
+
+def _missing(stage: Stage, available: AbstractSet[str]) -> str:
+    """Which result that a stage requires is not available; empty where it can be run."""
     for name in stage.after:
-        if name not in there:
+        if name not in available:
             return f"{name} has no result."
-    for of in stage.some.values():
-        if there.isdisjoint(of):
-            return f"none of {', '.join(of)} has a result."
+    for by_stage in stage.some.values():
+        if available.isdisjoint(by_stage):
+            return f"none of {', '.join(by_stage)} has a result."
     return ""
 
 
-def _among(stage: Stage, chosen: Sequence[str], *, default: bool) -> bool:
-    return default if not chosen else stage.name in chosen or stage.kind in chosen
+def _named(stage: Stage, chosen: Sequence[str]) -> bool:
+    return stage.name in chosen or stage.kind in chosen

@@ -1,4 +1,4 @@
-"""`run`: a study from its file to its report; what is finished is not done again."""
+"""`run`: a study from its file to its report; finished stages are not repeated."""
 
 from __future__ import annotations
 
@@ -6,73 +6,83 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from dvc.errors import InputError, OutputError, ParameterError
+from dvc.trust.verdict import Verdict
 from mrstrain.records.inputs import make_output, refuse_small_disk
-from mrstrain.records.progress import ALL
+from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
 from mrstrain.studies.costs import disk_bytes, seconds_of, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
-from mrstrain.studies.pipeline import Outcome, Pipeline, run_all
+from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, run_all
 from mrstrain.studies.plan import KINDS, Stage, plan
-
-Told = Callable[[str, str, float], None]
 
 LOG, REPORT = "study.log", "report.html"
 _USUAL_VOXELS, _USUAL_CELLS = 2e6, 70e3
-_NOTHING = ("nothing",)  # to be run: everything is taken as it is
+_NOTHING = ("nothing",)  # may be run: every stage is taken as it is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ran:
-    """What `run` gave.
+class StudyRun:
+    """Result of `run`.
 
     Attributes
     ----------
     study : Study
     outcomes : dict
-        Of every stage, by its name.
+        Outcome of every stage, by its name.
     """
 
     study: Study
-    outcomes: Mapping[str, Outcome]
+    outcomes: Mapping[str, StageOutcome]
 
     @property
     def complete(self) -> bool:
-        """Whether every stage that was asked for has a whole result of what the study says now."""
-        return all(outcome.whole for outcome in self.outcomes.values() if outcome.asked)
+        """Whether every requested stage has a complete result that matches the study as it is now."""
+        return all(outcome.complete for outcome in self.outcomes.values() if outcome.requested)
+
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Verdict on each registration that has a result, by load."""
+        return {
+            name.removeprefix("register "): section.verdict
+            for name, outcome in self.outcomes.items()
+            if outcome.record is not None and name.startswith("register ")
+            for section in outcome.record.result.sections
+            if section.verdict is not None
+        }
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines: what is incomplete or doubtful, the comparison, and where log and report are."""
         lines = []
         for name, outcome in self.outcomes.items():
             if outcome.left_out:
                 continue
-            if not outcome.whole:
-                told = () if outcome.record is None else outcome.record.given.lines
-                lines += [f"{name}: {outcome.words}. {outcome.reason}".rstrip(), *(f"    {line}" for line in told)]
+            if not outcome.complete:
+                details = () if outcome.record is None else outcome.record.result.lines
+                lines += [f"{name}: {outcome.status}. {outcome.reason}".rstrip(), *(f"    {line}" for line in details)]
             elif outcome.record is not None:
                 lines += [
                     f"{name}: {section.verdict.words}. {' '.join(section.verdict.reasons)}"
-                    for section in outcome.record.given.sections
+                    for section in outcome.record.result.sections
                     if section.verdict is not None and section.verdict.level != "trust" and name != "compare"
                 ]
-        compared = self.outcomes.get("compare")
-        if compared is not None and compared.record is not None:
-            lines += compared.record.given.lines
+        comparison = self.outcomes.get("compare")
+        if comparison is not None and comparison.record is not None:
+            lines += comparison.record.result.lines
         left_out = [name for name, outcome in self.outcomes.items() if outcome.left_out]
         if left_out:
             lines.append(f"Not asked for, and without a result: {', '.join(left_out)}.")
-        again = sum(outcome.again and outcome.record is not None for outcome in self.outcomes.values())
+        reused = sum(outcome.reused and outcome.record is not None for outcome in self.outcomes.values())
         return [
             *lines,
-            f"{len(self.outcomes)} stages, {again} of them there already. Log: {self.study.out / LOG}",
+            f"{len(self.outcomes)} stages, {reused} of them there already. Log: {self.study.out / LOG}",
             f"Report: {self.study.out / REPORT}",
         ]
 
@@ -84,8 +94,8 @@ def run(
     force: Sequence[str] = (),
     scheduler: str | None = None,
     workers: int | None = None,
-    progress: Told | None = None,
-) -> Ran:
+    progress: OnProgress | None = None,
+) -> StudyRun:
     """Run a study: register, mesh, simulate, compare and report.
 
     Parameters
@@ -95,32 +105,35 @@ def run(
     only : sequence of str
         Names or kinds of stages ("register", "simulate trebbi") that may be run; the others are taken as they are.
     force : sequence of str
-        Names or kinds of stages that are made anew.
+        Names or kinds of stages that are run even if they are finished.
     scheduler : str, optional
-        Address of a Dask scheduler whose workers see the study's folder; this machine's cores by default.
+        Address of a Dask scheduler whose workers see the study's folder; by default this machine's cores are used.
     workers : int, optional
-        Stages at once on this machine; one for each core by default.
+        Stages at once on this machine; by default one for each core.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
     Returns
     -------
-    Ran
-        With every stage's outcome; a stage that failed is named there, in the log and in the report.
+    StudyRun
+        With the outcome of every stage; a failed stage is named there, in the log and in the report.
 
     Raises
     ------
     InputError
-        If the study cannot be read, a file is missing, or stages that are to be run would fail by what it says or by
-        what is in its files, loaded images left aside; before anything is run.
+        Before anything is run: if the study cannot be read, a file is missing, or a stage that is to be run would fail
+        because of the study file or the files that it names (a damaged loaded image fails only its own stage).
     ParameterError
         If both a scheduler and a number of workers are given.
     OutputError
         If another run is at work in the same folder, or it cannot be written to.
     """
-    told = study if isinstance(study, Study) else read_study(study)
-    (ran,) = run_studies([told], only=only, force=force, scheduler=scheduler, workers=workers, progress=progress)
-    return ran
+    runs = run_studies([_read(study)], only=only, force=force, scheduler=scheduler, workers=workers, progress=progress)
+    return runs[0]
+
+
+def _read(study: Path | str | Study) -> Study:
+    return study if isinstance(study, Study) else read_study(study)
 
 
 def run_studies(
@@ -130,75 +143,93 @@ def run_studies(
     force: Sequence[str] = (),
     scheduler: str | None = None,
     workers: int | None = None,
-    progress: Told | None = None,
-) -> list[Ran]:
-    """Run several studies on one cluster, each as `run` does it; what cannot be run is refused before any begins."""
+    progress: OnProgress | None = None,
+) -> list[StudyRun]:
+    """Run several studies on one cluster, each as `run` does; what cannot be run is refused before any begins."""
     if scheduler is not None and workers is not None:
         raise ParameterError(
             f"--workers {workers} is for this machine's cores; the scheduler at {scheduler} has workers of its own. "
             "Give one of the two."
         )
-    planned = [plan(study) for study in studies]
-    for stages in planned:
-        refuse_unknown(stages, only, force)
-    refuse_missing(planned)
-    tell, ended = progress or (lambda *_: None), 0.0
-    seconds: dict[str, float] = {}
-    stages_told = f"{sum(map(len, planned))} stages"
-    prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
-    each = [
-        Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
-        for study, stages in zip(studies, planned, strict=True)
-    ]
-    todo = [pipeline.to_do() for pipeline in each]
-    refuse_wrong(studies, todo)
-    pipelines = dict(zip(prefixes, each, strict=True))
-    lines: dict[str, Callable[[str], None]] = {}
-
-    def line_of(prefix: str, log: Callable[[str], None]) -> Callable[[str], None]:
-        def line(text: str) -> None:
-            nonlocal ended
-            log(text)
-            name = prefix + text.split(": ", maxsplit=1)[0]
-            if name in seconds:
-                ended += seconds[name]
-                tell(name, "ended", 1.0)  # one that failed has not told so
-                tell(ALL, stages_told, round(ended / sum(seconds.values()), 9))
-
-        return line
+    planned = _planned(studies, only, force)
+    total = _TotalProgress(progress or (lambda *_: None), sum(len(pipeline.stages) for pipeline, _ in planned))
 
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
 
-        return cluster(tell, [study.out for study in studies], scheduler=scheduler, workers=workers)
+        return cluster(total.report, [study.out for study in studies], scheduler=scheduler, workers=workers)
 
+    logs: dict[str, Log] = {}
     on_disk: dict[int, tuple[int, float]] = {}
+    prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
+    pipelines = {prefix: pipeline for prefix, (pipeline, _) in zip(prefixes, planned, strict=True)}
     with ExitStack() as stack:
-        for prefix, study, stages, left in zip(prefixes, studies, planned, todo, strict=True):
+        for prefix, study, (pipeline, left) in zip(prefixes, studies, planned, strict=True):
             stack.enter_context(_alone(study.out))
             voxels, cells = _sizes(study, left)
             _refuse_small_disk(study, left, voxels, on_disk)
-            seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
+            total.seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
             log = stack.enter_context(_log(study.out / LOG))
-            log(f"Study '{study.study.name}': {len(stages)} stages, {len(left)} of them to do")
-            lines[prefix] = line_of(prefix, log)
-        run_all(pipelines, pool, lines)
-        tell(ALL, stages_told, 1.0)
-        done = []
+            log(f"Study '{study.study.name}': {len(pipeline.stages)} stages, {len(left)} of them to do")
+            logs[prefix] = total.also(log, prefix)
+        run_all(pipelines, pool, logs)
+        total.report(ALL, total.stages, 1.0)
+        runs = []
         for prefix, study in zip(prefixes, studies, strict=True):
-            outcomes = pipelines[prefix].in_order()
-            write_run_report(study.out / REPORT, study, outcomes)
-            lines[prefix](f"Report: {study.study.out}/{REPORT}")
-            done.append(Ran(study, outcomes))
-    return done
+            runs.append(StudyRun(study, pipelines[prefix].in_order()))
+            write_run_report(study.out / REPORT, study, runs[-1].outcomes)
+            logs[prefix](f"Report: {study.study.out}/{REPORT}")
+    return runs
+
+
+def _planned(studies: Sequence[Study], only: Sequence[str], force: Sequence[str]) -> list[tuple[Pipeline, list[Stage]]]:
+    """Pipeline of each study and the stages to do; what cannot be run is refused."""
+    stages_of = [plan(study) for study in studies]
+    for stages in stages_of:
+        refuse_unknown(stages, only, force)
+    refuse_missing(stages_of)
+    pipelines = [
+        Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
+        for study, stages in zip(studies, stages_of, strict=True)
+    ]
+    to_do = [pipeline.to_do() for pipeline in pipelines]
+    refuse_wrong(studies, to_do)
+    return list(zip(pipelines, to_do, strict=True))
+
+
+@dataclass(slots=True, eq=False)
+class _TotalProgress:
+    """Progress of all stages together, weighted by the seconds that each to be run is expected to take."""
+
+    report: OnProgress
+    number: int
+    seconds: dict[str, float] = field(default_factory=dict)
+    ended_s: float = 0.0
+
+    @property
+    def stages(self) -> str:
+        return f"{self.number} stages"
+
+    def also(self, log: Log, prefix: str) -> Log:
+        """A log that reports progress as well, for each stage that a line says has ended."""
+
+        def line(text: str) -> None:
+            log(text)
+            name = prefix + text.split(": ", maxsplit=1)[0]
+            if name in self.seconds:
+                self.ended_s += self.seconds[name]
+                self.report(name, "ended", 1.0)  # a failed stage has not reported it
+                self.report(ALL, self.stages, round(self.ended_s / sum(self.seconds.values()), 9))
+
+        return line
 
 
 def _sizes(study: Study, left: Sequence[Stage]) -> tuple[float, float]:
-    """Sizes that stages which are left depend on, as `sizes_of` tells them."""
+    """Voxels and cells (`sizes_of`) that the costs of the stages to do depend on."""
     try:
         return sizes_of(study) if left else (0.0, 0.0)
     except (InputError, OSError):
-        return _USUAL_VOXELS, _USUAL_CELLS  # the stages that read it say what is wrong with it
+        return _USUAL_VOXELS, _USUAL_CELLS  # the stages that read the file report what is wrong with it
 
 
 def _refuse_small_disk(
@@ -206,7 +237,7 @@ def _refuse_small_disk(
 ) -> None:
     """Refuse a run whose results would not fit, before any of it is made.
 
-    ``on_disk`` is added to: how many stages, and bytes, the studies so far will write to each disk.
+    ``on_disk`` is updated: stages, and bytes, that the studies so far will write to each disk.
     """
     if not left:
         return
@@ -217,51 +248,44 @@ def _refuse_small_disk(
     refuse_small_disk(study.out, needed, f"the results of {stages} stages need", "", "[study] out")
 
 
-def report(study: Path | str | Study) -> Ran:
-    """Write a study's report anew from what is there, without running anything.
+def report(study: Path | str | Study) -> StudyRun:
+    """Write a study's report again from the existing results, without running anything.
 
     Raises
     ------
     InputError
         If no stage has a result.
     """
-    told = study if isinstance(study, Study) else read_study(study)
-    stages = plan(told)
-    pipeline = Pipeline(stages, Ledger(told.out, told.place), only=_NOTHING)
+    study = _read(study)
+    pipeline = Pipeline(plan(study), Ledger(study.out, study.place), only=_NOTHING)
     pipeline.settle()
     outcomes = pipeline.in_order()
     if all(outcome.record is None for outcome in outcomes.values()):
-        raise InputError(f"{told.out} has no results yet: `mrstrain run` makes them.")
-    with _alone(told.out):
-        write_run_report(told.out / REPORT, told, outcomes)
-    return Ran(told, outcomes)
+        raise InputError(f"{study.out} has no results yet: `mrstrain run` makes them.")
+    with _alone(study.out):
+        write_run_report(study.out / REPORT, study, outcomes)
+    return StudyRun(study, outcomes)
 
 
 def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = ()) -> dict[str, str]:
-    """What `run` would do with each stage, as `Pipeline.forecast` tells it; parameters and errors are `run`'s own."""
-    told = study if isinstance(study, Study) else read_study(study)
-    stages = plan(told)
-    refuse_unknown(stages, only, force)
-    refuse_missing([stages])
-    pipeline = Pipeline(stages, Ledger(told.out, told.place), only=only, force=force)
-    refuse_wrong([told], [pipeline.to_do()])
-    return pipeline.forecast()
+    """What `run` would do with each stage (`Pipeline.forecast`); parameters and errors as in `run`."""
+    return _planned([_read(study)], only, force)[0][0].forecast()
 
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:
-    """Refuse names that no stage and no kind of stage has, and to make anew what is not to be run at all."""
+    """Refuse names of no stage or kind of stage, and to force a stage that is not to be run."""
     known = [*(stage.name for stage in stages), *KINDS]
     for name in (*only, *force):
         if name not in known:
             raise InputError(f"No stage is called '{name}'. There are: {', '.join(known)}.")
     for name in force if only else ():
-        meant = [stage for stage in stages if name in (stage.name, stage.kind)]
-        if meant and not any({stage.name, stage.kind} & {*only} for stage in meant):
+        forced = [stage for stage in stages if name in (stage.name, stage.kind)]
+        if forced and not any({stage.name, stage.kind} & {*only} for stage in forced):
             raise InputError(f"--force {name} makes nothing anew: --only {', '.join(only)} leaves it out.")
 
 
 def refuse_missing(planned: Sequence[Sequence[Stage]]) -> None:
-    """Refuse studies whose files are not there, naming every one of all of them."""
+    """Refuse studies with missing files, naming every missing file."""
     files = dict.fromkeys(path for stages in planned for stage in stages for path in stage.files)
     missing = [path for path in files if not path.exists()]
     if missing:
@@ -269,20 +293,20 @@ def refuse_missing(planned: Sequence[Sequence[Stage]]) -> None:
 
 
 def refuse_wrong(studies: Sequence[Study], todo: Sequence[Sequence[Stage]]) -> None:
-    """Refuse studies of whose stages to do some would fail, hours later, by what need not be computed to be known."""
-    told = {
+    """Refuse studies with a stage to do that would fail, hours later, for a reason that can be known beforehand."""
+    faults = {
         study.study.name: wrong
         for study, left in zip(studies, todo, strict=True)
         if left and (wrong := wrong_with(study, left))
     }
-    if told:
-        lines = [f"{name}: {sentence}" for name, wrong in told.items() for sentence in wrong]
+    if faults:
+        lines = [f"{name}: {sentence}" for name, wrong in faults.items() for sentence in wrong]
         raise InputError("This cannot be run as it is (`mrstrain check` tells more):\n  " + "\n  ".join(lines))
 
 
 @contextmanager
 def _alone(out: Path) -> Iterator[None]:
-    """Hold the results folder; the system lets go of it when the process ends, however it does."""
+    """Lock the results folder; the operating system releases it when the process ends, even by a kill."""
     make_output(out)
     folder = out / ".study"
     make_output(folder)
@@ -301,7 +325,7 @@ def _alone(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _log(path: Path) -> Iterator[Callable[[str], None]]:
-    """Append lines with their time to a file."""
+    """Append lines to a file, each with its time."""
     logger = logging.Logger(f"mrstrain {path}")
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)sZ %(message)s", "%Y-%m-%dT%H:%M:%S"))

@@ -19,7 +19,7 @@ Paths = Mapping[str, str | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class StageResult:
     """What a stage gave.
 
     Attributes
@@ -46,7 +46,9 @@ class Given:
     timed_out: bool = False
 
 
-def register(tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone: str | None, **options: Any) -> Given:
+def register(
+    tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone: str | None, **options: Any
+) -> StageResult:
     """One loaded image against the unloaded one; as `mrstrain.measurement.register_one.register_one`."""
     from mrstrain.measurement.register_one import register_one
 
@@ -66,10 +68,10 @@ def register(tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone
         tell=tell,
         **options,
     )
-    return Given(tuple(case.summary()), (case.section,))
+    return StageResult(tuple(case.summary()), (case.section,))
 
 
-def mesh(tell: Tell, *, out: str, labels: str, names: str | None, **options: Any) -> Given:
+def mesh(tell: Tell, *, out: str, labels: str, names: str | None, **options: Any) -> StageResult:
     """A label map's soft tissue as tetrahedra; as `mrstrain.mesh`."""
     from mrstrain.models.mesh import mesh as run
 
@@ -82,12 +84,12 @@ def mesh(tell: Tell, *, out: str, labels: str, names: str | None, **options: Any
         watch=lambda share: tell("meshing", share),
         **options,
     )
-    return Given(tuple(made.summary()))
+    return StageResult(tuple(made.summary()))
 
 
 def simulate(
     tell: Tell, *, out: str, mesh: str, material: str, loads: Sequence[Mapping[str, Any]], **options: Any
-) -> Given:
+) -> StageResult:
     """One material set under all loads; as `mrstrain.simulate`."""
     from fe import LoadStep
     from mrstrain.models.simulate import simulate as run
@@ -101,14 +103,18 @@ def simulate(
 
     done = run(mesh, out=out, sets=[material], loads=steps, workers=1, threads=1, progress=told, **options)
     timed_out = any(one.timed_out for one in done.sets)  # one set, if it did not fail
-    return Given(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), timed_out=timed_out)
+    return StageResult(
+        tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), timed_out=timed_out
+    )
 
 
-def drive(tell: Tell, *, out: str, mesh: str, dvc: str, material: str, loads: Sequence[str], **options: Any) -> Given:
+def drive(
+    tell: Tell, *, out: str, mesh: str, dvc: str, material: str, loads: Sequence[str], **options: Any
+) -> StageResult:
     """One material set whose outside goes where it was measured; as `mrstrain.drive`."""
     with Worker(threads=1) as worker:
         done = worker.run(f"driving {material}", _driven, mesh, dvc, out, material, tuple(loads), options)
-    return Given(tuple(done.summary()[:-1]), complete=done.complete)
+    return StageResult(tuple(done.summary()[:-1]), complete=done.complete)
 
 
 def _driven(mesh: str, dvc: str, out: str, material: str, loads: Sequence[str], options: Mapping[str, Any]) -> Any:
@@ -119,7 +125,7 @@ def _driven(mesh: str, dvc: str, out: str, material: str, loads: Sequence[str], 
 
 def level(
     tell: Tell, *, out: str, load0: str, model: str, load: str, images: Paths, bone: str | None, **options: Any
-) -> Given:
+) -> StageResult:
     """One model's load sent through the measurement; as `mrstrain.level`."""
     from mrstrain.comparison.level import level as run
 
@@ -138,22 +144,22 @@ def level(
         progress=lambda _, stage, fraction: tell(stage, fraction),
         **options,
     )
-    return Given(tuple(done.summary()[:-1]))
+    return StageResult(tuple(done.summary()[:-1]))
 
 
-def compare(tell: Tell, **options: Any) -> Given:
+def compare(tell: Tell, **options: Any) -> StageResult:
     """All models against the measurement; as `mrstrain.compare`, in a process whose memory is given back."""
     with Worker(threads=1) as worker:
         return worker.run("comparing", _compared, options)
 
 
-def _compared(options: dict[str, Any]) -> Given:
+def _compared(options: dict[str, Any]) -> StageResult:
     from mrstrain.comparison.compare import compare as run
 
     strains = options.pop("strains")
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
     done = run(options.pop("dvc"), models, strains=(strains[0], strains[1]), **options)
-    return Given(tuple(done.summary()[:-1]), done.sections, done.closing)
+    return StageResult(tuple(done.summary()[:-1]), done.sections, done.closing)
 
 
 def _path(given: str | None) -> Path | None:

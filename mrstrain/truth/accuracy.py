@@ -1,41 +1,44 @@
-"""`accuracy`: the error of a preset, by tissue, place, strain, noise and resolution, on phantoms of known strain."""
+"""`accuracy`: error of a registration preset by tissue, position, strain, noise and resolution, on phantoms."""
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.registration.engines import DEFAULT, engine_named
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
+from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance, write_json
-from mrstrain.truth.accuracy_page import write_study_report
-from phantoms.accuracy_run import Case, Samples, measure, motion_named
-from phantoms.anatomy import Heel
-from phantoms.error_model import CoverageRow, coverage_rows, fit_error_model
-from phantoms.error_tables import (
+from mrstrain.records.tables import write_csv
+from mrstrain.truth.accuracy_page import write_accuracy_report
+from phantoms import (
+    AccuracyCase,
+    CoverageRow,
     ErrorRow,
+    ErrorSamples,
     FloorRow,
+    Heel,
     ResolutionRow,
     RunRow,
+    coverage_rows,
     error_rows,
+    fit_error_model,
     floor_rows,
+    heel_grid,
+    measure_run,
+    motion_named,
     resolution_rows,
     run_rows,
 )
-from phantoms.heel import heel_grid
-
-Told = Callable[[str, str, float], None]
 
 MOTIONS = ("still", "smooth", "sliding", "Load1", "Load2", "Load3", "Load4")
 WAVES = tuple(f"wave-{length}" for length in (6, 8, 10, 12, 16, 20, 24, 48))
@@ -46,28 +49,28 @@ CONDITIONS: tuple[tuple[tuple[float, float, float], float], ...] = (
     ((1.2, 1.2, 1.2), 25.0),
     ((0.8, 0.8, 1.6), 25.0),
 )
-"""Voxel (mm) and signal-to-noise ratio of the default study."""
+"""Voxel size (mm) and signal-to-noise ratio of the default study."""
 SEEDS = (1, 2)
-"""Published figures come from 9000 to 9999, on which nothing is ever tuned."""
+"""Heels of the default study. Published figures come from 9000 to 9999, on which nothing is ever tuned."""
 LABELS_OFF = (0, 1, -1)
-"""By how many voxels bones and skin are too large in label maps, in turn, where the engine believes them."""
+"""Voxels by which bones and skin are too large in the label maps, in turn, for the engine that relies on them."""
 
-_MEGABYTES = 5.0  # of one run's samples, as measured at 0.8 mm
+_MEGABYTES = 5.0  # measured for one run's samples at 0.8 mm
 
 
 @dataclass(frozen=True, slots=True)
-class Study:
-    """What a study gave.
+class AccuracyStudy:
+    """Result of `accuracy`.
 
     Attributes
     ----------
     out : Path
-        With ``errors.csv``, ``zero_strain.csv``, ``resolution.csv``, ``coverage.csv``, an error model of each preset
-        and ``report.html``.
+        Folder of ``errors.csv``, ``zero_strain.csv``, ``resolution.csv``, ``coverage.csv``, an error model of each
+        preset and ``report.html``.
     errors, floors, resolution : tuple of rows
-        As in the tables.
+        Rows of the tables.
     failures : dict
-        Case to the reason why it has no result.
+        Name of each case without a result, and why.
     """
 
     out: Path
@@ -77,9 +80,9 @@ class Study:
     failures: dict[str, str]
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines."""
         lines = [
-            f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {r.motion}, {r.tissue}: maximal shear RMSE "
+            f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {r.motion}, {r.tissue}: max. shear RMSE "
             f"{r.shear_rmse:.4f}, bias {r.shear_bias:+.4f}; displacement RMSE {r.u_rmse_mm:.3f} mm"
             for r in self.errors
             if r.by == "all" and r.tissue == "fat"
@@ -93,15 +96,15 @@ def cases_of(
     conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
     motions: Sequence[str] = (*MOTIONS, *WAVES),
     seeds: Sequence[int] = SEEDS,
-) -> list[Case]:
-    """Every preset with every condition (voxel in mm, SNR), motion and seed; waves with the first seed alone.
+) -> list[AccuracyCase]:
+    """Every preset with every condition (voxel in mm, SNR), motion and seed; shear waves with the first seed only.
 
     By default seven motions with two heels each and eight waves, at five conditions: 110 registrations. For an engine
     that needs labels these are exact, too large and too small in turn, and there are no waves, which move bone as they
     move tissue.
     """
     return [
-        Case(preset, spacing, snr, motion, seed, LABELS_OFF[(m + s) % len(LABELS_OFF)] if labelled else 0)
+        AccuracyCase(preset, spacing, snr, motion, seed, LABELS_OFF[(m + s) % len(LABELS_OFF)] if labelled else 0)
         for preset, labelled in [(preset, engine_named(preset).needs_labels) for preset in presets]
         for spacing, snr in conditions
         for m, motion in enumerate(motions)
@@ -110,44 +113,40 @@ def cases_of(
     ]
 
 
-def expected_minutes(cases: Sequence[Case], workers: int) -> float:
-    """About how long registrations take, so many at once."""
+def expected_minutes(cases: Sequence[AccuracyCase], workers: int) -> float:
+    """Estimated time of the cases with so many ``workers``, minutes."""
     return sum(engine_named(case.preset).cost.phantom_seconds for case in cases) / workers / 60.0
 
 
 def accuracy(
     out: Path | str,
     *,
-    cases: Sequence[Case] | None = None,
+    cases: Sequence[AccuracyCase] | None = None,
     workers: int | None = None,
     tell_plan: Callable[[str], None] | None = None,
-    progress: Told | None = None,
-) -> Study:
-    """Measure the error of registration presets on phantoms; a study that was broken off goes on where it stopped.
+    progress: OnProgress | None = None,
+) -> AccuracyStudy:
+    """Measure the error of registration presets on phantoms; an interrupted study resumes.
 
     Parameters
     ----------
     out : path
-        Each run's samples are kept in ``runs``, and used again while preset and software (`dvc.software`) are the
-        same. Tables and page are of all that lies there: a later call with other cases adds to them.
-    cases : sequence of Case
-        The default of `cases_of` where not given.
+        Samples of each run are kept in ``runs`` and used again as long as preset and software (`dvc.software`) are
+        unchanged. Tables and report cover all runs found there, so a later call with other cases adds to them.
+    cases : sequence of AccuracyCase
+        Default: ``cases_of()``.
     workers : int
         Registrations at once, on one thread each; by default one for each core.
     tell_plan : callable, optional
-        Gets a sentence before anything runs: how many registrations, and about how long.
+        Called with a sentence before anything runs: number of registrations and estimated time.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
-
-    Returns
-    -------
-    Study
 
     Raises
     ------
     InputError
-        For a case that cannot be: voxel, noise, motion or preset; for two parameter files of one name, here or in an
-        earlier call. Before anything runs.
+        Before anything runs: if the voxel size, SNR, motion or preset of a case is invalid, or two parameter files
+        share a name, here or with an earlier call.
     OutputError
         If the folder cannot be written to, or the disk has too little room.
     MrstrainError
@@ -156,57 +155,57 @@ def accuracy(
     wanted = list(cases_of() if cases is None else cases)
     if not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
-            "A study needs at least one case, and each only once (an engine that needs labels has none with a wave, "
-            "which moves bone)."
+            "An accuracy study needs at least one case, and each only once (an engine that needs labels has "
+            "no waves: they move bone)."
         )
     for case in wanted:
         _check(case)
     target = Path(out)
-    runs = target / "runs"
-    found = _finished(runs)
-    _refuse_one_name_for_two([*(samples.case for samples in found.values()), *wanted])
-    left = [case for case in wanted if case.name not in found]
-    refuse_small_disk(target, len(left) * _MEGABYTES * 1e6 + 20e6, "the study needs", ", or a smaller study")
+    folder = target / "runs"
+    runs = _finished(folder)
+    _refuse_one_name_for_two([*(run.case for run in runs.values()), *wanted])
+    missing = [case for case in wanted if case.name not in runs]
+    refuse_small_disk(target, len(missing) * _MEGABYTES * 1e6 + 20e6, "the study needs", ", or a smaller study")
     make_output(target)
-    runs.mkdir(exist_ok=True)
-    at_once = max(1, min(workers or usable_cores(), len(left)))
+    folder.mkdir(exist_ok=True)
+    at_once = max(1, min(workers or usable_cores(), len(missing)))
     if tell_plan is not None:
         tell_plan(
-            f"{len(left)} registrations to do ({len(wanted) - len(left)} are there already), about "
-            f"{expected_minutes(left, at_once):.0f} minutes with {at_once} at once."
+            f"{len(missing)} registrations to do ({len(wanted) - len(missing)} are there already), about "
+            f"{expected_minutes(missing, at_once):.0f} minutes with {at_once} at once."
         )
-    failures = _run_all(left, at_once, runs, found, progress or (lambda *_: None))
-    if not found:
+    failures = _measure_all(missing, at_once, folder, runs, progress or (lambda *_: None))
+    if not runs:
         raise MrstrainError("No case could be measured. " + " ".join(f"{n}: {r}" for n, r in failures.items()))
-    return _write(target, [found[name] for name in sorted(found)], failures)
+    return _write(target, [runs[name] for name in sorted(runs)], failures)
 
 
-def _finished(folder: Path) -> dict[str, Samples]:
-    """Runs of this and of earlier calls that are as they would be made now."""
-    found: dict[str, Samples] = {}
+def _finished(folder: Path) -> dict[str, ErrorSamples]:
+    """Samples of this and earlier calls, by case, whose preset and software are unchanged."""
+    runs: dict[str, ErrorSamples] = {}
     for path in sorted(folder.glob("*.npz")):
         try:
-            samples = Samples.read(path, _key)
-        except MrstrainError:  # its preset is gone
+            samples = ErrorSamples.read(path, _key)
+        except MrstrainError:  # the parameter file no longer exists
             continue
         if samples is not None:
-            found[samples.case.name] = samples
-    return found
+            runs[samples.case.name] = samples
+    return runs
 
 
-def _refuse_one_name_for_two(cases: Sequence[Case]) -> None:
-    """Runs and error models are kept under the preset's or file's name: one of two would pass for the other."""
+def _refuse_one_name_for_two(cases: Sequence[AccuracyCase]) -> None:
+    """Refuse parameter files that share a name: runs and error models are stored under it."""
     named: dict[str, str] = {}
     for case in cases:
         other = named.setdefault(Path(case.preset).stem, case.preset)
         if other != case.preset:
             raise InputError(
                 f"{other} and {case.preset} would share the name '{Path(other).stem}' in this study: rename one, or "
-                "judge it in another --out."
+                "measure it in another --out."
             )
 
 
-def _check(case: Case) -> None:
+def _check(case: AccuracyCase) -> None:
     engine_named(case.preset)
     heel_grid(case.spacing_mm)
     if case.wavelength_mm is not None and not case.wavelength_mm >= 2.0 * max(case.spacing_mm):
@@ -223,83 +222,82 @@ def _check(case: Case) -> None:
         raise InputError(f"The motion '{case.motion}' folds (det F = {lowest:.2f}); no image can show it.")
 
 
-def _key(case: Case) -> str:
-    """What a run's result depends on beside its case."""
+def _key(case: AccuracyCase) -> str:
+    """Hash of what a run depends on besides its case: preset and software."""
     text = engine_named(case.preset).text
     return hashlib.sha256(f"{text}; {software_key('phantoms')}".encode()).hexdigest()
 
 
-def _run_all(
-    cases: Sequence[Case], at_once: int, folder: Path, found: dict[str, Samples], tell: Told
+def _measure_all(
+    cases: Sequence[AccuracyCase], at_once: int, folder: Path, runs: dict[str, ErrorSamples], progress: OnProgress
 ) -> dict[str, str]:
-    """Measure cases, several at once; each is written as soon as it is there."""
-    making, telling = threading.Lock(), threading.Lock()
+    """Measure cases, several at once; each is written and added to ``runs`` as soon as it is finished."""
+    computing, reporting = threading.Lock(), threading.Lock()
     failures: dict[str, str] = {}
-    under_way: dict[str, float] = {}
+    fractions: dict[str, float] = {}
 
-    def told(name: str, fraction: float) -> None:
-        with telling:
-            under_way[name] = fraction
-            # of those to do now, so that the time left is that of this session
-            tell("accuracy", f"{len(cases)} registrations", sum(under_way.values()) / len(cases))
+    def report(name: str, fraction: float) -> None:
+        with reporting:
+            fractions[name] = fraction
+            # relative to the cases of this call, so that the time left is that of this call
+            progress("accuracy", f"{len(cases)} registrations", sum(fractions.values()) / len(cases))
 
-    def one(case: Case, worker: Worker) -> None:
+    def measure_one(case: AccuracyCase, worker: Worker) -> None:
         try:
-            samples = measure(case, worker, making, lambda fraction: told(case.name, fraction))
+            samples = measure_run(case, worker, computing, lambda fraction: report(case.name, fraction))
             samples.write(folder / f"{case.name}.npz", _key(case))
-            found[case.name] = samples
+            runs[case.name] = samples
         except MrstrainError as error:
             failures[case.name] = str(error)
-        told(case.name, 1.0)
+        report(case.name, 1.0)
 
-    each_in_workers(cases, one, at_once=at_once, threads=1)
+    each_in_workers(cases, measure_one, at_once=at_once, threads=1)
     return failures
 
 
-def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> Study:
-    errors, floors, resolution = error_rows(runs), floor_rows(runs), resolution_rows(runs)
+def _write(target: Path, runs: Sequence[ErrorSamples], failures: dict[str, str]) -> AccuracyStudy:
+    study = AccuracyStudy(
+        target, tuple(error_rows(runs)), tuple(floor_rows(runs)), tuple(resolution_rows(runs)), failures
+    )
     coverage = coverage_rows(runs)
-    for name, rows, kind in (
-        ("errors", errors, ErrorRow),
-        ("zero_strain", floors, FloorRow),
-        ("resolution", resolution, ResolutionRow),
-        ("coverage", coverage, CoverageRow),
-        ("runs", run_rows(runs), RunRow),
-    ):
-        _write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], [asdict(row) for row in rows])
-    presets = list(dict.fromkeys(r.case.preset for r in runs))
-    for preset in presets:
-        some = [r for r in runs if r.case.preset == preset and r.case.keeps_volume]
-        if any(r.case.wavelength_mm is None for r in some):
-            plain = [r for r in some if r.case.wavelength_mm is None]
-            seeds = sorted({r.case.seed for r in plain})
-            motions = ", ".join(dict.fromkeys(r.case.motion for r in plain))
-            source = f"{len(plain)} registrations of phantom heels, seeds {seeds}, motions {motions}"
-            if any(r.case.labels_off for r in plain):
-                off = ", ".join(f"{by:+d}" for by in sorted({r.case.labels_off for r in plain}))
-                source += f", bones and skin in label maps too large by {off} voxels"
-            fit_error_model(some, engine_named(preset).text, source).write(
-                target / f"error_model_{Path(preset).stem}.json"
-            )
+    tables: dict[str, tuple[type[Any], Sequence[Any]]] = {
+        "errors": (ErrorRow, study.errors),
+        "zero_strain": (FloorRow, study.floors),
+        "resolution": (ResolutionRow, study.resolution),
+        "coverage": (CoverageRow, coverage),
+        "runs": (RunRow, run_rows(runs)),
+    }
+    for name, (kind, rows) in tables.items():
+        write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], map(astuple, rows))
+    presets = {preset: engine_named(preset).text for preset in dict.fromkeys(r.case.preset for r in runs)}
+    for preset, parameters in presets.items():
+        some = [r for r in runs if r.case.preset == preset and r.case.keeps_volume and r.case.wavelength_mm is None]
+        if some:
+            model = fit_error_model(some, parameters, _source(some))
+            model.write(target / f"error_model_{Path(preset).stem}.json")
     record = provenance(
         "accuracy",
         {},
         {
             "cases": [r.case.name for r in runs],
             "failures": dict(failures),
-            "presets": {p: engine_named(p).text for p in presets},
+            "presets": presets,
             "seconds_of_registration": {r.case.name: round(r.seconds, 1) for r in runs},
         },
     )
     write_json(target / "provenance.json", record)
-    write_study_report(target / "report.html", errors, floors, resolution, coverage, failures, record)
-    return Study(target, tuple(errors), tuple(floors), tuple(resolution), failures)
+    write_accuracy_report(
+        target / "report.html", study.errors, study.floors, study.resolution, coverage, failures, record
+    )
+    return study
 
 
-def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, object]]) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-    write_whole(path, text.getvalue())
+def _source(runs: Sequence[ErrorSamples]) -> str:
+    """A sentence on the registrations that an error model is fitted to."""
+    seeds = sorted({r.case.seed for r in runs})
+    motions = ", ".join(dict.fromkeys(r.case.motion for r in runs))
+    source = f"{len(runs)} registrations of phantom heels, seeds {seeds}, motions {motions}"
+    if any(r.case.labels_off for r in runs):
+        off = ", ".join(f"{by:+d}" for by in sorted({r.case.labels_off for r in runs}))
+        source += f", bones and skin in label maps too large by {off} voxels"
+    return source

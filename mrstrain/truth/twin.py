@@ -1,4 +1,4 @@
-"""`twin`: somebody's own unloaded image after a deformation of known strain, with the truth beside it."""
+"""`twin`: synthetic warp of a subject's own unloaded image by a given deformation, with the truth beside it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from mrstrain.measurement.results import Case, write_measured
 from mrstrain.measurement.strain import read_deformation
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import write_json
-from phantoms.twin import loaded_twin
+from phantoms import Acquisition, synthetic_warp
 
 _TRUTH = Path("truth") / "twin"
 _IMAGE = "twin.nii.gz"
 
 
 @dataclass(frozen=True, slots=True)
-class Twinned:
-    """What `twin` gave: the made image, the folder of its truth, and the truth's case."""
+class TwinFiles:
+    """What `twin` wrote: the warped image, the folder of the truth, and the truth's case."""
 
     image: Path
     truth: Path
@@ -27,11 +27,11 @@ class Twinned:
     register: str
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, with the command that registers the image."""
         shear = ", ".join(f"{region} {p50:.3f} / {p95:.3f}" for region, (p50, p95) in self.case.shear.items())
         return [
-            f"Made image: {self.image}; {self.shown:.0%} of the tissue is in it. Truth: {self.truth}",
-            f"True maximal shear, median / 95th percentile: {shear}",
+            f"Warped image: {self.image}; it shows {self.shown:.0%} of the tissue. Truth: {self.truth}",
+            f"True max. shear, median / 95th percentile: {shear}",
             f"To register it: {self.register}",
         ]
 
@@ -48,16 +48,16 @@ def twin(
     names: Path | str | None = None,
     frame: str | None = None,
     seed: int = 1,
-) -> Twinned:
-    """Make the loaded image that a deformation would have made of an unloaded one, and write the truth.
+) -> TwinFiles:
+    """Warp an unloaded image by a deformation, as if it had been scanned under load, and write the truth.
 
     Parameters
     ----------
     load0 : path
-        Unloaded image of your own.
+        Unloaded image.
     deformation : path
-        The whole motion, the foot's own included: an elastix or ITK transform or a displacement image, such as the
-        ``TransformParameters.1.txt`` of a load that was registered. It maps points of ``load0`` to the loaded foot.
+        Total motion, rigid motion included: an elastix or ITK transform or a displacement image, such as the
+        ``TransformParameters.1.txt`` of a registered load. It maps points of ``load0`` to the loaded image, LPS mm.
     out : path
         Gets ``twin.nii.gz`` and ``truth/twin`` in the layout of `register`'s results.
     bone, bone_label, labels, names, tissue, frame
@@ -67,12 +67,12 @@ def twin(
 
     Returns
     -------
-    Twinned
+    TwinFiles
 
     Raises
     ------
     InputError
-        If something does not fit, the deformation folds or leaves the image. Before anything is written.
+        Before anything is written: if the inputs do not fit together, or the deformation folds or leaves the image.
     """
     target = Path(out)
     subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
@@ -82,7 +82,8 @@ def twin(
     refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], given.files)
     measured = given.measured(_TRUTH.name)
     make_output(target)
-    made = loaded_twin(subject.reference, measured.tissue, given.whole, near=measured.bone_motion, seed=seed)
+    acquisition = Acquisition(seed)
+    made = synthetic_warp(subject.reference, measured.tissue, given.whole, acquisition, near=measured.bone_motion)
     write_image(target / _IMAGE, made.image)
     (target / _TRUTH).parent.mkdir(exist_ok=True)
     case = write_measured(target / _TRUTH, measured, given.record)
@@ -91,4 +92,4 @@ def twin(
     told = " ".join(f"{option} {value}" for option, value in options.items() if value is not None)
     align = "" if bone is not None or bone_label is not None else " --align none"
     command = f"mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}"
-    return Twinned(target / _IMAGE, target / _TRUTH, case, made.shown, command)
+    return TwinFiles(target / _IMAGE, target / _TRUTH, case, made.shown, command)

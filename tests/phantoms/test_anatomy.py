@@ -7,8 +7,7 @@ import pytest
 
 from dvc.errors import InputError
 from dvc.images.image import Grid
-from phantoms.anatomy import FAT_SIGNAL, TISSUES, Heel
-from phantoms.heel import centred_grid, labels_of, labels_to_mesh
+from phantoms import FAT_SIGNAL, TISSUES, Heel, centred_grid, labels_of, labels_to_mesh
 
 
 def test_every_tissue_is_there(heel: Heel) -> None:

@@ -12,10 +12,7 @@ from hypothesis import strategies as st
 from dvc.deformation.protocol import Composed, Motion
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
-from phantoms.anatomy import Heel
-from phantoms.bodies import EllipsoidUnion
-from phantoms.flow import Border, Flow
-from phantoms.heel import LOADS, pressed, sliding, swelling, under_load
+from phantoms import LOADS, Border, EllipsoidUnion, Flow, Heel, pressed, sliding, swelling, under_load
 
 
 def test_flow_is_a_deformation(heel: Heel) -> None:

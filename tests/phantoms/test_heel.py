@@ -11,19 +11,19 @@ from dvc.deformation.protocol import RigidMotion
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
 from dvc.images.image import Grid, Image
-from phantoms.anatomy import FAT_SIGNAL, Heel
-from phantoms.heel import (
+from phantoms import (
+    FAT_SIGNAL,
     LOADS,
+    Heel,
     HeelPair,
-    badly_drawn,
-    default_motion,
+    acquire,
+    default_foot_motion,
     heel_pair,
-    loaded_signal,
-    octants,
+    misdrawn,
     pressed,
     under_load,
 )
-from phantoms.mri import acquire
+from phantoms.heel import octants
 
 COARSE = {"shape": (40, 45, 42), "spacing_mm": 2.5}
 
@@ -37,7 +37,7 @@ def pair() -> HeelPair:
 def test_signal_moves_with_the_tissue(heel: Heel, load: str) -> None:
     """Before blur, bias and noise, the loaded heel at x has the signal of the unloaded heel at X."""
     flow = pressed(heel) if load == "smooth" else under_load(heel, load)
-    motion = default_motion()
+    motion = default_foot_motion()
     X = np.random.default_rng(3).uniform([-30, -40, -42], [30, 44, 20], (4000, 3))
     before = heel.intensity_at(X)
     after = loaded_signal(heel, flow, motion)(motion.apply(X + flow.displacement(X)))
@@ -48,11 +48,22 @@ def test_signal_moves_with_the_tissue(heel: Heel, load: str) -> None:
     assert np.mean(np.abs(shifted - before) < 1e-4 * scale) < 0.5
 
 
+def loaded_signal(heel, motion, foot_motion):
+    """Noise-free signal of the heel after both motions, as a function of points (n, 3) mm."""
+    back, home = motion.inverse(), foot_motion.inverse()
+
+    def signal(points_mm):
+        x = home.apply(points_mm)
+        return heel.intensity_at(x + back.displacement(x))
+
+    return signal
+
+
 def test_voxels_are_carried_back_with_their_shape(heel: Heel) -> None:
     """Against samples that are each carried back by the flow itself."""
     turn = Rotation.from_rotvec([0.1, 0.3, -0.2]).as_matrix()
     grid = Grid((24, 22, 14), (0.8, 0.8, 1.6), (-8.0, 6.0, -38.0), turn)
-    flow, motion = pressed(heel), default_motion()
+    flow, motion = pressed(heel), default_foot_motion()
     signals = loaded_signal(heel, flow, motion), octants(heel, grid, flow, motion)
     one, two = (
         acquire(signal, grid, snr=None, reference_signal=1.0, seed=0, bias_seed=None).values for signal in signals
@@ -200,7 +211,7 @@ def test_a_label_map_that_is_badly_drawn_is_off_by_no_more_than_asked(pair: Heel
     stiff = np.isin(labels.labels, [n for n, name in labels.names.items() if name in ("bone", "ankle", "skin")])
     body = labels.labels > 0
     for by in (1, -1):
-        off = badly_drawn(labels, by)
+        off = misdrawn(labels, by)
         changed = off.labels != labels.labels
         grown = binary_dilation(stiff if by > 0 else body & ~stiff)
         np.testing.assert_array_equal(changed, grown & body & (stiff != (by > 0)))
@@ -208,4 +219,4 @@ def test_a_label_map_that_is_badly_drawn_is_off_by_no_more_than_asked(pair: Heel
         assert 0.02 < changed[body].mean() < 0.3
         for number in np.unique(off.labels[changed]):  # each gets the label of a neighbour
             assert np.all(binary_dilation(labels.labels == number, np.ones((3, 3, 3)))[off.labels == number])
-    np.testing.assert_array_equal(badly_drawn(labels, 0).labels, labels.labels)
+    np.testing.assert_array_equal(misdrawn(labels, 0).labels, labels.labels)

@@ -8,7 +8,7 @@ import pytest
 from dvc.deformation.protocol import Composed, Motion, RigidMotion
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
-from phantoms.motions import Bending, ShearWave, compressed, sheared, stretched
+from phantoms import Bending, ShearWave, compressed, sheared, stretched
 
 CENTRE = np.array([3.0, -2.0, 5.0])
 X, Y, Z = np.eye(3)

@@ -8,10 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from dvc.errors import InputError
 from dvc.images.image import Grid
-from phantoms import mri
-from phantoms.anatomy import Heel
-from phantoms.heel import centred_grid, scan
-from phantoms.mri import acquire, sensitivity
+from phantoms import Heel, acquire, centred_grid, mri, scan, sensitivity
 
 
 def test_rician_noise_has_its_sigma() -> None:

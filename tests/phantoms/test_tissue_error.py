@@ -8,7 +8,7 @@ import pytest
 from dvc.deformation.protocol import Affine
 from dvc.errors import GeometryError
 from dvc.images.image import Grid, LabelMap
-from phantoms.tissue_error import errors_by_tissue
+from phantoms import errors_by_tissue
 
 GRID = Grid((8, 6, 5), (1.0, 1.5, 2.0), (-4.0, 3.0, 1.0))
 STRETCH = np.diag([1.2, 1.0, 1.0])

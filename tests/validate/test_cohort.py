@@ -11,10 +11,10 @@ import pytest
 from dvc.errors import InputError
 from mrstrain.studies.cohort import cohort
 from mrstrain.studies.file import read_study
-from mrstrain.studies.ledger import Record
-from mrstrain.studies.pipeline import Outcome
-from mrstrain.studies.run import Ran
-from mrstrain.studies.stages import Given
+from mrstrain.studies.ledger import StageRecord
+from mrstrain.studies.pipeline import StageOutcome
+from mrstrain.studies.run import StudyRun
+from mrstrain.studies.stages import StageResult
 from validate.cohort import standings
 
 STUDY = """
@@ -103,21 +103,28 @@ def compared(folder: Path, name: str, near: float, far: float) -> Path:
 @pytest.mark.parametrize(
     ("outcome", "why"),
     [
-        (Outcome("compare", None, "Not run: none of register Load1 has a result."), "compare not run. Not run: none"),
-        (Outcome("compare", None, "The label map has no 'bone'."), "compare FAILED. The label map has no 'bone'."),
+        (
+            StageOutcome("compare", None, "Not run: none of register Load1 has a result."),
+            "compare not run. Not run: none",
+        ),
+        (StageOutcome("compare", None, "The label map has no 'bone'."), "compare FAILED. The label map has no 'bone'."),
         (None, "its study compares no model"),
     ],
 )
 def test_a_table_that_an_earlier_run_left_is_not_ranked_over(tmp_path, monkeypatch, outcome, why):
     places = [compared(tmp_path, "Ada", 0.1, 0.3), compared(tmp_path, "Ben", 0.9, 0.2)]
-    record = Record(stage="compare", key="k", made_utc="", seconds=1.0, files={}, given=Given(()), made_from={})
-    well = Outcome("compare", record)
+    record = StageRecord(
+        stage="compare", key="k", made_utc="", seconds=1.0, files={}, result=StageResult(()), made_from={}
+    )
+    well = StageOutcome("compare", record)
 
     def ended(studies, **_):
-        return [Ran(study, {} if one is None else {"compare": one}) for study, one in zip(studies, ends, strict=True)]
+        return [
+            StudyRun(study, {} if one is None else {"compare": one}) for study, one in zip(studies, ends, strict=True)
+        ]
 
     monkeypatch.setattr("mrstrain.studies.cohort.run_studies", ended)
-    ends: list[Outcome | None] = [well, well]
+    ends: list[StageOutcome | None] = [well, well]
     both = cohort(places, out=tmp_path / "both")
     assert (both.ranking[0].model, both.ranking[0].subjects) == ("far", 2)
     assert not any("not counted" in note for note in both.notes)
@@ -139,8 +146,10 @@ def test_a_model_that_few_subjects_have_does_not_take_the_others_from_the_rankin
     for place in places[1:]:  # a law that only Ada's heel bore
         table = place / "results" / "comparison" / "areas.csv"
         table.write_text("".join(line for line in table.read_text().splitlines(True) if ",far," not in line))
-    record = Record(stage="compare", key="k", made_utc="", seconds=1.0, files={}, given=Given(()), made_from={})
-    ended = lambda studies, **_: [Ran(study, {"compare": Outcome("compare", record)}) for study in studies]  # noqa: E731
+    record = StageRecord(
+        stage="compare", key="k", made_utc="", seconds=1.0, files={}, result=StageResult(()), made_from={}
+    )
+    ended = lambda studies, **_: [StudyRun(study, {"compare": StageOutcome("compare", record)}) for study in studies]  # noqa: E731
     monkeypatch.setattr("mrstrain.studies.cohort.run_studies", ended)
     done = cohort(places, out=tmp_path / "out")
     assert [(one.model, one.subjects) for one in done.ranking] == [("near", 3)]
@@ -150,8 +159,10 @@ def test_a_model_that_few_subjects_have_does_not_take_the_others_from_the_rankin
 
 def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refused(tmp_path, monkeypatch):
     places = [compared(tmp_path / "Mueller_Hans", name, 0.1, 0.3) for name in ("Ada", "Ben", "Cy")]
-    record = Record(stage="compare", key="k", made_utc="", seconds=1.0, files={}, given=Given(()), made_from={})
-    ended = lambda studies, **_: [Ran(study, {"compare": Outcome("compare", record)}) for study in studies]  # noqa: E731
+    record = StageRecord(
+        stage="compare", key="k", made_utc="", seconds=1.0, files={}, result=StageResult(()), made_from={}
+    )
+    ended = lambda studies, **_: [StudyRun(study, {"compare": StageOutcome("compare", record)}) for study in studies]  # noqa: E731
     monkeypatch.setattr("mrstrain.studies.cohort.run_studies", ended)
     alike = cohort(places, out=tmp_path / "alike")
     assert not any("not measured and simulated alike" in note for note in alike.notes)

@@ -16,7 +16,7 @@ from dvc.io.images.write import write_image, write_mask
 from dvc.mesh import TetMesh
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.comparison.level import level
-from phantoms.heel import heel_grid, labels_of, scan
+from phantoms import heel_grid, labels_of, scan
 from tests.blocks import block
 from tests.quick import QUICK
 from tests.validate.test_comparison import cube, error_table, labels, sheared

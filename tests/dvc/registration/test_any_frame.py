@@ -14,8 +14,7 @@ from dvc.registration.elastix.engine import Elastix
 from dvc.registration.elastix.presets import Preset
 from dvc.registration.gauss_newton.engine import GaussNewton
 from dvc.registration.register import Registration, Settings, register
-from phantoms.anatomy import Heel
-from phantoms.heel import scan
+from phantoms import Heel, scan
 from tests.quick import QUICK
 
 OURS = Settings(GaussNewton(bending=4.0, volume=300.0))

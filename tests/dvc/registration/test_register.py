@@ -22,7 +22,7 @@ from dvc.registration.elastix.engine import Elastix
 from dvc.registration.elastix.presets import Preset, load_preset
 from dvc.registration.gauss_newton.engine import GaussNewton
 from dvc.registration.register import Settings, register
-from phantoms.heel import heel_pair
+from phantoms import heel_pair
 
 COARSE_MM = 0.1  # at voxels of 1.6 mm; the full size, 0.8 mm, is held to 0.05 mm and 0.05 degrees below
 QUICK = {

@@ -22,8 +22,7 @@ from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.page import weights_table
 from mrstrain.measurement.register import register as run
 from mrstrain.measurement.register_one import register_one
-from phantoms.anatomy import Heel
-from phantoms.heel import scan
+from phantoms import Heel, scan
 
 
 @pytest.fixture(scope="module")

@@ -35,9 +35,7 @@ from mrstrain.measurement.measured_folder import measurements_in, spline_in
 from mrstrain.measurement.register import register as run
 from mrstrain.measurement.register_one import register_one
 from mrstrain.measurement.strain import read_any, strain
-from phantoms.accuracy_run import distances_mm
-from phantoms.anatomy import Heel
-from phantoms.heel import drawn_motion, labels_of, scan, sliding
+from phantoms import Heel, distances_mm, labels_of, random_foot_motion, scan, sliding
 from tests.dvc.deformation.test_bordered_spline import scanned, sheared
 
 GRID = Grid((35, 35, 28), (1.6, 1.6, 1.6), (-28.2, -10.2, -43.6))  # the pad, with the lower half of the calcaneus
@@ -72,7 +70,7 @@ class Pad:
 def pad(tmp_path_factory) -> Pad:
     folder = tmp_path_factory.mktemp("pad")
     heel = Heel(1)
-    motion, foot, labels = sliding(heel, 4.0), drawn_motion(1, 5), labels_of(heel, GRID)
+    motion, foot, labels = sliding(heel, 4.0), random_foot_motion(1, 5), labels_of(heel, GRID)
     for number, (name, how) in enumerate({"Load0": (None, None), "Load1": (motion, foot)}.items()):
         write_image(folder / f"{name}.nii.gz", scan(heel, GRID, *how, snr=25.0, number=number))
     write_labels(folder / "tissues.nrrd", labels)

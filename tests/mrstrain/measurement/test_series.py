@@ -27,8 +27,7 @@ from dvc.trust.verdict import Verdict
 from dvc.worker import Worker
 from mrstrain.measurement.register import Series, register
 from mrstrain.measurement.results import Case
-from phantoms.anatomy import Heel
-from phantoms.heel import pressed, scan
+from phantoms import Heel, pressed, scan
 from tests.quick import QUICK
 
 

@@ -14,16 +14,16 @@ from dvc.io.images.labels import read_labels
 from dvc.report.page import Section
 from dvc.trust.verdict import Verdict
 from mrstrain.models.loads import LOADS
-from mrstrain.studies.demo import _make, _reached, _told
+from mrstrain.studies.demo import _make, _reached, _summary
 from mrstrain.studies.file import read_study
-from mrstrain.studies.ledger import Record
-from mrstrain.studies.pipeline import Outcome
+from mrstrain.studies.ledger import StageRecord
+from mrstrain.studies.pipeline import StageOutcome
 from mrstrain.studies.plan import plan
-from mrstrain.studies.run import Ran, run
-from mrstrain.studies.stages import Given
+from mrstrain.studies.run import StudyRun, run
+from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import read_errors, write_errors
 from mrstrain.truth.phantom import phantom
-from phantoms.tissue_error import TissueError
+from phantoms import TissueError
 
 demonstration = import_module("mrstrain.studies.demo")  # the package has a function of that name
 
@@ -78,10 +78,10 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
     _make(folder, 1, False, None)
     study = read_study(folder)
 
-    def ended(stage: str, *lines: str, verdict: str | None = None, complete: bool = True) -> Outcome:
+    def ended(stage: str, *lines: str, verdict: str | None = None, complete: bool = True) -> StageOutcome:
         sections = () if verdict is None else (Section(stage, verdict=Verdict(verdict, ("why",))),)
-        given = Given(lines, sections, complete=complete)
-        return Outcome(stage, Record(stage=stage, key="", made_utc="", seconds=1.0, files={}, given=given))
+        given = StageResult(lines, sections, complete=complete)
+        return StageOutcome(stage, StageRecord(stage=stage, key="", made_utc="", seconds=1.0, files={}, result=given))
 
     outcomes = {
         f"register {load.name}": ended(f"register {load.name}", verdict="caution" if load.name == "Load3" else "trust")
@@ -91,7 +91,7 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
         "compare", "Load1: trebbi 1.0", "All loads: trebbi 2.5", "Nearest over all loads: trebbi."
     )
     errors = {x.name: (TissueError("fat", 9, 0.1, 0.44, 0.0221, 0.0, 0.1, 0.1, 0.2, 0),) for x in LOADS}
-    lines = _told(errors, Ran(study, outcomes))
+    lines = _summary(errors, StudyRun(study, outcomes))
     assert len(lines) == 5
     assert "Load1 trust" in lines[0]
     assert "Load3 use with care" in lines[0]
@@ -99,16 +99,16 @@ def test_it_ends_with_five_lines_and_the_reports_path(folder):
     assert lines[2:4] == ["All loads: trebbi 2.5", "Nearest over all loads: trebbi."]
     assert lines[4] == f"Report: {folder / 'results' / 'report.html'}"
     outcomes["simulate luboz"] = ended("simulate luboz", "luboz, Load1: ONLY 75% of the load", complete=False)
-    lines = _told(errors, Ran(study, outcomes))
+    lines = _summary(errors, StudyRun(study, outcomes))
     assert lines[4] == "simulate luboz: in part. luboz, Load1: ONLY 75% of the load"
     assert lines[5].startswith("Report: ")
 
 
 def test_a_model_that_its_limit_of_time_ended_is_no_failure_of_the_demonstration():
     def reached(*, timed_out: bool, reason: str = "", there: bool = True) -> bool:
-        given = Given((), complete=False, timed_out=timed_out)
-        record = Record(stage="simulate friedman", key="", made_utc="", seconds=1.0, files={}, given=given)
-        return _reached(Outcome("simulate friedman", record if there else None, reason))
+        given = StageResult((), complete=False, timed_out=timed_out)
+        record = StageRecord(stage="simulate friedman", key="", made_utc="", seconds=1.0, files={}, result=given)
+        return _reached(StageOutcome("simulate friedman", record if there else None, reason))
 
     assert reached(timed_out=True)
     assert not reached(timed_out=False)
@@ -141,9 +141,11 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
 
 
 def test_errors_are_read_again_while_their_registrations_are_the_same(tmp_path):
-    def outcomes(made_utc: str) -> dict[str, Outcome]:
-        record = Record(stage="register Load1", key="", made_utc=made_utc, seconds=1.0, files={}, given=Given(()))
-        return {"register Load1": Outcome("register Load1", record)}
+    def outcomes(made_utc: str) -> dict[str, StageOutcome]:
+        record = StageRecord(
+            stage="register Load1", key="", made_utc=made_utc, seconds=1.0, files={}, result=StageResult(())
+        )
+        return {"register Load1": StageOutcome("register Load1", record)}
 
     errors = {
         "Load1": tuple(TissueError(name, 12345, 0.1, 0.4, 1 / 3, -0.01, 0.05, 0.1, 0.2, 1) for name in ("fat", "a, b"))

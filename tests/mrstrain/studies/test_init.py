@@ -90,8 +90,8 @@ def test_dicom_folders_are_found_whatever_their_files_are_called(tmp_path):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / name).write_bytes(bytes(128) + b"DICM" if folder in ("Load0", "Load1") else b"x")
     begun = init(tmp_path)
-    assert begun.found.load0 == "Load0"
-    assert begun.found.loads == {"Load1": "Load1", "Load2": "Load2"}
+    assert begun.inputs.load0 == "Load0"
+    assert begun.inputs.loads == {"Load1": "Load1", "Load2": "Load2"}
     assert "NOT USED: Load3, a folder without a DICOM image in it" in begun.summary()
     assert "Put in what was not found" in begun.summary()[-1]  # the label map
     (tmp_path / "study.toml").unlink()
@@ -103,14 +103,14 @@ def test_a_dicom_folder_may_hold_many_other_files(tmp_path):
     (tmp_path / "Load0").mkdir()
     for name in (*(f"A{n:02d}.bmp" for n in range(25)), "I1.dcm"):
         (tmp_path / "Load0" / name).write_bytes(b"x")
-    assert init(tmp_path).found.load0 == "Load0"
+    assert init(tmp_path).inputs.load0 == "Load0"
 
 
 def test_enhanced_dicom_files_are_found_and_single_slices_left_alone(tmp_path, monkeypatch):
     for name in ("Load0.dcm", "Load1.DCM", "load2_slice1.dcm", "load2_slice2.dcm", "notes.dcm"):
         (tmp_path / name).write_bytes(bytes(128) + b"DICM")  # no image at all
-    assert init(tmp_path).found.load0 is None
+    assert init(tmp_path).inputs.load0 is None
     (tmp_path / "study.toml").unlink()
     monkeypatch.setattr("mrstrain.studies.init.is_multiframe", lambda path: path.stem in ("Load0", "Load1"))
-    found = init(tmp_path).found
-    assert (found.load0, found.loads, found.passed_over) == ("Load0.dcm", {"Load1": "Load1.DCM"}, {})
+    found = init(tmp_path).inputs
+    assert (found.load0, found.loads, found.unused) == ("Load0.dcm", {"Load1": "Load1.DCM"}, {})

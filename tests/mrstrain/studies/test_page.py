@@ -15,14 +15,14 @@ from dvc.report.page import Section
 from dvc.trust.verdict import Verdict
 from mrstrain.cli.app import app
 from mrstrain.studies.file import Study, read_study
-from mrstrain.studies.ledger import Ledger, Record
+from mrstrain.studies.ledger import Ledger, StageRecord
 from mrstrain.studies.page import write_run_report
-from mrstrain.studies.pipeline import Outcome
+from mrstrain.studies.pipeline import StageOutcome
 from mrstrain.studies.plan import plan
-from mrstrain.studies.run import Ran, report, run
-from mrstrain.studies.stages import Given
+from mrstrain.studies.run import StudyRun, report, run
+from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import TABLE, write_errors
-from phantoms.tissue_error import TissueError
+from phantoms import TissueError
 from tests.mrstrain.comparison.test_methods import measured
 
 STUDY = """
@@ -40,7 +40,7 @@ normal_n = 15
 [models]
 sets = ["trebbi"]
 """
-SOUND = Given((), (Section("Load1", Verdict("trust")),))
+SOUND = StageResult((), (Section("Load1", Verdict("trust")),))
 
 
 @pytest.fixture
@@ -51,23 +51,25 @@ def study(tmp_path: Path) -> Study:
     return read_study(tmp_path)
 
 
-def record(stage: str, given: Given, made: str = "2026-01-01T00:00:00Z") -> Record:
-    return Record(stage=stage, key="", made_utc=made, seconds=1.0, files={}, given=given)
+def record(stage: str, given: StageResult, made: str = "2026-01-01T00:00:00Z") -> StageRecord:
+    return StageRecord(stage=stage, key="", made_utc=made, seconds=1.0, files={}, result=given)
 
 
-def ended(study: Study, **given: Given | str) -> dict[str, Outcome]:
+def ended(study: Study, **given: StageResult | str) -> dict[str, StageOutcome]:
     """Outcomes of all stages: records where something is given, reasons where a sentence is, else not asked for."""
     outcomes = {}
     for stage in plan(study):
         one = given.get(stage.name.replace(" ", "_"))
-        if isinstance(one, Given):
-            outcomes[stage.name] = Outcome(stage.name, record(stage.name, one))
+        if isinstance(one, StageResult):
+            outcomes[stage.name] = StageOutcome(stage.name, record(stage.name, one))
         else:
-            outcomes[stage.name] = Outcome(stage.name, None, one or "Not run: nobody asked.", asked=one is not None)
+            outcomes[stage.name] = StageOutcome(
+                stage.name, None, one or "Not run: nobody asked.", requested=one is not None
+            )
     return outcomes
 
 
-def page_of(study: Study, outcomes: dict[str, Outcome]) -> str:
+def page_of(study: Study, outcomes: dict[str, StageOutcome]) -> str:
     study.out.mkdir(exist_ok=True)
     write_run_report(study.out / "report.html", study, outcomes)
     return (study.out / "report.html").read_text()
@@ -84,30 +86,30 @@ def test_what_was_not_asked_for_or_failed_is_no_verdict_on_the_registrations(stu
     told = head(page_of(study, only))
     assert told.startswith("Heel Trust The measurement: 2 images are registered soundly. Not asked for")
     assert told.endswith("without a result: mesh, simulate trebbi, compare.")
-    assert Ran(study, only).complete
-    assert "Not asked for, and without a result: mesh, simulate trebbi, compare." in Ran(study, only).summary()
+    assert StudyRun(study, only).complete
+    assert "Not asked for, and without a result: mesh, simulate trebbi, compare." in StudyRun(study, only).summary()
 
     broken = ended(study, **sound, mesh="It broke.\nTraceback", simulate_trebbi="Not run: mesh has no result.")
     told = head(page_of(study, broken))
     assert "Do not trust" not in told
     assert "Not whole: mesh failed (It broke); simulate trebbi not run (mesh has no result)." in told
     assert "Traceback" not in told
-    assert not Ran(study, broken).complete
+    assert not StudyRun(study, broken).complete
 
-    part = ended(study, **sound, mesh=SOUND, simulate_trebbi=Given((), complete=False))
+    part = ended(study, **sound, mesh=SOUND, simulate_trebbi=StageResult((), complete=False))
     assert "Not whole: simulate trebbi in part." in head(page_of(study, part))
-    assert not Ran(study, part).complete
+    assert not StudyRun(study, part).complete
 
 
 def test_a_registration_that_is_not_to_be_trusted_heads_the_report(study: Study) -> None:
-    folded = Given((), (Section("Load2", Verdict("distrust", ("It folds.",))),))
+    folded = StageResult((), (Section("Load2", Verdict("distrust", ("It folds.",))),))
     told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=folded)))
     assert told.startswith("Heel Do not trust It folds.")
     # a comparison made of it before is not what is there now
-    compared = Given((), (Section("Models", Verdict("distrust", ("It folds.",))),))
+    compared = StageResult((), (Section("Models", Verdict("distrust", ("It folds.",))),))
     told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=SOUND, compare=compared)))
     assert told.startswith("Heel Trust")
-    placed = Given((), (Section("Models", Verdict("caution", ("In metres?",))),))
+    placed = StageResult((), (Section("Models", Verdict("caution", ("In metres?",))),))
     told = head(page_of(study, ended(study, register_Load1=SOUND, register_Load2=SOUND, compare=placed)))
     assert told.startswith("Heel Use with care In metres?")
 
@@ -129,7 +131,7 @@ def test_registrations_alone_have_a_methods_text(study: Study) -> None:
     assert "Tustison NJ" in page
     assert "Models and measurement" not in page
     closing = (Section("Methods, to be pasted", paragraphs=("All of it.",)),)
-    page = page_of(study, ended(study, register_Load1=SOUND, compare=Given((), (), closing)))
+    page = page_of(study, ended(study, register_Load1=SOUND, compare=StageResult((), (), closing)))
     assert page.count("Methods, to be pasted") == 1  # that of the comparison tells the registrations too
 
 
@@ -153,7 +155,7 @@ def test_the_error_of_a_phantom_stays_in_the_report_as_long_as_its_registration_
     page = (study.out / "report.html").read_text()
     assert "0.0123" in page
     assert "0.0456" not in page
-    assert "Registered anew since, and not known: Load2" in page
+    assert "Registered again since, so not known: Load2" in page
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline, run_all
 from mrstrain.studies.plan import Stage
 from mrstrain.studies.run import refuse_unknown
-from mrstrain.studies.stages import Given
+from mrstrain.studies.stages import StageResult
 
 
 class Here:
@@ -40,9 +40,9 @@ class Here:
             return
         read = [Path(p).read_text() for p in [*arguments["reads"], *arguments.get("parts", [])]]
         out.write_text(json.dumps([name, arguments["number"], *read]))
-        self._ended.append((name, Given((f"{name} done",)), 1.0))
+        self._ended.append((name, StageResult((f"{name} done",)), 1.0))
 
-    def next(self) -> tuple[str, Given | str, float]:
+    def next(self) -> tuple[str, StageResult | str, float]:
         return self._ended.pop(0)
 
 
@@ -99,12 +99,12 @@ ALL = ["register a", "register b", "mesh", "simulate a", "simulate b", "compare"
 def test_finished_work_is_not_done_again(folder):
     first, outcomes, told = ran(folder)
     assert first == ALL
-    assert all(o.words == "done" for o in outcomes.values())
+    assert all(o.status == "done" for o in outcomes.values())
     assert "compare: done after 1 s" in told
     assert "    compare done" in told
     again, outcomes, _ = ran(folder)
     assert again == []
-    assert all(o.words == "there already" for o in outcomes.values())
+    assert all(o.status == "there already" for o in outcomes.values())
 
 
 def test_changed_content_of_the_same_size_is_done_again_and_what_builds_on_it(folder):
@@ -130,7 +130,7 @@ def test_a_result_that_was_lost_is_made_again(folder):
 def test_a_failure_is_named_and_the_others_finish(folder):
     first, outcomes, told = ran(folder, failing=("register b", "simulate a"))
     assert first == ALL
-    assert outcomes["register b"].words == "FAILED"
+    assert outcomes["register b"].status == "FAILED"
     assert outcomes["register b"].reason == "It broke."
     assert outcomes["compare"].record is not None
     assert "register b" not in (folder / "results" / "compare").read_text()
@@ -142,10 +142,10 @@ def test_a_failure_is_named_and_the_others_finish(folder):
 def test_what_cannot_do_without_a_failed_one_is_not_run(folder):
     first, outcomes, _ = ran(folder, failing=("mesh",))
     assert "simulate a" not in first
-    assert outcomes["simulate a"].words == "not run"
+    assert outcomes["simulate a"].status == "not run"
     assert outcomes["simulate a"].reason == "Not run: mesh has no result."
     _, outcomes, _ = ran(folder, failing=("mesh", "register a", "register b"), force=("register",))
-    assert outcomes["compare"].words == "not run"
+    assert outcomes["compare"].status == "not run"
     assert (folder / "results" / "compare").exists()  # nothing that was finished is lost
     assert ran(folder)[0] == ["register a", "register b", "mesh", "simulate a", "simulate b", "compare"]
 
@@ -162,7 +162,7 @@ def test_a_result_of_other_inputs_does_not_outlive_a_failure(folder):
 def test_only_and_force(folder):
     first, outcomes, _ = ran(folder, only=("register",))
     assert first == ["register a", "register b"]
-    assert outcomes["mesh"].words == "not run"
+    assert outcomes["mesh"].status == "not run"
     ran(folder)
     assert ran(folder, force=("simulate b",))[0] == ["simulate b", "compare"]
     assert ran(folder, force=("register",))[0] == ["register a", "register b", "compare"]
@@ -170,14 +170,14 @@ def test_only_and_force(folder):
     first, outcomes, _ = ran(folder, only=("mesh", "simulate", "compare"))
     assert first == []
     assert outcomes["register a"].reason.startswith("Made from other inputs")
-    assert outcomes["compare"].words == "OUT OF DATE"  # what builds on it is no newer
+    assert outcomes["compare"].status == "OUT OF DATE"  # what builds on it is no newer
     assert outcomes["compare"].reason == "Built on register a, out of date."
-    assert [name for name, one in outcomes.items() if not one.asked] == ["register a", "register b"]
-    assert [name for name, one in outcomes.items() if not one.whole] == ["register a", "compare"]
+    assert [name for name, one in outcomes.items() if not one.requested] == ["register a", "register b"]
+    assert [name for name, one in outcomes.items() if not one.complete] == ["register a", "compare"]
     first, outcomes, _ = ran(folder, only=("compare",), force=("compare",))
     assert first == ["compare"]
-    assert not outcomes["compare"].whole
-    assert all(one.whole for one in ran(folder)[1].values())
+    assert not outcomes["compare"].complete
+    assert all(one.complete for one in ran(folder)[1].values())
 
 
 @pytest.mark.parametrize(
@@ -327,16 +327,16 @@ def test_what_may_be_lacking_is_gone_without(folder):
         return cluster.ran, pipeline.outcomes
 
     first, outcomes = run(("register b",))
-    assert outcomes["register a"].words == "done"
+    assert outcomes["register a"].status == "done"
     assert first.index("register b") < first.index("register a")
     assert run(())[0] == ["register b", "register a", "compare"]  # and made anew when it is there
 
 
 def test_a_result_that_may_come_out_better_is_run_again(folder):
     class Halting(Here):
-        def next(self) -> tuple[str, Given | str, float]:
+        def next(self) -> tuple[str, StageResult | str, float]:
             name, given, seconds = super().next()
-            again = name == "simulate a" and isinstance(given, Given)
+            again = name == "simulate a" and isinstance(given, StageResult)
             return name, replace(given, complete=False, retry=True) if again else given, seconds
 
     def run(cluster: Here) -> list[str]:
@@ -355,7 +355,7 @@ def test_a_result_that_may_come_out_better_is_run_again(folder):
 def test_an_input_that_vanishes_fails_its_stage_alone(folder):
     (folder / "a.txt").unlink()
     first, outcomes, _ = ran(folder)
-    assert outcomes["register a"].words == "FAILED"
+    assert outcomes["register a"].status == "FAILED"
     assert "a.txt" in outcomes["register a"].reason
     assert first == ALL[1:]
 
@@ -365,10 +365,10 @@ def test_taken_as_they_are_stale_results_are_called_so_and_reasons_are_kept(fold
     (folder / "a.txt").write_text("z")
     pipeline = Pipeline(stages_in(folder), Ledger(folder / "results", folder), only=("nothing",))
     assert pipeline.settle() == []
-    assert pipeline.outcomes["register a"].words == "OUT OF DATE"
-    assert not pipeline.outcomes["register a"].whole
+    assert pipeline.outcomes["register a"].status == "OUT OF DATE"
+    assert not pipeline.outcomes["register a"].complete
     assert pipeline.outcomes["register b"].reason == "It broke."
-    assert pipeline.outcomes["mesh"].whole
+    assert pipeline.outcomes["mesh"].complete
 
 
 def test_what_other_code_made_is_made_anew(folder, monkeypatch):

@@ -166,7 +166,7 @@ def test_run_again_does_nothing_in_under_ten_seconds(done):
     began = time.monotonic()
     outcomes = run(folder).outcomes
     assert time.monotonic() - began < 10.0
-    assert all(o.again for o in outcomes.values())
+    assert all(o.reused for o in outcomes.values())
     assert (folder / "results" / "mesh" / "mesh.vtu").stat().st_mtime_ns == before
 
 
@@ -278,7 +278,7 @@ def test_killed_in_any_stage_and_run_again(done, tmp_path, stage):
     of_all: list[float] = []
     again = run(study, progress=lambda case, _, fraction: of_all.append(fraction) if case == "all" else None)
     assert again.complete
-    assert [name for name in STAGES if not again.outcomes[name].again] == left
+    assert [name for name in STAGES if not again.outcomes[name].reused] == left
     assert {name: (records / f"{name}.json").read_bytes() for name in kept} == kept
     assert len(of_all) == len(left) + 1  # of what is left to do, each by its time, and the end
     assert sorted(of_all) == of_all
@@ -334,7 +334,7 @@ def test_a_cluster_whose_worker_is_killed_loses_nothing(done, images, tmp_path):
             assert np.array_equal(shear_of(study, load), shear_of(folder, load), equal_nan=True)
         rest = run(study, scheduler=address)  # what builds on them, by the worker that is left
         assert rest.complete
-        assert [name for name in STAGES if not rest.outcomes[name].again] == ["mesh", "simulate akrami", "compare"]
+        assert [name for name in STAGES if not rest.outcomes[name].reused] == ["mesh", "simulate akrami", "compare"]
         assert areas(study) == pytest.approx(areas(folder), rel=0.2)  # on a mesh of its own
         outcomes = (study / "results" / "study.log").read_text()
         assert "FAILED" not in outcomes
@@ -392,7 +392,7 @@ def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path
         shutil.copytree(folder, places[-1])
         (places[-1] / "study.toml").write_text(STUDY.replace("Heel <b>3</b>", name))
     told = cohort(places, out=tmp_path / "cohort")
-    assert all(o.again for one in told.ran for o in one.outcomes.values())
+    assert all(o.reused for one in told.ran for o in one.outcomes.values())
     (first,) = told.ranking
     assert (first.model, first.subjects, first.nearest_in) == ("akrami", 2, 2)
     with (folder / "results" / "comparison" / "areas.csv").open() as file:

@@ -22,26 +22,39 @@ from dvc.trust.error_model import POOLED
 from dvc.worker import Worker
 from mrstrain import accuracy
 from mrstrain.truth.accuracy import MOTIONS, cases_of, expected_minutes
-from phantoms.accuracy_run import Case, Samples, distances_mm, measure, motion_named
-from phantoms.anatomy import TISSUES, Heel
-from phantoms.error_model import coverage_rows, fit_error_model
-from phantoms.error_tables import error_rows, floor_rows, resolution_rows, wavelength_recovered
-from phantoms.motions import stretched
+from phantoms import (
+    TISSUES,
+    AccuracyCase,
+    ErrorSamples,
+    Heel,
+    coverage_rows,
+    distances_mm,
+    error_rows,
+    fit_error_model,
+    floor_rows,
+    measure_run,
+    motion_named,
+    resolution_rows,
+    stretched,
+    wavelength_recovered,
+)
 from tests.quick import QUICK
 
 COARSE = (2.3, 2.3, 2.3)
-CASE = Case("heel-mr", COARSE, 25.0, "Load1", 4)
+CASE = AccuracyCase("heel-mr", COARSE, 25.0, "Load1", 4)
 FAT = next(number for number, name in TISSUES.items() if name == "fat")
 BONE = next(number for number, name in TISSUES.items() if name == "bone")
 
 
-def samples(case: Case, bias: float = 0.0, sd: float = 0.01, count: int = 4000, offset: float = 0.0) -> Samples:
+def samples(
+    case: AccuracyCase, bias: float = 0.0, sd: float = 0.01, count: int = 4000, offset: float = 0.0
+) -> ErrorSamples:
     """Made-up samples of fat, with an error that is known: ``bias`` where the shear is above 0.1, ``sd`` everywhere."""
     random = np.random.default_rng([case.seed, count])
     true = random.uniform(0.0, 0.4, count).astype(np.float32)
     error = np.where(true > 0.1, bias, 0.0) + sd * random.standard_normal(count) + offset
     slope = np.cos(np.linspace(0.0, 60.0, count)).astype(np.float32)
-    return Samples(
+    return ErrorSamples(
         case=case,
         estimated_snr=25.0,
         seconds=1.0,
@@ -186,14 +199,14 @@ def test_coverage_judges_each_heel_by_the_others() -> None:
 def test_samples_survive_their_file_and_a_damaged_one_is_made_anew(tmp_path: Path) -> None:
     path, made = tmp_path / "run.npz", samples(CASE)
     made.write(path, "key")
-    again = Samples.read(path, lambda _: "key")
+    again = ErrorSamples.read(path, lambda _: "key")
     assert again is not None
     assert again.case == CASE
     np.testing.assert_array_equal(again.shear, made.shear)
-    assert Samples.read(path, lambda _: "another preset") is None
+    assert ErrorSamples.read(path, lambda _: "another preset") is None
     path.write_bytes(path.read_bytes()[:2000])
-    assert Samples.read(path, lambda _: "key") is None
-    assert Samples.read(tmp_path / "none.npz", lambda _: "key") is None
+    assert ErrorSamples.read(path, lambda _: "key") is None
+    assert ErrorSamples.read(tmp_path / "none.npz", lambda _: "key") is None
 
 
 def test_parameter_files_of_ones_own_can_be_judged(tmp_path: Path) -> None:
@@ -277,7 +290,7 @@ def test_what_cannot_be_studied_is_refused_before_anything_runs(
 
     rigid = tmp_path / "rigid.txt"
     rigid.write_text(load_preset("heel-mr").text.replace("RecursiveBSplineTransform", "EulerTransform"))
-    monkeypatch.setattr("mrstrain.truth.accuracy.measure", never)
+    monkeypatch.setattr("mrstrain.truth.accuracy.measure_run", never)
     for wrong, says in (
         (replace(CASE, snr=0.0), "SNR"),
         (replace(CASE, spacing_mm=(0.1, 0.1, 0.1)), "spacing"),
@@ -336,12 +349,12 @@ def _alive(group: int) -> bool:
 
 
 def test_a_failed_run_is_told_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def measured(case: Case, *_: object) -> Samples:
+    def measured(case: AccuracyCase, *_: object) -> ErrorSamples:
         if case.motion == "Load2":
             raise MrstrainError("the optimiser diverged")
         return samples(case)
 
-    monkeypatch.setattr("mrstrain.truth.accuracy.measure", measured)
+    monkeypatch.setattr("mrstrain.truth.accuracy.measure_run", measured)
     study = accuracy(tmp_path, cases=[CASE, replace(CASE, motion="Load2")], workers=1)
     assert list(study.failures.values()) == ["the optimiser diverged"]
     assert any("FAILED. the optimiser diverged" in line for line in study.summary())
@@ -351,7 +364,7 @@ def test_a_failed_run_is_told_and_the_others_go_on(monkeypatch: pytest.MonkeyPat
 def test_two_parameter_files_of_one_name_are_never_taken_for_each_other(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("mrstrain.truth.accuracy.measure", lambda case, *_: samples(case))
+    monkeypatch.setattr("mrstrain.truth.accuracy.measure_run", lambda case, *_: samples(case))
     cases = []
     for folder, iterations in (("a", 100), ("b", 200)):
         file = tmp_path / folder / "mine.txt"
@@ -388,7 +401,7 @@ def test_a_run_is_that_of_its_case(
     monkeypatch.chdir(tmp_path)
     Path("quick.txt").write_text(QUICK)
     case = replace(CASE, preset=preset, motion="still")
-    one, two = (measure(case, worker, nullcontext(), lambda _: None) for _ in range(2))
+    one, two = (measure_run(case, worker, nullcontext(), lambda _: None) for _ in range(2))
     np.testing.assert_array_equal(one.shear, two.shear)
     assert not one.true_shear.any()
     assert 0.001 < np.median(one.shear) < 0.15  # voxels of 2.3 mm; .018 at 0.8 mm

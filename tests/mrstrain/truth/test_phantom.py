@@ -16,8 +16,7 @@ from dvc.io.images.labels import read_labels, read_mask
 from dvc.io.images.read import read_image
 from mrstrain import phantom as make
 from mrstrain.cli.app import app
-from phantoms.anatomy import Heel
-from phantoms.heel import drawn_motion, under_load
+from phantoms import Heel, random_foot_motion, under_load
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +68,7 @@ def test_foot_motions_are_recorded_and_true(made: Path) -> None:
         return float(loaded.values[tuple(at.T)].mean())
 
     assert foot.angle_deg > 0.5
-    np.testing.assert_array_equal(foot.rotation, drawn_motion(2, 1).rotation)  # this seed's, not every phantom's
+    np.testing.assert_array_equal(foot.rotation, random_foot_motion(2, 1).rotation)  # this seed's, not every phantom's
     assert brightness(foot.apply(rim)) < 0.95 * brightness(rim)
 
 

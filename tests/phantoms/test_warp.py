@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,17 @@ from dvc.io.images.write import write_image, write_mask, write_vectors
 from dvc.io.transforms.read import read_transform
 from dvc.io.transforms.write import write_elastix_transform
 from mrstrain.cli.app import app
-from phantoms.heel import drawn_motion, heel_grid, labels_of, scan, under_load
-from phantoms.motions import ShearWave
-from phantoms.twin import found_back, loaded_twin
+from phantoms import (
+    Acquisition,
+    ShearWave,
+    heel_grid,
+    labels_of,
+    material_points,
+    random_foot_motion,
+    scan,
+    synthetic_warp,
+    under_load,
+)
 
 SPACING = 1.6
 
@@ -53,27 +62,29 @@ def test_noise_alone_is_measured_in_tissue_too() -> None:
 def test_points_are_found_back_through_a_sampled_field() -> None:
     """Of a displacement image there is no closed inverse; Newton's finds it to 1e-6 mm, or says that there is none."""
     wave = ShearWave(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), 25.0, 0.5)
-    foot = drawn_motion(3, 1)
+    foot = random_foot_motion(3, 1)
     grid = Grid((30, 30, 30), (2.0, 2.0, 2.0), (-29.0, -29.0, -29.0))
     X = grid.points().reshape(-1, 3)
     field = SampledDisplacement(grid, Composed([wave, foot]).displacement(X).reshape(*grid.shape, 3))
     points = np.random.default_rng(0).uniform(-18.0, 18.0, (500, 3))
     x = points + field.displacement(points)
-    np.testing.assert_allclose(found_back(field, x, foot.inverse().apply(x)), points, atol=1e-6)
-    assert np.isnan(found_back(field, np.array([[200.0, 0.0, 0.0]]), np.zeros((1, 3)))).all()
+    np.testing.assert_allclose(material_points(field, x, foot.inverse().apply(x)), points, atol=1e-6)
+    assert np.isnan(material_points(field, np.array([[200.0, 0.0, 0.0]]), np.zeros((1, 3)))).all()
 
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_twin_shows_the_motion(unloaded: tuple[Image, Mask], heel, exact: bool) -> None:
     """Against a scan of the same heel after the same motion: alike where tissue is, unlike without the motion."""
     image, body = unloaded
-    motion, foot = under_load(heel, "Load1"), drawn_motion(2, 1)
+    motion, foot = under_load(heel, "Load1"), random_foot_motion(2, 1)
     whole = Composed([motion, foot])
     if exact:
-        made = loaded_twin(image, body, whole, near=foot, seed=5)
+        made = synthetic_warp(image, body, whole, Acquisition(seed=5), near=foot)
     else:
         u = whole.displacement(image.grid.points().reshape(-1, 3)).reshape(*image.grid.shape, 3)
-        made = loaded_twin(image, body, Within(SampledDisplacement(image.grid, u), body), near=foot, seed=5)
+        made = synthetic_warp(
+            image, body, Within(SampledDisplacement(image.grid, u), body), Acquisition(seed=5), near=foot
+        )
     real = scan(heel, image.grid, motion, foot, snr=None, number=7)
     inside = real.values > 200.0
 
@@ -95,7 +106,7 @@ def test_noise_does_not_move_with_the_tissue(unloaded: tuple[Image, Mask], heel)
     clean = scan(heel, image.grid, snr=None, number=0)
     noise = (image.values - clean.values)[body.inside]
     still = Affine(np.eye(3), np.zeros(3))
-    made = loaded_twin(image, body, still, seed=5, shading=False)
+    made = synthetic_warp(image, body, still, Acquisition(seed=5, bias_field=False))
     left = (made.image.values - clean.values)[body.inside]
     assert (noise @ left) / (noise @ noise) < 0.5
     assert left.std() < 3.0 * noise.std()
@@ -106,9 +117,9 @@ def test_a_transform_as_register_writes_it_will_do(unloaded: tuple[Image, Mask],
     image, body = unloaded
     control = Grid((16, 17, 17), (8.0, 8.0, 8.0), image.grid.centre_mm - 64.0)
     bspline = BSpline(control, np.random.default_rng(0).normal(scale=0.8, size=(3, *control.shape)))
-    foot = drawn_motion(2, 1)
+    foot = random_foot_motion(2, 1)
     path = write_elastix_transform(tmp_path, bspline, foot, image.grid)[-1]
-    made = loaded_twin(image, body, read_transform(path), near=foot, seed=1)
+    made = synthetic_warp(image, body, read_transform(path), Acquisition(seed=1), near=foot)
     assert made.shown > 0.9
     points = body.points()[::97]
     moved = points + read_transform(path).displacement(points)
@@ -122,7 +133,7 @@ def test_a_transform_as_register_writes_it_will_do(unloaded: tuple[Image, Mask],
 def test_the_skin_keeps_its_partial_volume(unloaded: tuple[Image, Mask]) -> None:
     """At rest the twin's rim, air included, is that of the unloaded scan; cut at the mask it would be dark outside."""
     image, body = unloaded
-    made = loaded_twin(image, body, Affine(np.eye(3), np.zeros(3)), seed=5, shading=False)
+    made = synthetic_warp(image, body, Affine(np.eye(3), np.zeros(3)), Acquisition(seed=5, bias_field=False))
     rim = binary_dilation(body.inside) & ~body.inside
     assert image.values[rim].mean() > 2.0 * made.noise_sd
     assert made.image.values[rim].mean() == pytest.approx(image.values[rim].mean(), rel=0.25)
@@ -131,17 +142,17 @@ def test_the_skin_keeps_its_partial_volume(unloaded: tuple[Image, Mask]) -> None
 def test_what_no_image_can_show_is_refused(unloaded: tuple[Image, Mask]) -> None:
     image, body = unloaded
     with pytest.raises(InputError, match="folds"):
-        loaded_twin(image, body, Affine(np.diag([-1.0, 1.0, 1.0]), np.zeros(3)), seed=1)
+        synthetic_warp(image, body, Affine(np.diag([-1.0, 1.0, 1.0]), np.zeros(3)), Acquisition(seed=1))
     with pytest.raises(InputError, match="field of view"):
-        loaded_twin(image, body, RigidMotion(np.eye(3), np.array([90.0, 0.0, 0.0])), seed=1)
+        synthetic_warp(image, body, RigidMotion(np.eye(3), np.array([90.0, 0.0, 0.0])), Acquisition(seed=1))
     other = Mask(Grid(body.grid.shape, body.grid.spacing_mm, body.grid.origin_mm + 1.0), body.inside)
     with pytest.raises(InputError, match="not on the unloaded image"):
-        loaded_twin(image, other, RigidMotion.identity(), seed=1)
+        synthetic_warp(image, other, RigidMotion.identity(), Acquisition(seed=1))
     part = np.zeros(body.grid.shape, dtype=bool)
     part[:20] = True
     few = Within(Affine(np.eye(3), np.zeros(3)), Mask(body.grid, part))
     with pytest.raises(InputError, match=r"half|defined"):
-        loaded_twin(image, body, few, seed=1)
+        synthetic_warp(image, body, few, Acquisition(seed=1))
 
 
 def test_command_writes_the_twin_and_its_truth(unloaded: tuple[Image, Mask], heel, tmp_path: Path) -> None:
@@ -149,7 +160,7 @@ def test_command_writes_the_twin_and_its_truth(unloaded: tuple[Image, Mask], hee
     write_image(tmp_path / "Load0.nii.gz", image)
     bone = labels_of(heel, image.grid).region("bone")
     write_mask(tmp_path / "bone.nii.gz", bone)
-    motion, foot = under_load(heel, "Load4"), drawn_motion(2, 1)
+    motion, foot = under_load(heel, "Load4"), random_foot_motion(2, 1)
     u = Composed([motion, foot]).displacement(image.grid.points().reshape(-1, 3)).reshape(*image.grid.shape, 3)
     write_vectors(tmp_path / "u.nii.gz", image.grid, u.astype(np.float32), ("x", "y", "z"), "u", "LPS", unit="mm")
     given = ["twin", str(tmp_path / "Load0.nii.gz"), str(tmp_path / "u.nii.gz"), "--out", str(tmp_path / "out")]
@@ -168,10 +179,10 @@ def test_command_writes_the_twin_and_its_truth(unloaded: tuple[Image, Mask], hee
 def test_where_the_unloaded_image_did_not_look_the_twin_has_no_value(unloaded: tuple[Image, Mask]) -> None:
     image, body = unloaded
     foot = RigidMotion(np.eye(3), np.array([0.0, 0.0, -3.0 * SPACING]))  # the leg's end comes into view
-    given = {"near": foot, "seed": 1, "onto": image.grid}
-    missing = ~np.isfinite(loaded_twin(image, body, foot, beyond_missing=True, **given).image.values)
+    own = Acquisition(seed=1, grid=image.grid)
+    missing = ~np.isfinite(synthetic_warp(image, body, foot, own, near=foot, beyond_missing=True).image.values)
     assert missing[..., -3:].all()
     assert not missing[..., :-3].any()
-    assert np.isfinite(loaded_twin(image, body, foot, **given).image.values).all()
-    noisier = loaded_twin(image, body, foot, noisier=2.0, **given)
+    assert np.isfinite(synthetic_warp(image, body, foot, own, near=foot).image.values).all()
+    noisier = synthetic_warp(image, body, foot, replace(own, noise_factor=2.0), near=foot)
     assert noisier.noise_sd == pytest.approx(2.0 * noise_sd(image, body), rel=1e-3)
