@@ -186,7 +186,7 @@ def test_a_killed_command_goes_on_where_it_was(tmp_path: Path) -> None:
     assert not (out / "simulation.json").exists()
     assert not (out / "c.restart.npz").exists()
     so_far = (out / "log-a.txt").read_text().splitlines()
-    assert any(line.startswith("moved: travel") for line in so_far)  # each step is there as it is made
+    assert any(line.startswith("moved: displacement") for line in so_far)  # there as it is made
     again = CliRunner().invoke(app, [*command, "--out", str(out.parent)])
     assert again.exit_code == 0, again.output
     log = (out / "log-a.txt").read_text().splitlines()
