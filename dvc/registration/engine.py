@@ -195,6 +195,11 @@ class Engine(Protocol):
         return True
 
     @property
+    def starts_anywhere(self) -> bool:
+        """Whether it can start from any displacement, whoever found it, or from results of its own alone."""
+        return True
+
+    @property
     def seeds(self) -> int:
         """How many independent seeds it draws random numbers from."""
         return 0

@@ -61,10 +61,15 @@ class Measurement:
 
 
 def spline_in(folder: Path) -> Deformation:
-    """The displacement of tissue relative to its bone that `register` found for one load, with its own gradient."""
+    """The displacement of tissue relative to its bone that `register` found for one load.
+
+    With its own gradient, where the engine has a file that holds it; otherwise its displacement image.
+    """
     for name in (BORDERS, "TransformParameters.0.txt"):
         if (folder / name).is_file():
             return read_transform(folder / name)
+    if (folder / "transform.h5").is_file() and (folder / _FIELD).is_file():
+        return read_displacement(folder / _FIELD)
     raise InputError(f"{folder} has neither {BORDERS} nor TransformParameters.0.txt: register this load again.")
 
 

@@ -16,6 +16,7 @@ from dvc.images.image import Image, Mask
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.read import read_image
 from dvc.registration.align import AlignOn
+from dvc.registration.engines import DEFAULT
 from dvc.registration.register import Registration, Settings, refuse_one_image_twice
 from dvc.registration.register import register as register_pair
 from dvc.trust.error_model import ErrorModel, error_model_of, read_error_model
@@ -186,6 +187,10 @@ def register(
     )  # fmt: skip
     if start_frame is not None and start is None:
         raise ParameterError("--start-frame is the frame of --start, which is not given.")
+    if start is not None and not chosen.starts_anywhere:
+        raise ParameterError(
+            f"--start is for --engine {DEFAULT}; {chosen.family} begins at results of its own (--chain)."
+        )
     files = (load0, *paths, bone, tissue, labels, names, landmarks, start, mesh, error_model)
     given = [Path(p) for p in files if p is not None]
     refuse_touching_inputs(target, cases, given)
@@ -214,8 +219,6 @@ def register(
     body = subject.tissue or tissue_mask(subject.reference)
     held = {"bone": subject.bone, "image": body, "none": None}[align]
     begun_at = None if start is None else without_motion(read_any(start, start_frame), held)[0]
-    if begun_at is not None:
-        chosen.check_start(begun_at)
     refuse_one_image_twice(
         [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
     )

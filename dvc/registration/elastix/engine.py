@@ -49,6 +49,7 @@ class Elastix(Engine):
     presets: tuple[Preset, ...] = field(default_factory=lambda: (load_preset("heel-mr"),))
 
     family = "elastix"
+    starts_anywhere = False
     sees_brightness = False  # its metrics are correlation and mutual information
     cost = Cost(phantom_seconds=75.0, gib=0.75)  # 3,500 iterations, whatever the voxel
 

@@ -11,7 +11,7 @@ from dvc.deformation.protocol import Affine, evaluate_on_grid
 from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.registration.gauss_newton.fit import control_grid, spline_through
-from dvc.registration.gauss_newton.level import Level, Weights, _share_at, cofactors, conjugate_gradients
+from dvc.registration.gauss_newton.level import Level, Splines, Weights, _share_at, cofactors, conjugate_gradients
 from dvc.registration.gauss_newton.spline_sums import SplineSums
 from tests.textures import GRID, everything, pair_of
 
@@ -80,7 +80,15 @@ def level() -> Level:
     fixed, moving = pair_of(Affine(np.eye(3), np.array([0.4, -0.3, 0.2])))
     inside, bone = everything().inside, np.zeros(GRID.shape, dtype=bool)
     bone[10:20, 12:24, 10:22] = True
-    return Level(fixed, moving, inside, inside & ~bone, bone, control_grid(GRID, np.full(3, 5.0)), rough=((1.0, 0.0),))
+    return Level(
+        fixed,
+        moving,
+        inside,
+        inside & ~bone,
+        bone,
+        control_grid(GRID, np.full(3, 5.0)),
+        splines=Splines(rough=((1.0, 0.0),)),
+    )
 
 
 def rotated(level: Level) -> np.ndarray:
