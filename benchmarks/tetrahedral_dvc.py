@@ -44,7 +44,7 @@ from fe.mesh_file import read_tet_mesh
 from fe.published import material_set
 from mrstrain.records.provenance import versions
 from phantoms.accuracy_run import distances_mm
-from validate.fe_result import read_result
+from validate import read_result
 
 GAIN_MM, VOLUME, NU = 10.0, 300.0, 0.45
 STEPS, LONGEST_MM, HALVINGS = 12, 1.5, 4

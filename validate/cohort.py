@@ -16,7 +16,7 @@ _SURE, _LEVEL = 0.95, 0.975
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class CohortRank:
     """A model's place over subjects.
 
     Attributes
@@ -54,7 +54,7 @@ class Standing:
         return bool(self.behind_low > 0.0)
 
 
-def standings(shares: Mapping[str, Mapping[str, float]]) -> tuple[Standing, ...]:
+def rank_over_subjects(shares: Mapping[str, Mapping[str, float]]) -> tuple[CohortRank, ...]:
     """Rank models over the subjects that have a result of each, the nearest first.
 
     Subjects are taken as drawn from one population, independent of each other. Intervals are those of a mean: they
@@ -86,7 +86,7 @@ def standings(shares: Mapping[str, Mapping[str, float]]) -> tuple[Standing, ...]
         mean, low, high = _mean(table[at])
         behind = float((table[at] - first).mean())
         made.append(
-            Standing(
+            CohortRank(
                 names[at], len(subjects), mean, low, high, float(table[at].min()), float(table[at].max()),
                 int(np.count_nonzero(nearest == at)), behind, behind - half, behind + half,
             )

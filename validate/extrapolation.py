@@ -23,7 +23,7 @@ _SMOOTH_MM, _ROUNDS = 2.0, 40
 _MENDING, _LEAST_VOLUME = 12, 0.1
 
 
-def carried_on(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacement:
+def extrapolated(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacement:
     """A model's displacement at every voxel of a grid: its own in its mesh, zero in bone, else carried on smoothly.
 
     Parameters

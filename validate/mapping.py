@@ -46,7 +46,7 @@ class Field:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mapped:
+class MappedFields:
     """One load, measured and simulated, at the centroids of a mesh's cells; reference configuration, LPS mm.
 
     Attributes
@@ -130,13 +130,13 @@ def sampled(deformation: Deformation, points_mm: FloatArray) -> Field:
     return Field(u, strain.max_shear, strain.jacobian)
 
 
-def mapped(
+def map_fields(
     mesh: TetMesh,
     labels: LabelMap,
     bones: Sequence[str],
     measured: Deformation,
     models: Mapping[str, Deformation],
-) -> Mapped:
+) -> MappedFields:
     """Evaluate a measured and simulated deformations at the centroids of a mesh's cells.
 
     Parameters
@@ -165,7 +165,7 @@ def mapped(
     kept = np.flatnonzero(soft)
     if len(kept) < len(points):
         mesh = _part(mesh, kept)
-    found = Mapped(
+    found = MappedFields(
         mesh,
         points[kept],
         mesh.volumes_mm3 / 1000.0,

@@ -35,7 +35,7 @@ _FAR_MM, _FEW = 3.0, 0.01
 _NO_EQUATION = np.empty(0, dtype=np.int64)
 
 
-def outside(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
+def boundary_displacement(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
     """Nodes (k,) on the outside of a mesh, and their measured displacement (k, 3), LPS mm.
 
     Nodes of the facets "bone" stay. A node at which the measurement is not defined (the outermost half voxel) goes with
@@ -67,7 +67,7 @@ def _everywhere(mesh: TetMesh, measured: Deformation) -> FloatArray:
     return filled_from_nearest(u, mesh.points_mm)
 
 
-def driven(
+def simulate_driven(
     mesh: TetMesh,
     laws: Mapping[str, Material],
     measured: Deformation,
@@ -104,7 +104,7 @@ def driven(
     """
     check_laws(mesh, laws)
     began = time.monotonic()
-    nodes, u = outside(mesh, measured)
+    nodes, u = boundary_displacement(mesh, measured)
     guess = _everywhere(mesh, measured)
     guess[nodes] = u
     model = Model.of(mesh, laws, element("P1"))
@@ -144,7 +144,7 @@ def driven(
     )
 
 
-def write_boundary(
+def write_boundary_conditions(
     stem: Path, mesh: TetMesh, nodes: IntArray, u_mm: FloatArray, *, unit: str = "mm", frame: str = "LPS"
 ) -> list[Path]:
     """Write displacements (k, 3) LPS mm of a mesh's nodes as boundary conditions, in its file's own unit and frame.

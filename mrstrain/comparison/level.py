@@ -1,17 +1,19 @@
-"""`level`: models sent through the measurement itself, so that like is compared with like."""
+"""`level`: forward-model comparison, the measurement simulated on the displacement of a model (levelling)."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
 
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
+from dvc.images.image import Image, Mask
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
@@ -20,14 +22,12 @@ from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_o
 from mrstrain.measurement.engines import engine_of, settings_of
 from mrstrain.measurement.measured_folder import measurements_in
 from mrstrain.measurement.register import register
-from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.inputs import Subject, make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 from phantoms.twin import loaded_twin
-from validate.extrapolation import LEVELLED, carried_on
-from validate.fe_result import FeResult
-from validate.mapping import filled_from_nearest
+from validate import LEVELLED, FeResult, extrapolated, filled_from_nearest
 
-_APART_MM, _FEW = 0.1, 0.01
+_CHANGED_MM, _FEW = 0.1, 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def level(
     seed: int = 1,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Levelled:
-    """Send a model's deformations through the measurement.
+    """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
 
     Parameters
     ----------
@@ -73,20 +73,20 @@ def level(
     model : path
         A folder with a file for each load, as in `compare`.
     out : path
-        Gets a folder called as the model and "-levelled", which `compare` takes beside the model itself, and one ending
-        in "-work" with the images that the model would have given and, by load, their registration.
+        Gets a folder named as the model and "-levelled", for `compare` beside the model itself, and one ending in
+        "-work" with the warped images and, by load, their registration.
     bone, bone_label, tissue, labels, names
         As in `register`; the bone is needed.
     loads : sequence of str
         Names of the loads; all of the model's files by default.
     engine, borders, preset, parameters
-        Those of the measurement, as in `register`; elastix parameters that are not known are let pass.
+        Those of the measurement, as in `register`; unknown elastix parameters are accepted.
     model_mesh, model_unit, model_frame
         As in `compare`.
     threads : int, optional
         Of each registration; by default all cores.
     seed : int
-        Of the noise that is drawn anew, and of the registration.
+        Of the fresh noise, and of the registration.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -98,89 +98,95 @@ def level(
         If no load could be registered.
     """
     target, place = Path(out), Path(model)
-    # Refused now rather than after the images are made.
-    # Beyond its mesh a model is carried on without regard to volume: what the images then ask for is no tissue's.
+    # The extrapolated displacement outside the model's mesh is not isochoric: volume is kept whatever the images show.
     volume = USUAL_VOLUME if engine_of(engine, preset, parameters) == GAUSS_NEWTON else None
     settings_of(
         engine, preset, parameters, volume=volume, borders=borders, labelled=labels is not None, allow_unknown=True
-    )
+    )  # refused now rather than after the images are made
     if not place.is_dir():
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
-    subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
+    anatomy: dict[str, Any] = {"bone": bone, "bone_label": bone_label, "tissue": tissue, "labels": labels}
+    anatomy["names"] = names
+    subject = read_subject(load0, **anatomy)
     if subject.bone is None:
-        raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is at rest.")
-    wanted = list(loads) or loads_of(place, model_mesh is not None)
-    usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame)
-    files, notes = model_files(wanted, [place], usual)
+        raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is rigid.")
+    reading = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame)
+    files, notes = model_files(list(loads) or loads_of(place, model_mesh is not None), [place], reading)
+    results = {load: file for load, (file,) in files.items()}
     name = place.resolve().name + LEVELLED
     work = name + "-work"
-    given = [Path(p) for p in (load0, bone, tissue, labels, names, model_mesh, *parameters) if p is not None]
-    refuse_touching_inputs(target, [name, work], [*given, *(f.path for of in files.values() for f in of)])
-    results: dict[str, FeResult] = {}
-    body = subject.tissue or tissue_mask(subject.reference)
-    made = {}
-    for load, (file,) in files.items():
-        results[load] = file.read(subject.reference.grid)
-    for load, result in results.items():
-        field = carried_on(result.deformation, subject.reference.grid, subject.bone.inside)
-        middles = result.mesh.centroids_mm
-        apart = field.displacement(middles) - result.deformation.displacement(middles)
-        share = float(np.mean(np.linalg.norm(apart, axis=1) > _APART_MM))
-        if share > _FEW:
-            notes.append(
-                f"{load}: where the model's cells are nearly flat it was smoothed before it moved the image, by over "
-                f"{_APART_MM:g} mm in {share:.0%} of its cells."
-            )
-        made[load] = loaded_twin(subject.reference, body, field, seed=seed)
-    for folder in (target, target / name, target / work, target / work / "images"):
-        make_output(folder)
-    for load in results:  # of an earlier run
-        (target / name / f"{load}.vtu").unlink(missing_ok=True)
+    inputs = [Path(p) for p in (load0, bone, tissue, labels, names, model_mesh, *parameters) if p is not None]
+    refuse_touching_inputs(target, [name, work], [*inputs, *(f.path for f in results.values())])
+    read = {load: file.read(subject.reference.grid) for load, file in results.items()}
+    images, smoothed = _warped_images(subject, subject.bone, read, seed)
+    how: dict[str, Any] = {
+        "engine": engine,
+        "volume": volume,
+        "borders": borders,
+        "preset": preset,
+        "threads": threads,
+        "seed": seed,
+    }
     record = provenance(
         "level",
         {
             **subject.files,
-            "models": [f.path for of in files.values() for f in of],
+            "models": [f.path for f in results.values()],
             "parameters": [Path(p) for p in parameters],
         },
-        {
-            "engine": engine,
-            "volume": volume,
-            "borders": borders,
-            "preset": preset,
-            "threads": threads,
-            "seed": seed,
-            "bone_label": bone_label,
-            "model_unit": model_unit,
-            "model_frame": model_frame,
-        },
+        how | {"bone_label": bone_label, "model_unit": model_unit, "model_frame": model_frame},
     )
-    write_json(target / name / "provenance.json", record)
-    for load, twin in made.items():
-        write_image(target / work / "images" / f"{load}.nii.gz", twin.image)
-    write_whole(target / name / SETTINGS, IN_IMAGE)
-    failures, registered = list[str](), target / work / "registered"
-    make_output(registered)
-    for load, result in results.items():  # each in a folder of its own: a study levels several at once
+    _prepare(target, name, images, record)
+    how |= anatomy | {"parameters": parameters, "allow_unknown_parameters": True, "progress": progress}
+    failures = []
+    for load, result in read.items():  # each in a folder of its own: a study levels several at once
+        registered = target / work / "registered" / load
         try:
-            register(
-                load0, [target / work / "images" / f"{load}.nii.gz"], out=registered / load, bone=bone,
-                bone_label=bone_label, tissue=tissue, labels=labels, names=names, engine=engine,
-                volume=volume, borders=borders, preset=preset, parameters=parameters, allow_unknown_parameters=True,
-                threads=threads, seed=seed, progress=progress,
-            )  # fmt: skip
+            register(load0, [target / work / "images" / f"{load}.nii.gz"], out=registered, **how)
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")
         else:
-            _write(target / name / f"{load}.vtu", result, registered / load)
-    if len(failures) == len(results):
+            _write(target / name / f"{load}.vtu", result, registered)
+    if len(failures) == len(read):
         raise RegistrationError(" ".join(failures))
-    notes += failures
-    return Levelled(target / name, tuple(notes))
+    return Levelled(target / name, (*notes, *smoothed, *failures))
+
+
+def _warped_images(
+    subject: Subject, bone: Mask, results: Mapping[str, FeResult], seed: int
+) -> tuple[dict[str, Image], list[str]]:
+    """The unloaded image warped by each result, with fresh noise; and where a result was smoothed to do so."""
+    images, notes = {}, []
+    body = subject.tissue or tissue_mask(subject.reference)
+    for load, result in results.items():
+        field = extrapolated(result.deformation, subject.reference.grid, bone.inside)
+        centroids = result.mesh.centroids_mm
+        difference = field.displacement(centroids) - result.deformation.displacement(centroids)
+        changed = float(np.mean(np.linalg.norm(difference, axis=1) > _CHANGED_MM))
+        if changed > _FEW:
+            notes.append(
+                f"{load}: where the model's cells are nearly flat it was smoothed before it warped the image, by over "
+                f"{_CHANGED_MM:g} mm in {changed:.0%} of its cells."
+            )
+        images[load] = loaded_twin(subject.reference, body, field, seed=seed).image
+    return images, notes
+
+
+def _prepare(target: Path, name: str, images: Mapping[str, Image], record: Mapping[str, object]) -> None:
+    """Make the folders, with the images; results of an earlier run are removed."""
+    work = target / f"{name}-work"
+    for folder in (target, target / name, work, work / "images", work / "registered"):
+        make_output(folder)
+    for load in images:
+        (target / name / f"{load}.vtu").unlink(missing_ok=True)
+    write_json(target / name / "provenance.json", record)
+    for load, image in images.items():
+        write_image(work / "images" / f"{load}.nii.gz", image)
+    write_whole(target / name / SETTINGS, IN_IMAGE)
 
 
 def _write(path: Path, result: FeResult, registered: Path) -> None:
-    """The measured displacement at the nodes of the model's mesh; where it is not defined, that of the nearest node."""
+    """Write the registered displacement at the nodes of the model's mesh; where undefined, that of the nearest node."""
     mesh = result.mesh
     (measured,) = measurements_in(registered)
     u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)

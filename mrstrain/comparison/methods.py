@@ -12,8 +12,10 @@ from dvc.io.images.read import format_of
 from dvc.io.transforms.elastix_text import parse_parameters
 from dvc.report.viewer import NIIVUE
 from fe.simulate import LoadStep
+from mrstrain.records.provenance import versions
+from validate import Comparison, Criteria
 from validate.curves import DRAWS
-from validate.location_intervals import DRAWS as LOCATED
+from validate.location_intervals import LOCATION_DRAWS
 
 # Checked against the publishers' records or the projects' own pages; a paper whose DOI was not found goes without.
 _PAPERS = {
@@ -39,8 +41,6 @@ _PAPERS = {
     "Bland 1986": "Bland JM, Altman DG. Statistical methods for assessing agreement between two methods of clinical "
     "measurement. Lancet 327(8476):307-310, 1986. doi:10.1016/S0140-6736(86)90837-8",
 }
-METHODS = "Methods, to be pasted"
-"""Title of a report's section with these paragraphs."""
 _IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")
 """Roles in a record of the files that are read as images."""
 _GIVEN = "the displacement was taken as it was given."
@@ -51,15 +51,7 @@ Record = Mapping[str, Any]
 
 
 def methods(
-    measured: Mapping[str, Path],
-    models: Mapping[str, Path],
-    cells: int,
-    strains: tuple[float, float],
-    thresholds: Sequence[float],
-    least_ml: float,
-    *,
-    error_known: bool,
-    version: str,
+    measured: Mapping[str, Path], models: Mapping[str, Path], comparison: Comparison, criteria: Criteria
 ) -> tuple[str, ...]:
     """Paragraphs for a methods section, the references last.
 
@@ -68,23 +60,18 @@ def methods(
     measured : mapping of load to path
         Folders of the measurement, with their ``provenance.json`` where `register` or `strain` wrote them.
     models : mapping of name to path
-        A result's file of each; a ``simulation.json`` beside it tells how it was computed.
-    cells : int
-        Number of cells on which fields are compared.
-    strains, thresholds, least_ml
-        As in `mrstrain.comparison.compare.compare`.
-    error_known : bool
-        Whether intervals come from an error model.
-    version : str
-        Of the program that compares.
+        A result's file of each; a ``simulation.json`` beside it records how it was computed.
+    comparison : Comparison
+    criteria : Criteria
+        What it was computed by.
     """
     parts = [
         _measured(measured),
         *_simulated(models, measured),
-        _compared(cells, strains, thresholds, least_ml, version),
+        _compared(len(comparison.loads[0].fields.points_mm), criteria),
     ]
-    if error_known:
-        parts.append(_doubt(measured))
+    if any(one.bands for one in comparison.loads):
+        parts.append(_uncertainty(measured))
     parts.append(f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue).")
     return _with_references(parts)
 
@@ -307,25 +294,25 @@ def _solver(record: Record) -> str:
     )
 
 
-def _compared(
-    cells: int, strains: tuple[float, float], thresholds: Sequence[float], least_ml: float, version: str
-) -> str:
-    levels = _listed([f"{t:g}" for t in thresholds])
+def _compared(cells: int, criteria: Criteria) -> str:
+    levels = _listed([f"{t.max_shear:g}" for t in criteria.thresholds])
+    (low, high), version = criteria.strains, versions()["mrstrain"]
     return (
         f"Models and measurement were compared with mrstrain {version} at the centroids of the same {cells} "
         "tetrahedra, weighted by volume, in the unloaded configuration. Intensity: area between the curves of tissue "
-        f"volume above a maximal shear, from {strains[0]:g} to {strains[1]:g}. Location: tissue above {levels}; "
+        f"volume above a maximal shear, from {low:g} to {high:g}. Location: tissue above {levels}; "
         "overlap (Dice 1945), distance of the centroids, 95th percentile of the Hausdorff distance, clusters of "
-        f"{least_ml:g} mL or more. "
+        f"{criteria.least_ml:g} mL or more. "
         "Agreement cell by cell: regression, concordance (Lin 1989), limits of agreement (Bland 1986)."
     )
 
 
-def _doubt(measured: Mapping[str, Path]) -> str:
+def _uncertainty(measured: Mapping[str, Path]) -> str:
     known, twin = _sources(measured), _twins(measured)
     return (
-        f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATED} draws) come from truths drawn by the "
-        f"registration's error model: bias, spatially correlated noise. {known} {twin}Displacement has no error model."
+        f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) come from truths drawn by "
+        "the registration's error model: bias, spatially correlated noise. "
+        f"{known} {twin}Displacement has no error model."
     )
 
 

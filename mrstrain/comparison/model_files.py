@@ -15,7 +15,7 @@ from dvc.errors import ExtentError, InputError
 from dvc.images.image import Grid
 from dvc.mesh import box_told
 from mrstrain.records.inputs import read_matrix
-from validate.fe_result import FeResult, check_overlap, read_result
+from validate import FeResult, check_overlap, read_result
 
 ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
 SETTINGS = "model.toml"
@@ -27,7 +27,7 @@ IN_IMAGE = 'unit = "mm"\nframe = "LPS"\nto_image = [[1, 0, 0, 0], [0, 1, 0, 0], 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """How a model's files are read; as in `validate.fe_result.read_result`."""
+    """How a model's files are read; as in `validate.read_result`."""
 
     mesh: Path | None = None
     unit: str = "mm"

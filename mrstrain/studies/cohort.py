@@ -12,9 +12,8 @@ import numpy as np
 
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
-from dvc.report.page import Picture, Section, Table, write_report
+from dvc.report.page import Picture, Section, Table, caption_of, record_lines, write_report
 from dvc.trust.verdict import Verdict, worst
-from mrstrain.measurement.page import flat, said
 from mrstrain.measurement.register import REPEAT
 from mrstrain.records.inputs import make_output
 from mrstrain.records.provenance import provenance, write_json
@@ -22,11 +21,7 @@ from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
 from mrstrain.studies.file import FILE, read_study
 from mrstrain.studies.plan import COMPARISON
 from mrstrain.studies.run import Ran, Told, run_studies
-from validate import figures
-from validate.cohort import Standing, standings
-from validate.comparison import NOTHING
-from validate.extrapolation import LEVELLED
-from validate.mapping import ALL
+from validate import ALL, LEVELLED, NOTHING, CohortRank, over_subjects, rank_over_subjects
 
 _TOTAL = "all loads"
 
@@ -41,7 +36,7 @@ class Cohort:
         With ``report.html``, ``cohort.csv`` (areas of every subject, model and load) and ``ranking.csv``.
     ran : tuple of Ran
         The studies, in the order given.
-    ranking : tuple of Standing
+    ranking : tuple of CohortRank
         The models over all loads, the nearest first; empty where no subject has a result of all.
     notes : tuple of str
         Who is not among those ranked over, what is unlike between subjects, and whose registrations are doubtful.
@@ -49,7 +44,7 @@ class Cohort:
 
     out: Path
     ran: tuple[Ran, ...]
-    ranking: tuple[Standing, ...]
+    ranking: tuple[CohortRank, ...]
     notes: tuple[str, ...]
 
     @property
@@ -116,7 +111,7 @@ def cohort(
     notes += unlike([one.study for one in ran if one.study.study.name not in without])
     notes += _doubts([one for one in ran if any(one.study.study.name in of for of in shares.values())])
     try:
-        ranking = standings(shares)
+        ranking = rank_over_subjects(shares)
     except InputError as none:
         ranking = ()
         notes.append(str(none))
@@ -206,7 +201,9 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
     return shares, notes
 
 
-def _write_tables(target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[Standing]) -> None:
+def _write_tables(
+    target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[CohortRank]
+) -> None:
     first = next(row for rows in areas.values() for row in rows)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -215,7 +212,7 @@ def _write_tables(target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]]
     write_whole(target / "cohort.csv", text.getvalue())
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([f.name for f in fields(Standing)])
+    writer.writerow([f.name for f in fields(CohortRank)])
     writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in astuple(s)] for s in ranking)
     write_whole(target / "ranking.csv", text.getvalue())
 
@@ -224,7 +221,7 @@ def _write_page(
     path: Path,
     ran: Sequence[Ran],
     shares: Mapping[str, Mapping[str, float]],
-    ranking: Sequence[Standing],
+    ranking: Sequence[CohortRank],
     notes: Sequence[str],
     record: Mapping[str, object],
 ) -> None:
@@ -249,11 +246,11 @@ def _write_page(
         ("subject", *order),
         tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in names),
     )
-    drawn = Picture("Distribution over subjects", said(figures.over_subjects), figures.over_subjects(shares, order))
+    drawn = Picture("Distribution over subjects", caption_of(over_subjects), over_subjects(shares, order))
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for one in ran:
         failed = [f"{o.stage}: {o.words}. {o.reason}" for o in one.outcomes.values() if o.record is None]
         verdicts = list(_registered(one).values())
         verdict = worst(verdicts) if verdicts else None
         sections.append(Section(one.study.study.name, verdict, paragraphs=tuple(f"Not whole: {why}" for why in failed)))
-    write_report(path, "Models over subjects", None, sections, [], flat(record))
+    write_report(path, "Models over subjects", None, sections, [], record_lines(record))

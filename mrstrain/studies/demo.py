@@ -190,6 +190,6 @@ def _told(errors: dict[str, tuple[TissueError, ...]], ran: Ran) -> list[str]:
     ]
     compared = ran.outcomes["compare"].record
     if compared is not None:
-        lines += [line for line in compared.given.lines if line.startswith(("All loads", "Nearest over"))]
+        lines += [line for line in compared.given.lines if line.startswith(("All loads", "Best match over"))]
     lines += [_why(outcome) for outcome in ran.outcomes.values() if not outcome.whole]
     return [*lines, f"Report: {ran.study.out / REPORT}"]

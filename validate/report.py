@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import Protocol
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,17 +12,16 @@ from dvc.deformation.protocol import Deformation, evaluate_on_grid
 from dvc.deformation.strain import StrainField
 from dvc.images.image import LabelMap, Mask
 from dvc.io.images.read import read_voxels
-from dvc.report.page import Cell, Picture, Section, Table
+from dvc.report.page import METHODS, Cell, Picture, Section, Table, caption_of
 from dvc.report.viewer import Viewer, Volume
 from dvc.trust.verdict import Verdict
-from mrstrain.comparison.methods import METHODS
-from mrstrain.measurement.page import said
 from validate import figures
-from validate.comparison import NOTHING, Comparison, Total
 from validate.curves import Area
 from validate.fe_result import FeResult
+from validate.load_comparison import NOTHING, LoadComparison
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
+from validate.ranking import Ranking
 
 _AROUND = 4  # voxels around the tissue in the viewer
 _PANELS = 4  # tissues whose curves are drawn, all soft tissue first
@@ -51,91 +49,76 @@ _CLOSING = Section(
 )  # fmt: skip
 
 
-class Judged(Protocol):
-    """A measurement with the verdict on its registration."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """A load's pictures, by the stem of their files, and its viewer."""
 
-    @property
-    def verdict(self) -> Verdict | None:
-        """None where it has none."""
-        ...
+    pictures: Mapping[str, Picture]
+    viewer: Viewer
 
 
-def pictures_of(
-    one: Comparison,
-    measured: Deformation,
-    results: Sequence[FeResult],
-    labels: LabelMap,
-    bones: Sequence[str],
-    axes: FloatArray,
-    strains: tuple[float, float],
-    colours: Sequence[str],
+def draw(one: LoadComparison, colours: Sequence[str]) -> Drawn:
+    """Draw one load; ``colours`` names all models in the order of their colours."""
+    measured, results = one.case.read()
+    return Drawn(_pictures(one, measured, results, colours), _viewer(one, measured, results))
+
+
+def _pictures(
+    one: LoadComparison, measured: Deformation, results: Sequence[FeResult], colours: Sequence[str]
 ) -> dict[str, Picture]:
-    """Draw a load's figures, by the stem of their files; ``colours`` names the models in the order of their colours."""
-    found = one.found
-    displacements = {r.name: _at_nodes(r, found.mesh.points_mm) for r in results}
-    told = [name for name in found.tissues if any(a.tissue == name for a in one.areas)]
-    curves = figures.volume_strain(found, one.bands, strains, (ALL, *told)[:_PANELS], colours)
-    point = lowest_bone_point(labels, bones[0], axes)
-    across = (found.mesh.points_mm - point) @ axes[:, 2]
-    through = f"It goes through the lowest point of {bones[0]}."
+    fields, axes, bone = one.fields, one.case.axes, one.bones[0]
+    displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
+    tissues = [name for name in fields.tissues if any(a.tissue == name for a in one.areas)]
+    curves = figures.volume_strain(fields, one.bands, one.criteria.strains, (ALL, *tissues)[:_PANELS], colours)
+    point = lowest_bone_point(one.labels, bone, axes)
+    across = (fields.mesh.points_mm - point) @ axes[:, 2]
+    through = f"It goes through the lowest point of {bone}."
     if not across.min() < 0.0 < across.max():
-        point = found.mesh.bounds_mm.mean(axis=0)
-        through = (
-            f"The lowest point of {bones[0]} lies beside the mesh: the slice goes through the mesh's middle instead."
-        )
-    slices = figures.slices(found, measured, displacements, axes, point)
-    apart = said(figures.differences)
+        point = fields.mesh.bounds_mm.mean(axis=0)
+        through = f"The lowest point of {bone} lies beside the mesh: the slice goes through the mesh's middle instead."
+    slices = figures.slices(fields, measured, displacements, axes, point)
+    shear, u = (figures.differences(fields, one.agreements, quantity) for quantity in ("max_shear", "u_mm"))
+    differences = caption_of(figures.differences)
     return {
-        "curves": Picture("Volume above a strain", said(figures.volume_strain), curves),
-        "slices": Picture("Where the strain lies", f"{said(figures.slices)} {through}", slices),
-        "agreement": Picture("Maximal shear, cell by cell", said(figures.scatter), figures.scatter(found)),
-        "differences_shear": Picture(
-            "Differences of maximal shear", apart, figures.differences(found, one.agreements, "max_shear")
-        ),
-        "differences_u": Picture(
-            "Differences of the displacement's length", apart, figures.differences(found, one.agreements, "u_mm")
-        ),
+        "curves": Picture("Volume above a strain", caption_of(figures.volume_strain), curves),
+        "slices": Picture("Where the strain lies", f"{caption_of(figures.slices)} {through}", slices),
+        "agreement": Picture("Maximal shear, cell by cell", caption_of(figures.scatter), figures.scatter(fields)),
+        "differences_shear": Picture("Differences of maximal shear", differences, shear),
+        "differences_u": Picture("Differences of the displacement's length", differences, u),
     }
 
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
-    """Where a bone lies furthest along the plate's outward normal, LPS mm; the middle of a flat one."""
+    """Point of a bone furthest along the plate's outward normal, LPS mm; the mean of several."""
     points = labels.grid.points(np.isin(labels.labels, [n for n, name in labels.names.items() if name == bone]))
     height = points @ axes[:, 0]
     return np.asarray(points[height < height.min() + 0.5 * labels.grid.spacing_mm.min()].mean(axis=0))
 
 
 def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
-    """A model's displacement at the nodes of the compared mesh; its own nodes' where that is its mesh."""
+    """A model's displacement at nodes (n, 3) of the compared mesh; as stored if that is the model's own mesh."""
     if result.mesh.points_mm.shape == points_mm.shape and np.array_equal(result.mesh.points_mm, points_mm):
         return result.deformation.u_mm
     return filled_from_nearest(result.deformation.displacement(points_mm), points_mm)
 
 
-def viewer_of(
-    one: Comparison,
-    measured: Deformation,
-    results: Sequence[FeResult],
-    labels: LabelMap,
-    bones: Sequence[str],
-    folder: Path,
-) -> Viewer:
-    """The measured strain and that of the nearest model over the image, on the label map's voxels.
+def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResult]) -> Viewer:
+    """Measured strain and that of the best model over the image, on the label map's voxels.
 
-    The image is the loaded one as registered, which lies on the unloaded anatomy, where the measurement has it.
+    The image is the loaded one as registered, on the unloaded anatomy, if the case has one; else the label map.
     """
+    labels, scanned = one.labels, one.case.image
     box = Mask(labels.grid, labels.labels > 0).box(_AROUND)
-    soft = [number for number, name in labels.names.items() if name not in bones]
+    soft = [number for number, name in labels.names.items() if name not in one.bones]
     grid, inside = labels.grid.part(box), np.isin(labels.labels[box], soft)
-    names = [a.model for a in one.ranked()] or list(one.found.models)
+    names = [a.model for a in one.ranked()] or list(one.fields.models)
     model = next(r for r in results if r.name == names[0])
     shear = []
     for field in (measured, model.deformation):
         values = np.full(grid.shape, np.nan)
         values[inside] = StrainField.from_gradient(evaluate_on_grid(field, grid, inside)[1]).max_shear
         shear.append(values)
-    scanned = folder / "registered.nii.gz"
-    seen, voxels = read_voxels(scanned) if scanned.is_file() else (None, np.empty(0))
+    seen, voxels = read_voxels(scanned) if scanned is not None else (None, np.empty(0))
     if seen is not None and seen.same_as(labels.grid):
         shown = np.nan_to_num(voxels[box])
     else:
@@ -150,73 +133,72 @@ def viewer_of(
     )
 
 
-def page_sections(
-    shown: Sequence[tuple[Comparison, Judged, Mapping[str, Picture], Viewer]],
-    summed: Total,
-    notes: Sequence[str],
-    strange: Sequence[str],
-    strains: tuple[float, float],
-) -> list[Section]:
-    """The report's parts: models and loads first, with what is ``strange`` about a model, then each load."""
-    heads = {
-        one.load: one.load
-        if measurement.verdict is None or measurement.verdict.level == "trust"
-        else f"{one.load} ({measurement.verdict.words.lower()})"
-        for one, measurement, _, _ in shown
-    }
-    slips = Verdict("caution", tuple(strange)) if strange else None
-    table = _areas([one for one, _, _, _ in shown], heads, summed, strains)
-    sections = [Section("Models and loads", slips, (table,), (), (*summed.told, *notes))]
-    for one, measurement, drawn, viewer in shown:
-        verdict = measurement.verdict
-        covered = one.found.coverage()
-        told = (
-            f"Compared: {covered['common']:.1f} mL of the mesh's {covered['mesh']:.1f} mL of soft tissue; the "
-            f"measurement is defined in {covered['measured']:.1f} mL."
-        )
-        judged = () if verdict is None else (f"Its registration is judged: {verdict.words}.",)
-        doubtful = verdict if verdict is not None and verdict.level != "trust" else None
-        first = tuple(drawn[stem] for stem in ("curves", "slices"))
-        cells = tuple(picture for stem, picture in drawn.items() if stem not in ("curves", "slices"))
-        sections.append(
-            Section(
-                one.load, doubtful, (_tissues(one), _location(one), _travel(one)), first, (told, *judged), (viewer,)
-            )
-        )
-        sections.append(Section(f"{one.load}, cell by cell", None, (_agreement(one), _by_distance(one)), cells))
-    return sections
+def load_sections(one: LoadComparison, drawn: Drawn) -> list[Section]:
+    """A load's part of the report: how much and where, then cell by cell."""
+    verdict = one.case.verdict
+    covered = one.fields.coverage()
+    compared = (
+        f"Compared: {covered['common']:.1f} mL of the mesh's {covered['mesh']:.1f} mL of soft tissue; the "
+        f"measurement is defined in {covered['measured']:.1f} mL."
+    )
+    trust = () if verdict is None else (f"Verdict on its registration: {verdict.words}.",)
+    first = tuple(drawn.pictures[stem] for stem in ("curves", "slices"))
+    others = tuple(picture for stem, picture in drawn.pictures.items() if stem not in ("curves", "slices"))
+    tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
+    return [
+        Section(one.load, doubtful, tables, first, (compared, *trust), (drawn.viewer,)),
+        Section(f"{one.load}, cell by cell", None, (_agreement(one), _by_distance(one)), others),
+    ]
+
+
+def overview(
+    loads: Sequence[LoadComparison], ranking: Ranking, warnings: Sequence[str], notes: Sequence[str]
+) -> Section:
+    """The first part of the report: areas of all models under all loads, with ``warnings`` about models."""
+    slips = Verdict("caution", tuple(warnings)) if warnings else None
+    return Section("Models and loads", slips, (_areas(loads, ranking),), (), (*ranking.statements, *notes))
+
+
+def _head(one: LoadComparison) -> str:
+    """A load's name, with its verdict if that is not trust."""
+    verdict = one.case.verdict
+    return one.load if verdict is None or verdict.level == "trust" else f"{one.load} ({verdict.words.lower()})"
 
 
 def closing_sections(thresholds: Sequence[Threshold], methods: Sequence[str]) -> list[Section]:
-    """How a comparison is read, where its levels of strain come from, and paragraphs for a methods section."""
+    """How a comparison is read, sources of its thresholds, and paragraphs for a methods section if there are any."""
     sources = Section(
         "Levels of strain",
         None,
         (Table("Thresholds", ("maximal shear", "source"), tuple((t.max_shear, t.source) for t in thresholds)),),
     )
-    return [_CLOSING, sources, Section(METHODS, paragraphs=tuple(methods))]
+    return [_CLOSING, sources, *([Section(METHODS, paragraphs=tuple(methods))] if methods else [])]
 
 
 def shown(area: Area) -> str:
-    """An area as people read it: with the interval that the measurement's error leaves, where that is known."""
+    """An area in mL, with its 95 % interval where the measurement uncertainty is known."""
     known = not np.isnan(area.low_ml)
     return f"{area.best_ml:.2f}" + (f" ({area.low_ml:.2f} to {area.high_ml:.2f})" if known else "")
 
 
-def _areas(done: Sequence[Comparison], heads: Mapping[str, str], summed: Total, strains: tuple[float, float]) -> Table:
-    areas = {(a.model, a.load): a for one in done for a in one.areas if a.tissue == ALL}
-    sums = {a.model: a for a in (*summed.areas, summed.nothing)}
+def ranks(ranking: Ranking, model: str) -> str:
+    """Rank of a model over all loads: a range if not distinguishable from neighbours, a dash if not ranked."""
+    return "–".join(str(rank) for rank in dict.fromkeys(ranking.rank(model) or ("–",)))
+
+
+def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
+    areas = {(a.model, a.load): a for one in loads for a in one.areas if a.tissue == ALL}
+    sums = {a.model: a for a in (*ranking.areas, ranking.nothing)}
+    low, high = loads[0].criteria.strains
     names = [*sums, *dict.fromkeys(model for model, _ in areas if model not in sums)]
     rows: dict[str, tuple[Cell, ...]] = {}
     for name in names:
-        cells = ["–" if (area := areas.get((name, one.load))) is None else shown(area) for one in done]
-        place = summed.place(name)
-        told = "–" if place is None else "–".join(str(p) for p in dict.fromkeys(place))
-        rows[name] = (name, told, *cells, shown(sums[name]) if name in sums else "–")
+        cells = ["–" if (area := areas.get((name, one.load))) is None else shown(area) for one in loads]
+        rows[name] = (name, ranks(ranking, name), *cells, shown(sums[name]) if name in sums else "–")
     nothing = rows.pop(NOTHING)
     return Table(
-        f"Area between the volume-strain curves of soft tissue, strains {strains[0]:g} to {strains[1]:g}, mL",
-        ("model", "place", *(heads[one.load] for one in done), "all loads"),
+        f"Area between the volume-strain curves of soft tissue, strains {low:g} to {high:g}, mL",
+        ("model", "rank", *(_head(one) for one in loads), "all loads"),
         tuple(rows.values()),
         "The nearest model over all loads first; a place is a range where the measurement does not tell which of "
         "several models is nearer. Where the measurement's error is known, the area is the median over truths that "
@@ -227,8 +209,8 @@ def _areas(done: Sequence[Comparison], heads: Mapping[str, str], summed: Total, 
     )
 
 
-def _tissues(one: Comparison) -> Table:
-    def told(areas: Iterable[Area]) -> tuple[tuple[Cell, ...], ...]:
+def _tissues(one: LoadComparison) -> Table:
+    def cells(areas: Iterable[Area]) -> tuple[tuple[Cell, ...], ...]:
         return tuple(
             (a.model, a.tissue, a.ml, 100.0 * a.share, a.estimate_ml, a.low_ml, a.high_ml, a.floor_ml) for a in areas
         )
@@ -236,14 +218,14 @@ def _tissues(one: Comparison) -> Table:
     return Table(
         "Area between the curves, by tissue",
         ("model", "tissue", "as found, mL", "share, %", "estimate, mL", "95 % from", "to", "a perfect model's"),
-        told(a for a in one.areas if a.model != NOTHING),
+        cells(a for a in one.areas if a.model != NOTHING),
         "As found: with the measurement's noise and smoothing. Estimate and interval: these taken out. A perfect "
         "model's: what noise alone would give; an interval that reaches it begins at 0.",
-        told(a for a in one.areas if a.model == NOTHING),
+        cells(a for a in one.areas if a.model == NOTHING),
     )
 
 
-def _location(one: Comparison) -> Table:
+def _location(one: LoadComparison) -> Table:
     rows = tuple(
         (o.model, o.threshold, _ranged(o.measured_ml, o.measured_low_ml, o.measured_high_ml), o.model_ml,
          f"{o.measured_clusters} / {o.model_clusters}", f"{_ranged(o.measured_mean)} / {_ranged(o.model_mean)}",
@@ -284,8 +266,8 @@ def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
     return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.2g}–{high:.2g})"
 
 
-def _agreement(one: Comparison) -> Table:
-    rows = _rows_of(one, [ALL, *one.found.tissues])
+def _agreement(one: LoadComparison) -> Table:
+    rows = _rows_of(one, [ALL, *one.fields.tissues])
     return Table(
         "Agreement cell by cell",
         ("model", "quantity", "tissue", *_AGREED),
@@ -297,8 +279,8 @@ def _agreement(one: Comparison) -> Table:
     )  # fmt: skip
 
 
-def _by_distance(one: Comparison) -> Table:
-    known = (ALL, *one.found.tissues)
+def _by_distance(one: LoadComparison) -> Table:
+    known = (ALL, *one.fields.tissues)
     return Table(
         "Agreement by distance to bone",
         ("model", "quantity", "where", *_AGREED),
@@ -307,7 +289,7 @@ def _by_distance(one: Comparison) -> Table:
     )
 
 
-def _rows_of(one: Comparison, parts: Sequence[str]) -> tuple[tuple[Cell, ...], ...]:
+def _rows_of(one: LoadComparison, parts: Sequence[str]) -> tuple[tuple[Cell, ...], ...]:
     return tuple(
         (a.model, {"max_shear": "shear", "u_mm": "u, mm"}[a.quantity], a.part, a.measured_mean,
          a.model_mean, a.slope, a.intercept, a.r2, a.rmse, a.concordance, a.bias, a.lower, a.upper)
@@ -316,11 +298,11 @@ def _rows_of(one: Comparison, parts: Sequence[str]) -> tuple[tuple[Cell, ...], .
     )  # fmt: skip
 
 
-def _travel(one: Comparison) -> Table:
+def _skin(one: LoadComparison) -> Table:
     rows = tuple(
         (t.model, t.nodes, t.measured_mm, t.model_mm, t.measured_along_mm, t.model_along_mm,
          100.0 * t.measured_volume_change, 100.0 * t.model_volume_change)
-        for t in one.travels
+        for t in one.skin
     )  # fmt: skip
     return Table(
         "Skin under the plate, and volume of the fat",
