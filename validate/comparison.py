@@ -125,15 +125,22 @@ class Comparison:
         ]
         table = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
         titles = "".join(f"<th>{html.escape(name)}</th>" for name in head)
-        first = next(iter([*self.ranking.statements, *self.summary()]), "")
         verdict = "" if self.verdict is None else f"<p>Verdict on the inputs: <b>{self.verdict.words}</b></p>"
         image = base64.b64encode(png_bytes(self.plot())).decode()
         return (
-            f"<div><p><b>{html.escape(first)}</b></p>{verdict}<table><caption>Area between volume-strain curves, "
-            f"maximum shear strain {self.strains[0]:g} to {self.strains[1]:g}, mL (95 % interval)</caption>"
+            f"<div><p><b>{html.escape(self._answer())}</b></p>{verdict}<table><caption>Area between volume-strain "
+            f"curves, maximum shear strain {self.strains[0]:g} to {self.strains[1]:g}, mL (95 % interval)</caption>"
             f'<tr>{titles}</tr>{table}</table><img alt="Volume-strain curves" style="max-width:100%" '
             f'src="data:image/png;base64,{image}"></div>'
         )
+
+    def _answer(self) -> str:
+        """One sentence: the best match, or for a single model its area."""
+        if self.ranking.statements:
+            return self.ranking.statements[0]
+        ranked = self.ranking.areas or tuple(a for a in self.areas if a.tissue == ALL and a.model != NOTHING)
+        best = min(ranked, key=lambda a: a.best_ml)
+        return f"{best.model}: area between curves {shown(best)} mL ({best.load}), normalised {best.share:.1%}."
 
     def plot(self, kind: Literal["curves", "areas"] = "curves", *, tissue: str = ALL) -> Figure:
         """Draw volume-strain curves, a panel for each load, or the areas between them with their 95 % intervals.

@@ -99,14 +99,14 @@ def areas_by_load(areas: Sequence[Area]) -> Figure:
     """Area between curves by load and model: the estimate with its 95 % interval, or as measured if that is unknown."""
     models, loads = (list(dict.fromkeys(getattr(a, of) for a in areas)) for of in ("model", "load"))
     figure, (axes,) = chart()
-    width = 0.8 / len(models)
+    width = 0.6 / len(models)
     for number, model in enumerate(models):
         rows = [a for a in areas if a.model == model]
         at = [loads.index(a.load) + (number - 0.5 * (len(models) - 1)) * width for a in rows]
-        axes.bar(at, [a.best_ml for a in rows], 0.9 * width, color=_colour(number), label=model)
-        for x, area in zip(at, rows, strict=True):
-            axes.plot([x, x], [area.low_ml, area.high_ml], color=INK, linewidth=1.2)
+        axes.plot(at, [a.best_ml for a in rows], "o", color=_colour(number), label=model)
+        axes.vlines(at, [a.low_ml for a in rows], [a.high_ml for a in rows], color=_colour(number), linewidth=1.8)
     axes.set_xticks(range(len(loads)), loads)
+    axes.set_xlim(-0.5, len(loads) - 0.5)
     axes.set_ylim(0.0, None)
     label_axes(axes, "", "area between curves, mL")
     axes.legend(fontsize=9, frameon=False)

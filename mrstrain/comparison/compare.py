@@ -80,29 +80,25 @@ def compare(
     dvc : path
         Results of `register` or `strain`: a folder for each load, or one of these.
     models : sequence of path
-        For each model a folder with a file named after each load (Load1.vtu, .vtk, .msh, .frd, or .csv with
-        ``model_mesh``), or, for a single load, a file.
+        Folders, with a file named after each load (Load1.vtu ...; .csv with ``model_mesh``), or a single load's file.
     labels, names : path
         Label map of the unloaded image and its names: tissues, and distance to bone.
     out : path
         Gets ``report.html``, tables, and a folder for each load.
-    loads : sequence of str
-        Names of measured loads; all by default.
-    bones : sequence of str
-        Labels of bone.
+    loads, bones : sequence of str
+        Names of measured loads, all by default; labels of bone.
     mesh : path, optional
         Where fields are compared; the first model's mesh by default.
     model_mesh, model_unit, model_frame, to_image
         As in `validate.read_result`.
     plate_normal, shear_direction, towards
-        The plate's outward normal and the direction of shear, LPS (3,); ``towards`` has both by load, for loads in
-        other directions.
+        The plate's outward normal and the direction of shear, LPS (3,); in ``towards`` by load, if in others.
     strains, thresholds, least_ml
         As in `validate.Criteria`; ``thresholds`` is a table with columns max_shear and source.
     on_image : bool
         Also write each model's displacement and maximum shear strain on the voxels of the label map.
     progress : callable, optional
-        ``progress(case, stage, fraction)``.
+        Gets case, stage, fraction.
 
     Raises
     ------

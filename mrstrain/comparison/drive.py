@@ -94,26 +94,14 @@ def drive(
     prescribed = {load: boundary_displacement(read, field) for load, field in measured.items()}
     folders = {name: target / (name + ENDING) for name in laws}
     refuse_touching_inputs(target, [BOUNDARY, *(f.name for f in folders.values())], [place, Path(dvc)])
-    make_output(target)
-    for folder in (target / BOUNDARY, *folders.values()):
-        make_output(folder)
-        clear(folder)
-    record = provenance(
-        "drive",
-        {
-            "mesh": place,
-            "measured": [f for m in measurements for f in m.files],
-            "sets": [Path(s) for s in sets if str(s).endswith(".toml")],
-        },
-        {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame},
-    )
+    _prepare(target, [target / BOUNDARY, *folders.values()])
+    inputs = {"mesh": [place], "measured": [f for m in measurements for f in m.files]}
+    inputs["sets"] = [Path(s) for s in sets if str(s).endswith(".toml")]
+    record = provenance("drive", inputs, {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame})
     for load, (nodes, u) in prescribed.items():
         write_boundary_conditions(target / BOUNDARY / load, read, nodes, u, unit=mesh_unit, frame=mesh_frame)
-    lines = [
-        f"{m.load}: verdict on the measurement: {m.verdict.words}"
-        for m in measurements
-        if m.verdict and m.verdict.reasons
-    ]
+    doubtful = [(m.load, m.verdict) for m in measurements if m.verdict and m.verdict.reasons]
+    lines = [f"{load}: verdict on the measurement: {verdict.words}" for load, verdict in doubtful]
     complete = True
     for number, (name, (region_laws, notes)) in enumerate(laws.items()):
         tell("drive", "simulating", number / len(laws))
@@ -128,6 +116,13 @@ def drive(
         )  # fmt: skip
     tell("drive", "simulating", 1.0)
     return Driven(target, complete, tuple(lines))
+
+
+def _prepare(target: Path, folders: Sequence[Path]) -> None:
+    make_output(target)
+    for folder in folders:
+        make_output(folder)
+        clear(folder)
 
 
 def _refuse_bone_motion(measurements: Sequence[Measurement]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
-from dvc.images.image import Image, Mask
+from dvc.images.image import Image
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
@@ -70,23 +70,17 @@ def level(
     ----------
     load0 : path
         The unloaded image.
-    model : path
-        A folder with a file for each load, as in `compare`.
+    model, model_mesh, model_unit, model_frame
+        A folder with a file for each load, and how it is read; as in `compare`.
     out : path
         Gets a folder named as the model and "-levelled", for `compare` beside the model itself, and one ending in
         "-work" with the warped images and, by load, their registration.
-    bone, bone_label, tissue, labels, names
-        As in `register`; the bone is needed.
+    bone, bone_label, tissue, labels, names, engine, borders, preset, parameters
+        Those of the measurement, as in `register`; the bone is needed. Unknown elastix parameters are accepted.
     loads : sequence of str
         Names of the loads; all of the model's files by default.
-    engine, borders, preset, parameters
-        Those of the measurement, as in `register`; unknown elastix parameters are accepted.
-    model_mesh, model_unit, model_frame
-        As in `compare`.
-    threads : int, optional
-        Of each registration; by default all cores.
-    seed : int
-        Of the fresh noise, and of the registration.
+    threads, seed : int, optional
+        Of each registration; the seed also of the fresh noise.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -97,69 +91,64 @@ def level(
     RegistrationError
         If no load could be registered.
     """
-    target, place = Path(out), Path(model)
+    target, place, mesh = Path(out), Path(model), None if model_mesh is None else Path(model_mesh)
+    if not place.is_dir():
+        raise InputError(f"{place} is no folder with a model's results, a file for each load.")
     # The extrapolated displacement outside the model's mesh is not isochoric: volume is kept whatever the images show.
     volume = USUAL_VOLUME if engine_of(engine, preset, parameters) == GAUSS_NEWTON else None
+    how: dict[str, Any] = {"engine": engine, "volume": volume, "borders": borders, "preset": preset}
     settings_of(
         engine, preset, parameters, volume=volume, borders=borders, labelled=labels is not None, allow_unknown=True
     )  # refused now rather than after the images are made
-    if not place.is_dir():
-        raise InputError(f"{place} is no folder with a model's results, a file for each load.")
     anatomy: dict[str, Any] = {"bone": bone, "bone_label": bone_label, "tissue": tissue, "labels": labels}
-    anatomy["names"] = names
-    subject = read_subject(load0, **anatomy)
-    if subject.bone is None:
-        raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is rigid.")
-    reading = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame)
-    files, notes = model_files(list(loads) or loads_of(place, model_mesh is not None), [place], reading)
-    results = {load: file for load, (file,) in files.items()}
-    name = place.resolve().name + LEVELLED
-    work = name + "-work"
-    inputs = [Path(p) for p in (load0, bone, tissue, labels, names, model_mesh, *parameters) if p is not None]
-    refuse_touching_inputs(target, [name, work], [*inputs, *(f.path for f in results.values())])
-    read = {load: file.read(subject.reference.grid) for load, file in results.items()}
-    images, smoothed = _warped_images(subject, subject.bone, read, seed)
-    how: dict[str, Any] = {
-        "engine": engine,
-        "volume": volume,
-        "borders": borders,
-        "preset": preset,
-        "threads": threads,
-        "seed": seed,
-    }
-    record = provenance(
-        "level",
-        {
-            **subject.files,
-            "models": [f.path for f in results.values()],
-            "parameters": [Path(p) for p in parameters],
-        },
-        how | {"bone_label": bone_label, "model_unit": model_unit, "model_frame": model_frame},
+    subject = read_subject(load0, names=names, **anatomy)
+    of_load, notes = model_files(
+        list(loads) or loads_of(place, mesh is not None), [place], Reading(mesh, model_unit, model_frame)
     )
-    _prepare(target, name, images, record)
-    how |= anatomy | {"parameters": parameters, "allow_unknown_parameters": True, "progress": progress}
-    failures = []
-    for load, result in read.items():  # each in a folder of its own: a study levels several at once
-        registered = target / work / "registered" / load
-        try:
-            register(load0, [target / work / "images" / f"{load}.nii.gz"], out=registered, **how)
-        except (RegistrationError, WorkerError) as failed:
-            failures.append(f"{load} was not registered: {failed}")
-        else:
-            _write(target / name / f"{load}.vtu", result, registered)
-    if len(failures) == len(read):
-        raise RegistrationError(" ".join(failures))
+    files = {load: file for load, (file,) in of_load.items()}
+    name = place.resolve().name + LEVELLED
+    inputs = [Path(p) for p in (load0, bone, tissue, labels, names, mesh, *parameters) if p is not None]
+    refuse_touching_inputs(target, [name, f"{name}-work"], [*inputs, *(f.path for f in files.values())])
+    results = {load: file.read(subject.reference.grid) for load, file in files.items()}
+    images, smoothed = _warped_images(subject, results, seed)
+    how |= {"threads": threads, "seed": seed}
+    sources = {"models": [f.path for f in files.values()], "parameters": [Path(p) for p in parameters]}
+    about = how | {"bone_label": bone_label, "model_unit": model_unit, "model_frame": model_frame}
+    _prepare(target, name, images, provenance("level", {**subject.files, **sources}, about))
+    how |= anatomy | {"names": names, "parameters": parameters, "allow_unknown_parameters": True}
+    failures = _register_each(load0, results, target / name, how | {"progress": progress})
     return Levelled(target / name, (*notes, *smoothed, *failures))
 
 
-def _warped_images(
-    subject: Subject, bone: Mask, results: Mapping[str, FeResult], seed: int
-) -> tuple[dict[str, Image], list[str]]:
+def _register_each(
+    load0: Path | str, results: Mapping[str, FeResult], folder: Path, options: Mapping[str, Any]
+) -> list[str]:
+    """Register each warped image and write what it gives on the model's mesh; a sentence for each that failed.
+
+    Every load has a folder of its own, since a study levels several at once.
+    """
+    work, failures = folder.with_name(f"{folder.name}-work"), []
+    for load, result in results.items():
+        registered = work / "registered" / load
+        try:
+            register(load0, [work / "images" / f"{load}.nii.gz"], out=registered, **options)
+        except (RegistrationError, WorkerError) as failed:
+            failures.append(f"{load} was not registered: {failed}")
+        else:
+            _write(folder / f"{load}.vtu", result, registered)
+    if len(failures) == len(results):
+        raise RegistrationError(" ".join(failures))
+    return failures
+
+
+def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int) -> tuple[dict[str, Image], list[str]]:
     """The unloaded image warped by each result, with fresh noise; and where a result was smoothed to do so."""
+    if subject.bone is None:
+        raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is rigid.")
     images, notes = {}, []
     body = subject.tissue or tissue_mask(subject.reference)
     for load, result in results.items():
-        field = extrapolated(result.deformation, subject.reference.grid, bone.inside)
+        field = extrapolated(result.deformation, subject.reference.grid, subject.bone.inside)
         centroids = result.mesh.centroids_mm
         difference = field.displacement(centroids) - result.deformation.displacement(centroids)
         changed = float(np.mean(np.linalg.norm(difference, axis=1) > _CHANGED_MM))
