@@ -32,9 +32,9 @@ def volume_strain(
     tissues: Sequence[str],
     colours: Sequence[str],
 ) -> bytes:
-    """Volume of tissue whose maximal shear exceeds a value: measured (black) and models, on the same cells.
+    """Volume of tissue above each maximum shear strain: measured (black) and models, in the same cells.
 
-    The grey band holds the true curve in 95 % of cases, by the measurement's error model; areas are
+    The grey band contains the true curve in 95 % of cases, by the measurement's error model; areas are
     taken between the dotted lines.
     """
     figure, panels = _panels(len(tissues))
@@ -68,7 +68,7 @@ def _draw_curves(
         axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
     axes.set_xlim(0.0, at[-1])
     axes.set_ylim(0.0, None)
-    label_axes(axes, "maximal shear", "volume above, mL")
+    label_axes(axes, "maximum shear strain", "volume above, mL")
 
 
 def _colour(number: int) -> str:
@@ -78,7 +78,7 @@ def _colour(number: int) -> str:
 def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Figure:
     """Volume-strain curves of one tissue, measured (black) and simulated, a panel for each load.
 
-    The grey band holds the true curve in 95 % of cases; areas are taken between the dotted lines.
+    The grey band contains the true curve in 95 % of cases; areas are taken between the dotted lines.
     """
     by_load: dict[str, dict[str, Curve]] = {}
     for curve in curves:
@@ -130,26 +130,26 @@ def slices(
     axes: FloatArray,
     point_mm: FloatArray,
 ) -> bytes:
-    """Maximal shear on a slice, measured and simulated, where tissue is under load.
+    """Maximum shear strain on a slice, measured and simulated, on the deformed tissue.
 
-    The slice holds the plate's normal and the direction of shear; the same cells in one colour scale. Grey is not
-    defined. Where the measurement does not reach a node, it is drawn with the displacement of the nearest one. Letters
-    name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
+    The slice contains the plate's normal and the direction of shear; the same cells in one colour scale. Grey is
+    undefined. A node beyond the measurement is drawn with the displacement of the nearest one within. Letters name the
+    sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
     return slice_sheet(fields.mesh, slice_panels(fields, measured, displacements), axes, point_mm)
 
 
 def slice_panels(fields: MappedFields, measured: Deformation, displacements: Mapping[str, FloatArray]) -> list[Slice]:
-    """What `slices` draws: the measurement, then each model, with displacements (n, 3) at the mesh's nodes."""
+    """Panels of `slices`: the measurement, then each model, with displacements (n, 3) at the mesh's nodes."""
     u = filled_from_nearest(measured.displacement(fields.mesh.points_mm), fields.mesh.points_mm)
     panels = [Slice("measured", u, fields.measured.max_shear)]
     return panels + [Slice(name, displacements[name], field.max_shear) for name, field in fields.models.items()]
 
 
 def scatter(fields: MappedFields) -> bytes:
-    """Simulated over measured maximal shear, cell by cell: how much volume lies where (darker is more, logarithmic).
+    """Simulated over measured maximum shear strain, cell by cell; darker is more volume (logarithmic).
 
-    On the line both agree.
+    Both agree on the line.
     """
     names = list(fields.models)
     figure, spots = _by_model(len(names))
@@ -171,9 +171,9 @@ def scatter(fields: MappedFields) -> bytes:
 
 
 def differences(fields: MappedFields, rows: Sequence[Agreement], quantity: str) -> bytes:
-    """Bland and Altman's plot: simulated minus measured over the mean of both, cell by cell (darker is more volume).
+    """Bland-Altman plot: simulated minus measured over the mean of both, cell by cell; darker is more volume.
 
-    The line is the mean difference, dashed are the limits of agreement: 1.96 standard deviations to either side.
+    The solid line is the mean difference, dashed lines are the limits of agreement, 1.96 standard deviations away.
     """
     limits = {row.model: row for row in rows if (row.quantity, row.part) == (quantity, ALL)}
     names = [name for name in fields.models if name in limits]
@@ -205,7 +205,7 @@ def _by_model(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[str]) -> bytes:
-    """Area between curves, as a share of volume and range, of every subject (points) by model; the bar is the mean.
+    """Normalised area between curves of every subject (points) by model; the bar is the mean.
 
     Lines join the models of one subject.
     """
@@ -220,7 +220,7 @@ def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[st
         axes.plot([at - 0.25, at + 0.25], [mean, mean], color=INK, linewidth=2.5)
     axes.set_xticks(range(len(models)), list(models), rotation=30, ha="right")
     axes.set_ylim(bottom=0.0)
-    label_axes(axes, "", "area between curves, % of volume and range")
+    label_axes(axes, "", "normalised area between curves, %")
     if len(subjects) <= len(REGION_COLOURS):
         axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)

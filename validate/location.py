@@ -47,7 +47,7 @@ def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
         raise InputError(f"{place}: a table of thresholds has the columns max_shear and source ({error}).") from error
     if not thresholds or not all(0.0 < t.max_shear < 3.0 for t in thresholds):
         raise InputError(
-            f"{place}: thresholds are maximal shears between 0 and 3 (no percent); it has "
+            f"{place}: thresholds are maximum shear strains between 0 and 3 (no percent); it has "
             f"{[t.max_shear for t in thresholds]}."
         )
     return thresholds

@@ -30,21 +30,22 @@ _CLOSING = Section(
     "How to read this",
     paragraphs=(
         "All fields are compared at the centroids of the same cells of one mesh, with the cells' volumes as weights, "
-        "in the reference (unloaded) configuration; cells in which the measurement or a model is not defined are left "
-        "out for all. Strain is Green-Lagrange, maximal shear (E1 - E3)/2. Displacement is that of tissue relative "
-        "to its bone, LPS mm.",
-        "The area between two volume-strain curves is the integral of the difference of volumes above a strain over "
-        "the range of strain, in mL; its share is divided by the tissue's volume and the width of the range. Curves "
-        "carry no place: two fields may have one curve and differ everywhere. Overlap (Dice), distances of centroids, "
-        "the Hausdorff distance (95th percentile) and the agreement cell by cell tell where.",
-        "Intervals and the grey band come from the error model of the registration: truths are drawn that could lie "
-        "behind the measured field, and the model's area to each is taken. Where an interval does not hold the area "
-        "as found, noise and smoothing have moved the measured curve. Two models are told apart where the area of one "
-        "is the smaller in 97.5 % of the draws, widened as the intervals are.",
-        "A measurement without a label map smears strain that jumps at a border of tissues over about 4 mm, and noise "
-        "lifts small shears; a model does neither. What the measurement cannot see, no comparison can: scanner "
-        "distortion, creep during a scan, tissue that slides along a smooth skin or inside a uniform region. Levels of "
-        "strain are no thresholds of injury unless the table of thresholds says so and why.",
+        "in the reference (unloaded) configuration; cells in which the measurement or a model is undefined are left "
+        "out for all. Strain is Green-Lagrange, maximum shear strain (E1 - E3)/2. Displacement is that of tissue "
+        "relative to its bone, LPS mm.",
+        "The area between two volume-strain curves (the area validation metric, with volume in place of probability) "
+        "is the integral of the absolute difference of the volumes above a strain over the range of strain, in mL; the "
+        "normalised area is divided by the tissue's volume and the width of the range. Curves carry no location: two "
+        "fields may have one curve and differ everywhere. Overlap (Dice), distances of centroids, the Hausdorff "
+        "distance (95th percentile) and the agreement cell by cell show where the fields differ.",
+        "Intervals and the grey band come from the error model of the registration: true fields that are consistent "
+        "with the measured one are drawn, and the model's area to each is computed. If an interval excludes the area "
+        "as measured, noise and smoothing have shifted the measured curve. Two models differ significantly if the area "
+        "of one is the smaller in 97.5 % of the draws, widened as the intervals are.",
+        "A measurement without a label map smooths strain discontinuities at tissue interfaces over about 4 mm, and "
+        "noise raises small shear strains; a model does neither. No comparison can show what the measurement does not: "
+        "scanner distortion, creep during a scan, tissue that slides along a smooth skin or inside a uniform region. "
+        "Thresholds of strain are not thresholds of injury unless their table says so and why.",
     ),
 )  # fmt: skip
 
@@ -82,9 +83,11 @@ def _pictures(
     return {
         "curves": Picture("Volume above a strain", caption_of(figures.volume_strain), curves),
         "slices": Picture("Where the strain lies", f"{caption_of(figures.slices)} {through}", slices),
-        "agreement": Picture("Maximal shear, cell by cell", caption_of(figures.scatter), figures.scatter(fields)),
-        "differences_shear": Picture("Differences of maximal shear", differences, shear),
-        "differences_u": Picture("Differences of the displacement's length", differences, u),
+        "agreement": Picture(
+            "Maximum shear strain, cell by cell", caption_of(figures.scatter), figures.scatter(fields)
+        ),
+        "differences_shear": Picture("Differences of maximum shear strain", differences, shear),
+        "differences_u": Picture("Differences of the displacement's magnitude", differences, u),
     }
 
 
@@ -125,9 +128,9 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
         shown = labels.labels[box].astype(np.float64)
     most = max(0.05, float(np.ceil(20.0 * np.nanquantile(shear[0], 0.99)) / 20.0))
     return Viewer(
-        "To turn and to scroll",
-        f"Maximal shear, 0 to {most:g}, in the unloaded configuration: measured, and by {model.name}. Drag to move "
-        "through the slices, with the right button to turn; both follow. Needs WebGL 2.",
+        "Interactive 3-D viewer",
+        f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and by {model.name}. Drag to "
+        "move through the slices, drag with the right button to rotate; both views follow. Needs WebGL 2.",
         Volume.of("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
         (Volume.of("measured", grid, shear[0], most), Volume.of(model.name, grid, shear[1], most)),
     )
@@ -168,9 +171,9 @@ def _head(one: LoadComparison) -> str:
 def closing_sections(thresholds: Sequence[Threshold], methods: Sequence[str]) -> list[Section]:
     """How a comparison is read, sources of its thresholds, and paragraphs for a methods section if there are any."""
     sources = Section(
-        "Levels of strain",
+        "Thresholds of strain",
         None,
-        (Table("Thresholds", ("maximal shear", "source"), tuple((t.max_shear, t.source) for t in thresholds)),),
+        (Table("Thresholds", ("maximum shear strain", "source"), tuple((t.max_shear, t.source) for t in thresholds)),),
     )
     return [_CLOSING, sources, *([Section(METHODS, paragraphs=tuple(methods))] if methods else [])]
 
@@ -200,11 +203,10 @@ def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
         f"Area between the volume-strain curves of soft tissue, strains {low:g} to {high:g}, mL",
         ("model", "rank", *(_head(one) for one in loads), "all loads"),
         tuple(rows.values()),
-        "The nearest model over all loads first; a place is a range where the measurement does not tell which of "
-        "several models is nearer. Where the measurement's error is known, the area is the median over truths that "
-        "could lie behind it, with a 95 % interval; areas as found, and by tissue, stand below and in areas.csv. "
-        "Levelled models come last, with their area as found. Below the line: the area of a model that predicts no "
-        "strain at all.",
+        "The best model over all loads first; the rank is a range where models are not distinguishable. Where the "
+        "measurement uncertainty is known, the area is the median over the true fields drawn, with a 95 % interval; "
+        "areas as measured, and by tissue, stand below and in areas.csv. Levelled models come last, with their area as "
+        "measured. Below the line: the area of a model that predicts zero strain everywhere.",
         (nothing,),
     )
 
@@ -217,10 +219,10 @@ def _tissues(one: LoadComparison) -> Table:
 
     return Table(
         "Area between the curves, by tissue",
-        ("model", "tissue", "as found, mL", "share, %", "estimate, mL", "95 % from", "to", "a perfect model's"),
+        ("model", "tissue", "as measured, mL", "normalised, %", "estimate, mL", "95 % from", "to", "perfect model"),
         cells(a for a in one.areas if a.model != NOTHING),
-        "As found: with the measurement's noise and smoothing. Estimate and interval: these taken out. A perfect "
-        "model's: what noise alone would give; an interval that reaches it begins at 0.",
+        "As measured: with the measurement's noise and smoothing. Estimate and interval: with these removed. Perfect "
+        "model: the area from noise alone; an interval that reaches it begins at 0.",
         cells(a for a in one.areas if a.model == NOTHING),
     )
 
@@ -241,26 +243,26 @@ def _location(one: LoadComparison) -> Table:
         if not np.isnan(o.measured_low_ml)
     }  # fmt: skip
     known = (
-        "In brackets 95 % intervals with the measurement's bias and noise taken out, so that one need not hold the "
-        "figure as found; below the line what noise alone leaves of a perfect model: an interval that reaches it goes "
-        "on to 1, or to 0 mm. "
+        "In brackets 95 % intervals with the measurement's bias and noise removed, so that one may exclude the value "
+        "as measured; below the line the values of a perfect model, from noise alone: an interval that reaches one is "
+        "extended to 1, or to 0 mm. "
         if perfect
-        else "The measurement's error is not known: no intervals. "
+        else "The measurement uncertainty is unknown: no intervals. "
     )
     return Table(
-        "Tissue above a strain: how much, and where",
-        ("model", "above", "measured, mL", "model, mL", "clusters", "mean shear", "Dice", "centroids, mm",
+        "Tissue above a threshold of strain: volume and location",
+        ("model", "above", "measured, mL", "model, mL", "clusters", "mean max. shear", "Dice", "centroids, mm",
          "largest, mm", "Hausdorff, mm"),
         rows,
-        known + "In clusters, connected parts of at least the least volume: their number and mean shear, measured / "
-        "model's; distances of the centroids of all together, and of the largest; Hausdorff distance at its 95th "
-        "percentile.",
+        known + "Clusters are connected cells of at least the smallest volume: their number and mean maximum shear "
+        "strain, measured / model's; distances of the centroids of all together, and of the largest; Hausdorff "
+        "distance at its 95th percentile.",
         tuple(perfect.values()),
     )  # fmt: skip
 
 
 def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
-    """A figure with its interval, where there is one."""
+    """A value with its interval, if there is one."""
     if np.isnan(value):
         return "–"
     return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.2g}–{high:.2g})"
@@ -272,10 +274,10 @@ def _agreement(one: LoadComparison) -> Table:
         "Agreement cell by cell",
         ("model", "quantity", "tissue", *_AGREED),
         rows,
-        "Of maximal shear and displacement u: means, regression of the model on the measurement, Lin's concordance, "
-        "Bland and Altman's limits. Of displacements: lengths, but for regression and concordance (the three "
-        "components together) and RMSE (of the difference). All as found, "
-        "without intervals: the error model tells of maximal shear, and there is none of displacement.",
+        "Maximum shear strain and displacement u: means, regression of the model on the measurement, Lin's "
+        "concordance, Bland and Altman's limits of agreement. For displacement these are of its magnitude, except "
+        "regression and concordance (the three components pooled) and RMSE (of the difference vector). All as "
+        "measured, without intervals: the error model covers maximum shear strain, and there is none of displacement.",
     )  # fmt: skip
 
 
@@ -305,10 +307,10 @@ def _skin(one: LoadComparison) -> Table:
         for t in one.skin
     )  # fmt: skip
     return Table(
-        "Skin under the plate, and volume of the fat",
-        ("model", "nodes", "inward, measured, mm", "model, mm", "across, measured, mm", "model, mm",
-         "fat's volume, measured, %", "model, %"),
+        "Skin under the plate, and volume change of the fat",
+        ("model", "nodes", "inward, measured, mm", "model, mm", "tangential, measured, mm", "model, mm",
+         "fat's volume change, measured, %", "model, %"),
         rows,
-        "Mean displacement 1 mm inside the skin on the model's plate, against the plate's outward normal and across "
-        "it; mean det F - 1.",
+        "Mean displacement 1 mm inside the skin on the model's plate, against the plate's outward normal and "
+        "tangential to it; mean det F - 1.",
     )  # fmt: skip

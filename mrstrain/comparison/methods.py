@@ -79,7 +79,7 @@ def methods(
 def methods_of_registrations(measured: Mapping[str, Path]) -> tuple[str, ...]:
     """Paragraphs on the measurement alone, the references last; ``measured`` as in `methods`."""
     known = _sources(measured)
-    return _with_references([_measured(measured), *([f"Error of the maximal shear: {known}"] if known else [])])
+    return _with_references([_measured(measured), *([f"Error of the maximum shear strain: {known}"] if known else [])])
 
 
 def _with_references(parts: Sequence[str]) -> tuple[str, ...]:
@@ -108,7 +108,7 @@ def _measured(measured: Mapping[str, Path]) -> str:
     told = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
         told + " Displacement is that of tissue in the unloaded configuration; strain is Green-Lagrange, "
-        "E = (F^T F - I)/2, and maximal shear half the difference of its largest and smallest principal value."
+        "E = (F^T F - I)/2, and maximum shear strain half the difference of its largest and smallest principal value."
     )
 
 
@@ -300,7 +300,7 @@ def _compared(cells: int, criteria: Criteria) -> str:
     return (
         f"Models and measurement were compared with mrstrain {version} at the centroids of the same {cells} "
         "tetrahedra, weighted by volume, in the unloaded configuration. Intensity: area between the curves of tissue "
-        f"volume above a maximal shear, from {low:g} to {high:g}. Location: tissue above {levels}; "
+        f"volume above a maximum shear strain, from {low:g} to {high:g}. Location: tissue above {levels}; "
         "overlap (Dice 1945), distance of the centroids, 95th percentile of the Hausdorff distance, clusters of "
         f"{criteria.least_ml:g} mL or more. "
         "Agreement cell by cell: regression, concordance (Lin 1989), limits of agreement (Bland 1986)."
@@ -337,5 +337,5 @@ def _twins(measured: Mapping[str, Path]) -> str:
 
 
 def _errors(measured: Mapping[str, Path]) -> dict[str, Record]:
-    """What each registration tells of the error of its maximal shear."""
+    """The record of each registration on the error of its maximum shear strain."""
     return {load: _record(folder / "quality.json").get("error_of_max_shear", {}) for load, folder in measured.items()}

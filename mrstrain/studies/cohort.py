@@ -58,7 +58,7 @@ class Cohort:
         lines += [
             f"{place}. {s.model}: {100 * s.mean:.2f} % ({100 * s.low:.2f} to {100 * s.high:.2f}), nearest in "
             f"{s.nearest_in} of {s.subjects} subjects"
-            + ("" if place == 1 or s.told_apart else "; not told from the first")
+            + ("" if place == 1 or s.differs_from_best else "; not told from the first")
             for place, s in enumerate(self.ranking, start=1)
         ]
         return [*lines, *self.notes, f"Report: {self.out / 'report.html'}"]
@@ -233,7 +233,7 @@ def _write_page(
         tuple(
             (s.model, 100 * s.mean, 100 * s.low, 100 * s.high, 100 * s.least, 100 * s.greatest, s.nearest_in,
              s.subjects, 100 * s.behind, 100 * s.behind_low, 100 * s.behind_high,
-             "–" if at == 0 else "yes" if s.told_apart else "no")
+             "–" if at == 0 else "yes" if s.differs_from_best else "no")
             for at, s in enumerate(ranking)
         ),
         "Area between volume-strain curves divided by the tissue's volume and the width of the range of strain. "
