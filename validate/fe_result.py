@@ -147,12 +147,12 @@ def _names_of_regions(place: Path) -> dict[str, str]:
 
 
 def _rigid(matrix: FloatArray) -> Affine:
-    given = np.asarray(matrix, dtype=np.float64)
-    turn = given[:3, :3] if given.shape == (4, 4) else np.zeros((3, 3))
+    affine = np.asarray(matrix, dtype=np.float64)
+    turn = affine[:3, :3] if affine.shape == (4, 4) else np.zeros((3, 3))
     proper = np.abs(turn.T @ turn - np.eye(3)).max() < 1e-4 and np.linalg.det(turn) > 0.0
-    if not (proper and np.allclose(given[3], [0.0, 0.0, 0.0, 1.0])):
+    if not (proper and np.allclose(affine[3], [0.0, 0.0, 0.0, 1.0])):
         raise InputError("The map to the image must be a 4 x 4 matrix of a rotation and a translation in mm.")
-    return Affine(turn, given[:3, 3])
+    return Affine(turn, affine[:3, 3])
 
 
 def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:

@@ -26,7 +26,7 @@ def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[str] =
     if not verdicts:
         return None
     distrust, caution = ([r for v in verdicts if v.level == level for r in v.reasons] for level in LEVELS[:0:-1])
-    sound = f"The measurement: {len(verdicts)} registrations are sound. The models are judged below."
+    sound = f"The measurement: {len(verdicts)} registrations are sound. The models are compared below."
     return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
 
 

@@ -69,7 +69,7 @@ def _everywhere(mesh: TetMesh, measured: Deformation) -> FloatArray:
 
 def simulate_driven(
     mesh: TetMesh,
-    laws: Mapping[str, Material],
+    materials: Mapping[str, Material],
     measured: Deformation,
     load: str,
     *,
@@ -82,7 +82,7 @@ def simulate_driven(
     ----------
     mesh : TetMesh
         Every cell in one region; the surface set "bone" does not move.
-    laws : mapping of region to Material
+    materials : mapping of region to Material
     measured : Deformation
         Of tissue relative to its bone, reference configuration, LPS mm.
     load : str
@@ -102,12 +102,12 @@ def simulate_driven(
     InputError
         As `boundary_displacement`, or if a cell does not have exactly one constitutive model.
     """
-    check_laws(mesh, laws)
+    check_laws(mesh, materials)
     began = time.monotonic()
     nodes, u = boundary_displacement(mesh, measured)
     guess = _everywhere(mesh, measured)
     guess[nodes] = u
-    model = Model.of(mesh, laws, element("P1"))
+    model = Model.of(mesh, materials, element("P1"))
     assembler = Assembler(model, (3 * nodes[:, None] + np.arange(3)).ravel(), {})
     solver = Solver(assembler.indptr, assembler.indices, threads=threads)
     state = np.zeros(model.unknowns)
@@ -156,12 +156,12 @@ def write_boundary_conditions(
     u = u_mm / MM_PER_UNIT[unit] * TO_LPS[frame]
     about = f"displacements in {unit}, {frame}, of nodes by their numbers in the mesh"
     written = {".inp": _abaqus(numbers, u), ".mac": _ansys(numbers, u), ".feb": _febio(numbers, u)}
-    told = {".inp": f"** {about}; into a *STEP", ".mac": f"! {about}", ".feb": f"<!-- {about} -->"}
+    remarks = {".inp": f"** {about}; into a *STEP", ".mac": f"! {about}", ".feb": f"<!-- {about} -->"}
     paths = []
     for ending, lines in written.items():
         paths.append(stem.with_name(stem.name + ending))
         first, *others = lines
-        written_lines = [first, told[ending], *others] if ending == ".feb" else [told[ending], first, *others]
+        written_lines = [first, remarks[ending], *others] if ending == ".feb" else [remarks[ending], first, *others]
         write_whole(paths[-1], "\n".join(written_lines) + "\n")
     return paths
 

@@ -18,11 +18,11 @@ from validate.mapping import MappedFields, check_bones, tissues_of
 
 _LEAST_OVERLAP, _GOOD_OVERLAP = 0.85, 0.95
 _SAME_TISSUE = 0.8
-_NEAR_BONE_MM, _AT_REST_MM = 1.5, 1.0
+_NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
 _VOLUME_CHANGE = 0.15
 _ALONG, _TURNED = 0.7, 0.5
 _UNIT = 1000.0
-_ALIKE = 0.02
+_TIED = 0.02
 
 
 def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",)) -> list[str]:
@@ -106,7 +106,7 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[st
         near = cKDTree(points).query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0] < _NEAR_BONE_MM
         if near.any():
             moved = float(np.median(np.linalg.norm(result.deformation.u_mm[near], axis=1)))
-            if moved > _AT_REST_MM:
+            if moved > _RIGID_MM:
                 warnings.append(
                     f"{result.name}: the model moves by {moved:.1f} mm at the bone, and the measurement is relative "
                     "to the bone; take the bone's motion out of it."
@@ -159,8 +159,8 @@ def displacement_slip(fields: MappedFields, name: str) -> str:
     }
     most = max(cosines.values())
     if most >= _ALONG and as_given < _TURNED * most:
-        alike = (axes for axes, cosine in cosines.items() if cosine > most - _ALIKE)
-        order, signs = min(alike, key=lambda axes: sum(o != n for n, o in enumerate(axes[0])) + axes[1].count(-1.0))
+        tied = (axes for axes, cosine in cosines.items() if cosine > most - _TIED)
+        order, signs = min(tied, key=lambda axes: sum(o != n for n, o in enumerate(axes[0])) + axes[1].count(-1.0))
         axes = " ".join(("-" if sign < 0.0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
         axes += " (the other of LPS and RAS)" if axes == "-x -y z" else ""
         warnings.append(

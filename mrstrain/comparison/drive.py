@@ -105,9 +105,9 @@ def drive(
     complete = True
     for number, (name, (region_laws, notes)) in enumerate(laws.items()):
         tell("drive", "simulating", number / len(laws))
-        outcome, told = _drive_set(folders[name], read, region_laws, measured, threads or usable_cores())
+        outcome, messages = _drive_set(folders[name], read, region_laws, measured, threads or usable_cores())
         complete = complete and [of["reached"] for of in outcome.values()] == [1.0] * len(measured)
-        lines += told
+        lines += messages
         regions = {str(n): region for n, region in enumerate(read.regions, start=1)}
         write_json(
             folders[name] / "simulation.json",

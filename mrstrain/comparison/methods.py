@@ -89,8 +89,8 @@ def _with_references(parts: Sequence[str]) -> tuple[str, ...]:
 
 def _record(place: Path) -> Record:
     try:
-        told = json.loads(place.read_text(encoding="utf-8"))
-        return told if isinstance(told, dict) else {}
+        record = json.loads(place.read_text(encoding="utf-8"))
+        return record if isinstance(record, dict) else {}
     except (OSError, ValueError):
         return {}
 
@@ -100,39 +100,39 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _measured(measured: Mapping[str, Path]) -> str:
-    """How displacement was measured; loads that were registered alike go into one sentence."""
+    """How displacement was measured; loads that were registered in the same way share a sentence."""
     groups: dict[str, list[str]] = {}
     for load, folder in measured.items():
         record = _record(folder / "provenance.json")
         groups.setdefault(_registration(record) + _files(record), []).append(load)
-    told = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
+    sentences = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
-        told + " Displacement is that of tissue in the unloaded configuration; strain is Green-Lagrange, "
+        sentences + " Displacement is that of tissue in the unloaded configuration; strain is Green-Lagrange, "
         "E = (F^T F - I)/2, and maximum shear strain half the difference of its largest and smallest principal value."
     )
 
 
 def _registration(record: Record) -> str:
-    given, versions = record.get("parameters", {}), record.get("versions", {})
-    stages, own = given.get("stages") or [], given.get("gauss_newton")
+    parameters, versions = record.get("parameters", {}), record.get("versions", {})
+    stages, own = parameters.get("stages") or [], parameters.get("gauss_newton")
     if record.get("command") != "register" or not (stages or own):
         return _GIVEN
     align = {
         "bone": "The loaded image was aligned with the unloaded one rigidly on the bone, and then",
         "image": "The loaded image was aligned with the unloaded one rigidly on the whole image, and then",
-    }.get(str(given.get("align")), "The loaded image was, without rigid alignment,")
+    }.get(str(parameters.get("align")), "The loaded image was, without rigid alignment,")
     elastix = f"elastix (Klein 2010, Shamonin 2014; itk-elastix {versions.get('itk-elastix', '?')})"
     ours = f"mrstrain {versions.get('mrstrain', '?')}"
-    on_bone = given.get("align") == "bone"
+    on_bone = parameters.get("align") == "bone"
     how = (
         f"with {elastix} through {ours}: {'; then '.join(_stage(stage) for stage in stages)}"
         if not own
-        else f"with the Gauss-Newton engine of {ours}: {_weights(own, given.get('borders'), on_bone)}"
+        else f"with the Gauss-Newton engine of {ours}: {_weights(own, parameters.get('borders'), on_bone)}"
     )
-    if given.get("align") != "none":
+    if parameters.get("align") != "none":
         how += "; rigid alignment by Gauss-Newton least squares (Baker 2004)"
     return (
-        f"{align} registered non-rigidly {how}; seed {given.get('seed')}. Beforehand the smooth receive field was "
+        f"{align} registered non-rigidly {how}; seed {parameters.get('seed')}. Beforehand the smooth receive field was "
         "taken out of both images (N4, Tustison 2010, as implemented in SimpleITK "
         f"{versions.get('SimpleITK', '?')}, Lowekamp 2013)."
     )
@@ -171,18 +171,18 @@ def _weights(own: Record, borders: Record | None, on_bone: bool) -> str:
         if on_bone
         else f" and on change of volume in the tissue ({kept})"
     )
-    told = (
+    spline = (
         f"a cubic B-spline with control points every {own.get('spacing_mm'):g} mm{_COARSE}, least squares over all "
         "voxels of the tissue and 3 mm around it, and "
         "penalties on bending (the square of the Laplacian of its coefficients, less where the displacement is curved; "
         f"weight {weight}){held}"
     )
     if borders is None:
-        return told
+        return spline
     skin = borders.get("skin")
     weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
     return (
-        f"{told}; from there a second B-spline was added that vanishes on the borders of the label map's tissues, so "
+        f"{spline}; from there a second B-spline was added that vanishes on the borders of the label map's tissues, so "
         f"that strain may jump there, {'the bone held at rest and ' if on_bone else ''}strain of a tissue called skin "
         f"penalised (weight {weight}), and bending counted by the Laplacian of both splines' Laplacian"
     )
@@ -190,13 +190,13 @@ def _weights(own: Record, borders: Record | None, on_bone: bool) -> str:
 
 def _stage(stage: Record) -> str:
     try:
-        told = parse_parameters(str(stage.get("text", "")))
+        parameters = parse_parameters(str(stage.get("text", "")))
     except ParameterError:
         return f"parameters '{stage.get('name')}'"
 
     def value(name: str) -> str:
         """Values of a parameter, one for all where they are equal."""
-        values = told.get(name, ())
+        values = parameters.get(name, ())
         return ", ".join(dict.fromkeys(values) if len(set(values)) == 1 else values) or "elastix' default"
 
     spacing = value("FinalGridSpacingInPhysicalUnits")
@@ -214,7 +214,7 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
     published = False
     for name, path in models.items():
         record = _record(path.parent / "simulation.json")
-        given = record.get("parameters", {})
+        parameters = record.get("parameters", {})
         if record.get("command") == "drive":
             driven.append(_driven(name, record))
             published = published or record["set"] in _PUBLISHED
@@ -222,24 +222,24 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
         if _record(path.parent / "provenance.json").get("command") == "level":
             levelled.setdefault(_levelled(path, measured), []).append(name)
             continue
-        if record.get("command") != "simulate" or "set" not in given:
+        if record.get("command") != "simulate" or "set" not in parameters:
             others.append(f"{name} ({path.suffix[1:]})")
             continue
-        laws = "; ".join(f"{region}: {law['law']}" for region, law in given["laws"].items())
-        parts.append(f"{name}: {given['title']} ({laws}).")
-        published = published or given["set"] in _PUBLISHED
+        laws = "; ".join(f"{region}: {law['law']}" for region, law in parameters["laws"].items())
+        parts.append(f"{name}: {parameters['title']} ({laws}).")
+        published = published or parameters["set"] in _PUBLISHED
         groups.setdefault(_solver(record), []).append(name)
-    told = []
+    sentences = []
     if parts:
-        told.append(" ".join([*(f"{_listed(names)} {how}" for how, names in groups.items()), *parts]))
+        sentences.append(" ".join([*(f"{_listed(names)} {how}" for how, names in groups.items()), *parts]))
     if driven:
-        told.append(f"{_DRIVEN} {' '.join(driven)}")
+        sentences.append(f"{_DRIVEN} {' '.join(driven)}")
     if published:
-        told.append("Published sets of laws are those that Trebbi 2023 compiled.")
-    told += [f"{_listed(names)}: {how}" for how, names in levelled.items()]
+        sentences.append("Published sets of laws are those that Trebbi 2023 compiled.")
+    sentences += [f"{_listed(names)}: {how}" for how, names in levelled.items()]
     if others:
-        told.append(f"Results of other programs were taken as given: {_listed(others)}.")
-    return told
+        sentences.append(f"Results of other programs were taken as given: {_listed(others)}.")
+    return sentences
 
 
 _DRIVEN = (
@@ -271,15 +271,15 @@ def _along(axes: Sequence[Sequence[float]], column: int, sign: float = 1.0) -> s
 
 
 def _solver(record: Record) -> str:
-    given, versions = record["parameters"], record.get("versions", {})
-    made = given.get("mesh_made")
+    parameters, versions = record["parameters"], record.get("versions", {})
+    made = parameters.get("mesh_made")
     mesh = (
         f" on a mesh of fTetWild (Hu 2020; pytetwild {made['pytetwild']}) with edges of {made['edge_mm']:g} mm"
         if made
         else ""
     )
-    loads = _listed([f"{step['name']} {LoadStep(**step).told}" for path in given["paths"] for step in path])
-    axes = {load: told.get("plate_axes_lps") for load, told in record.get("outcome", {}).items()}
+    loads = _listed([f"{step['name']} {LoadStep(**step).told}" for path in parameters["paths"] for step in path])
+    axes = {load: of.get("plate_axes_lps") for load, of in record.get("outcome", {}).items()}
     if any(own != first for own in axes.values() for first in axes.values()):
         loads += "".join(
             f"; {load} with the plate's outward normal along {_along(own, 0, -1.0)} "
@@ -287,10 +287,10 @@ def _solver(record: Record) -> str:
             for load, own in axes.items()
             if own is not None
         )
-    contact = "bonded to the plate from the first touch" if given.get("taped", True) else "without friction"
+    contact = "bonded to the plate from the first touch" if parameters.get("taped", True) else "without friction"
     return (
-        f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh}: {given['element']}; "
-        f"plate {given['plate']}; skin {contact}; fixed: {', '.join(given['fixed'])}; loads {loads}."
+        f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh}: {parameters['element']}; "
+        f"plate {parameters['plate']}; skin {contact}; fixed: {', '.join(parameters['fixed'])}; loads {loads}."
     )
 
 
@@ -317,21 +317,21 @@ def _uncertainty(measured: Mapping[str, Path]) -> str:
 
 
 def _sources(measured: Mapping[str, Path]) -> str:
-    """Where the registrations' error models come from, each told once."""
+    """Where the registrations' error models come from, each once."""
     return " ".join(sorted({str(one["source"]) for one in _errors(measured).values() if one.get("source")}))
 
 
 def _twins(measured: Mapping[str, Path]) -> str:
-    """Which registrations' error bars a twin judged; a sentence with a space after it, or nothing."""
-    judged = [
+    """Which registrations' error bars were checked by a synthetic warp; a sentence and a space, or nothing."""
+    checked = [
         load
         for load, of in _errors(measured).items()
         if any(row.get("factor") is not None for row in of.get("twin", []))
     ]
-    if not judged:
+    if not checked:
         return ""
     return (
-        f"The error bars of {_listed(judged)} were judged by a twin of the pair (the unloaded image moved by what was "
+        f"The error bars of {_listed(checked)} were checked by a synthetic warp (the unloaded image moved by what was "
         "measured, and registered once more), and made wider where they did not hold. "
     )
 

@@ -66,7 +66,7 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
 def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(study: Path) -> None:
     sound = dict.fromkeys(("Load1", "Load2"), Verdict("trust"))
     assert verdict_on(sound) == Verdict(
-        "trust", ("The measurement: 2 registrations are sound. The models are judged below.",)
+        "trust", ("The measurement: 2 registrations are sound. The models are compared below.",)
     )
     assert verdict_on(dict.fromkeys(sound)) is None
     assert verdict_on(sound, ["It is mirrored."]) == Verdict("caution", ("It is mirrored.",))
