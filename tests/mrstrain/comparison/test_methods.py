@@ -158,15 +158,15 @@ def test_borders_are_told(tmp_path: Path) -> None:
 
 def test_a_twin_that_judged_the_error_bars_is_told(tmp_path: Path) -> None:
     loads = {load: measured(tmp_path, load) for load in ("Load1", "Load2")}
-    assert "twin" not in told(loads, {})
+    assert "synthetic warp" not in told(loads, {})
     rows = [{"region": "fat", "factor": 1.2}]
     for load, more in (("Load1", {"twin": rows}), ("Load2", {"twin": [], "of_twin": "There is none."})):
         error = {"source": "A study of 3 heels."} | more
         (loads[load] / "quality.json").write_text(json.dumps({"error_of_max_shear": error}))
-    assert "The error bars of Load1 were judged by a twin" in told(loads, {})
+    assert "The error bars of Load1 were checked by a synthetic warp" in told(loads, {})
     error = {"known": False, "twin": [{"region": "fat", "factor": None}]}  # a pair without error bars
     (loads["Load1"] / "quality.json").write_text(json.dumps({"error_of_max_shear": error}))
-    assert "twin" not in told(loads, {})
+    assert "synthetic warp" not in told(loads, {})
 
 
 def test_driven_and_levelled_models_are_not_those_of_other_programs(tmp_path: Path) -> None:
