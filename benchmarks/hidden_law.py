@@ -46,10 +46,7 @@ from phantoms import (
     random_foot_motion,
     scan,
 )
-from validate.comparison import ALL_LOADS, compare, total
-from validate.extrapolation import carried_on
-from validate.fe_result import read_result
-from validate.mapping import ALL
+from validate import ALL, ALL_LOADS, LoadCase, compare_load, extrapolated, rank_over_loads, read_result
 
 HIDDEN = """
 [hidden]
@@ -192,7 +189,7 @@ def truth(hidden: Path, load: str, labels: LabelMap) -> SampledDisplacement:
     inner = tuple(slice(r, r + n) for r, n in zip(room, grid.shape, strict=True))
     bone = np.zeros(shape, dtype=bool)
     bone[inner] = labels.region("bone").inside | labels.region("ankle").inside
-    return carried_on(read_result("hidden", hidden / f"{load}.vtu").deformation, wide, bone)
+    return extrapolated(read_result("hidden", hidden / f"{load}.vtu").deformation, wide, bone)
 
 
 def as_motion(there: SampledDisplacement, labels: LabelMap) -> Moved:
@@ -227,10 +224,10 @@ def scores(study: Path, hidden: Path, labels: LabelMap) -> dict[str, object]:
                 if e.tissue not in BONES  # the model has none: what of it the mesh covers is the border's staircase
             }  # fmt: skip
         models = [read_result(s, results / "models" / s / f"{load}.vtu") for s in SETS]
-        one = compare(load, model.deformation, models, names, bones=("bone",), normal=np.array([0.0, 0.0, -1.0]))
+        one = compare_load(LoadCase.of(load, model.deformation, models), names)
         true.append(one)
         comparisons[load] = {a.model: a.ml for a in one.areas if a.tissue == ALL and a.model in SETS}
-    comparisons[ALL_LOADS] = {a.model: a.ml for a in total(true).areas if a.model in SETS}
+    comparisons[ALL_LOADS] = {a.model: a.ml for a in rank_over_loads(true).areas if a.model in SETS}
     measured: dict[str, dict[str, list[float]]] = {}
     with (results / "comparison" / "areas.csv").open() as file:
         for row in csv.DictReader(file):

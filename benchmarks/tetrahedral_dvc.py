@@ -43,7 +43,7 @@ from dvc.registration.register import Settings, register
 from fe import NeoHooke, material_set, read_tet_mesh
 from mrstrain.records.provenance import versions
 from phantoms import distances_mm
-from validate.fe_result import read_result
+from validate import read_result
 
 GAIN_MM, VOLUME, NU = 10.0, 300.0, 0.45
 STEPS, LONGEST_MM, HALVINGS = 12, 1.5, 4

@@ -1,4 +1,4 @@
-"""Agreement of a simulated with a measured field, cell by cell; every figure is weighted by volume."""
+"""Cell-by-cell agreement of a simulated with a measured field, weighted by cell volume."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.deformation.nodal import OnMesh
 from dvc.deformation.protocol import Deformation
 from dvc.mesh import outer_faces
-from validate.mapping import ALL, Mapped
+from validate.mapping import ALL, MappedFields
 
 TO_BONE_MM = (0.0, 3.0, 6.0, 12.0)
 """Lower ends of the bins of distance to bone, mm."""
 
 _FLAT = 1e-12  # variance over mean square
-_LEAST = 10  # cells below which nothing is told
+_LEAST = 10  # cells; fewer give no row
 _COPLANAR_MM = 0.3
 _INWARD_MM = 1.0
 
@@ -28,22 +28,22 @@ class Agreement:
     Attributes
     ----------
     model, load, quantity, part : str
-        The quantity is "max_shear" or "u_mm": means, bias and limits of the displacement's length; regression and
-        concordance of its three components together, so that a wrong direction shows.
+        The quantity is "max_shear" or "u_mm". For displacement, means, bias and limits are those of its magnitude;
+        regression and concordance pool its three components, so that a wrong direction shows.
     cells : int
     volume_ml : float
     measured_mean, model_mean : float
     slope, intercept : float
-        Least squares of the model on the measurement.
+        Least-squares regression of the model on the measurement.
     r2 : float
-        Square of the correlation.
+        Squared correlation.
     rmse : float
-        Root mean square of model minus measurement; for the displacement of the difference vector's length, mm.
+        Root mean square of model minus measurement; for displacement, of the magnitude of the difference vector, mm.
     concordance : float
-        Lin's coefficient (1989, doi:10.2307/2532051): 1 where both are equal.
+        Lin's concordance correlation coefficient (1989, doi:10.2307/2532051): 1 where both are equal.
     bias, lower, upper : float
-        Mean of model minus measurement, and that -+ 1.96 standard deviations (Bland and Altman 1986,
-        doi:10.1016/S0140-6736(86)90837-8).
+        Mean of model minus measurement, and the limits of agreement, 1.96 standard deviations to either side (Bland
+        and Altman 1986, doi:10.1016/S0140-6736(86)90837-8).
     """
 
     model: str
@@ -79,8 +79,8 @@ def agreement(
     Examples
     --------
     >>> x = np.linspace(0.0, 1.0, 20)
-    >>> found = agreement("a", "Load1", "max_shear", "fat", x, 2.0 * x + 0.1, np.ones(20))
-    >>> round(found.slope, 9), round(found.intercept, 9), round(found.r2, 9), round(found.bias, 9)
+    >>> row = agreement("a", "Load1", "max_shear", "fat", x, 2.0 * x + 0.1, np.ones(20))
+    >>> round(row.slope, 9), round(row.intercept, 9), round(row.r2, 9), round(row.bias, 9)
     (2.0, 0.1, 1.0, 0.6)
     """
     if len(measured) < _LEAST:
@@ -103,25 +103,25 @@ def agreement(
     )  # fmt: skip
 
 
-def agreements(found: Mapped, model: str, load: str) -> list[Agreement]:
-    """Agreement of maximal shear and displacement in all soft tissue, each tissue, and by distance to bone."""
-    common, field = found.common, found.models[model]
+def agreements(fields: MappedFields, model: str, load: str) -> list[Agreement]:
+    """Agreement of maximum shear strain and displacement: all soft tissue, each tissue, and by distance to bone."""
+    common, field = fields.common, fields.models[model]
     parts: dict[str, BoolArray] = {ALL: common}
-    parts |= {tissue: common & (found.tissue == tissue) for tissue in found.tissues}
+    parts |= {tissue: common & (fields.tissue == tissue) for tissue in fields.tissues}
     ends = (*TO_BONE_MM[1:], np.inf)
     for low, high in zip(TO_BONE_MM, ends, strict=True):
-        told = f"{low:g} to {high:g} mm from bone" if np.isfinite(high) else f"over {low:g} mm from bone"
-        parts[told] = common & (found.to_bone_mm >= low) & (found.to_bone_mm < high)
+        name = f"{low:g} to {high:g} mm from bone" if np.isfinite(high) else f"over {low:g} mm from bone"
+        parts[name] = common & (fields.to_bone_mm >= low) & (fields.to_bone_mm < high)
     rows = []
     for part, where in parts.items():
-        volumes = found.volumes_ml[where]
-        u, v = found.measured.u_mm[where], field.u_mm[where]
-        apart = float(np.sqrt(volumes @ ((v - u) ** 2).sum(axis=1) / volumes.sum())) if where.any() else 0.0
+        volumes = fields.volumes_ml[where]
+        u, v = fields.measured.u_mm[where], field.u_mm[where]
+        rmse = float(np.sqrt(volumes @ ((v - u) ** 2).sum(axis=1) / volumes.sum())) if where.any() else 0.0
         rows.append(
-            agreement(model, load, "max_shear", part, found.measured.max_shear[where], field.max_shear[where], volumes)
+            agreement(model, load, "max_shear", part, fields.measured.max_shear[where], field.max_shear[where], volumes)
         )
         lengths = agreement(
-            model, load, "u_mm", part, np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1), volumes, apart
+            model, load, "u_mm", part, np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1), volumes, rmse
         )
         vectors = agreement(model, load, "u_mm", part, u.ravel(), v.ravel(), np.repeat(volumes, 3))
         if lengths is not None and vectors is not None:
@@ -138,18 +138,18 @@ def agreements(found: Mapped, model: str, load: str) -> list[Agreement]:
 
 
 @dataclass(frozen=True, slots=True)
-class Travel:
-    """Displacement of the skin under the plate, and change of the tissues' volume.
+class SkinDisplacement:
+    """Displacement of the skin under the plate, and volume change of the fat; a row of travel.csv.
 
     Attributes
     ----------
     model, load : str
     nodes : int
-        Of the skin under the model's plate at which both are defined.
+        Nodes of the skin on the model's plate where both fields are defined.
     measured_mm, model_mm : float
-        Mean displacement along the plate's normal force (towards the foot).
+        Mean displacement along the normal force (into the body part), mm.
     measured_along_mm, model_along_mm : float
-        Mean displacement across it, length.
+        Magnitude of the mean tangential displacement, mm.
     measured_volume_change, model_volume_change : float
         Mean of det F - 1 over the fat, or over all tissue where no fat is compared.
     """
@@ -165,10 +165,11 @@ class Travel:
     model_volume_change: float
 
 
-def sole_under_plate(model: OnMesh, normal: FloatArray) -> IntArray:
-    """Nodes on the outside of a model that lie on one plane across ``normal`` once it is deformed.
+def skin_on_plate(model: OnMesh, normal: FloatArray) -> IntArray:
+    """Surface nodes of a model that are coplanar, across ``normal``, in the deformed configuration.
 
-    The plane with most nodes, in the half of the model towards the plate: tissue may bulge past a small plate.
+    Of all such planes in the half of the model that faces the plate, the one with most nodes: tissue may bulge past a
+    small plate.
     """
     outside = np.unique(outer_faces(model.mesh.cells))
     height = (model.mesh.points_mm + model.u_mm)[outside] @ normal
@@ -178,24 +179,28 @@ def sole_under_plate(model: OnMesh, normal: FloatArray) -> IntArray:
     return np.asarray(outside[(height >= low) & (height <= low + _COPLANAR_MM)])
 
 
-def travel(found: Mapped, name: str, load: str, model: OnMesh, measured: Deformation, normal: FloatArray) -> Travel:
-    """Compare how far the plate took the skin on it, by the mean displacement 1 mm inside the skin.
+def skin_displacement(
+    fields: MappedFields, name: str, load: str, model: OnMesh, measured: Deformation, normal: FloatArray
+) -> SkinDisplacement:
+    """Mean displacement, measured and simulated, 1 mm inside the skin that lies on the plate.
 
     Parameters
     ----------
     normal : (3,)
         The plate's outward unit normal, LPS.
     """
-    nodes = sole_under_plate(model, normal)
+    nodes = skin_on_plate(model, normal)
     inside = model.mesh.points_mm[nodes] - _INWARD_MM * normal
     both = measured.displacement(inside), model.displacement(inside)
     known = np.isfinite(both[0]).all(axis=1) & np.isfinite(both[1]).all(axis=1)
     moved = [u[known] for u in both]
     mean = [m.mean(axis=0) if known.any() else np.full(3, np.nan) for m in moved]
-    fat = np.char.lower(found.tissue) == "fat"
-    where = found.common & (fat if (found.common & fat).any() else True)
-    volumes = found.volumes_ml[where] / found.volumes_ml[where].sum()
-    change = [float(volumes @ field.jacobian[where]) - 1.0 for field in (found.measured, found.models[name])]
+    fat = np.char.lower(fields.tissue) == "fat"
+    where = fields.common & (fat if (fields.common & fat).any() else True)
+    volumes = fields.volumes_ml[where] / fields.volumes_ml[where].sum()
+    change = [float(volumes @ field.jacobian[where]) - 1.0 for field in (fields.measured, fields.models[name])]
     along = [float(-m @ normal) for m in mean]
     across = [float(np.linalg.norm(m - (m @ normal) * normal)) for m in mean]
-    return Travel(name, load, int(known.sum()), along[0], along[1], across[0], across[1], change[0], change[1])
+    return SkinDisplacement(
+        name, load, int(known.sum()), along[0], along[1], across[0], across[1], change[0], change[1]
+    )

@@ -1,8 +1,8 @@
-"""Cells of a mesh by their nodes (VTK's order): faces as triangles, and points between the nodes of quadratic cells.
+"""Shapes of cells by their nodes (VTK's order): faces as triangles, and interpolated mid-face and mid-cell nodes.
 
-A quadratic cell has a node in the middle of each edge; some kinds have one in the middle of each quadrangle, and of
-the cell, as well. Where these are missing they are interpolated, so that the cell can be cut into tetrahedra of half
-its size.
+A quadratic cell has a node in the middle of each edge; some kinds also have one in the middle of each quadrangle and
+of the cell. Where these are missing they are interpolated, so that the cell can be cut into tetrahedra of half its
+size.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Nodes = tuple[int, ...]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """A kind of cell without its order.
+    """Geometry of a kind of cell, of any order.
 
     Attributes
     ----------

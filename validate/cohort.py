@@ -1,4 +1,4 @@
-"""Models over many subjects: how far each is from the measurement, and which are told apart."""
+"""Models ranked over subjects, with simultaneous intervals of their differences."""
 
 from __future__ import annotations
 
@@ -16,24 +16,23 @@ _SURE, _LEVEL = 0.95, 0.975
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
-    """A model's place over subjects.
+class CohortRank:
+    """A model over subjects; a row of ranking.csv.
 
     Attributes
     ----------
     model : str
     subjects : int
-        On which every model has a result.
+        Number of subjects with a result of every model.
     mean, low, high : float
-        Of the area between its curve and the measured one, divided by the tissue's volume and the width of the range;
-        95 % interval of the mean over subjects (Student's t). NaN for one subject.
+        Mean normalised area between curves, and its 95 % interval over subjects (Student's t); NaN for one subject.
     least, greatest : float
         Over the subjects.
     nearest_in : int
-        Subjects in which it is the nearest.
+        Subjects in which it has the smallest area.
     behind, behind_low, behind_high : float
-        Mean over subjects of its area minus that of the first model, in the same subject, and an interval that holds
-        for all pairs of models at once, so that it stays true of the one which the subjects made the first.
+        Mean paired difference to the area of the best model, and a simultaneous interval for all pairs of models: it
+        stays valid although the same subjects determined which model is the best.
     """
 
     model: str
@@ -49,25 +48,24 @@ class Standing:
     behind_high: float
 
     @property
-    def told_apart(self) -> bool:
-        """Whether the subjects tell it from the first model."""
+    def differs_from_best(self) -> bool:
+        """Whether it is significantly worse than the best model."""
         return bool(self.behind_low > 0.0)
 
 
-def standings(shares: Mapping[str, Mapping[str, float]]) -> tuple[Standing, ...]:
-    """Rank models over the subjects that have a result of each, the nearest first.
+def rank_over_subjects(shares: Mapping[str, Mapping[str, float]]) -> tuple[CohortRank, ...]:
+    """Rank models over the subjects that have a result of each, the best first.
 
-    Subjects are taken as drawn from one population, independent of each other. Intervals are those of a mean: they
-    narrow with more subjects, and hold the error of the measurement as far as it differs from subject to subject.
+    Subjects are taken as an independent sample of one population. Intervals are those of a mean: they narrow with more
+    subjects, and include the measurement error as far as it varies between subjects.
 
-    Differences have the simultaneous 95 % intervals of Tukey (the honestly significant difference of a design with
-    subjects as blocks: Kutner and others, Applied Linear Statistical Models, section 21.5), which take what subject and
-    model do not explain as of one size for all models.
+    Differences have Tukey's simultaneous 95 % intervals (honestly significant difference, subjects as blocks: Kutner
+    and others, Applied Linear Statistical Models, section 21.5), which assume one residual variance for all models.
 
     Parameters
     ----------
     shares : mapping of model to mapping of subject to float
-        Area between curves over volume and width of the range.
+        Normalised area between curves.
 
     Raises
     ------
@@ -81,17 +79,17 @@ def standings(shares: Mapping[str, Mapping[str, float]]) -> tuple[Standing, ...]
     table = np.array([[shares[n][s] for s in subjects] for n in names])
     order = np.argsort(table.mean(axis=1), kind="stable")
     first, nearest, half = table[order[0]], np.argmin(table, axis=0), _simultaneous(table)
-    made = []
+    ranks = []
     for at in order:
         mean, low, high = _mean(table[at])
         behind = float((table[at] - first).mean())
-        made.append(
-            Standing(
+        ranks.append(
+            CohortRank(
                 names[at], len(subjects), mean, low, high, float(table[at].min()), float(table[at].max()),
                 int(np.count_nonzero(nearest == at)), behind, behind - half, behind + half,
             )
         )  # fmt: skip
-    return tuple(made)
+    return tuple(ranks)
 
 
 def _mean(values: FloatArray) -> tuple[float, float, float]:
@@ -103,7 +101,7 @@ def _mean(values: FloatArray) -> tuple[float, float, float]:
 
 
 def _simultaneous(table: FloatArray) -> float:
-    """Half the width of the 95 % intervals of all differences of means of models (k, subjects) at once."""
+    """Half width of the simultaneous 95 % intervals of all differences between means of models (k, subjects)."""
     models, subjects = table.shape
     if models < 2 or subjects < 2:
         return float("nan")

@@ -1,314 +1,354 @@
-"""One load, measured and simulated by several models: every figure of the comparison."""
+"""A measurement compared with finite-element models under one or several loads: figures, files, notebook, plots."""
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
+import base64
+import html
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from dvc.arrays import BoolArray, FloatArray
-from dvc.deformation.protocol import Deformation
+from dvc.atomic_files import whole_folder, write_whole
+from dvc.errors import InputError
 from dvc.images.image import LabelMap
 from dvc.mesh import TetMesh
-from dvc.trust.error_model import ErrorTable
-from dvc.trust.truth_draws import TruthDraws
-from validate.agreement import Agreement, Travel, agreements, travel
-from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands
+from dvc.report.page import Section, record_lines, write_report
+from dvc.report.sheet import png_bytes
+from dvc.trust.verdict import Verdict, worst
+from validate import figures
+from validate.agreement import Agreement, SkinDisplacement
+from validate.curves import Area
 from validate.extrapolation import LEVELLED
-from validate.fe_result import FeResult
-from validate.location import LEAST_ML, Overlap, Threshold, neighbours, overlap
-from validate.location_intervals import DRAWS as LOCATED
-from validate.location_intervals import with_intervals
-from validate.mapping import ALL, Mapped, mapped
-
-_STRAINED = 0.01
-
-NOTHING = "no deformation"
-"""A model that predicts no strain anywhere: what areas are to be seen beside, and outside the order."""
-
-
-Pairs = tuple[tuple[str, str], ...]
-"""Of models, each in the order of their areas."""
-
-ALL_LOADS = "all loads"
+from validate.limitations import limitations, verdict_on
+from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
+from validate.location import Overlap
+from validate.mapping import ALL
+from validate.misfit import check_models, displacement_slip
+from validate.ranking import ALL_LOADS, Ranking, rank_over_loads
+from validate.report import closing_sections, draw, load_sections, overview, ranks, shown
+from validate.tables import (
+    CURVES,
+    RECORD,
+    TABLES,
+    Curve,
+    curves_of,
+    read_curves,
+    read_rows,
+    remove_earlier,
+    write_curves,
+    write_fields,
+    write_on_image,
+    write_rows,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Models against the measurement, under one load.
+    """One measurement compared with finite-element models.
 
     Attributes
     ----------
-    load : str
-    found : Mapped
     areas : tuple of Area
-        By model and tissue; that of all soft tissue first. Those of `NOTHING` come last.
+        Area between volume-strain curves by load, model and tissue.
     overlaps : tuple of Overlap
+        Location: clusters above thresholds.
     agreements : tuple of Agreement
-    travels : tuple of Travel
-    bands : mapping of tissue to Band
-        Empty where the measurement's error is not known.
+        Cell by cell: regression, concordance, limits of agreement.
+    skin : tuple of SkinDisplacement
+    curves : tuple of Curve
+        Volume-strain curves, measured and simulated.
+    ranking : Ranking
+        Of the models, over all loads and under each.
     strains : (low, high)
-        Range of the areas.
+        Range of maximum shear strain of the areas.
+    coverage_ml : mapping of load to mapping
+        Volume of the mesh, of what each field defines of it, and of what is common to all.
+    verdict : Verdict or None
+        On the registrations and on slips of the models; None where nothing is known.
+    verdicts : mapping of load to Verdict or None
+        On each registration.
+    notes : tuple of str
+        Limitations of this comparison.
+    warnings : tuple of str
+        What looks wrong about a model.
+    loads : tuple of LoadComparison
+        Fields, by load; empty for a comparison that was read back.
     """
 
-    load: str
-    found: Mapped
     areas: tuple[Area, ...]
     overlaps: tuple[Overlap, ...]
     agreements: tuple[Agreement, ...]
-    travels: tuple[Travel, ...]
-    bands: Mapping[str, Band]
-    strains: tuple[float, float] = RANGE
+    skin: tuple[SkinDisplacement, ...]
+    curves: tuple[Curve, ...]
+    ranking: Ranking
+    strains: tuple[float, float]
+    coverage_ml: Mapping[str, Mapping[str, float]]
+    verdict: Verdict | None
+    verdicts: Mapping[str, Verdict | None]
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    loads: tuple[LoadComparison, ...] = ()
 
-    @property
-    def hardly_strained(self) -> bool:
-        """Whether under a hundredth of the tissue is measured above the lower end of the range."""
-        where = self.found.common
-        volumes = self.found.volumes_ml[where]
-        above = volumes[self.found.measured.max_shear[where] > self.strains[0]].sum()
-        return bool(above < _STRAINED * volumes.sum())
+    def summary(self) -> list[str]:
+        """Verdict, areas, and which differences are significant, a line each."""
+        lines = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}"]
+        for load in self.coverage_ml:
+            areas = {a.model: a for a in self.areas if (a.load, a.tissue) == (load, ALL) and a.model != NOTHING}
+            ranked = sorted((a for a in areas.values() if not a.model.endswith(LEVELLED)), key=lambda a: a.best_ml)
+            lines.append(f"{load}: area between curves, mL, best first: {_listed(ranked)}")
+            for name in (name for name in areas if name.endswith(LEVELLED)):
+                before = areas[name.removesuffix(LEVELLED)].ml if name.removesuffix(LEVELLED) in areas else np.nan
+                lines.append(f"{load}: {name} {areas[name].ml:.2f} as measured, {before:.2f} before levelling")
+        if len(self.coverage_ml) > 1 and self.ranking.areas:
+            lines.append(f"All loads: {_listed(self.ranking.areas)}")
+        return [*lines, *self.ranking.statements, *self.notes]
 
-    def ranked(self, tissue: str = ALL) -> list[Area]:
-        """Areas of a tissue, the smallest first: as estimated from the truths drawn, where the error is known.
+    def __str__(self) -> str:
+        return "\n".join(self.summary())
 
-        Levelled models are left out, as their areas are those as found, and of another kind; so is `NOTHING`.
+    def _repr_html_(self) -> str:
+        """For a notebook: the answer, the areas of all soft tissue, and the curves."""
+        loads = list(self.coverage_ml)
+        areas = {(a.model, a.load): a for a in self.areas if a.tissue == ALL}
+        over_all = {a.model: a for a in (*self.ranking.areas, self.ranking.nothing)}
+        head = ["model", "rank", *loads, *(["all loads"] if len(loads) > 1 else [])]
+        rows = [
+            [name, ranks(self.ranking, name)]
+            + [shown(areas[name, load]) if (name, load) in areas else "–" for load in loads]
+            + ([shown(of)] if len(loads) > 1 else [])
+            for name, of in over_all.items()
+        ]
+        table = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+        titles = "".join(f"<th>{html.escape(name)}</th>" for name in head)
+        verdict = "" if self.verdict is None else f"<p>Verdict on the inputs: <b>{self.verdict.words}</b></p>"
+        image = base64.b64encode(png_bytes(self.plot())).decode()
+        return (
+            f"<div><p><b>{html.escape(self._answer())}</b></p>{verdict}<table><caption>Area between volume-strain "
+            f"curves, maximum shear strain {self.strains[0]:g} to {self.strains[1]:g}, mL (95 % interval)</caption>"
+            f'<tr>{titles}</tr>{table}</table><img alt="Volume-strain curves" style="max-width:100%" '
+            f'src="data:image/png;base64,{image}"></div>'
+        )
+
+    def _answer(self) -> str:
+        """One sentence: the best match, or for a single model its area."""
+        if self.ranking.statements:
+            return self.ranking.statements[0]
+        ranked = self.ranking.areas or tuple(a for a in self.areas if a.tissue == ALL and a.model != NOTHING)
+        best = min(ranked, key=lambda a: a.best_ml)
+        return f"{best.model}: area between curves {shown(best)} mL ({best.load}), normalised {best.share:.1%}."
+
+    def plot(self, kind: Literal["curves", "areas"] = "curves", *, tissue: str = ALL) -> Figure:
+        """Draw volume-strain curves, a panel for each load, or the areas between them with their 95 % intervals.
+
+        Raises
+        ------
+        InputError
+            If there is no such kind of plot, or no such tissue.
         """
-        models = (a for a in self.areas if a.tissue == tissue and a.model != NOTHING and not a.model.endswith(LEVELLED))
-        return sorted(models, key=lambda a: a.best_ml)
+        tissues = dict.fromkeys(c.tissue for c in self.curves)
+        if tissue not in tissues:
+            raise InputError(f"No tissue '{tissue}' is compared; there are {', '.join(tissues)}.")
+        if kind == "curves":
+            return figures.curves_by_load([c for c in self.curves if c.tissue == tissue], self.strains)
+        if kind == "areas":
+            return figures.areas_by_load([a for a in self.areas if a.tissue == tissue and a.model != NOTHING])
+        raise InputError(f"A comparison has plots of 'curves' and 'areas', none of '{kind}'.")
 
-    def not_told_apart(self) -> Pairs:
-        """Pairs of models of which the measurement cannot tell which is nearer; all where its error is not known."""
-        return _not_told_apart(self.ranked(), None if self.hardly_strained else self.bands.get(ALL))
+    def write(
+        self,
+        folder: Path | str,
+        *,
+        record: Mapping[str, object] | None = None,
+        methods: Sequence[str] = (),
+        on_image: bool = False,
+    ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:
+        """Write tables, fields, pictures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
+
+        Parameters
+        ----------
+        folder : path
+            Gets ``report.html``, ``comparison.json``, tables, and a folder for each load.
+        record : mapping, optional
+            Provenance, kept in the JSON files; by default the range of the areas.
+        methods : sequence of str
+            Paragraphs for a methods section.
+        on_image : bool
+            Also write each model's displacement and maximum shear strain on the voxels of the label map.
+
+        Returns
+        -------
+        sections, closing : tuple of Section
+            Of the report.
+
+        Raises
+        ------
+        InputError
+            If the comparison was read back: its fields are not in memory.
+        OutputError
+            If the folder cannot be written.
+        """
+        if not self.loads:
+            raise InputError("A comparison that was read back has no fields to write; copy its folder instead.")
+        target = Path(folder)
+        target.mkdir(parents=True, exist_ok=True)
+        remove_earlier(target, list(self.coverage_ml))
+        about = dict(record) if record is not None else {"parameters": {"strains": list(self.strains)}}
+        colours = list(dict.fromkeys(name for load in self.coverage_ml for name in self._models(load)))
+        sections = [overview(self.loads, self.ranking, self.warnings, self._beside_verdict())]
+        for one in self.loads:
+            drawn = draw(one, colours)
+            with whole_folder(target / one.load) as part:
+                write_fields(part / "fields.vtu", one)
+                for stem, picture in drawn.pictures.items():
+                    (part / f"{stem}.png").write_bytes(picture.png)
+                if on_image:
+                    write_on_image(part, one)
+                _write_json(part / "provenance.json", about | {"verdict": _plain(one.case.verdict)})
+            sections += load_sections(one, drawn)
+        self._write_tables(target)
+        _write_json(target / RECORD, self._record() | about)
+        closing = closing_sections(self.loads[0].criteria.thresholds, methods)
+        title, lines = "Models against the measurement", record_lines(about)
+        write_report(target / "report.html", title, self.verdict, sections, closing, lines)
+        return tuple(sections), tuple(closing)
+
+    @classmethod
+    def read(cls, folder: Path | str) -> Comparison:
+        """Read a comparison from its folder, to the six digits of the tables, without the fields in the cells.
+
+        Raises
+        ------
+        InputError
+            If the folder holds no comparison.
+        """
+        place = Path(folder)
+        rows = {name: read_rows(place / name, kind) for name, kind in TABLES.items()}
+        try:
+            content = json.loads((place / RECORD).read_text(encoding="utf-8"))
+            low, high = content["parameters"]["strains"]
+            pairs = {load: tuple((a, b) for a, b in of) for load, of in content["not_told_apart"].items()}
+            verdicts = {load: _verdict(of) for load, of in content["verdict_by_load"].items()}
+            *areas, nothing = (a for a in rows["areas.csv"] if a.load == ALL_LOADS)
+            ranking = Ranking(tuple(areas), nothing, tuple(content["told_apart"]), pairs)
+            coverage, verdict, notes = content["coverage_ml"], _verdict(content["verdict"]), tuple(content["notes"])
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(f"{place / RECORD} is no record of a comparison ({error}).") from error
+        by_load = tuple(a for a in rows["areas.csv"] if a.load != ALL_LOADS)
+        return cls(
+            by_load, rows["location.csv"], rows["agreement.csv"], rows["travel.csv"], read_curves(place / CURVES),
+            ranking, (low, high), coverage, verdict, verdicts, notes,
+        )  # fmt: skip
+
+    def _models(self, load: str) -> list[str]:
+        return [name for name in self.coverage_ml[load] if name not in ("mesh", "measured", "common")]
+
+    def _beside_verdict(self) -> list[str]:
+        """Notes that are no reasons of the verdict."""
+        reasons = () if self.verdict is None or self.verdict.level == "trust" else self.verdict.reasons
+        return [note for note in self.notes if note not in reasons]
+
+    def _write_tables(self, target: Path) -> None:
+        levels = {load: "" if of is None else of.level for load, of in self.verdicts.items()}
+        known = [of for of in self.verdicts.values() if of is not None]
+        levels[ALL_LOADS] = worst(known).level if known else ""
+        totals = (*self.ranking.areas, self.ranking.nothing)
+        rows = ((*self.areas, *totals), self.overlaps, self.agreements, self.skin)
+        for name, of in zip(TABLES, rows, strict=True):
+            write_rows(target / name, of, levels)
+        write_curves(target / CURVES, self.curves, levels)
+
+    def _record(self) -> dict[str, object]:
+        return {
+            "total_area_ml": {a.model: a.best_ml for a in self.ranking.areas},
+            "told_apart": list(self.ranking.statements),
+            "not_told_apart": self.ranking.not_distinguishable,
+            "notes": list(self.notes),
+            "coverage_ml": self.coverage_ml,
+            "verdict": _plain(self.verdict),
+            "verdict_by_load": {load: _plain(verdict) for load, verdict in self.verdicts.items()},
+        }
 
 
 def compare(
-    load: str,
-    measured: Deformation,
-    results: Sequence[FeResult],
+    cases: Sequence[LoadCase],
     labels: LabelMap,
+    bones: Sequence[str] = ("bone",),
     *,
-    bones: Sequence[str],
-    normal: FloatArray,
     mesh: TetMesh | None = None,
-    table: ErrorTable | None = None,
-    strains: tuple[float, float] = RANGE,
-    thresholds: Sequence[Threshold] = (),
-    least_ml: float = LEAST_ML,
-    seed: int = 1,
+    criteria: Criteria | None = None,
+    notes: Sequence[str] = (),
+    warnings: Sequence[str] | None = None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Comparison:
-    """Compare models with a measurement of one load, at the centroids of one mesh's cells.
+    """Compare models with a measurement of one or several loads.
 
     Parameters
     ----------
-    load : str
-    measured : Deformation
-        Of tissue relative to its bone, reference configuration, LPS mm.
-    results : sequence of FeResult
+    cases : sequence of LoadCase
+        Each with at least one model.
     labels : LabelMap
-        Of the unloaded image.
+        Of the unloaded image: tissues, and distance to bone.
     bones : sequence of str
         Labels of bone.
-    normal : (3,)
-        The plate's outward unit normal, LPS.
     mesh : TetMesh, optional
-        Where to compare; the first model's by default.
-    table : ErrorTable, optional
-        The measurement's error; without it no figure has an interval, and no difference counts as seen.
-    strains : (low, high)
-        Range of maximal shear over which curves are compared.
-    thresholds : sequence of Threshold
-        Above which clusters are looked at.
-    least_ml : float
-        Volume of the smallest cluster that counts.
-    seed : int
-        Of the truths drawn; those of different loads are independent.
+        Where fields are compared; by default the mesh of each load's first model.
+    criteria : Criteria, optional
+        Range of strain, thresholds, smallest cluster.
+    notes : sequence of str
+        What else is known about the models.
+    warnings : sequence of str, optional
+        What `check_models` gave; by default the models are checked here.
+    progress : callable
+        Gets the fraction done.
 
     Raises
     ------
-    InputError
-        As `mapped`.
+    InputError, GeometryError
+        As `check_models` and `validate.load_comparison.compare_load`.
     """
-    models = {result.name: result.deformation for result in results}
-    found = mapped(mesh if mesh is not None else results[0].mesh, labels, bones, measured, models)
-    common = found.common
-    tissues: dict[str, BoolArray] = {ALL: common}
-    tissues |= {
-        name: common & (found.tissue == name) for name in found.tissues if (common & (found.tissue == name)).any()
-    }
-    truths: list[FloatArray] = []
-    told = {} if table is None else _bands(found, tissues, table, strains, zlib.crc32(load.encode()) + seed, truths)
-    areas = []
-    for name, shear in _shears(found).items():
-        for tissue, where in tissues.items():
-            volumes = found.volumes_ml[where]
-            area = area_between(found.measured.max_shear[where], shear[where], volumes, strains)
-            share = area / volumes.sum() / (strains[1] - strains[0])
-            # what was measured itself carries the measurement's bias as well: as found, like is compared with like
-            estimated = told[tissue].interval(name) if tissue in told and not name.endswith(LEVELLED) else ()
-            areas.append(Area(name, load, tissue, area, share, *estimated))
-    touching = neighbours(found.mesh)
-    measured_shear = np.where(common, found.measured.max_shear, -1.0)
-    overlaps = [
-        overlap(
-            name, load, threshold.max_shear, measured_shear, np.where(common, field.max_shear, -1.0),
-            found.volumes_ml, found.points_mm, touching, least_ml,
-        )
-        for name, field in found.models.items()
-        for threshold in thresholds
-    ]  # fmt: skip
-    if table is not None:
-        overlaps = with_intervals(
-            overlaps, truths, {name: field.max_shear[common] for name, field in found.models.items()},
-            found.volumes_ml[common], found.points_mm[common], touching[common][:, common], least_ml, table.factor,
-        )  # fmt: skip
-    rows = [row for name in models for row in agreements(found, name, load)]
-    travels = [travel(found, r.name, load, r.deformation, measured, normal) for r in results]
-    return Comparison(load, found, tuple(areas), tuple(overlaps), tuple(rows), tuple(travels), told, strains)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Total:
-    """Models over all loads.
-
-    Attributes
-    ----------
-    areas : tuple of Area
-        Of the models that have every load, the nearest first; levelled ones last.
-    nothing : Area
-        Of `NOTHING`.
-    told : tuple of str
-        Which models the measurement tells apart, over all loads and under each.
-    not_told_apart : mapping of load to Pairs
-        As in `Comparison`; those over all loads under `ALL_LOADS`.
-    """
-
-    areas: tuple[Area, ...]
-    nothing: Area
-    told: tuple[str, ...]
-    not_told_apart: Mapping[str, Pairs]
-
-    def place(self, model: str) -> tuple[int, int] | None:
-        """First and last place over all loads that a model may have; None for one that is not in the order."""
-        names = [a.model for a in _in_order(self.areas)]
-        if model not in names:
-            return None
-        place, pairs = 1 + names.index(model), self.not_told_apart[ALL_LOADS]
-        return place - sum(b == model for _, b in pairs), place + sum(a == model for a, _ in pairs)
-
-
-def total(done: Sequence[Comparison], distrusted: Sequence[str] = ()) -> Total:
-    """Areas over all loads, and what can be told.
-
-    Loads are measured one by one, so their errors are taken as independent. The share is the mean of the loads' shares.
-    What is told says of the ``distrusted`` loads that their registration is not to be trusted.
-    """
-    everywhere = [name for name in done[0].found.models if all(name in one.found.models for one in done)]
-    bands_of = [one.bands[ALL] for one in done if ALL in one.bands]
-    whole: Band | None = None
-    if len(bands_of) == len(done):
-        areas = {name: np.sum([band.areas_ml[name] for band in bands_of], axis=0) for name in (*everywhere, NOTHING)}
-        floor = float(sum(band.floor_ml for band in bands_of))
-        first = bands_of[0]
-        whole = Band(first.strains, first.low_ml, first.high_ml, areas, floor, max(b.widening for b in bands_of))
-    rows = []
-    for name in (*everywhere, NOTHING):
-        parts = [a for one in done for a in one.areas if a.tissue == ALL and a.model == name]
-        estimated = whole.interval(name) if whole is not None and not name.endswith(LEVELLED) else ()
-        share = float(np.mean([a.share for a in parts]))
-        rows.append(Area(name, ALL_LOADS, ALL, sum(a.ml for a in parts), share, *estimated))
-    nothing = rows.pop()
-    rows.sort(key=lambda a: (a.model.endswith(LEVELLED), a.best_ml))
-    told = []
-    for one in done:
-        if one.hardly_strained:
-            told.append(
-                f"Under {one.load} hardly any tissue is measured above the range's lower end: areas do not judge."
-            )
-        elif ALL in one.bands:
-            sentence = _told(f"under {one.load}", one.ranked(), one.bands[ALL])
-            doubt = " Its registration is not to be trusted." if one.load in distrusted else ""
-            told.append(sentence + doubt if sentence else "")
-    if len(done) > 1 and everywhere and whole is not None and not all(one.hardly_strained for one in done):
-        sentence = _told("over all loads", _in_order(rows), whole)
-        counted = [one.load for one in done if one.load in distrusted]
-        doubt = (
-            f" The registration of {', '.join(counted)}, which counts in it, is not to be trusted." if counted else ""
-        )
-        told.insert(0, sentence + doubt if sentence else "")
-    judged = None if all(one.hardly_strained for one in done) else whole
-    pairs = {ALL_LOADS: _not_told_apart(_in_order(rows), judged)} | {one.load: one.not_told_apart() for one in done}
-    return Total(tuple(rows), nothing, tuple(sentence for sentence in told if sentence), pairs)
-
-
-def _in_order(areas: Sequence[Area]) -> list[Area]:
-    """Those that are ranked: a levelled model's area is of another kind."""
-    return [a for a in areas if not a.model.endswith(LEVELLED)]
-
-
-def _not_told_apart(ranked: Sequence[Area], band: Band | None) -> Pairs:
-    """Pairs, in order, of which neither is surely the nearer; all where nothing is known."""
-    pairs = combinations([a.model for a in ranked], 2)
-    return tuple((a, b) for a, b in pairs if band is None or not (band.surely_below(a, b) or band.surely_below(b, a)))
-
-
-def _told(where: str, ranked: Sequence[Area], band: Band) -> str:
-    """Which model is nearest, and which others the measurement cannot tell from it; nothing for one model.
-
-    Of the others, neighbours in the order that are not told apart are named as well.
-    """
-    if len(ranked) < 2:
-        return ""
-    pairs = _not_told_apart(ranked, band)
-    first, *others = (a.model for a in ranked)
-    near = [b for a, b in pairs if a == first]
-    alike = [f"{a} and {b}" for a, b in pairwise(others) if (a, b) in pairs]
-    return (
-        f"Nearest {where}, by the area: {first}. "
-        + (
-            f"The measurement does not tell these apart from it by the area: {', '.join(near)}."
-            if near
-            else "It is told apart from all others."
-        )
-        + (f" Further down, neighbours that it does not tell apart: {'; '.join(alike)}." if alike else "")
+    by = criteria or Criteria()
+    odd = list(check_models(cases, labels, bones) if warnings is None else warnings)
+    loads: list[LoadComparison] = []
+    for number, case in enumerate(cases):
+        progress(number / len(cases))
+        loads.append(compare_load(case, labels, bones, mesh=mesh, criteria=by))
+        fields = loads[-1].fields
+        odd += [f"{case.load}: {slip}" for name in fields.models if (slip := displacement_slip(fields, name))]
+    verdict = verdict_on({case.load: case.verdict for case in cases}, odd)
+    doubts = () if verdict is None or verdict.level == "trust" else verdict.reasons
+    return Comparison(
+        areas=tuple(a for one in loads for a in one.areas),
+        overlaps=tuple(o for one in loads for o in one.overlaps),
+        agreements=tuple(a for one in loads for a in one.agreements),
+        skin=tuple(s for one in loads for s in one.skin),
+        curves=tuple(curve for one in loads for curve in curves_of(one)),
+        ranking=rank_over_loads(loads),
+        strains=by.strains,
+        coverage_ml={one.load: one.fields.coverage() for one in loads},
+        verdict=verdict,
+        verdicts={case.load: case.verdict for case in cases},
+        notes=(*notes, *doubts, *limitations(loads)),
+        warnings=tuple(odd),
+        loads=tuple(loads),
     )
 
 
-def _shears(found: Mapped) -> dict[str, FloatArray]:
-    """Maximal shear of each model, and that of none."""
-    return {name: field.max_shear for name, field in found.models.items()} | {NOTHING: np.zeros(len(found.points_mm))}
+def _listed(areas: Sequence[Area]) -> str:
+    return ", ".join(f"{a.model} {shown(a)}" for a in areas)
 
 
-def _bands(
-    found: Mapped,
-    tissues: Mapping[str, BoolArray],
-    table: ErrorTable,
-    strains: tuple[float, float],
-    seed: int,
-    first: list[FloatArray],
-) -> dict[str, Band]:
-    """Bands by tissue; the ``first`` truths drawn for them are kept."""
-    common = found.common
-    draws = TruthDraws(
-        found.points_mm[common], found.measured.max_shear[common], [str(t).lower() for t in found.tissue[common]],
-        found.to_bone_mm[common], table, seed,
-    )  # fmt: skip
+def _plain(verdict: Verdict | None) -> dict[str, object] | None:
+    return None if verdict is None else verdict.as_dict()
 
-    def kept() -> Iterator[FloatArray]:
-        for truth in draws.many(DRAWS):
-            if len(first) < LOCATED:
-                first.append(truth.astype(np.float32))
-            yield truth
 
-    return bands(
-        kept(),
-        {name: shear[common] for name, shear in _shears(found).items()},
-        found.volumes_ml[common],
-        {name: where[common] for name, where in tissues.items()},
-        table.factor,
-        draws.narrowed,
-        strains,
-    )
+def _verdict(content: Mapping[str, object] | None) -> Verdict | None:
+    return None if content is None else Verdict(content["level"], tuple(content["reasons"]))  # type: ignore[arg-type]
+
+
+def _write_json(path: Path, content: Mapping[str, object]) -> None:
+    write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

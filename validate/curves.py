@@ -1,8 +1,9 @@
-"""Strain intensity: the volume of tissue above each strain, and the area between two such curves.
+"""Strain intensity: volume-strain curves, and the area between two of them.
 
-V(s) is the volume of the cells whose maximal shear exceeds s: an exact step function, without bins. The area between
-a model's curve and the measured one is A = integral of |V_FE - V_DVC| ds over a range of strain, in mL (strain has no
-unit); divided by the tissue's volume and the width of the range it is the mean share of tissue that is misjudged.
+V(s) is the volume of the cells whose maximum shear strain exceeds s: an exact step function, without bins. The metric
+is A = integral of |V_FE - V_DVC| ds over a range of strain, in mL: the area validation metric (Ferson, Oberkampf and
+Ginzburg 2008) with volume in place of probability. The normalised area, A over the tissue's volume and the width of
+the range, is dimensionless.
 """
 
 from __future__ import annotations
@@ -18,21 +19,21 @@ from dvc.trust.error_model import widened
 from dvc.trust.regions import volume_above
 
 RANGE = (0.2, 0.5)
-"""Strains between which curves are compared, by default."""
+"""Range of maximum shear strain over which curves are compared by default."""
 
 MOST_STRAIN = 3.0
-"""Maximal shear beyond which a range is taken to be in percent."""
+"""Upper end of a range; beyond, it is taken to be in percent."""
 
 DRAWS = 200
-"""Truths drawn for the curves and areas of a load."""
+"""Truths drawn from the error model for the curves and areas of a load."""
 
 _GRID = 301
 _SURE = 0.975
-_EVERY = 4  # draws, of which one is made a perfect model
+_EVERY = 4  # of so many draws one is made a perfect model
 
 
 def check_range(strains: tuple[float, float]) -> None:
-    """Refuse a range of strain between which no curves can be compared.
+    """Refuse a range of strain over which curves cannot be compared.
 
     Raises
     ------
@@ -49,7 +50,7 @@ def check_range(strains: tuple[float, float]) -> None:
 def area_between(
     first: FloatArray, second: FloatArray, volumes_ml: FloatArray, strains: tuple[float, float] = RANGE
 ) -> float:
-    """Area (mL) between the volume-strain curves of two fields (n,) on the same cells, exact.
+    """Area (mL) between the volume-strain curves of two fields (n,) on the same cells; exact.
 
     Examples
     --------
@@ -68,22 +69,22 @@ def area_between(
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Area between a model's volume-strain curve and the measured one.
+    """Area between a model's volume-strain curve and the measured one; a row of areas.csv.
 
     Attributes
     ----------
     model, load, tissue : str
     ml : float
-        As found.
+        As measured, with the measurement's bias and noise.
     share : float
-        Divided by the tissue's volume and the width of the range.
+        The same normalised by the tissue's volume and the width of the range.
     estimate_ml : float
-        Median of the areas to the truths drawn: the measurement's bias taken out. NaN, as those below, where the error
-        is not known.
+        Median of the areas to the truths drawn, which removes the measurement's bias. NaN, as are those below, if the
+        measurement uncertainty is unknown.
     low_ml, high_ml : float
-        95 % interval from the measurement's uncertainty.
+        95 % interval from the measurement uncertainty.
     floor_ml : float
-        What a perfect model would be given by noise alone; see `Band`.
+        Area that a perfect model would get from noise alone; see `Band`.
     """
 
     model: str
@@ -98,13 +99,13 @@ class Area:
 
     @property
     def best_ml(self) -> float:
-        """The estimate, where there is one, else the area as found."""
+        """The estimate if there is one, else the area as measured."""
         return self.ml if np.isnan(self.estimate_ml) else self.estimate_ml
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
-    """Volume-strain curves that the truth may have, and what they make of the areas.
+    """Band of the true volume-strain curve, and the areas to the truths drawn.
 
     Attributes
     ----------
@@ -114,10 +115,10 @@ class Band:
     areas_ml : mapping of model to (draws,)
         Area to each truth drawn.
     floor_ml : float
-        What a perfect model would be given: the median area between a truth drawn, made narrower as `bands` tells, and
-        the next one.
+        Area that a perfect model would get: the median area between a truth drawn, narrowed as in `bands`, and the
+        next one.
     widening : float
-        By which intervals of draws are widened; see `dvc.trust.error_model.ErrorTable`.
+        Factor on intervals of draws; see `dvc.trust.error_model.ErrorTable`.
     """
 
     strains: FloatArray
@@ -130,13 +131,13 @@ class Band:
     def interval(self, model: str) -> tuple[float, float, float, float]:
         """Estimate of a model's area, its 95 % interval, and the floor, mL.
 
-        An area cannot be below zero, and noise alone makes it larger: an interval that reaches the floor begins at 0.
+        An area is not negative, and noise alone increases it: an interval that reaches the floor begins at 0.
         """
         low, middle, high = (float(v[0]) for v in widened(self.areas_ml[model][:, None], self.widening))
         return middle, 0.0 if low <= self.floor_ml else low, high, self.floor_ml
 
     def surely_below(self, model: str, other: str) -> bool:
-        """Whether a model's area is below another's by more than the measurement's uncertainty."""
+        """Whether a model's area is significantly smaller than another's (97.5 % of the draws, widened)."""
         difference = self.areas_ml[model] - self.areas_ml[other]
         middle, high = np.median(difference), np.quantile(difference, _SURE)
         return bool(middle + self.widening * (high - middle) < 0.0)
@@ -151,27 +152,27 @@ def bands(
     narrowed: Callable[[FloatArray], FloatArray],
     strains: tuple[float, float] = RANGE,
 ) -> dict[str, Band]:
-    """Bands of the measured curve by tissue, from truths drawn for all cells at once.
+    """Bands of the true curve by tissue, from truths drawn for all cells at once.
 
     Parameters
     ----------
     truths : iterable of (n,)
-        Maximal shear of each truth drawn, in the cells; see `dvc.trust.truth_draws.TruthDraws`.
+        Maximum shear strain of each truth drawn, in the cells; see `dvc.trust.truth_draws.TruthDraws`.
     models : mapping of name to (n,)
-        Maximal shear in the cells.
+        Maximum shear strain in the cells.
     volumes_ml : (n,)
     tissues : mapping of name to (n,) bool
     widening : float
     narrowed : callable
-        Makes a truth drawn (n,) as narrow as a perfect model is: `dvc.trust.truth_draws.TruthDraws.narrowed`.
+        Narrows a truth drawn (n,) to the spread of a perfect model: `dvc.trust.truth_draws.TruthDraws.narrowed`.
     strains : (low, high)
         Range of the areas; the band begins at 0 and ends at one and a half times its upper end.
 
     Notes
     -----
-    A truth drawn is what was found, which carries noise, less noise. Where strain is spread over little more than the
-    noise, and the error model does not know it, truths drawn are wider than the truth and all alike: two of them would
-    tell too small an area for a perfect model, whose curve is steeper than theirs.
+    A truth drawn is the measured field, which carries noise, minus drawn noise. Where the strain varies by little more
+    than the noise, truths drawn have a wider distribution than the truth, and similar ones: the area between two of
+    them would be too small for a perfect model, whose curve is steeper.
     """
     low, high = strains
     inner = np.linspace(low, high, _GRID)
@@ -190,8 +191,8 @@ def bands(
             both = volume_above(truth[inside], volumes_ml[inside], np.concatenate([outer, inner]))
             curve = both[len(outer) :]
             drawn[name].append(both[: len(outer)])
-            for model, found in curves[name].items():
-                areas[name][model].append(float(np.trapezoid(np.abs(found - curve), dx=step)))
+            for model, simulated in curves[name].items():
+                areas[name][model].append(float(np.trapezoid(np.abs(simulated - curve), dx=step)))
             if name in perfect:
                 floors[name].append(float(np.trapezoid(np.abs(perfect.pop(name) - curve), dx=step)))
         if number % _EVERY == 0:
@@ -204,7 +205,7 @@ def bands(
             outer,
             least,
             np.minimum(most, volumes_ml[inside].sum()),
-            {model: np.array(found) for model, found in areas[name].items()},
+            {model: np.array(drawn_areas) for model, drawn_areas in areas[name].items()},
             float(np.median(floors[name])),
             widening,
         )

@@ -1,8 +1,7 @@
-"""A model's deformation carried on over a whole image, so that it can be measured as the tissue was.
+"""A model's displacement extrapolated over a whole image, for forward-model comparison (levelling).
 
-A measurement smooths and a model does not. Levelling sends the model through the measurement: its deformation moves
-the unloaded image, noise is drawn anew, and the pair is registered as the scans were. What comes back is what the
-measurement would have made of a foot that moved as the model says.
+A measurement smooths and a model does not. Levelling simulates the measurement on the model's displacement: it warps
+the unloaded image, fresh noise is added, and the pair is registered as the scans were.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from dvc.errors import InputError
 from dvc.images.image import Grid
 
 LEVELLED = "-levelled"
-"""Ending of the name of a model that was sent through the measurement."""
+"""Suffix of the name of a levelled model."""
 
 _SMOOTH_MM, _ROUNDS = 2.0, 40
 _MENDING, _LEAST_VOLUME = 12, 0.1
 
 
-def carried_on(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacement:
-    """A model's displacement at every voxel of a grid: its own in its mesh, zero in bone, else carried on smoothly.
+def extrapolated(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacement:
+    """A model's displacement at every voxel: as simulated in its mesh, zero in bone, smoothly extrapolated elsewhere.
 
     Parameters
     ----------
@@ -65,9 +64,9 @@ def carried_on(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacemen
 
 
 def _unfolded(grid: Grid, u: FloatArray) -> SampledDisplacement:
-    """The displacement, smoothed around the voxels at which its spline folds, in some rounds.
+    """The displacement, smoothed repeatedly around the voxels at which its spline folds.
 
-    A model is linear in each cell, and where one is nearly flat the spline through voxels overshoots.
+    A model is linear in each cell; where a cell is nearly flat the spline through the voxels overshoots.
     """
     width = _SMOOTH_MM / grid.spacing_mm
     for _ in range(_MENDING):

@@ -1,4 +1,4 @@
-"""What a finite-element code computed, as a `Deformation`: whatever the code, its unit and its frame.
+"""Results of any finite-element code as a `Deformation`, whatever its unit and frame.
 
 A result is one file with mesh and displacement (VTU, VTK, Gmsh, CalculiX .frd, FEBio .xplt), or a mesh (also Abaqus
 .inp, ANSYS .cdb) and a table of its nodes' displacements (.csv: node number, and three components).
@@ -33,13 +33,13 @@ _COMPONENTS = (
 )  # fmt: skip
 _SCALES = {1.0: "this unit", 1e3: "metres (--model-unit m)"}
 _TURNS = {(1.0, 1.0, 1.0): "this frame", (-1.0, -1.0, 1.0): "the other of LPS and RAS (--model-frame)"}
-_INSIDE = 0.5  # share of a mesh's nodes that has to lie in the image
+_INSIDE = 0.5  # fraction of a mesh's nodes that has to lie in the image
 _MOST_MM = 200.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeResult:
-    """A model's answer to one load.
+    """A model's result for one load.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class FeResult:
 
     @property
     def mesh(self) -> TetMesh:
-        """Where it is defined."""
+        """The linear tetrahedra on which it is defined."""
         return self.deformation.mesh
 
 
@@ -74,22 +74,23 @@ def read_result(
     Parameters
     ----------
     name : str
-        What the model is called in tables.
+        Of the model, as it stands in tables.
     path : path
-        With mesh and displacement, or a table of displacements of the nodes of ``mesh``.
+        With mesh and displacement, or a table of nodal displacements on ``mesh``.
     mesh : path, optional
-        For a table: the mesh it belongs to.
+        Mesh of a table.
     unit : {"mm", "m"}
         Of coordinates and displacements.
     frame : {"LPS", "RAS"}
         Of coordinates and displacements.
     to_image : (4, 4), optional
-        Rigid map of the model's own frame to the image's, LPS mm, after unit and frame; displacements turn with it.
+        Rigid map of the model's frame to the image's, LPS mm, applied after unit and frame; it also rotates the
+        displacement.
 
     Raises
     ------
     InputError
-        If there is no displacement, a node has none, or it is none of a body part.
+        If there is no displacement, a node has none, or it is not that of a body part under load.
     ImageFileError, GeometryError
         As `dvc.io.meshes.read.read_mesh`.
     """
@@ -125,19 +126,19 @@ def read_result(
     largest = float(np.linalg.norm(moved, axis=1).max())
     if not 0.0 < largest < _MOST_MM:
         raise InputError(
-            f"{place}: the largest displacement is {largest:.3g} mm, which is none of tissue under a plate. Is the "
-            "unit right, and the load step the last one?"
+            f"{place}: the largest displacement is {largest:.3g} mm, which is implausible for tissue under a plate. Is "
+            "the unit right, and the load step the last one?"
         )
     return FeResult(name, place, OnMesh(tets, moved))
 
 
 def _names_of_regions(place: Path) -> dict[str, str]:
-    """Names of the numbers in the array ``region``, where a simulation or a mesh of ours tells them."""
+    """Names of the numbers in the array ``region``, from the record beside one of our own files."""
     tables = ((place.with_name("simulation.json"), "region_numbers_in_vtu"), (place.with_suffix(".json"), "regions"))
     for file, key in tables:
         try:
-            told = json.loads(file.read_text(encoding="utf-8"))
-            table = told.get(key) or told.get("parameters", {}).get(key)
+            record = json.loads(file.read_text(encoding="utf-8"))
+            table = record.get(key) or record.get("parameters", {}).get(key)
             if table:
                 return {f"region {number}": str(name) for number, name in table.items()}
         except (OSError, ValueError, AttributeError):
@@ -146,12 +147,12 @@ def _names_of_regions(place: Path) -> dict[str, str]:
 
 
 def _rigid(matrix: FloatArray) -> Affine:
-    given = np.asarray(matrix, dtype=np.float64)
-    turn = given[:3, :3] if given.shape == (4, 4) else np.zeros((3, 3))
+    affine = np.asarray(matrix, dtype=np.float64)
+    turn = affine[:3, :3] if affine.shape == (4, 4) else np.zeros((3, 3))
     proper = np.abs(turn.T @ turn - np.eye(3)).max() < 1e-4 and np.linalg.det(turn) > 0.0
-    if not (proper and np.allclose(given[3], [0.0, 0.0, 0.0, 1.0])):
+    if not (proper and np.allclose(affine[3], [0.0, 0.0, 0.0, 1.0])):
         raise InputError("The map to the image must be a 4 x 4 matrix of a rotation and a translation in mm.")
-    return Affine(turn, given[:3, 3])
+    return Affine(turn, affine[:3, 3])
 
 
 def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:

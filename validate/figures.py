@@ -1,4 +1,4 @@
-"""Figures of a comparison, each as PNG bytes; what a figure's docstring says is its caption."""
+"""Figures of a comparison: PNG bytes, with the docstring as caption, and matplotlib figures for interactive use."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from dvc.report.figures import REGION_COLOURS
 from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet
 from validate.agreement import Agreement
-from validate.curves import Band
-from validate.mapping import ALL, Mapped, filled_from_nearest
+from validate.curves import Area, Band
+from validate.mapping import ALL, MappedFields, filled_from_nearest
+from validate.tables import LOWER, UPPER, Curve
 
 _POINTS = 601
 _COLUMNS = 3
@@ -25,37 +26,91 @@ _BINS = 60
 
 
 def volume_strain(
-    found: Mapped,
+    fields: MappedFields,
     bands: Mapping[str, Band],
     strains: tuple[float, float],
     tissues: Sequence[str],
     colours: Sequence[str],
 ) -> bytes:
-    """Volume of tissue whose maximal shear exceeds a value: measured (black) and models, on the same cells.
+    """Volume of tissue above each maximum shear strain: measured (black) and models, in the same cells.
 
-    The grey band holds the true curve in 95 % of cases, by the measurement's error model; areas are
+    The grey band contains the true curve in 95 % of cases, by the measurement's error model; areas are
     taken between the dotted lines.
     """
     figure, panels = _panels(len(tissues))
     at = np.linspace(0.0, 1.5 * strains[1], _POINTS)
     for axes, tissue in zip(panels, tissues, strict=True):
-        if tissue in bands:
-            band = bands[tissue]
-            axes.fill_between(band.strains, band.low_ml, band.high_ml, color=_BAND, linewidth=0, label="95 % of truths")
-        for name, above in found.curves(tissue, at).items():
-            if name == "measured":
-                axes.plot(at, above, color="black", linewidth=2.2, label=name)
-            else:
-                colour = REGION_COLOURS[colours.index(name) % (len(REGION_COLOURS) - 1)]
-                axes.plot(at, above, color=colour, linewidth=1.5, label=name)
-        for edge in strains:
-            axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
+        band = bands.get(tissue)
+        edges = None if band is None else (band.strains, band.low_ml, band.high_ml)
+        _draw_curves(axes, at, fields.curves(tissue, at), edges, strains, colours)
         axes.set_title(tissue, color=INK, **FONT)
-        axes.set_xlim(0.0, at[-1])
-        axes.set_ylim(0.0, None)
-        label_axes(axes, "maximal shear", "volume above, mL")
     panels[0].legend(fontsize=9, frameon=False)
     return png_bytes(figure)
+
+
+def _draw_curves(
+    axes: Axes,
+    at: FloatArray,
+    volumes_ml: Mapping[str, FloatArray],
+    band: tuple[FloatArray, FloatArray, FloatArray] | None,
+    strains: tuple[float, float],
+    colours: Sequence[str],
+) -> None:
+    """Volume above each strain ``at``, measured and simulated, with the 95 % band of the true curve."""
+    if band is not None:
+        axes.fill_between(*band, color=_BAND, linewidth=0, label="95 % of truths")
+    for name, above in volumes_ml.items():
+        if name == "measured":
+            axes.plot(at, above, color="black", linewidth=2.2, label=name)
+        else:
+            axes.plot(at, above, color=_colour(colours.index(name)), linewidth=1.5, label=name)
+    for edge in strains:
+        axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
+    axes.set_xlim(0.0, at[-1])
+    axes.set_ylim(0.0, None)
+    label_axes(axes, "maximum shear strain", "volume above, mL")
+
+
+def _colour(number: int) -> str:
+    return REGION_COLOURS[number % (len(REGION_COLOURS) - 1)]
+
+
+def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Figure:
+    """Volume-strain curves of one tissue, measured (black) and simulated, a panel for each load.
+
+    The grey band contains the true curve in 95 % of cases; areas are taken between the dotted lines.
+    """
+    by_load: dict[str, dict[str, Curve]] = {}
+    for curve in curves:
+        by_load.setdefault(curve.load, {})[curve.field] = curve
+    models = [name for name in dict.fromkeys(c.field for c in curves) if name not in ("measured", LOWER, UPPER)]
+    figure, panels = _panels(len(by_load))
+    for axes, (load, of) in zip(panels, by_load.items(), strict=True):
+        at = of["measured"].max_shear
+        band = (at, of[LOWER].volume_above_ml, of[UPPER].volume_above_ml) if LOWER in of else None
+        volumes = {name: of[name].volume_above_ml for name in ("measured", *models) if name in of}
+        _draw_curves(axes, at, volumes, band, strains, models)
+        axes.set_title(load, color=INK, **FONT)
+    panels[0].legend(fontsize=9, frameon=False)
+    return figure
+
+
+def areas_by_load(areas: Sequence[Area]) -> Figure:
+    """Area between curves by load and model: the estimate with its 95 % interval, or as measured if that is unknown."""
+    models, loads = (list(dict.fromkeys(getattr(a, of) for a in areas)) for of in ("model", "load"))
+    figure, (axes,) = chart()
+    width = 0.6 / len(models)
+    for number, model in enumerate(models):
+        rows = [a for a in areas if a.model == model]
+        at = [loads.index(a.load) + (number - 0.5 * (len(models) - 1)) * width for a in rows]
+        axes.plot(at, [a.best_ml for a in rows], "o", color=_colour(number), label=model)
+        axes.vlines(at, [a.low_ml for a in rows], [a.high_ml for a in rows], color=_colour(number), linewidth=1.8)
+    axes.set_xticks(range(len(loads)), loads)
+    axes.set_xlim(-0.5, len(loads) - 0.5)
+    axes.set_ylim(0.0, None)
+    label_axes(axes, "", "area between curves, mL")
+    axes.legend(fontsize=9, frameon=False)
+    return figure
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
@@ -69,41 +124,43 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def slices(
-    found: Mapped,
+    fields: MappedFields,
     measured: Deformation,
     displacements: Mapping[str, FloatArray],
     axes: FloatArray,
     point_mm: FloatArray,
 ) -> bytes:
-    """Maximal shear on a slice, measured and simulated, where tissue is under load.
+    """Maximum shear strain on a slice, measured and simulated, on the deformed tissue.
 
-    The slice holds the plate's normal and the direction of shear; the same cells in one colour scale. Grey is not
-    defined. Where the measurement does not reach a node, it is drawn with the displacement of the nearest one. Letters
-    name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
+    The slice contains the plate's normal and the direction of shear; the same cells in one colour scale. Grey is
+    undefined. A node beyond the measurement is drawn with the displacement of the nearest one within. Letters name the
+    sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
-    return png_bytes(slice_sheet(found.mesh, slice_panels(found, measured, displacements), axes, point_mm))
+    return png_bytes(slice_sheet(fields.mesh, slice_panels(fields, measured, displacements), axes, point_mm))
 
 
-def slice_panels(found: Mapped, measured: Deformation, displacements: Mapping[str, FloatArray]) -> list[Slice]:
-    """What `slices` draws: the measurement, then each model, with displacements (n, 3) at the mesh's nodes."""
-    u = filled_from_nearest(measured.displacement(found.mesh.points_mm), found.mesh.points_mm)
-    panels = [Slice("measured", u, found.measured.max_shear)]
-    return panels + [Slice(name, displacements[name], field.max_shear) for name, field in found.models.items()]
+def slice_panels(fields: MappedFields, measured: Deformation, displacements: Mapping[str, FloatArray]) -> list[Slice]:
+    """Panels of `slices`: the measurement, then each model, with displacements (n, 3) at the mesh's nodes."""
+    u = filled_from_nearest(measured.displacement(fields.mesh.points_mm), fields.mesh.points_mm)
+    panels = [Slice("measured", u, fields.measured.max_shear)]
+    return panels + [Slice(name, displacements[name], field.max_shear) for name, field in fields.models.items()]
 
 
-def scatter(found: Mapped) -> bytes:
-    """Simulated over measured maximal shear, cell by cell: how much volume lies where (darker is more, logarithmic).
+def scatter(fields: MappedFields) -> bytes:
+    """Simulated over measured maximum shear strain, cell by cell; darker is more volume (logarithmic).
 
-    On the line both agree.
+    Both agree on the line.
     """
-    names = list(found.models)
+    names = list(fields.models)
     figure, spots = _by_model(len(names))
-    where = found.common
-    x, volumes = found.measured.max_shear[where], found.volumes_ml[where]
-    most = max(0.1, *(float(np.quantile(f.max_shear[where], 0.995)) for f in (found.measured, *found.models.values())))
+    where = fields.common
+    x, volumes = fields.measured.max_shear[where], fields.volumes_ml[where]
+    most = max(
+        0.1, *(float(np.quantile(f.max_shear[where], 0.995)) for f in (fields.measured, *fields.models.values()))
+    )
     for spot, name in zip(spots, names, strict=True):
         spot.hist2d(
-            x, found.models[name].max_shear[where], bins=_BINS, range=((0.0, most), (0.0, most)), weights=volumes,
+            x, fields.models[name].max_shear[where], bins=_BINS, range=((0.0, most), (0.0, most)), weights=volumes,
             norm="log", cmap="Blues",
         )  # fmt: skip
         spot.plot([0.0, most], [0.0, most], color=INK, linewidth=0.9)
@@ -113,22 +170,22 @@ def scatter(found: Mapped) -> bytes:
     return png_bytes(figure)
 
 
-def differences(found: Mapped, rows: Sequence[Agreement], quantity: str) -> bytes:
-    """Bland and Altman's plot: simulated minus measured over the mean of both, cell by cell (darker is more volume).
+def differences(fields: MappedFields, rows: Sequence[Agreement], quantity: str) -> bytes:
+    """Bland-Altman plot: simulated minus measured over the mean of both, cell by cell; darker is more volume.
 
-    The line is the mean difference, dashed are the limits of agreement: 1.96 standard deviations to either side.
+    The solid line is the mean difference, dashed lines are the limits of agreement, 1.96 standard deviations away.
     """
-    told = {row.model: row for row in rows if (row.quantity, row.part) == (quantity, ALL)}
-    names = [name for name in found.models if name in told]
+    limits = {row.model: row for row in rows if (row.quantity, row.part) == (quantity, ALL)}
+    names = [name for name in fields.models if name in limits]
     figure, spots = _by_model(max(1, len(names)))
-    where = found.common
+    where = fields.common
     for spot, name in zip(spots, names, strict=False):
         x, y = (
             field.max_shear[where] if quantity == "max_shear" else np.linalg.norm(field.u_mm[where], axis=1)
-            for field in (found.measured, found.models[name])
+            for field in (fields.measured, fields.models[name])
         )
-        spot.hist2d(0.5 * (x + y), y - x, bins=_BINS, weights=found.volumes_ml[where], norm="log", cmap="Blues")
-        for height, style in ((told[name].bias, "-"), (told[name].lower, "--"), (told[name].upper, "--")):
+        spot.hist2d(0.5 * (x + y), y - x, bins=_BINS, weights=fields.volumes_ml[where], norm="log", cmap="Blues")
+        for height, style in ((limits[name].bias, "-"), (limits[name].lower, "--"), (limits[name].upper, "--")):
             spot.axhline(height, color=INK, linewidth=0.9, linestyle=style)
         spot.set_title(name, color=INK, **FONT)
         unit = "" if quantity == "max_shear" else ", mm"
@@ -148,7 +205,7 @@ def _by_model(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[str]) -> bytes:
-    """Area between curves, as a share of volume and range, of every subject (points) by model; the bar is the mean.
+    """Normalised area between curves of every subject (points) by model; the bar is the mean.
 
     Lines join the models of one subject.
     """
@@ -163,7 +220,7 @@ def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[st
         axes.plot([at - 0.25, at + 0.25], [mean, mean], color=INK, linewidth=2.5)
     axes.set_xticks(range(len(models)), list(models), rotation=30, ha="right")
     axes.set_ylim(bottom=0.0)
-    label_axes(axes, "", "area between curves, % of volume and range")
+    label_axes(axes, "", "normalised area between curves, %")
     if len(subjects) <= len(REGION_COLOURS):
         axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)

@@ -1,4 +1,4 @@
-"""Strain location: connected tissue above a strain, measured and simulated, and how far apart the two lie."""
+"""Strain location: clusters of tissue above a strain threshold, measured and simulated, and their distance."""
 
 from __future__ import annotations
 
@@ -18,43 +18,43 @@ from dvc.errors import InputError
 from dvc.mesh import FACES, TetMesh
 
 LEAST_ML = 0.1
-"""Volume under which a cluster is not told, by default."""
+"""Volume of the smallest cluster that counts by default, mL."""
 
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """A maximal shear above which tissue is looked at, and where the number comes from."""
+    """A maximum shear strain above which clusters are compared, and the source of the number."""
 
     max_shear: float
     source: str
 
 
 def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
-    """Thresholds of a table with columns max_shear and source; by default that which comes with the package.
+    """Read a table with columns max_shear and source; by default the one in the package.
 
     Raises
     ------
     InputError
-        If there is no such table, or a value is none of a strain.
+        If there is no such table, or a value is no strain between 0 and 3.
     """
     place = path if path is not None else files("validate") / "thresholds.csv"
     try:
         rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines(), restval=""))
-        found = tuple(Threshold(float(row["max_shear"]), row["source"].strip()) for row in rows)
+        thresholds = tuple(Threshold(float(row["max_shear"]), row["source"].strip()) for row in rows)
     except OSError as error:
         raise InputError(f"{place} cannot be read as thresholds: {error.strerror}.") from error
     except (KeyError, ValueError, AttributeError) as error:
         raise InputError(f"{place}: a table of thresholds has the columns max_shear and source ({error}).") from error
-    if not found or not all(0.0 < t.max_shear < 3.0 for t in found):
+    if not thresholds or not all(0.0 < t.max_shear < 3.0 for t in thresholds):
         raise InputError(
-            f"{place}: thresholds are maximal shears between 0 and 3 (no percent); it has "
-            f"{[t.max_shear for t in found]}."
+            f"{place}: thresholds are maximum shear strains between 0 and 3 (no percent); it has "
+            f"{[t.max_shear for t in thresholds]}."
         )
-    return found
+    return thresholds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cluster:
+class StrainCluster:
     """Connected cells above a threshold.
 
     Attributes
@@ -71,79 +71,92 @@ class Cluster:
     centroid_mm: FloatArray
 
 
-def neighbours(mesh: TetMesh) -> sparse.csr_matrix:
-    """Which cells share a face, (m, m)."""
-    count = len(mesh.cells)
-    faces = np.sort(np.concatenate([mesh.cells[:, face] for face in FACES]), axis=1)
-    order = np.lexsort(faces.T)
-    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
-    first, second = order[:-1][same] % count, order[1:][same] % count
-    return sparse.csr_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
+@dataclass(frozen=True, slots=True, eq=False)
+class CellGraph:
+    """Cells of a mesh and which of them share a face.
 
+    Attributes
+    ----------
+    volumes_ml : (n,)
+    points_mm : (n, 3)
+        Centroids, reference configuration, LPS.
+    adjacency : (n, n) sparse
+    """
 
-def clusters(
-    above: BoolArray,
-    shear: FloatArray,
-    volumes_ml: FloatArray,
-    points_mm: FloatArray,
-    touching: sparse.csr_matrix,
-    least_ml: float = LEAST_ML,
-) -> list[Cluster]:
-    """Clusters of cells ``above`` (n,), connected through faces, of at least a volume; the largest first."""
-    cells = np.flatnonzero(above)
-    if not len(cells):
-        return []
-    _, number = connected_components(touching[cells][:, cells], directed=False)
-    found = []
-    for n in range(number.max() + 1):
-        members = cells[number == n]
-        volume = volumes_ml[members]
-        if volume.sum() >= least_ml:
-            share = volume / volume.sum()
-            found.append(
-                Cluster(members, float(volume.sum()), float(share @ shear[members]), share @ points_mm[members])
-            )
-    return sorted(found, key=lambda c: -c.volume_ml)
+    volumes_ml: FloatArray
+    points_mm: FloatArray
+    adjacency: sparse.csr_matrix
 
+    @classmethod
+    def of(cls, mesh: TetMesh) -> CellGraph:
+        """All cells of a mesh."""
+        count = len(mesh.cells)
+        faces = np.sort(np.concatenate([mesh.cells[:, face] for face in FACES]), axis=1)
+        order = np.lexsort(faces.T)
+        same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
+        first, second = order[:-1][same] % count, order[1:][same] % count
+        pairs = sparse.csr_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
+        return cls(mesh.volumes_mm3 / 1000.0, mesh.centroids_mm, pairs)
 
-def in_clusters(
-    above: BoolArray, volumes_ml: FloatArray, touching: sparse.csr_matrix, least_ml: float = LEAST_ML
-) -> BoolArray:
-    """Those of the cells ``above`` (n,) that lie in a cluster of at least a volume."""
-    cells = np.flatnonzero(above)
-    kept = np.zeros(len(above), dtype=bool)
-    if len(cells):
-        _, number = connected_components(touching[cells][:, cells], directed=False)
-        kept[cells] = np.bincount(number, volumes_ml[cells])[number] >= least_ml
-    return kept
+    def part(self, kept: BoolArray) -> CellGraph:
+        """Some of the cells (n,)."""
+        return CellGraph(self.volumes_ml[kept], self.points_mm[kept], self.adjacency[kept][:, kept])
+
+    def clusters(self, above: BoolArray, shear: FloatArray, least_ml: float = LEAST_ML) -> list[StrainCluster]:
+        """Clusters of the cells ``above`` (n,) of at least a volume, the largest first; ``shear`` (n,)."""
+        cells, number = self._components(above)
+        kept = []
+        for n in range(number.max() + 1 if len(cells) else 0):
+            members = cells[number == n]
+            volume = self.volumes_ml[members]
+            if volume.sum() >= least_ml:
+                weight = volume / volume.sum()
+                mean, centroid = float(weight @ shear[members]), weight @ self.points_mm[members]
+                kept.append(StrainCluster(members, float(volume.sum()), mean, centroid))
+        return sorted(kept, key=lambda c: -c.volume_ml)
+
+    def region(self, above: BoolArray, least_ml: float = LEAST_ML) -> StrainedRegion:
+        """All cells ``above`` (n,) that lie in a cluster of at least a volume."""
+        cells, number = self._components(above)
+        kept = np.zeros(len(above), dtype=bool)
+        if len(cells):
+            kept[cells] = np.bincount(number, self.volumes_ml[cells])[number] >= least_ml
+        return StrainedRegion(kept, self)
+
+    def _components(self, above: BoolArray) -> tuple[IntArray, IntArray]:
+        """The cells above, and the number of the cluster of each."""
+        cells = np.flatnonzero(above)
+        if not len(cells):
+            return cells, cells
+        return cells, connected_components(self.adjacency[cells][:, cells], directed=False)[1]
 
 
 @dataclass(frozen=True, slots=True)
 class Overlap:
-    """Where a model and the measurement put tissue above a threshold, in clusters of at least the least volume.
+    """Overlap and distance of the clusters above a threshold, measured and simulated; a row of location.csv.
 
     Attributes
     ----------
     model, load : str
     threshold : float
-        Maximal shear.
+        Maximum shear strain.
     measured_ml, model_ml : float
-        Volume of the clusters; all that lies above, specks too, is in the volume-strain curves.
+        Volume of the clusters; the volume-strain curves also hold what lies above outside clusters.
     measured_clusters, model_clusters : int
-        How many.
+        Their number.
     measured_mean, model_mean : float
-        Mean maximal shear in them, by volume; NaN where there is none.
+        Volume-weighted mean of the maximum shear strain in them; NaN where there is none.
     dice : float
-        Twice the common volume over the sum of both.
+        Dice coefficient: twice the common volume over the sum of both.
     centroids_mm : float
-        Distance of the centroids of all clusters together.
+        Distance of the centroids of all clusters together, mm.
     largest_mm : float
-        The same of the largest cluster of each.
+        The same of the largest cluster of each, mm.
     hausdorff95_mm : float
-        95th percentile, by volume, of the distance of either to the other; the larger of the two.
+        Hausdorff distance at the 95th percentile (by volume), the larger of both directions, mm.
     measured_low_ml, measured_high_ml, dice_low ... : float
-        95 % intervals from the measurement's error, and what a perfect model would be given; NaN where the error is
-        not known. See `validate.location_intervals`.
+        95 % intervals from the measurement uncertainty, and the value that a perfect model would get; NaN where no
+        error model is known. See `validate.location_intervals`.
     """
 
     model: str
@@ -178,29 +191,25 @@ def overlap(
     threshold: float,
     measured: FloatArray,
     simulated: FloatArray,
-    volumes_ml: FloatArray,
-    points_mm: FloatArray,
-    touching: sparse.csr_matrix,
+    cells: CellGraph,
     least_ml: float = LEAST_ML,
 ) -> Overlap:
-    """Compare what lies above a threshold in two fields (n,) on the same cells; figures without a meaning are NaN."""
+    """Compare the clusters above a threshold of two fields (n,) on the same cells; undefined figures are NaN."""
     fields = (measured, simulated)
-    found = [clusters(shear > threshold, shear, volumes_ml, points_mm, touching, least_ml) for shear in fields]
-    above = [in_clusters(shear > threshold, volumes_ml, touching, least_ml) for shear in fields]
-    both = [Part(cells, volumes_ml, points_mm) for cells in above]
-    means = [part.mean_of(shear) for part, shear in zip(both, fields, strict=True)]
+    clusters = [cells.clusters(shear > threshold, shear, least_ml) for shear in fields]
+    first, second = (cells.region(shear > threshold, least_ml) for shear in fields)
     largest = float("nan")
-    if all(found):
-        largest = float(np.linalg.norm(found[0][0].centroid_mm - found[1][0].centroid_mm))
+    if all(clusters):
+        largest = float(np.linalg.norm(clusters[0][0].centroid_mm - clusters[1][0].centroid_mm))
     return Overlap(
-        model, load, threshold, both[0].volume_ml, both[1].volume_ml, len(found[0]), len(found[1]),
-        means[0], means[1], dice(both[0], both[1]), centroids_apart(both[0], both[1]), largest,
-        hausdorff95(both[0], both[1]),
+        model, load, threshold, first.volume_ml, second.volume_ml, len(clusters[0]), len(clusters[1]),
+        first.mean_of(measured), second.mean_of(simulated), dice(first, second), centroid_distance(first, second),
+        largest, hausdorff95(first, second),
     )  # fmt: skip
 
 
-class Part:
-    """Cells in clusters above a threshold, and what their place is told by.
+class StrainedRegion:
+    """Cells in clusters above a threshold.
 
     Attributes
     ----------
@@ -208,10 +217,10 @@ class Part:
     volume_ml : float
     """
 
-    def __init__(self, above: BoolArray, volumes_ml: FloatArray, points_mm: FloatArray) -> None:
+    def __init__(self, above: BoolArray, cells: CellGraph) -> None:
         self.above = above
-        self._volumes, self._points = volumes_ml, points_mm
-        self.volume_ml = float(volumes_ml[above].sum())
+        self._volumes, self._points = cells.volumes_ml, cells.points_mm
+        self.volume_ml = float(self._volumes[above].sum())
 
     @cached_property
     def _near(self) -> cKDTree:
@@ -225,18 +234,18 @@ class Part:
         return np.asarray(self._volumes[self.above] @ self._points[self.above] / self.volume_ml)
 
     def mean_of(self, values: FloatArray) -> float:
-        """Mean of values (n,) by volume; NaN for no cell."""
+        """Volume-weighted mean of values (n,); NaN for no cell."""
         inside = self.above
         return float(self._volumes[inside] @ values[inside] / self.volume_ml) if inside.any() else float("nan")
 
-    def shared_ml(self, other: Part) -> float:
+    def shared_ml(self, other: StrainedRegion) -> float:
         """Volume common to both."""
         return float(self._volumes[self.above & other.above].sum())
 
-    def distance95(self, other: Part, most: int | None = None) -> float:
-        """95th percentile, by volume, of the distance of these cells to the nearest of the other's, mm.
+    def distance95(self, other: StrainedRegion, most: int | None = None) -> float:
+        """95th percentile (by volume) of the distance of these cells to the nearest of another region, mm.
 
-        With ``most``, of so many or fewer of the cells, taken at equal steps.
+        With ``most``, of at most so many of the cells, taken at equal steps.
         """
         cells = np.flatnonzero(self.above)
         cells = cells[:: max(1, len(cells) // most)] if most else cells
@@ -244,23 +253,23 @@ class Part:
         distance = np.zeros(len(cells))
         distance[alone] = other._near.query(self._points[cells[alone]])[0]
         order = np.argsort(distance)
-        share = np.cumsum(self._volumes[cells[order]])
-        return float(distance[order][min(int(np.searchsorted(share, 0.95 * share[-1])), len(order) - 1)])
+        volume = np.cumsum(self._volumes[cells[order]])
+        return float(distance[order][min(int(np.searchsorted(volume, 0.95 * volume[-1])), len(order) - 1)])
 
 
-def dice(first: Part, second: Part) -> float:
+def dice(first: StrainedRegion, second: StrainedRegion) -> float:
     """Twice the common volume over the sum of both (Dice 1945); NaN where both are empty."""
     both = first.volume_ml + second.volume_ml
     return 2.0 * first.shared_ml(second) / both if both > 0.0 else float("nan")
 
 
-def centroids_apart(first: Part, second: Part) -> float:
+def centroid_distance(first: StrainedRegion, second: StrainedRegion) -> float:
     """Distance of the centroids, mm; NaN where one is empty."""
     return float(np.linalg.norm(first.centroid_mm - second.centroid_mm))
 
 
-def hausdorff95(first: Part, second: Part, most: int | None = None) -> float:
-    """Larger of the two distances at their 95th percentiles, mm; NaN where one is empty. ``most`` as in `Part`."""
+def hausdorff95(first: StrainedRegion, second: StrainedRegion, most: int | None = None) -> float:
+    """Hausdorff distance at the 95th percentile, mm; NaN where one is empty. ``most`` as in `distance95`."""
     if not (first.above.any() and second.above.any()):
         return float("nan")
     return max(first.distance95(second, most), second.distance95(first, most))

@@ -1,4 +1,4 @@
-"""A measured and several simulated deformations at the same points, with the same volumes."""
+"""A measured and several simulated deformations, evaluated in the same cells."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from dvc.mesh import TetMesh
 from dvc.trust.regions import volume_above
 
 ALL = "all soft tissue"
-"""All tissue that is compared, together."""
+"""Name of all compared tissue together."""
 
 OTHER = "unnamed"
-"""Tissue of cells that neither the mesh nor the label map names."""
+"""Tissue of cells that are named neither by the mesh nor by the label map."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """A deformation at the points of a comparison.
+    """A deformation in the cells compared.
 
     Attributes
     ----------
@@ -41,12 +41,12 @@ class Field:
 
     @property
     def defined(self) -> BoolArray:
-        """Where there is a value."""
+        """Cells with a value (n,)."""
         return np.isfinite(self.max_shear)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mapped:
+class MappedFields:
     """One load, measured and simulated, at the centroids of a mesh's cells; reference configuration, LPS mm.
 
     Attributes
@@ -72,7 +72,7 @@ class Mapped:
 
     @property
     def common(self) -> BoolArray:
-        """Cells in which the measurement and every model are defined: all are scored on the same tissue."""
+        """Cells (n,) in which the measurement and every model are defined: all are compared on the same tissue."""
         kept = self.measured.defined.copy()
         for field in self.models.values():
             kept &= field.defined
@@ -80,25 +80,28 @@ class Mapped:
 
     @property
     def tissues(self) -> list[str]:
-        """Names, the largest first."""
+        """Names of the tissues, the largest first."""
         names = np.unique(self.tissue)
         return sorted((str(n) for n in names), key=lambda n: -self.volumes_ml[self.tissue == n].sum())
 
     def curves(self, tissue: str, strains: FloatArray) -> dict[str, FloatArray]:
-        """Volume (mL) of a tissue (or `ALL`) above each strain (k,), "measured" and by model, in the common cells."""
+        """Volume (mL) of a tissue (or `ALL`) above each strain (k,), of "measured" and each model, in common cells."""
         where = self.common & ((self.tissue == tissue) | (tissue == ALL))
         fields = {"measured": self.measured, **self.models}
         return {n: volume_above(f.max_shear[where], self.volumes_ml[where], strains) for n, f in fields.items()}
 
     def coverage(self) -> dict[str, float]:
-        """Volume (mL) of the mesh, of what each field defines of it, and of what is common to all."""
-        told = {"mesh": float(self.volumes_ml.sum()), "measured": float(self.volumes_ml[self.measured.defined].sum())}
-        told |= {name: float(self.volumes_ml[field.defined].sum()) for name, field in self.models.items()}
-        return told | {"common": float(self.volumes_ml[self.common].sum())}
+        """Volume (mL) of the mesh, of the part where each field is defined, and of the common part."""
+        volumes = {
+            "mesh": float(self.volumes_ml.sum()),
+            "measured": float(self.volumes_ml[self.measured.defined].sum()),
+        }
+        volumes |= {name: float(self.volumes_ml[field.defined].sum()) for name, field in self.models.items()}
+        return volumes | {"common": float(self.volumes_ml[self.common].sum())}
 
 
 def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray:
-    """Values (n, k) at points (n, 3), a row with NaN replaced by that of the nearest point without."""
+    """Values (n, k) at points (n, 3), rows with NaN replaced by the row of the nearest point without."""
     known = np.isfinite(values).all(axis=1)
     filled = values.copy()
     if not known.all():
@@ -108,12 +111,12 @@ def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray
 
 
 def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
-    """Refuse bones that the label map does not have.
+    """Refuse bones that are not in the label map.
 
     Raises
     ------
     InputError
-        Naming the labels there are.
+        Naming the labels that are.
     """
     for name in bones:
         if name not in labels.names.values():
@@ -123,20 +126,20 @@ def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
             )
 
 
-def sampled(deformation: Deformation, points_mm: FloatArray) -> Field:
+def sample(deformation: Deformation, points_mm: FloatArray) -> Field:
     """A deformation at points (n, 3)."""
     u, H = deformation.evaluate(points_mm)
     strain = StrainField.from_gradient(H)
     return Field(u, strain.max_shear, strain.jacobian)
 
 
-def mapped(
+def map_fields(
     mesh: TetMesh,
     labels: LabelMap,
     bones: Sequence[str],
     measured: Deformation,
     models: Mapping[str, Deformation],
-) -> Mapped:
+) -> MappedFields:
     """Evaluate a measured and simulated deformations at the centroids of a mesh's cells.
 
     Parameters
@@ -165,19 +168,19 @@ def mapped(
     kept = np.flatnonzero(soft)
     if len(kept) < len(points):
         mesh = _part(mesh, kept)
-    found = Mapped(
+    fields = MappedFields(
         mesh,
         points[kept],
         mesh.volumes_mm3 / 1000.0,
         tissue[kept],
         distance,
-        sampled(measured, points[kept]),
-        {name: sampled(model, points[kept]) for name, model in models.items()},
+        sample(measured, points[kept]),
+        {name: sample(model, points[kept]) for name, model in models.items()},
     )
-    if not found.common.any():
-        told = "; ".join(f"{name} {volume:.1f} mL" for name, volume in found.coverage().items())
-        raise InputError(f"Measurement and models are defined nowhere together ({told}). Do they share a frame?")
-    return found
+    if not fields.common.any():
+        covered = "; ".join(f"{name} {volume:.1f} mL" for name, volume in fields.coverage().items())
+        raise InputError(f"Measurement and models are defined nowhere together ({covered}). Do they share a frame?")
+    return fields
 
 
 def tissues_of(mesh: TetMesh, labels: LabelMap, points: FloatArray, *, by_mesh: bool = True) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Materials judged apart from the plate: the measured displacement on a model's outside drives the model.
+"""Constitutive models under measured (Dirichlet) boundary conditions: the measured displacement on a mesh's surface.
 
-Bone stays where it is; every other node on the outside goes where the measurement puts it. What the inside then does
-depends on the laws alone, not on how plate, contact and friction were idealised.
+Bone does not move; every other surface node has its measured displacement. The interior then depends on the
+constitutive models alone, not on how plate, contact and friction were idealised.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _GROWTH, _SHRINK = 1.7, 0.4
 _FAR_MM, _FEW = 3.0, 0.01
 
 
-def outside(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
-    """Nodes (k,) on the outside of a mesh, and their measured displacement (k, 3), LPS mm.
+def boundary_displacement(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
+    """Surface nodes (k,) of a mesh, and their measured displacement (k, 3), LPS mm.
 
-    Nodes of the facets "bone" stay. A node at which the measurement is not defined (the outermost half voxel) goes with
-    the nearest node of the mesh at which it is.
+    Nodes of the surface set "bone" have zero displacement. A node at which the measurement is undefined (the outermost
+    half voxel) takes the value of the nearest node at which it is defined.
 
     Raises
     ------
     InputError
-        If over a hundredth of the nodes lie further than 3 mm from any that is measured.
+        If more than 1 % of the nodes lie over 3 mm from any at which the measurement is defined.
     """
     nodes = np.unique(outer_faces(mesh.cells))
     u = _everywhere(mesh, measured)[nodes]
@@ -64,47 +64,47 @@ def _everywhere(mesh: TetMesh, measured: Deformation) -> FloatArray:
     return filled_from_nearest(u, mesh.points_mm)
 
 
-def driven(
+def simulate_driven(
     mesh: TetMesh,
-    laws: Mapping[str, Material],
+    materials: Mapping[str, Material],
     measured: Deformation,
     load: str,
     *,
     threads: int = 1,
     tell: Callable[[str], None] = lambda _: None,
 ) -> LoadState:
-    """The state of a mesh whose outside goes where a measurement puts it.
+    """Equilibrium of a mesh with the measured displacement prescribed on its surface.
 
     Parameters
     ----------
     mesh : TetMesh
-        Every cell in one region; facets "bone" do not move.
-    laws : mapping of region to Material
+        Every cell in one region; the surface set "bone" does not move.
+    materials : mapping of region to Material
     measured : Deformation
         Of tissue relative to its bone, reference configuration, LPS mm.
     load : str
         Name of the load.
     threads : int
-        Of the linear algebra.
+        Of the linear solver.
     tell : callable
-        Gets a line for each step.
+        Gets a line for each increment.
 
     Returns
     -------
     LoadState
-        Without a plate; ``reached`` below 1 where the last steps found no balance.
+        Without a plate; ``reached`` is below 1 if equilibrium was lost, and the last converged increment is given.
 
     Raises
     ------
     InputError
-        As `outside`, or if a cell has not one law.
+        As `boundary_displacement`, or if a cell does not have exactly one constitutive model.
     """
-    check_materials(mesh, laws)
+    check_materials(mesh, materials)
     began = time.monotonic()
-    nodes, u = outside(mesh, measured)
+    nodes, u = boundary_displacement(mesh, measured)
     guess = _everywhere(mesh, measured)
     guess[nodes] = u
-    model = Model.of(mesh, laws, element("P1"))
+    model = Model.of(mesh, materials, element("P1"))
     assembler = Assembler(model, (3 * nodes[:, None] + np.arange(3)).ravel(), {})
     solver = Solver(assembler.indptr, assembler.indices, threads=threads)
     state = np.zeros(model.unknowns)
@@ -115,17 +115,17 @@ def driven(
             share = min(1.0, done + step)
             tried = state.copy()
             tried[:count] += (share - done) * guess.ravel()
-            found = equilibrium(assembler, solver, tried, Imposed(np.zeros(assembler.size)), Tolerance(), log=tell)
-            if found is None:
+            converged = equilibrium(assembler, solver, tried, Imposed(np.zeros(assembler.size)), Tolerance(), log=tell)
+            if converged is None:
                 step *= _SHRINK
                 continue
-            state, done, step = found.state, share, step * _GROWTH
-            iterations += found.iterations
-            tell(f"{done:.0%} of the way")
+            state, done, step = converged.state, share, step * _GROWTH
+            iterations += converged.iterations
+            tell(f"{done:.0%} of the displacement")
     finally:
         solver.close()
     if done == 0.0:
-        raise MrstrainError(f"{load}: the model finds no balance with its outside where it was measured.")
+        raise MrstrainError(f"{load}: no equilibrium was found with the measured displacement on the surface.")
     return LoadState(
         load=LoadStep(load, float("nan")),
         reached=done,
@@ -139,25 +139,24 @@ def driven(
     )
 
 
-def write_boundary(
+def write_boundary_conditions(
     stem: Path, mesh: TetMesh, nodes: IntArray, u_mm: FloatArray, *, unit: str = "mm", frame: str = "LPS"
 ) -> list[Path]:
     """Write displacements (k, 3) LPS mm of a mesh's nodes as boundary conditions, in its file's own unit and frame.
 
-    Nodes have the mesh's own numbers; those of a file that gives none are counted from 1, as in `fe.decks`.
-
-    ``.inp`` for Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D), ``.feb`` for FEBio 4, to be merged.
+    Node numbers are those of the mesh file, or counted from 1, as in `fe.decks`, if it has none. Files: ``.inp`` for
+    Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D), ``.feb`` for FEBio 4, to be merged into a model.
     """
     numbers = mesh.node_ids[nodes] + (1 if mesh.node_ids.min() == 0 else 0)
     u = u_mm / MM_PER_UNIT[unit] * TO_LPS[frame]
     about = f"displacements in {unit}, {frame}, of nodes by their numbers in the mesh"
     written = {".inp": _abaqus(numbers, u), ".mac": _ansys(numbers, u), ".feb": _febio(numbers, u)}
-    told = {".inp": f"** {about}; into a *STEP", ".mac": f"! {about}", ".feb": f"<!-- {about} -->"}
+    remarks = {".inp": f"** {about}; into a *STEP", ".mac": f"! {about}", ".feb": f"<!-- {about} -->"}
     paths = []
     for ending, lines in written.items():
         paths.append(stem.with_name(stem.name + ending))
         first, *others = lines
-        written_lines = [first, told[ending], *others] if ending == ".feb" else [told[ending], first, *others]
+        written_lines = [first, remarks[ending], *others] if ending == ".feb" else [remarks[ending], first, *others]
         write_whole(paths[-1], "\n".join(written_lines) + "\n")
     return paths
 

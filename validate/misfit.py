@@ -1,4 +1,4 @@
-"""Signs that a model does not belong where it lies: slips of unit, frame or reference that would pass in silence."""
+"""Checks that a model lies in the imaged tissue: slips of unit, frame or reference configuration."""
 
 from __future__ import annotations
 
@@ -9,28 +9,53 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dvc.errors import GeometryError
+from dvc.errors import GeometryError, InputError
 from dvc.images.image import LabelMap
 from dvc.mesh import TetMesh, box_told
-from validate.fe_result import FeResult
-from validate.mapping import Mapped, tissues_of
+from validate.fe_result import FeResult, check_overlap
+from validate.load_comparison import LoadCase
+from validate.mapping import MappedFields, check_bones, tissues_of
 
 _LEAST_OVERLAP, _GOOD_OVERLAP = 0.85, 0.95
 _SAME_TISSUE = 0.8
-_NEAR_BONE_MM, _AT_REST_MM = 1.5, 1.0
+_NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
 _VOLUME_CHANGE = 0.15
 _ALONG, _TURNED = 0.7, 0.5
 _UNIT = 1000.0
-_ALIKE = 0.02
+_TIED = 0.02
+
+
+def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",)) -> list[str]:
+    """Check that every model lies in the imaged tissue; a sentence for each thing that looks wrong.
+
+    Raises
+    ------
+    InputError
+        If there is no case, a case has no model, or the label map has no such bone.
+    GeometryError
+        If a model does not lie in the image, or less than 85 % of it in the labelled soft tissue.
+    """
+    check_bones(labels, bones)
+    warnings = []
+    for case in cases:
+        _, results = case.read()
+        if not results:
+            raise InputError(f"{case.load}: no model is given.")
+        for result in results:
+            check_overlap(result.path, result.mesh, labels.grid)
+            warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones)]
+    if not cases:
+        raise InputError("No load is given to compare.")
+    return warnings
 
 
 def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence[str]) -> float:
-    """Share of the smaller one's volume in which a mesh and the labelled soft tissue overlap.
+    """Overlap of a mesh and the labelled soft tissue, as a fraction of the smaller volume.
 
     Raises
     ------
     GeometryError
-        If it is under 85 %: the mesh is somewhere else.
+        If it is under 85 %.
     """
     soft = [number for number, name in labels.names.items() if name not in bones]
     tissue = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=False)
@@ -50,26 +75,28 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
 
 
 def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[str]:
-    """Check a model against the label map, and tell in sentences what is strange.
+    """Check a model against the label map; a sentence for each thing that looks wrong.
 
     Raises
     ------
     GeometryError
         As `check_in_tissue`.
     """
-    mesh, told = result.mesh, []
+    mesh, warnings = result.mesh, []
     overlap = check_in_tissue(result.path, mesh, labels, bones)
     tissue = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=False)
     names = [name for name in labels.names.values() if name not in bones]
     soft = np.isin(tissue, names)
     volume = mesh.volumes_mm3
     if overlap < _GOOD_OVERLAP:
-        told.append(f"{result.name}: {overlap:.0%} of the model lies in the labelled soft tissue; is its frame right?")
+        warnings.append(
+            f"{result.name}: {overlap:.0%} of the model lies in the labelled soft tissue; is its frame right?"
+        )
     of_mesh = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=True)
     both = soft & np.isin(of_mesh, names)
     same = float(volume[both & (of_mesh == tissue)].sum() / max(volume[both].sum(), 1e-12))
     if both.any() and same < _SAME_TISSUE:
-        told.append(
+        warnings.append(
             f"{result.name}: model and label map name the same tissue in {same:.0%} of the volume alone; the names of "
             "one, or the model's frame, are wrong."
         )
@@ -79,52 +106,52 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[st
         near = cKDTree(points).query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0] < _NEAR_BONE_MM
         if near.any():
             moved = float(np.median(np.linalg.norm(result.deformation.u_mm[near], axis=1)))
-            if moved > _AT_REST_MM:
-                told.append(
+            if moved > _RIGID_MM:
+                warnings.append(
                     f"{result.name}: the model moves by {moved:.1f} mm at the bone, and the measurement is relative "
                     "to the bone; take the bone's motion out of it."
                 )
     determinant = np.linalg.det(np.eye(3) + result.deformation.cell_gradients)
     change = float(volume @ np.abs(determinant - 1.0) / volume.sum())
     if change > _VOLUME_CHANGE:
-        told.append(
+        warnings.append(
             f"{result.name}: its cells change their volume by {change:.0%} in the mean, which soft tissue does not; "
             "are displacements in the frame and unit of the coordinates, and these the unloaded ones?"
         )
-    return told
+    return warnings
 
 
-def displacement_slip(found: Mapped, name: str) -> str:
-    """Tell where a model's displacement only fits what was measured in another order of axes, frame or unit.
+def displacement_slip(fields: MappedFields, name: str) -> str:
+    """Whether a model's displacement fits the measured one only with another order of axes, frame or unit.
 
     Parameters
     ----------
-    found : Mapped
-        Displacements u of the measurement and v of the model in the same cells, weighted by their volumes.
+    fields : MappedFields
+        Displacement u of the measurement and v of the model in the same cells, weighted by cell volume.
     name : str
         Of the model.
 
     Returns
     -------
     str
-        A sentence that names the slip; empty where there is none, or none that can be told.
+        A sentence that names the slip; empty where none is detected.
 
     Notes
     -----
-    Direction and size are judged apart, as a model that is too stiff or too soft is no slip. Direction is the cosine
-    <u, v> / (|u| |v|) over all cells: a slip is told where one of the 48 orders and signs of the components reaches 0.7
-    and the components as given have less than half of that. A sign or an exchange that hardly changes the
-    displacement is not told. Size is |v| / |u|: a slip of unit is told where it is nearer to 1000 or to 1/1000 than
-    to 1.
+    Direction and magnitude are tested separately, since a model that is too stiff or too soft is not a slip. The
+    direction is compared by the cosine <u, v> / (|u| |v|) over all cells: a slip is reported if one of the 48 orders
+    and signs of the components reaches 0.7 and the components as stored have less than half of that. A sign or an
+    exchange that hardly changes the displacement is not reported. A slip of unit is reported if |v| / |u| is nearer to
+    1000 or 1/1000 than to 1.
     """
-    where = found.common
-    weight = found.volumes_ml[where] / found.volumes_ml[where].sum()
-    u, v = found.measured.u_mm[where], found.models[name].u_mm[where]
+    where = fields.common
+    weight = fields.volumes_ml[where] / fields.volumes_ml[where].sum()
+    u, v = fields.measured.u_mm[where], fields.models[name].u_mm[where]
     size, of_model = (float(np.sqrt(weight @ (w**2).sum(axis=1))) for w in (u, v))
     if min(size, of_model) == 0.0:
         return ""
     shared = np.einsum("n,ni,nj->ij", weight, u, v) / (size * of_model)
-    as_given, told = float(np.trace(shared)), []
+    as_given, warnings = float(np.trace(shared)), []
     cosines = {
         (order, signs): float(np.array(signs) @ shared[range(3), order])
         for order in permutations(range(3))
@@ -132,15 +159,15 @@ def displacement_slip(found: Mapped, name: str) -> str:
     }
     most = max(cosines.values())
     if most >= _ALONG and as_given < _TURNED * most:
-        alike = (axes for axes, cosine in cosines.items() if cosine > most - _ALIKE)
-        order, signs = min(alike, key=lambda axes: sum(o != n for n, o in enumerate(axes[0])) + axes[1].count(-1.0))
+        tied = (axes for axes, cosine in cosines.items() if cosine > most - _TIED)
+        order, signs = min(tied, key=lambda axes: sum(o != n for n, o in enumerate(axes[0])) + axes[1].count(-1.0))
         axes = " ".join(("-" if sign < 0.0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
         axes += " (the other of LPS and RAS)" if axes == "-x -y z" else ""
-        told.append(
+        warnings.append(
             f"fits far better with its components taken as {axes} (cosine {most:.2f}, as given {as_given:.2f}): is it "
             "in the frame and order of axes of the coordinates?"
         )
     if abs(np.log(of_model / size)) > 0.5 * np.log(_UNIT):
         unit = "in metres" if of_model < size else "1000 times too large"
-        told.append(f"is {of_model / size:.2g} times as large as the measured one: is it {unit}?")
-    return f"{name}: its displacement {', and '.join(told)}" if told else ""
+        warnings.append(f"is {of_model / size:.2g} times as large as the measured one: is it {unit}?")
+    return f"{name}: its displacement {', and '.join(warnings)}" if warnings else ""

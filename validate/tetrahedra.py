@@ -68,8 +68,8 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
             continue
         made, middle = _quadratic(block, nodes) if whole else _linear(block, nodes)
         faces += made
-        triangles = np.concatenate([found.reshape(-1, 3) for _, found in made])
-        of = np.concatenate([np.repeat(np.arange(len(found)), found.shape[1]) for _, found in made])
+        triangles = np.concatenate([part.reshape(-1, 3) for _, part in made])
+        of = np.concatenate([np.repeat(np.arange(len(part)), part.shape[1]) for _, part in made])
         cells.append(_outward(nodes.points, triangles, middle, of, block))
         parents.append(numbers[of])
     every, parent = np.concatenate(cells), np.concatenate(parents)
@@ -81,9 +81,9 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
         if sum(map(len, members)):
             regions[name] = np.concatenate(members)
     facets = {
-        name: found
+        name: triangles
         for name, corners in _surfaces(mesh)
-        if len(found := _on_surface(corners, faces, len(mesh.points_mm)))
+        if len(triangles := _on_surface(corners, faces, len(mesh.points_mm)))
     }
     made_of = TetMesh(nodes.points, every, regions, facets, np.arange(len(nodes.points)))
     return made_of, nodes.carry[made_of.node_ids]
@@ -136,15 +136,15 @@ def _linear(block: CellBlock, nodes: _Nodes) -> tuple[_Faces, IntArray]:
 
 def _linear_faces(block: CellBlock) -> _Faces:
     """Faces as triangles, quadrangles cut from their lowest node."""
-    found: _Faces = []
+    faces: _Faces = []
     for face in SHAPES[block.shape].faces:
         corners = block.corners[:, list(face)]
         if len(face) == 3:
-            found.append((corners, corners[:, None]))
+            faces.append((corners, corners[:, None]))
         else:
             turned = np.take_along_axis(corners, (np.argmin(corners, axis=1)[:, None] + np.arange(4)) % 4, axis=1)
-            found.append((corners, turned[:, np.array([(0, 1, 2), (0, 2, 3)])]))
-    return found
+            faces.append((corners, turned[:, np.array([(0, 1, 2), (0, 2, 3)])]))
+    return faces
 
 
 def _quadratic(block: CellBlock, nodes: _Nodes) -> tuple[_Faces, IntArray]:
@@ -171,7 +171,8 @@ def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: In
     """Tetrahedra (k, 4) of positive volume over triangles (k, 3) around the middles (m,) of the cells (k,) they are of.
 
     Every triangle's normal has to point away from the middle once the faces are followed consistently; a cell where one
-    does not is folded. It is found by the volumes: those of a sound cell add up to that of its faces' divergence.
+    does not is folded. It is detected by
+    volume: the tetrahedra of a valid cell add up to the volume that its faces enclose.
     """
     tets = np.concatenate([triangles, middle[cell][:, None]], axis=1)
     corner = points[tets]
@@ -189,9 +190,10 @@ def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: In
 
 
 def _turning(triangles: IntArray, cell: IntArray) -> FloatArray:
-    """+1 or -1 for each triangle, so that those of a cell all turn the same way round its surface.
+    """+1 or -1 for each triangle, so that all triangles of a cell have the same sense around its surface.
 
-    Two triangles of a closed surface that share an edge turn alike if they run along it in opposite directions.
+    Two triangles of a closed surface that share an edge have the same sense if they traverse it in opposite
+    directions.
     """
     count = len(triangles)
     start, end = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
@@ -238,10 +240,10 @@ def _on_surface(corners: list[tuple[int, ...]], faces: _Faces, count: int) -> In
     wanted = {tuple(sorted(face)) for face in corners}
     there = np.zeros(count, dtype=bool)
     there[np.concatenate([np.array(face) for face in wanted])] = True
-    found: dict[tuple[int, ...], IntArray] = {}
+    matching: dict[tuple[int, ...], IntArray] = {}
     for keys, triangles in faces:
         for row in np.flatnonzero(there[keys].all(axis=1)):
             key = tuple(sorted(keys[row].tolist()))
             if key in wanted:
-                found[key] = triangles[row]
-    return np.concatenate(list(found.values())) if found else np.empty((0, 3), dtype=np.int64)
+                matching[key] = triangles[row]
+    return np.concatenate(list(matching.values())) if matching else np.empty((0, 3), dtype=np.int64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -20,6 +20,10 @@ Cell = str | float | int | None
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CSS_PIXELS_PER_DOT = 96 / 120  # figures are drawn at 120 dots per inch: text of 10 pt is then 10 pt on the page
+
+
+METHODS = "Methods text"
+"""Title of a report's section with paragraphs for a methods section."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +112,28 @@ def shown(value: Cell) -> str:
         return "–"
     if isinstance(value, float | np.floating):
         return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return str(value)
+
+
+def caption_of(draw: Callable[..., bytes]) -> str:
+    """A figure's caption: the docstring of the function that draws it."""
+    return " ".join((draw.__doc__ or "").split())
+
+
+def record_lines(record: Mapping[str, object]) -> dict[str, str]:
+    """A provenance record as lines of a report."""
+    lines: dict[str, str] = {}
+    for name, value in record.items():
+        if isinstance(value, Mapping):
+            lines |= {f"{name}: {key}": _line(item) for key, item in value.items()}
+        else:
+            lines[name] = str(value)
+    return lines
+
+
+def _line(value: object) -> str:
+    if isinstance(value, list) and value and isinstance(value[0], Mapping):
+        return "\n".join(", ".join(str(v) for v in item.values()) for item in value)
     return str(value)
 
 

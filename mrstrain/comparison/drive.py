@@ -1,15 +1,19 @@
-"""`drive`: a model whose outside goes where the measurement puts it, so that laws are judged apart from the plate."""
+"""`drive`: constitutive models under measured (Dirichlet) boundary conditions, free of plate, contact and friction."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dvc.atomic_files import write_whole
+from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, MrstrainError
+from dvc.mesh import TetMesh
 from dvc.worker import usable_cores
 from fe import (
+    Material,
+    RegionFigures,
     check_materials,
     clear_simulation,
     material_set,
@@ -19,10 +23,10 @@ from fe import (
     write_state,
 )
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
-from mrstrain.measurement.measured_folder import measurements_in
+from mrstrain.measurement.measured_folder import Measurement, measurements_in
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
-from validate.measured_boundary import driven, outside, write_boundary
+from validate import boundary_displacement, simulate_driven, write_boundary_conditions
 
 BOUNDARY, ENDING = "boundary", "-driven"
 """Folder of the boundary conditions for other codes; ending of a set's folder."""
@@ -53,20 +57,20 @@ def drive(
     mesh_frame: str = "LPS",
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Driven:
-    """Drive a mesh by measured displacements of its outside.
+    """Simulate a mesh with the measured displacement prescribed on its surface.
 
     Parameters
     ----------
     mesh : path
-        As in `simulate`; facets "bone" do not move.
+        As in `simulate`; the surface set "bone" does not move.
     dvc : path
         Results of `register` or `strain`: a folder for each load, or one of these.
     out : path
-        Gets a folder for each set (SET-driven) with ``LOAD.vtu``, as `simulate` writes them and `compare` takes them,
-        and a folder ``boundary`` with the displacements of the outside for ANSYS, Abaqus and FEBio, by the mesh's
-        node numbers, in its unit and frame.
+        Gets a folder for each material set (SET-driven) with ``LOAD.vtu``, for `compare`, and a folder ``boundary``
+        with the displacements as boundary conditions for ANSYS, Abaqus and FEBio, by the mesh's node numbers, in its
+        unit and frame.
     sets : sequence of str
-        Names of published sets, or files of your own (.toml).
+        Names of published material sets, or files of your own (.toml).
     loads : sequence of str
         Names of measured loads; all by default.
     threads : int, optional
@@ -89,66 +93,78 @@ def drive(
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
         check_materials(read, region_laws)
-    found = measurements_in(Path(dvc), loads)
-    loose = [m.load for m in found if m.aligned_on == "none"]
-    if loose:
-        raise InputError(
-            f"{', '.join(loose)}: the bone's motion was not taken out of this measurement, and the model's bone stays "
-            "where it is. Register with a bone."
-        )
-    measured = {m.load: m.deformation() for m in found}
-    edges = {load: outside(read, field) for load, field in measured.items()}
+    measurements = measurements_in(Path(dvc), loads)
+    _refuse_bone_motion(measurements)
+    measured = {m.load: m.deformation() for m in measurements}
+    prescribed = {load: boundary_displacement(read, field) for load, field in measured.items()}
     folders = {name: target / (name + ENDING) for name in laws}
     refuse_touching_inputs(target, [BOUNDARY, *(f.name for f in folders.values())], [place, Path(dvc)])
-    make_output(target)
-    for folder in (target / BOUNDARY, *folders.values()):
-        make_output(folder)
-        clear_simulation(folder)
-    own = [Path(s) for s in sets if str(s).endswith(".toml")]
-    record = provenance(
-        "drive",
-        {"mesh": place, "measured": [f for m in found for f in m.files], "sets": own},
-        {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame},
-    )
-    lines = [
-        f"{m.load}: the measurement is judged: {m.verdict.words}" for m in found if m.verdict and m.verdict.reasons
-    ]
+    _prepare(target, [target / BOUNDARY, *folders.values()])
+    inputs = {"mesh": [place], "measured": [f for m in measurements for f in m.files]}
+    inputs["sets"] = [Path(s) for s in sets if str(s).endswith(".toml")]
+    record = provenance("drive", inputs, {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame})
+    for load, (nodes, u) in prescribed.items():
+        write_boundary_conditions(target / BOUNDARY / load, read, nodes, u, unit=mesh_unit, frame=mesh_frame)
+    doubtful = [(m.load, m.verdict) for m in measurements if m.verdict and m.verdict.reasons]
+    lines = [f"{load}: verdict on the measurement: {verdict.words}" for load, verdict in doubtful]
     complete = True
-    for load, (nodes, u) in edges.items():
-        write_boundary(target / BOUNDARY / load, read, nodes, u, unit=mesh_unit, frame=mesh_frame)
-    total = len(chosen) * len(measured)
-    for number, one in enumerate(chosen):
-        region_laws, notes = laws[one.name]
-        rows, outcome, log = [], {}, list[str]()
-        for at, (load, field) in enumerate(measured.items()):
-            tell("drive", "simulating", (number * len(measured) + at) / total)
-            try:
-                state = driven(read, region_laws, field, load, threads=threads or usable_cores(), tell=log.append)
-            except InputError:
-                raise
-            except MrstrainError as failure:
-                complete = False
-                lines.append(f"{one.name}: {failure}")
-                continue
-            write_state(folders[one.name] / f"{load}.vtu", read, state, region_laws)
-            outcome[load] = {
-                "reached": state.reached,
-                "iterations": state.iterations,
-                "seconds": round(state.seconds, 1),
-            }
-            complete = complete and state.reached == 1.0
-            rows += region_figures(read, state, region_laws)
-            told = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p90:.3f}" for r in rows if r.load == load)
-            part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the displacement was reached;"
-            lines.append(f"{one.name}, {load}:{part} maximal shear, median / 90th percentile: {told}")
-        write_regions_csv(folders[one.name] / "regions.csv", rows)
-        write_whole(folders[one.name] / SETTINGS, IN_IMAGE)
-        write_whole(folders[one.name] / "log.txt", "\n".join(log) + "\n")
-        regions = {str(n): name for n, name in enumerate(read.regions, start=1)}
+    for number, (name, (region_laws, notes)) in enumerate(laws.items()):
+        tell("drive", "simulating", number / len(laws))
+        outcome, messages = _drive_set(folders[name], read, region_laws, measured, threads or usable_cores())
+        complete = complete and [of["reached"] for of in outcome.values()] == [1.0] * len(measured)
+        lines += messages
+        regions = {str(n): region for n, region in enumerate(read.regions, start=1)}
         write_json(
-            folders[one.name] / "simulation.json",
-            {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": one.name,
+            folders[name] / "simulation.json",
+            {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": name,
              "laws": {region: law.description for region, law in region_laws.items()}} | record,
         )  # fmt: skip
     tell("drive", "simulating", 1.0)
     return Driven(target, complete, tuple(lines))
+
+
+def _prepare(target: Path, folders: Sequence[Path]) -> None:
+    make_output(target)
+    for folder in folders:
+        make_output(folder)
+        clear_simulation(folder)
+
+
+def _refuse_bone_motion(measurements: Sequence[Measurement]) -> None:
+    loose = [m.load for m in measurements if m.aligned_on == "none"]
+    if loose:
+        raise InputError(
+            f"{', '.join(loose)}: the bone's motion was not removed from this measurement, and the model's bone does "
+            "not move. Register with a bone."
+        )
+
+
+def _drive_set(
+    folder: Path, mesh: TetMesh, laws: Mapping[str, Material], measured: Mapping[str, Deformation], threads: int
+) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Simulate all loads with one material set, and write them: the outcome of each load, and lines for a person."""
+    rows, outcome, log, lines = list[RegionFigures](), dict[str, dict[str, float]](), list[str](), list[str]()
+    name = folder.name.removesuffix(ENDING)
+    for load, field in measured.items():
+        try:
+            state = simulate_driven(mesh, laws, field, load, threads=threads, tell=log.append)
+        except InputError:
+            raise
+        except MrstrainError as failure:
+            lines.append(f"{name}: {failure}")
+            continue
+        write_state(folder / f"{load}.vtu", mesh, state, laws)
+        outcome[load] = {
+            "reached": state.reached,
+            "iterations": state.iterations,
+            "seconds": round(state.seconds, 1),
+        }
+        own = region_figures(mesh, state, laws)
+        rows += own
+        figures = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p90:.3f}" for r in own)
+        part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the displacement was reached;"
+        lines.append(f"{name}, {load}:{part} max. shear, median / 90th percentile: {figures}")
+    write_regions_csv(folder / "regions.csv", rows)
+    write_whole(folder / SETTINGS, IN_IMAGE)
+    write_whole(folder / "log.txt", "\n".join(log) + "\n")
+    return outcome, lines

@@ -1,31 +1,31 @@
-"""`level`: models sent through the measurement itself, so that like is compared with like."""
+"""`level`: forward-model comparison, the measurement simulated on the displacement of a model (levelling)."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
 
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
+from dvc.images.image import Image
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.measured_folder import measurements_in
 from mrstrain.measurement.register import register
-from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.inputs import Subject, make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 from phantoms import Acquisition, synthetic_warp
-from validate.extrapolation import LEVELLED, carried_on
-from validate.fe_result import FeResult
-from validate.mapping import filled_from_nearest
+from validate import LEVELLED, FeResult, extrapolated, filled_from_nearest
 
-_APART_MM, _FEW = 0.1, 0.01
+_CHANGED_MM, _FEW = 0.1, 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,29 +62,23 @@ def level(
     seed: int = 1,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Levelled:
-    """Send a model's deformations through the measurement.
+    """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
 
     Parameters
     ----------
     load0 : path
         The unloaded image.
-    model : path
-        A folder with a file for each load, as in `compare`.
+    model, model_mesh, model_unit, model_frame
+        A folder with a file for each load, and how it is read; as in `compare`.
     out : path
-        Gets a folder called as the model and "-levelled", which `compare` takes beside the model itself, and one ending
-        in "-work" with the images that the model would have given and, by load, their registration.
-    bone, bone_label, tissue, labels, names
-        As in `register`; the bone is needed.
+        Gets a folder named as the model and "-levelled", for `compare` beside the model itself, and one ending in
+        "-work" with the warped images and, by load, their registration.
+    bone, bone_label, tissue, labels, names, engine, borders, preset, parameters
+        Those of the measurement, as in `register`; the bone is needed. Unknown elastix parameters are accepted.
     loads : sequence of str
         Names of the loads; all of the model's files by default.
-    engine, borders, preset, parameters
-        Those of the measurement, as in `register`; elastix parameters that are not known are let pass.
-    model_mesh, model_unit, model_frame
-        As in `compare`.
-    threads : int, optional
-        Of each registration; by default all cores.
-    seed : int
-        Of the noise that is drawn anew, and of the registration.
+    threads, seed : int, optional
+        Of each registration; the seed also of the fresh noise.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -95,90 +89,91 @@ def level(
     RegistrationError
         If no load could be registered.
     """
-    target, place = Path(out), Path(model)
-    # Refused now rather than after the images are made.
-    # Beyond its mesh a model is carried on without regard to volume: what the images then ask for is no tissue's.
-    volume = volume_kept(engine, preset, parameters)
-    engine_of(
-        engine, preset, parameters, volume=volume, borders=borders, labelled=labels is not None, allow_unknown=True
-    )
+    target, place, mesh = Path(out), Path(model), None if model_mesh is None else Path(model_mesh)
     if not place.is_dir():
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
-    subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
-    if subject.bone is None:
-        raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is at rest.")
-    wanted = list(loads) or loads_of(place, model_mesh is not None)
-    usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame)
-    files, notes = model_files(wanted, [place], usual)
-    name = place.resolve().name + LEVELLED
-    work = name + "-work"
-    given = [Path(p) for p in (load0, bone, tissue, labels, names, model_mesh, *parameters) if p is not None]
-    refuse_touching_inputs(target, [name, work], [*given, *(f.path for of in files.values() for f in of)])
-    results: dict[str, FeResult] = {}
-    body = subject.tissue or tissue_mask(subject.reference)
-    made = {}
-    for load, (file,) in files.items():
-        results[load] = file.read(subject.reference.grid)
-    for load, result in results.items():
-        field = carried_on(result.deformation, subject.reference.grid, subject.bone.inside)
-        middles = result.mesh.centroids_mm
-        apart = field.displacement(middles) - result.deformation.displacement(middles)
-        share = float(np.mean(np.linalg.norm(apart, axis=1) > _APART_MM))
-        if share > _FEW:
-            notes.append(
-                f"{load}: where the model's cells are nearly flat it was smoothed before it moved the image, by over "
-                f"{_APART_MM:g} mm in {share:.0%} of its cells."
-            )
-        made[load] = synthetic_warp(subject.reference, body, field, Acquisition(seed))
-    for folder in (target, target / name, target / work, target / work / "images"):
-        make_output(folder)
-    for load in results:  # of an earlier run
-        (target / name / f"{load}.vtu").unlink(missing_ok=True)
-    record = provenance(
-        "level",
-        {
-            **subject.files,
-            "models": [f.path for of in files.values() for f in of],
-            "parameters": [Path(p) for p in parameters],
-        },
-        {
-            "engine": engine,
-            "volume": volume,
-            "borders": borders,
-            "preset": preset,
-            "threads": threads,
-            "seed": seed,
-            "bone_label": bone_label,
-            "model_unit": model_unit,
-            "model_frame": model_frame,
-        },
+    # The extrapolated displacement outside the model's mesh is not isochoric: volume is kept whatever the images show.
+    volume = volume_kept(engine, preset, parameters)
+    how: dict[str, Any] = {"engine": engine, "volume": volume, "borders": borders, "preset": preset}
+    engine_of(
+        engine, preset, parameters, volume=volume, borders=borders, labelled=labels is not None, allow_unknown=True
+    )  # refused now rather than after the images are made
+    anatomy: dict[str, Any] = {"bone": bone, "bone_label": bone_label, "tissue": tissue, "labels": labels}
+    subject = read_subject(load0, names=names, **anatomy)
+    of_load, notes = model_files(
+        list(loads) or loads_of(place, mesh is not None), [place], Reading(mesh, model_unit, model_frame)
     )
-    write_json(target / name / "provenance.json", record)
-    for load, twin in made.items():
-        write_image(target / work / "images" / f"{load}.nii.gz", twin.image)
-    write_whole(target / name / SETTINGS, IN_IMAGE)
-    failures, registered = list[str](), target / work / "registered"
-    make_output(registered)
-    for load, result in results.items():  # each in a folder of its own: a study levels several at once
+    files = {load: file for load, (file,) in of_load.items()}
+    name = place.resolve().name + LEVELLED
+    inputs = [Path(p) for p in (load0, bone, tissue, labels, names, mesh, *parameters) if p is not None]
+    refuse_touching_inputs(target, [name, f"{name}-work"], [*inputs, *(f.path for f in files.values())])
+    results = {load: file.read(subject.reference.grid) for load, file in files.items()}
+    images, smoothed = _warped_images(subject, results, seed)
+    how |= {"threads": threads, "seed": seed}
+    sources = {"models": [f.path for f in files.values()], "parameters": [Path(p) for p in parameters]}
+    about = how | {"bone_label": bone_label, "model_unit": model_unit, "model_frame": model_frame}
+    _prepare(target, name, images, provenance("level", {**subject.files, **sources}, about))
+    how |= anatomy | {"names": names, "parameters": parameters, "allow_unknown_parameters": True}
+    failures = _register_each(load0, results, target / name, how | {"progress": progress})
+    return Levelled(target / name, (*notes, *smoothed, *failures))
+
+
+def _register_each(
+    load0: Path | str, results: Mapping[str, FeResult], folder: Path, options: Mapping[str, Any]
+) -> list[str]:
+    """Register each warped image and write what it gives on the model's mesh; a sentence for each that failed.
+
+    Every load has a folder of its own, since a study levels several at once.
+    """
+    work, failures = folder.with_name(f"{folder.name}-work"), []
+    for load, result in results.items():
+        registered = work / "registered" / load
         try:
-            register(
-                load0, [target / work / "images" / f"{load}.nii.gz"], out=registered / load, bone=bone,
-                bone_label=bone_label, tissue=tissue, labels=labels, names=names, engine=engine,
-                volume=volume, borders=borders, preset=preset, parameters=parameters, allow_unknown_parameters=True,
-                threads=threads, seed=seed, progress=progress,
-            )  # fmt: skip
+            register(load0, [work / "images" / f"{load}.nii.gz"], out=registered, **options)
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")
         else:
-            _write(target / name / f"{load}.vtu", result, registered / load)
+            _write(folder / f"{load}.vtu", result, registered)
     if len(failures) == len(results):
         raise RegistrationError(" ".join(failures))
-    notes += failures
-    return Levelled(target / name, tuple(notes))
+    return failures
+
+
+def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int) -> tuple[dict[str, Image], list[str]]:
+    """The unloaded image warped by each result, with fresh noise; and where a result was smoothed to do so."""
+    if subject.bone is None:
+        raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is rigid.")
+    images, notes = {}, []
+    body = subject.tissue or tissue_mask(subject.reference)
+    for load, result in results.items():
+        field = extrapolated(result.deformation, subject.reference.grid, subject.bone.inside)
+        centroids = result.mesh.centroids_mm
+        difference = field.displacement(centroids) - result.deformation.displacement(centroids)
+        changed = float(np.mean(np.linalg.norm(difference, axis=1) > _CHANGED_MM))
+        if changed > _FEW:
+            notes.append(
+                f"{load}: where the model's cells are nearly flat it was smoothed before it warped the image, by over "
+                f"{_CHANGED_MM:g} mm in {changed:.0%} of its cells."
+            )
+        images[load] = synthetic_warp(subject.reference, body, field, Acquisition(seed)).image
+    return images, notes
+
+
+def _prepare(target: Path, name: str, images: Mapping[str, Image], record: Mapping[str, object]) -> None:
+    """Make the folders, with the images; results of an earlier run are removed."""
+    work = target / f"{name}-work"
+    for folder in (target, target / name, work, work / "images", work / "registered"):
+        make_output(folder)
+    for load in images:
+        (target / name / f"{load}.vtu").unlink(missing_ok=True)
+    write_json(target / name / "provenance.json", record)
+    for load, image in images.items():
+        write_image(work / "images" / f"{load}.nii.gz", image)
+    write_whole(target / name / SETTINGS, IN_IMAGE)
 
 
 def _write(path: Path, result: FeResult, registered: Path) -> None:
-    """The measured displacement at the nodes of the model's mesh; where it is not defined, that of the nearest node."""
+    """Write the registered displacement at the nodes of the model's mesh; where undefined, that of the nearest node."""
     mesh = result.mesh
     (measured,) = measurements_in(registered)
     u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)

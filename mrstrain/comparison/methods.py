@@ -11,8 +11,10 @@ from dvc.io.images.read import format_of
 from dvc.registration.engines import methods_of
 from dvc.report.viewer import NIIVUE
 from fe import LoadStep
+from mrstrain.records.provenance import versions
+from validate import Comparison, Criteria
 from validate.curves import DRAWS
-from validate.location_intervals import DRAWS as LOCATED
+from validate.location_intervals import LOCATION_DRAWS
 
 # Checked against the publishers' records or the projects' own pages; a paper whose DOI was not found goes without.
 _PAPERS = {
@@ -38,8 +40,6 @@ _PAPERS = {
     "Bland 1986": "Bland JM, Altman DG. Statistical methods for assessing agreement between two methods of clinical "
     "measurement. Lancet 327(8476):307-310, 1986. doi:10.1016/S0140-6736(86)90837-8",
 }
-METHODS = "Methods, to be pasted"
-"""Title of a report's section with these paragraphs."""
 _IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")
 """Roles in a record of the files that are read as images."""
 _GIVEN = "the displacement was taken as it was given."
@@ -49,15 +49,7 @@ Record = Mapping[str, Any]
 
 
 def methods(
-    measured: Mapping[str, Path],
-    models: Mapping[str, Path],
-    cells: int,
-    strains: tuple[float, float],
-    thresholds: Sequence[float],
-    least_ml: float,
-    *,
-    error_known: bool,
-    version: str,
+    measured: Mapping[str, Path], models: Mapping[str, Path], comparison: Comparison, criteria: Criteria
 ) -> tuple[str, ...]:
     """Paragraphs for a methods section, the references last.
 
@@ -66,23 +58,18 @@ def methods(
     measured : mapping of load to path
         Folders of the measurement, with their ``provenance.json`` where `register` or `strain` wrote them.
     models : mapping of name to path
-        A result's file of each; a ``simulation.json`` beside it tells how it was computed.
-    cells : int
-        Number of cells on which fields are compared.
-    strains, thresholds, least_ml
-        As in `mrstrain.comparison.compare.compare`.
-    error_known : bool
-        Whether intervals come from an error model.
-    version : str
-        Of the program that compares.
+        A result's file of each; a ``simulation.json`` beside it records how it was computed.
+    comparison : Comparison
+    criteria : Criteria
+        What it was computed by.
     """
     parts = [
         _measured(measured),
         *_simulated(models, measured),
-        _compared(cells, strains, thresholds, least_ml, version),
+        _compared(len(comparison.loads[0].fields.points_mm), criteria),
     ]
-    if error_known:
-        parts.append(_doubt(measured))
+    if any(one.bands for one in comparison.loads):
+        parts.append(_uncertainty(measured))
     parts.append(f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue).")
     return _with_references(parts)
 
@@ -90,7 +77,7 @@ def methods(
 def methods_of_registrations(measured: Mapping[str, Path]) -> tuple[str, ...]:
     """Paragraphs on the measurement alone, the references last; ``measured`` as in `methods`."""
     known = _sources(measured)
-    return _with_references([_measured(measured), *([f"Error of the maximal shear: {known}"] if known else [])])
+    return _with_references([_measured(measured), *([f"Error of the maximum shear strain: {known}"] if known else [])])
 
 
 def _with_references(parts: Sequence[str]) -> tuple[str, ...]:
@@ -100,8 +87,8 @@ def _with_references(parts: Sequence[str]) -> tuple[str, ...]:
 
 def _record(place: Path) -> Record:
     try:
-        told = json.loads(place.read_text(encoding="utf-8"))
-        return told if isinstance(told, dict) else {}
+        record = json.loads(place.read_text(encoding="utf-8"))
+        return record if isinstance(record, dict) else {}
     except (OSError, ValueError):
         return {}
 
@@ -111,31 +98,31 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _measured(measured: Mapping[str, Path]) -> str:
-    """How displacement was measured; loads that were registered alike go into one sentence."""
+    """How displacement was measured; loads that were registered in the same way share a sentence."""
     groups: dict[str, list[str]] = {}
     for load, folder in measured.items():
         record = _record(folder / "provenance.json")
         groups.setdefault(_registration(record) + _files(record), []).append(load)
-    told = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
+    sentences = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
-        told + " Displacement is that of tissue in the unloaded configuration; strain is Green-Lagrange, "
-        "E = (F^T F - I)/2, and maximal shear half the difference of its largest and smallest principal value."
+        sentences + " Displacement is that of tissue in the unloaded configuration; strain is Green-Lagrange, "
+        "E = (F^T F - I)/2, and maximum shear strain half the difference of its largest and smallest principal value."
     )
 
 
 def _registration(record: Record) -> str:
-    given, versions = record.get("parameters", {}), record.get("versions", {})
-    how = methods_of(given, versions)
+    parameters, versions = record.get("parameters", {}), record.get("versions", {})
+    how = methods_of(parameters, versions)
     if record.get("command") != "register" or not how:
         return _GIVEN
     align = {
         "bone": "The loaded image was aligned with the unloaded one rigidly on the bone, and then",
         "image": "The loaded image was aligned with the unloaded one rigidly on the whole image, and then",
-    }.get(str(given.get("align")), "The loaded image was, without rigid alignment,")
-    if given.get("align") != "none":
+    }.get(str(parameters.get("align")), "The loaded image was, without rigid alignment,")
+    if parameters.get("align") != "none":
         how += "; rigid alignment by Gauss-Newton least squares (Baker 2004)"
     return (
-        f"{align} registered non-rigidly {how}; seed {given.get('seed')}. Beforehand the smooth receive field was "
+        f"{align} registered non-rigidly {how}; seed {parameters.get('seed')}. Beforehand the smooth receive field was "
         "taken out of both images (N4, Tustison 2010, as implemented in SimpleITK "
         f"{versions.get('SimpleITK', '?')}, Lowekamp 2013)."
     )
@@ -167,7 +154,7 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
     published = False
     for name, path in models.items():
         record = _record(path.parent / "simulation.json")
-        given = record.get("parameters", {})
+        parameters = record.get("parameters", {})
         if record.get("command") == "drive":
             driven.append(_driven(name, record))
             published = published or record["set"] in _PUBLISHED
@@ -175,24 +162,24 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
         if _record(path.parent / "provenance.json").get("command") == "level":
             levelled.setdefault(_levelled(path, measured), []).append(name)
             continue
-        if record.get("command") != "simulate" or "set" not in given:
+        if record.get("command") != "simulate" or "set" not in parameters:
             others.append(f"{name} ({path.suffix[1:]})")
             continue
-        laws = "; ".join(f"{region}: {law['law']}" for region, law in given["laws"].items())
-        parts.append(f"{name}: {given['title']} ({laws}).")
-        published = published or given["set"] in _PUBLISHED
+        laws = "; ".join(f"{region}: {law['law']}" for region, law in parameters["laws"].items())
+        parts.append(f"{name}: {parameters['title']} ({laws}).")
+        published = published or parameters["set"] in _PUBLISHED
         groups.setdefault(_solver(record), []).append(name)
-    told = []
+    sentences = []
     if parts:
-        told.append(" ".join([*(f"{_listed(names)} {how}" for how, names in groups.items()), *parts]))
+        sentences.append(" ".join([*(f"{_listed(names)} {how}" for how, names in groups.items()), *parts]))
     if driven:
-        told.append(f"{_DRIVEN} {' '.join(driven)}")
+        sentences.append(f"{_DRIVEN} {' '.join(driven)}")
     if published:
-        told.append("Published sets of laws are those that Trebbi 2023 compiled.")
-    told += [f"{_listed(names)}: {how}" for how, names in levelled.items()]
+        sentences.append("Published sets of laws are those that Trebbi 2023 compiled.")
+    sentences += [f"{_listed(names)}: {how}" for how, names in levelled.items()]
     if others:
-        told.append(f"Results of other programs were taken as given: {_listed(others)}.")
-    return told
+        sentences.append(f"Results of other programs were taken as given: {_listed(others)}.")
+    return sentences
 
 
 _DRIVEN = (
@@ -224,15 +211,15 @@ def _along(axes: Sequence[Sequence[float]], column: int, sign: float = 1.0) -> s
 
 
 def _solver(record: Record) -> str:
-    given, versions = record["parameters"], record.get("versions", {})
-    made = given.get("mesh_made")
+    parameters, versions = record["parameters"], record.get("versions", {})
+    made = parameters.get("mesh_made")
     mesh = (
         f" on a mesh of fTetWild (Hu 2020; pytetwild {made['pytetwild']}) with edges of {made['edge_mm']:g} mm"
         if made
         else ""
     )
-    loads = _listed([f"{step['name']} {LoadStep(**step)}" for path in given["paths"] for step in path])
-    axes = {load: told.get("plate_axes_lps") for load, told in record.get("outcome", {}).items()}
+    loads = _listed([f"{step['name']} {LoadStep(**step)}" for path in parameters["paths"] for step in path])
+    axes = {load: of.get("plate_axes_lps") for load, of in record.get("outcome", {}).items()}
     if any(own != first for own in axes.values() for first in axes.values()):
         loads += "".join(
             f"; {load} with the plate's outward normal along {_along(own, 0, -1.0)} "
@@ -240,55 +227,55 @@ def _solver(record: Record) -> str:
             for load, own in axes.items()
             if own is not None
         )
-    contact = "bonded to the plate from the first touch" if given.get("taped", True) else "without friction"
+    contact = "bonded to the plate from the first touch" if parameters.get("taped", True) else "without friction"
     return (
-        f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh}: {given['element']}; "
-        f"plate {given['plate']}; skin {contact}; fixed: {', '.join(given['fixed'])}; loads {loads}."
+        f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh}: {parameters['element']}; "
+        f"plate {parameters['plate']}; skin {contact}; fixed: {', '.join(parameters['fixed'])}; loads {loads}."
     )
 
 
-def _compared(
-    cells: int, strains: tuple[float, float], thresholds: Sequence[float], least_ml: float, version: str
-) -> str:
-    levels = _listed([f"{t:g}" for t in thresholds])
+def _compared(cells: int, criteria: Criteria) -> str:
+    levels = _listed([f"{t.max_shear:g}" for t in criteria.thresholds])
+    (low, high), version = criteria.strains, versions()["mrstrain"]
     return (
         f"Models and measurement were compared with mrstrain {version} at the centroids of the same {cells} "
         "tetrahedra, weighted by volume, in the unloaded configuration. Intensity: area between the curves of tissue "
-        f"volume above a maximal shear, from {strains[0]:g} to {strains[1]:g}. Location: tissue above {levels}; "
+        f"volume above a maximum shear strain, from {low:g} to {high:g}. Location: tissue above {levels}; "
         "overlap (Dice 1945), distance of the centroids, 95th percentile of the Hausdorff distance, clusters of "
-        f"{least_ml:g} mL or more. "
+        f"{criteria.least_ml:g} mL or more. "
         "Agreement cell by cell: regression, concordance (Lin 1989), limits of agreement (Bland 1986)."
     )
 
 
-def _doubt(measured: Mapping[str, Path]) -> str:
+def _uncertainty(measured: Mapping[str, Path]) -> str:
     known, twin = _sources(measured), _twins(measured)
     return (
-        f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATED} draws) come from truths drawn by the "
-        f"registration's error model: bias, spatially correlated noise. {known} {twin}Displacement has no error model."
+        f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) come from truths drawn by "
+        "the registration's error model: bias, spatially correlated noise. "
+        f"{known} {twin}Displacement has no error model."
     )
 
 
 def _sources(measured: Mapping[str, Path]) -> str:
-    """Where the registrations' error models come from, each told once."""
+    """Where the registrations' error models come from, each once."""
     return " ".join(sorted({str(one["source"]) for one in _errors(measured).values() if one.get("source")}))
 
 
 def _twins(measured: Mapping[str, Path]) -> str:
-    """Which registrations' error bars a twin judged; a sentence with a space after it, or nothing."""
-    judged = [
+    """Which registrations' error bars were checked by a synthetic warp; a sentence and a space, or nothing."""
+    checked = [
         load
         for load, of in _errors(measured).items()
         if any(row.get("factor") is not None for row in of.get("twin", []))
     ]
-    if not judged:
+    if not checked:
         return ""
     return (
-        f"The error bars of {_listed(judged)} were judged by a twin of the pair (the unloaded image moved by what was "
+        f"The error bars of {_listed(checked)} were checked by a synthetic warp (the unloaded image moved by what was "
         "measured, and registered once more), and made wider where they did not hold. "
     )
 
 
 def _errors(measured: Mapping[str, Path]) -> dict[str, Record]:
-    """What each registration tells of the error of its maximal shear."""
+    """The record of each registration on the error of its maximum shear strain."""
     return {load: _record(folder / "quality.json").get("error_of_max_shear", {}) for load, folder in measured.items()}

@@ -1,4 +1,4 @@
-"""Which file is whose: the models and loads of a comparison, and what a model's folder says of its unit and frame."""
+"""Files of the models by load, and how a model's files are read: mesh, unit, frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dvc.errors import ExtentError, InputError
 from dvc.images.image import Grid
 from dvc.mesh import box_told
 from mrstrain.records.inputs import read_matrix
-from validate.fe_result import FeResult, check_overlap, read_result
+from validate import FeResult, check_overlap, read_result
 
 ENDINGS = (".vtu", ".vtk", ".msh", ".frd", ".xplt", ".csv")
 SETTINGS = "model.toml"
@@ -27,7 +27,7 @@ IN_IMAGE = 'unit = "mm"\nframe = "LPS"\nto_image = [[1, 0, 0, 0], [0, 1, 0, 0], 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """How a model's files are read; as in `validate.fe_result.read_result`."""
+    """How a model's files are read; as in `validate.read_result`."""
 
     mesh: Path | None = None
     unit: str = "mm"
@@ -59,7 +59,7 @@ class ModelFile:
 def model_files(
     loads: Sequence[str], models: Sequence[Path], usual: Reading
 ) -> tuple[dict[str, list[ModelFile]], list[str]]:
-    """For each load the models' files, in the order given; and in sentences what is missing.
+    """Files of the models by load, in the order of the models; and a sentence for each that is missing.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def model_files(
                 files[load].append(ModelFile(name, chosen[load], reading))
                 if stable.get(load, 1.0) < 1.0:
                     notes.append(
-                        f"{name}, {load}: a law of this model is not stable (Drucker) at the strain reached, in up to "
+                        f"{name}, {load}: a material of it is not stable (Drucker) at the strain reached, in up to "
                         f"{1.0 - stable[load]:.1%} of a tissue. It is compared all the same; do not trust its rank."
                     )
     files = {load: of for load, of in files.items() if of}
@@ -104,10 +104,10 @@ def model_files(
 
 def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
     if place.is_dir():
-        found = {
+        files = {
             load: file for load in loads for ending in reversed(ENDINGS) if (file := place / (load + ending)).is_file()
         }
-        return place.resolve().name, found
+        return place.resolve().name, files
     if not place.is_file():
         raise InputError(f"{place}: there is no such model.")
     if place.stem in loads:
@@ -128,29 +128,29 @@ def files_named(place: Path) -> list[Path]:
     if not settings.is_file():
         return []
     try:
-        told = tomllib.loads(settings.read_text(encoding="utf-8"))
+        content = tomllib.loads(settings.read_text(encoding="utf-8"))
     except (OSError, ValueError):  # said where the model is read
         return [settings]
-    named = [settings.parent / str(told[key]) for key in ("mesh", "to_image") if isinstance(told.get(key), str)]
+    named = [settings.parent / str(content[key]) for key in ("mesh", "to_image") if isinstance(content.get(key), str)]
     return [settings, *(path for path in named if path.is_file())]
 
 
 def loads_of(place: Path, has_mesh: bool) -> list[str]:
-    """Loads for which a model's folder has a file: those that a simulation of ours tells, else by the files' names."""
-    told = _outcome(place, "reached")
-    if told:
-        return [load for load in told if any((place / (load + ending)).is_file() for ending in ENDINGS)]
+    """Loads for which a model's folder has a file: by the record of one of our simulations, else by file names."""
+    reached = _outcome(place, "reached")
+    if reached:
+        return [load for load in reached if any((place / (load + ending)).is_file() for ending in ENDINGS)]
     kept = [ending for ending in ENDINGS if ending != ".csv" or has_mesh or (place / SETTINGS).is_file()]
     own = _reading(place, Reading()).mesh
     return sorted({p.stem for p in place.iterdir() if p.suffix.lower() in kept and p != own})
 
 
 def _outcome(place: Path, key: str) -> dict[str, float]:
-    """What a simulation of ours tells of each load: "reached", its share, or "stable_share"."""
+    """From the record of one of our simulations, by load: the fraction "reached", or "stable_share"."""
     folder = place if place.is_dir() else place.parent
     try:
         outcome = json.loads((folder / "simulation.json").read_text(encoding="utf-8"))["outcome"]
-        return {load: float(told[key]) for load, told in outcome.items()}
+        return {load: float(of[key]) for load, of in outcome.items()}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 
@@ -160,17 +160,17 @@ def _reading(place: Path, usual: Reading) -> Reading:
     if not settings.is_file():
         return usual
     try:
-        told = tomllib.loads(settings.read_text(encoding="utf-8"))
+        content = tomllib.loads(settings.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{settings} is no TOML file ({error}).") from error
-    unknown = sorted(set(told) - {"mesh", "unit", "frame", "to_image"})
+    unknown = sorted(set(content) - {"mesh", "unit", "frame", "to_image"})
     if unknown:
         raise InputError(f"{settings}: '{unknown[0]}' is none of mesh, unit, frame, to_image.")
-    made = replace(usual, unit=str(told.get("unit", usual.unit)), frame=str(told.get("frame", usual.frame)))
-    if "mesh" in told:
-        made = replace(made, mesh=settings.parent / str(told["mesh"]))
-    if isinstance(told.get("to_image"), str):
-        made = replace(made, to_image=read_matrix(settings.parent / told["to_image"]))
-    elif "to_image" in told:
-        made = replace(made, to_image=np.asarray(told["to_image"], dtype=np.float64))
-    return made
+    reading = replace(usual, unit=str(content.get("unit", usual.unit)), frame=str(content.get("frame", usual.frame)))
+    if "mesh" in content:
+        reading = replace(reading, mesh=settings.parent / str(content["mesh"]))
+    if isinstance(content.get("to_image"), str):
+        reading = replace(reading, to_image=read_matrix(settings.parent / content["to_image"]))
+    elif "to_image" in content:
+        reading = replace(reading, to_image=np.asarray(content["to_image"], dtype=np.float64))
+    return reading

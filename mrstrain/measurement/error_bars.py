@@ -21,7 +21,7 @@ from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
 from dvc.registration.register import Registration
 from dvc.report import figures
-from dvc.report.page import Picture, Table
+from dvc.report.page import Picture, Table, caption_of
 from dvc.report.planes import View
 from dvc.trust.error_model import (
     POOLED,
@@ -34,7 +34,6 @@ from dvc.trust.error_model import (
 )
 from dvc.trust.twin_judgement import Judged, judged
 from dvc.trust.verdict import Verdict
-from mrstrain.measurement.page import said
 from mrstrain.measurement.twin_check import TwinCheck
 from mrstrain.records.inputs import Subject, is_bones_name
 
@@ -122,7 +121,7 @@ class ErrorBars:
         if self.uncertainty is None:
             return {}
         drawn = figures.sigma_slices(view, reference, self.uncertainty.sigma, _SIGMA_SCALE)
-        return {"sigma": Picture("How sure the maximal shear is", said(figures.sigma_slices), drawn)}
+        return {"sigma": Picture("How sure the maximal shear is", caption_of(figures.sigma_slices), drawn)}
 
 
 def error_bars(

@@ -14,7 +14,7 @@ from dvc.io.transforms.bordered_spline import NAME as BORDERS
 from dvc.io.transforms.displacement_image import read_displacement
 from dvc.io.transforms.read import read_transform
 from dvc.trust.error_model import ErrorTable, read_error_model
-from dvc.trust.verdict import Verdict, worst
+from dvc.trust.verdict import Verdict
 
 _FIELD, _VALID = "displacement.nii.gz", "valid.nii.gz"
 _REPEAT = "repeat"  # a repeat scan is no load
@@ -103,22 +103,3 @@ def measurements_in(place: Path, loads: Sequence[str] = ()) -> list[Measurement]
             aligned_on = str(told.get("alignment", {}).get("on", ""))
         found.append(Measurement(folder.resolve().name, folder, table, verdict, aligned_on))
     return found
-
-
-def verdict_on(measurements: Sequence[Measurement], strange: Sequence[str] = ()) -> Verdict | None:
-    """The verdict on a comparison with measurements: the worst of theirs, and of what is ``strange`` about models.
-
-    All reasons for less than trust are told, the worst first; trust is said to be in the measurement, and not in the
-    models. None where no measurement has a verdict and nothing is strange.
-    """
-    given = [Verdict("caution", tuple(strange))] if strange else []
-    for one in measurements:
-        if one.verdict is not None:
-            what = "is not to be trusted" if one.verdict.level == "distrust" else "is to be used with care"
-            told = tuple(f"{one.load}: its registration {what}: {reason}" for reason in one.verdict.reasons)
-            given.append(Verdict(one.verdict.level, () if one.verdict.level == "trust" else told))
-    if not given:
-        return None
-    reasons = {level: [r for v in given if v.level == level for r in v.reasons] for level in ("distrust", "caution")}
-    sound = f"The measurement: {len(given)} registrations are sound. The models are judged below."
-    return Verdict(worst(given).level, (*reasons["distrust"], *reasons["caution"]) or (sound,))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Image, LabelMap
 from dvc.registration.engine import Regularisation
 from dvc.report import figures
-from dvc.report.page import Cell, Picture, Section, Table, write_report
+from dvc.report.page import Cell, Picture, Section, Table, caption_of, record_lines, write_report
 from dvc.report.planes import View
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
@@ -51,7 +51,7 @@ def write_series_report(
     told = [*sections]
     told += [Section(name, Verdict("distrust", (f"Not registered. {reason}",))) for name, reason in failures.items()]
     verdict = worst([s.verdict for s in told if s.verdict is not None])
-    write_report(path, "Strain from MR image pairs", verdict, told, _CLOSING, flat(record))
+    write_report(path, "Strain from MR image pairs", verdict, told, _CLOSING, record_lines(record))
 
 
 def view_of(subject: Subject, maps: StrainMaps) -> View:
@@ -75,22 +75,17 @@ def agreement_pictures(
     """Draw how well the images agree, after the rigid part and after all."""
     return {
         "overlay": Picture(
-            "Before and after", said(figures.overlay), figures.overlay(view, reference, aligned, registered)
+            "Before and after", caption_of(figures.overlay), figures.overlay(view, reference, aligned, registered)
         ),
         "checkerboard": Picture(
-            "Checkerboard", said(figures.checkerboard), figures.checkerboard(view, reference, aligned, registered)
+            "Checkerboard", caption_of(figures.checkerboard), figures.checkerboard(view, reference, aligned, registered)
         ),
         "similarity": Picture(
             "Where the images agree",
-            said(figures.similarity_slices),
+            caption_of(figures.similarity_slices),
             figures.similarity_slices(view, local_rigid, local_after),
         ),
     }
-
-
-def said(draw: Callable[..., bytes]) -> str:
-    """A figure's docstring: it says how the figure is read."""
-    return " ".join((draw.__doc__ or "").split())
 
 
 def strain_pictures(
@@ -106,17 +101,17 @@ def strain_pictures(
     drawn = {
         "strain": Picture(
             "Maximal shear",
-            said(figures.strain_slices) + " Slices through the bone's lowest point along the plate's normal.",
+            caption_of(figures.strain_slices) + " Slices through the bone's lowest point along the plate's normal.",
             figures.strain_slices(view, reference, maps.max_shear, _SHEAR_SCALE, labels),
         ),
         "curves": Picture(
             "Volume above a strain",
-            said(figures.shear_curves),
+            caption_of(figures.shear_curves),
             figures.shear_curves(maps.max_shear, labels, None if floor is None else floor.shear_p95),
         ),
         "deformed_grid": Picture(
             "Deformed grid",
-            said(figures.deformed_grid),
+            caption_of(figures.deformed_grid),
             figures.deformed_grid(
                 view,
                 reference.values if aligned is None else aligned,
@@ -126,7 +121,7 @@ def strain_pictures(
         ),
         "jacobian": Picture(
             "Volume ratio",
-            said(figures.jacobian_slices),
+            caption_of(figures.jacobian_slices),
             figures.jacobian_slices(view, reference, maps.jacobian),
         ),
     }
@@ -222,20 +217,3 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
         tuple(rows),
         "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, and volumes above a value.",
     )
-
-
-def flat(record: Mapping[str, object]) -> dict[str, str]:
-    """A provenance record as lines of a page."""
-    shown: dict[str, str] = {}
-    for name, value in record.items():
-        if isinstance(value, Mapping):
-            shown |= {f"{name}: {key}": _line(item) for key, item in value.items()}
-        else:
-            shown[name] = str(value)
-    return shown
-
-
-def _line(value: object) -> str:
-    if isinstance(value, list) and value and isinstance(value[0], Mapping):
-        return "\n".join(", ".join(str(v) for v in item.values()) for item in value)
-    return str(value)

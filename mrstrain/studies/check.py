@@ -28,9 +28,7 @@ from mrstrain.studies.file import Study, Vector, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
 from mrstrain.studies.plan import Stage, labels_to_mesh, load_steps, plan, towards
-from validate.fe_result import check_overlap
-from validate.location import read_thresholds
-from validate.mapping import check_bones
+from validate import check_bones, check_overlap, read_thresholds
 
 _T = TypeVar("_T")
 _THERE = 0.5  # of what a label map labels: less in the image, and it lies elsewhere

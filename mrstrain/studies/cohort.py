@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dvc.errors import InputError
-from dvc.report.page import Picture, Section, Table, write_report
+from dvc.report.page import Picture, Section, Table, caption_of, record_lines, write_report
 from dvc.trust.verdict import worst
-from mrstrain.measurement.page import flat, said
 from mrstrain.measurement.register import REPEAT
 from mrstrain.records.inputs import make_output
 from mrstrain.records.progress import OnProgress
@@ -22,11 +21,7 @@ from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
 from mrstrain.studies.file import FILE, read_study
 from mrstrain.studies.plan import COMPARISON
 from mrstrain.studies.run import StudyRun, run_studies
-from validate import figures
-from validate.cohort import Standing, standings
-from validate.comparison import NOTHING
-from validate.extrapolation import LEVELLED
-from validate.mapping import ALL
+from validate import ALL, LEVELLED, NOTHING, CohortRank, over_subjects, rank_over_subjects
 
 _TOTAL = "all loads"
 
@@ -41,7 +36,7 @@ class Cohort:
         With ``report.html``, ``cohort.csv`` (areas of every subject, model and load) and ``ranking.csv``.
     ran : tuple of StudyRun
         The studies, in the order given.
-    ranking : tuple of Standing
+    ranking : tuple of CohortRank
         The models over all loads, the nearest first; empty where no subject has a result of all.
     notes : tuple of str
         Who is not among those ranked over, what is unlike between subjects, and whose registrations are doubtful.
@@ -49,7 +44,7 @@ class Cohort:
 
     out: Path
     ran: tuple[StudyRun, ...]
-    ranking: tuple[Standing, ...]
+    ranking: tuple[CohortRank, ...]
     notes: tuple[str, ...]
 
     @property
@@ -63,7 +58,7 @@ class Cohort:
         lines += [
             f"{place}. {s.model}: {100 * s.mean:.2f} % ({100 * s.low:.2f} to {100 * s.high:.2f}), nearest in "
             f"{s.nearest_in} of {s.subjects} subjects"
-            + ("" if place == 1 or s.told_apart else "; not told from the first")
+            + ("" if place == 1 or s.differs_from_best else "; not told from the first")
             for place, s in enumerate(self.ranking, start=1)
         ]
         return [*lines, *self.notes, f"Report: {self.out / 'report.html'}"]
@@ -116,7 +111,7 @@ def cohort(
     notes += unlike([one.study for one in ran if one.study.study.name not in without])
     notes += _doubts([one for one in ran if any(one.study.study.name in of for of in shares.values())])
     try:
-        ranking = standings(shares)
+        ranking = rank_over_subjects(shares)
     except InputError as none:
         ranking = ()
         notes.append(str(none))
@@ -195,18 +190,20 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
     return shares, notes
 
 
-def _write_tables(target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[Standing]) -> None:
+def _write_tables(
+    target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[CohortRank]
+) -> None:
     first = next(row for rows in areas.values() for row in rows)
     rows_of_all = ([subject, *row.values()] for subject, rows in areas.items() for row in rows)
     write_csv(target / "cohort.csv", ["subject", *first], rows_of_all)
-    write_csv(target / "ranking.csv", [f.name for f in fields(Standing)], map(astuple, ranking))
+    write_csv(target / "ranking.csv", [f.name for f in fields(CohortRank)], map(astuple, ranking))
 
 
 def _write_page(
     path: Path,
     ran: Sequence[StudyRun],
     shares: Mapping[str, Mapping[str, float]],
-    ranking: Sequence[Standing],
+    ranking: Sequence[CohortRank],
     notes: Sequence[str],
     record: Mapping[str, object],
 ) -> None:
@@ -218,7 +215,7 @@ def _write_page(
         tuple(
             (s.model, 100 * s.mean, 100 * s.low, 100 * s.high, 100 * s.least, 100 * s.greatest, s.nearest_in,
              s.subjects, 100 * s.behind, 100 * s.behind_low, 100 * s.behind_high,
-             "–" if at == 0 else "yes" if s.told_apart else "no")
+             "–" if at == 0 else "yes" if s.differs_from_best else "no")
             for at, s in enumerate(ranking)
         ),
         "Area between volume-strain curves divided by the tissue's volume and the width of the range of strain. "
@@ -231,11 +228,11 @@ def _write_page(
         ("subject", *order),
         tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in names),
     )
-    drawn = Picture("Distribution over subjects", said(figures.over_subjects), figures.over_subjects(shares, order))
+    drawn = Picture("Distribution over subjects", caption_of(over_subjects), over_subjects(shares, order))
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for one in ran:
         failed = [f"{o.stage}: {o.status}. {o.reason}" for o in one.outcomes.values() if o.record is None]
         verdicts = list(one.verdicts.values())
         verdict = worst(verdicts) if verdicts else None
         sections.append(Section(one.study.study.name, verdict, paragraphs=tuple(f"Not whole: {why}" for why in failed)))
-    write_report(path, "Models over subjects", None, sections, [], flat(record))
+    write_report(path, "Models over subjects", None, sections, [], record_lines(record))

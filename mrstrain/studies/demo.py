@@ -168,7 +168,7 @@ def _summary(errors: dict[str, tuple[TissueError, ...]], done: StudyRun) -> list
     ]
     comparison = done.outcomes["compare"].record
     if comparison is not None:
-        lines += [line for line in comparison.result.lines if line.startswith(("All loads", "Nearest over"))]
+        lines += [line for line in comparison.result.lines if line.startswith(("All loads", "Best match over"))]
     for outcome in done.outcomes.values():
         if not outcome.complete:
             partly = [] if outcome.record is None else [line for line in outcome.record.result.lines if "ONLY" in line]

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, Valid
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
-from validate.curves import RANGE, check_range
+from validate import RANGE, check_range
 
 FILE = "study.toml"
 

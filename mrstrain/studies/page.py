@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from dvc.report.page import Section, Table, write_report
+from dvc.report.page import METHODS, Section, Table, record_lines, write_report
 from dvc.trust.verdict import Verdict, worst
-from mrstrain.comparison.methods import METHODS, methods_of_registrations
-from mrstrain.measurement.page import flat
+from mrstrain.comparison.methods import methods_of_registrations
 from mrstrain.records.provenance import provenance, without_folders, write_json
 from mrstrain.studies.file import Study
 from mrstrain.studies.ledger import StageRecord
@@ -45,7 +44,7 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
         _verdict(registered, compared),
         [*error_against_truth(study, outcomes), *compared, *registered, _stages(outcomes)],
         closing,
-        flat(record),
+        record_lines(record),
         notes=_incomplete(outcomes),
     )
 

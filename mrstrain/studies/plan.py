@@ -13,7 +13,7 @@ from mrstrain.comparison.drive import ENDING
 from mrstrain.comparison.model_files import files_named
 from mrstrain.measurement.register import REPEAT
 from mrstrain.studies.file import Study, Vector, as_folder
-from validate.extrapolation import LEVELLED
+from validate import LEVELLED
 
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
 """Kinds of stages, in the order in which they come."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from dvc.report.page import Picture, Section, Table, write_report
+from dvc.report.page import Picture, Section, Table, caption_of, record_lines, write_report
 from dvc.trust.error_model import POOLED
-from mrstrain.measurement.page import flat, said
 from phantoms import CoverageRow, ErrorRow, FloorRow, ResolutionRow, figures, wavelength_recovered
 
 _CLOSING = (
@@ -54,7 +53,7 @@ def write_accuracy_report(
         sections.append(
             Section("Without a result", tables=(Table("Failures", ("case", "reason"), tuple(failures.items())),))
         )
-    write_report(path, "Accuracy of registration presets", None, sections, _CLOSING, flat(record))
+    write_report(path, "Accuracy of registration presets", None, sections, _CLOSING, record_lines(record))
 
 
 def _condition(row: ErrorRow | FloorRow | ResolutionRow) -> tuple[str, str, float]:
@@ -88,7 +87,9 @@ def _condition_section(
             )
         )
     pictures = tuple(
-        Picture(f"Error by {by.split(',')[0]}", said(figures.errors_by_place), figures.errors_by_place(errors, by))
+        Picture(
+            f"Error by {by.split(',')[0]}", caption_of(figures.errors_by_place), figures.errors_by_place(errors, by)
+        )
         for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
     )
     return Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tuple(tables), pictures=pictures)
@@ -126,10 +127,10 @@ def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow
         preset, voxel, snr = condition
         table_rows.append((preset, f"{voxel} mm", snr, *wavelengths, *noise))
     columns = ("preset", "voxel", "SNR", "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
-    pictures = [Picture("Spatial resolution", said(figures.resolution), figures.resolution(rows))]
+    pictures = [Picture("Spatial resolution", caption_of(figures.resolution), figures.resolution(rows))]
     if floors:
         pictures.append(
-            Picture("Noise against resolution", said(figures.trade_off), figures.trade_off(floors, rows, POOLED))
+            Picture("Noise against resolution", caption_of(figures.trade_off), figures.trade_off(floors, rows, POOLED))
         )
     table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows))
     return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))

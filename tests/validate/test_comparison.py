@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from dvc.deformation.nodal import OnMesh
 from dvc.deformation.protocol import Affine
+from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
 from dvc.images.image import Grid, LabelMap
 from dvc.mesh import TetMesh
 from dvc.trust.error_model import POOLED, ErrorTable
 from dvc.trust.truth_draws import TruthDraws
 from tests.blocks import block
-from validate.agreement import agreement, sole_under_plate
-from validate.comparison import Comparison, compare, total
-from validate.curves import area_between, bands
-from validate.fe_result import FeResult
-from validate.location import Threshold, clusters, neighbours, overlap, read_thresholds
+from validate import (
+    ALL,
+    CellGraph,
+    Criteria,
+    FeResult,
+    LoadCase,
+    LoadComparison,
+    Threshold,
+    area_between,
+    bands,
+    compare_load,
+    map_fields,
+    overlap,
+    rank_over_loads,
+    read_thresholds,
+)
+from validate.agreement import agreement, skin_on_plate
 from validate.location_intervals import with_intervals
-from validate.mapping import ALL, mapped
 
 SIDE = 20.0
 
@@ -51,7 +66,7 @@ def max_shear(gamma: float) -> float:
 
 
 def result(name: str, mesh: TetMesh, affine: Affine) -> FeResult:
-    return FeResult(name, None, OnMesh(mesh, affine.displacement(mesh.points_mm)))  # type: ignore[arg-type]
+    return FeResult(name, Path(name), OnMesh(mesh, affine.displacement(mesh.points_mm)))
 
 
 def test_area_between_curves_of_uniform_strains_has_its_closed_form() -> None:
@@ -71,14 +86,14 @@ def test_area_between_curves_of_uniform_strains_has_its_closed_form() -> None:
 
 def test_a_spot_that_is_moved_is_found_as_far_away() -> None:
     mesh = cube(16)
-    points, volumes, touching = mesh.centroids_mm, mesh.volumes_mm3 / 1000.0, neighbours(mesh)
+    points, cells = mesh.centroids_mm, CellGraph.of(mesh)
 
     def spot(at: tuple[float, float, float]) -> np.ndarray:
         return 0.6 * np.exp(-((points - at) ** 2).sum(axis=1) / (2.0 * 3.0**2))
 
-    still = overlap("m", "l", 0.3, spot((10, 10, 8)), spot((10, 10, 8)), volumes, points, touching, 0.01)
+    still = overlap("m", "l", 0.3, spot((10, 10, 8)), spot((10, 10, 8)), cells, 0.01)
     assert (still.dice, still.centroids_mm, still.hausdorff95_mm) == (1.0, 0.0, 0.0)
-    moved = overlap("m", "l", 0.3, spot((10, 10, 8)), spot((10, 10, 12)), volumes, points, touching, 0.01)
+    moved = overlap("m", "l", 0.3, spot((10, 10, 8)), spot((10, 10, 12)), cells, 0.01)
     assert moved.centroids_mm == pytest.approx(4.0, abs=0.15)
     assert moved.largest_mm == pytest.approx(4.0, abs=0.15)
     assert 2.5 < moved.hausdorff95_mm < 4.2
@@ -91,24 +106,24 @@ def test_a_spot_that_is_moved_is_found_as_far_away() -> None:
 
 def test_clusters_are_connected_and_large_enough() -> None:
     mesh = cube(12)
-    points, volumes = mesh.centroids_mm, mesh.volumes_mm3 / 1000.0
+    points, cells = mesh.centroids_mm, CellGraph.of(mesh)
     shear = np.where(points[:, 0] < 4.0, 0.5, np.where(points[:, 0] > 14.0, 0.7, 0.1))
-    found = clusters(shear > 0.3, shear, volumes, points, neighbours(mesh))
+    found = cells.clusters(shear > 0.3, shear)
     assert [round(c.mean_shear, 9) for c in found] == [0.7, 0.5]
     assert found[0].volume_ml > found[1].volume_ml > 1.0
     least = 1.01 * found[1].volume_ml
-    larger = clusters(shear > 0.3, shear, volumes, points, neighbours(mesh), least_ml=least)
+    larger = cells.clusters(shear > 0.3, shear, least_ml=least)
     assert [c.volume_ml for c in larger] == [found[0].volume_ml]
-    assert clusters(shear > 0.9, shear, volumes, points, neighbours(mesh)) == []
+    assert cells.clusters(shear > 0.9, shear) == []
 
 
 def test_a_speck_far_away_moves_nothing_and_clusters_tell_their_mean() -> None:
     mesh = cube(12)
-    points, volumes, touching = mesh.centroids_mm, mesh.volumes_mm3 / 1000.0, neighbours(mesh)
+    points, cells = mesh.centroids_mm, CellGraph.of(mesh)
     slab = points[:, 0] < 5.0
     measured = np.where(slab, 0.4 + 0.04 * points[:, 0], 0.1)
     model = np.where(points[:, 0] < 20.0 / 3.0, 0.5, 0.1)
-    clean = overlap("m", "l", 0.3, measured, model, volumes, points, touching)
+    clean = overlap("m", "l", 0.3, measured, model, cells)
     # by volume a linear field has the mean of its middle
     assert clean.measured_mean == pytest.approx(0.5, abs=1e-9)
     assert clean.model_mean == pytest.approx(0.5)
@@ -117,12 +132,12 @@ def test_a_speck_far_away_moves_nothing_and_clusters_tell_their_mean() -> None:
     assert clean.centroids_mm == pytest.approx(5.0 / 6.0)
     far = measured.copy()
     far[np.argmax(points[:, 0])] = 2.9
-    assert overlap("m", "l", 0.3, far, model, volumes, points, touching) == clean
-    assert overlap("m", "l", 0.3, far, model, volumes, points, touching, 0.0) != clean
-    told = with_intervals([clean], [far] * 4, {"m": model}, volumes, points, touching, 0.1, 1.0)[0]
+    assert overlap("m", "l", 0.3, far, model, cells) == clean
+    assert overlap("m", "l", 0.3, far, model, cells, 0.0) != clean
+    told = with_intervals([clean], [far] * 4, {"m": model}, cells, 0.1, 1.0)[0]
     assert (told.dice_low, told.dice_high) == pytest.approx((clean.dice, clean.dice))
     assert told.measured_high_ml == pytest.approx(2.0)
-    none = overlap("m", "l", 3.0, measured, model, volumes, points, touching)
+    none = overlap("m", "l", 3.0, measured, model, cells)
     assert np.isnan(none.measured_mean)
 
 
@@ -157,7 +172,7 @@ def test_agreement_has_its_closed_forms() -> None:
 
 def test_fields_are_compared_at_the_same_points_by_tissue_and_distance() -> None:
     mesh = cube()
-    found = mapped(mesh, labels(), ["bone"], sheared(0.4), {"half": sheared(0.2)})
+    found = map_fields(mesh, labels(), ["bone"], sheared(0.4), {"half": sheared(0.2)})
     assert found.measured.max_shear == pytest.approx(max_shear(0.4))
     assert found.models["half"].max_shear == pytest.approx(max_shear(0.2))
     assert found.volumes_ml.sum() == pytest.approx(8.0)
@@ -166,11 +181,11 @@ def test_fields_are_compared_at_the_same_points_by_tissue_and_distance() -> None
     # what a model does not reach is left out for all, and counted
     part = TetMesh(mesh.points_mm, mesh.cells[mesh.centroids_mm[:, 1] < 10.0])
     small = OnMesh(part, sheared(0.2).displacement(part.points_mm))
-    some = mapped(mesh, labels(), ["bone"], sheared(0.4), {"whole": sheared(0.2), "part": small})
+    some = map_fields(mesh, labels(), ["bone"], sheared(0.4), {"whole": sheared(0.2), "part": small})
     assert some.coverage()["part"] == pytest.approx(4.0, rel=0.1)
     assert some.coverage()["common"] == some.coverage()["part"]
     with pytest.raises(InputError, match="no 'calcaneus'"):
-        mapped(mesh, labels(), ["calcaneus"], sheared(0.4), {})
+        map_fields(mesh, labels(), ["calcaneus"], sheared(0.4), {})
 
 
 def test_equal_fields_have_no_difference_and_axis_slips_show() -> None:
@@ -179,9 +194,7 @@ def test_equal_fields_have_no_difference_and_axis_slips_show() -> None:
     swapped = Affine(truth.matrix[[1, 0, 2]][:, [1, 0, 2]], truth.translation_mm[[1, 0, 2]])
     turned = Affine(np.diag([-1.0, -1.0, 1.0]) @ truth.matrix @ np.diag([-1.0, -1.0, 1.0]), -truth.translation_mm)
     results = [result("equal", mesh, truth), result("swapped", mesh, swapped), result("turned", mesh, turned)]
-    one = compare(
-        "Load1", truth, results, labels(), bones=["bone"], normal=np.array([1.0, 0, 0]), thresholds=read_thresholds()
-    )
+    one = compare_load(case("Load1", truth, results), labels())
     area = {a.model: a.ml for a in one.areas if a.tissue == ALL}
     assert area["equal"] == pytest.approx(0.0, abs=1e-9)
     rows = {(a.model, a.quantity): a for a in one.agreements if a.part == ALL}
@@ -191,6 +204,12 @@ def test_equal_fields_have_no_difference_and_axis_slips_show() -> None:
     for name in ("swapped", "turned"):
         assert rows[name, "u_mm"].rmse > 1.0
     assert all(o.dice == 1.0 for o in one.overlaps if o.model == "equal" and o.measured_ml > 0.0)
+
+
+def case(load: str, measured: Affine, results: list[FeResult], error: ErrorTable | None = None) -> LoadCase:
+    """A load under a plate that lies across x."""
+    axes = plate_axes((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    return replace(LoadCase.of(load, measured, results, error), axes=axes)
 
 
 def error_table(bias: float, sd: float, widening: float = 1.0) -> ErrorTable:
@@ -281,37 +300,32 @@ def test_models_behind_the_nearest_that_noise_cannot_order_are_named_too() -> No
     # measured .431; one model below it and one above it by the same .117, which noise alone puts in order
     results = [result(name, mesh, sheared(gamma)) for name, gamma in (("below", 0.6), ("right", 0.79), ("above", 0.98))]
 
-    def compared(sd: float) -> list[Comparison]:
-        return [
-            compare(
-                load, sheared(0.8), results, labels(), bones=["bone"], normal=np.array([1.0, 0.0, 0.0]),
-                table=error_table(0.0, sd), strains=strains,
-            )
-            for load in ("Load1", "Load2")
-        ]  # fmt: skip
+    def compared(sd: float) -> list[LoadComparison]:
+        cases = [case(load, sheared(0.8), results, error_table(0.0, sd)) for load in ("Load1", "Load2")]
+        return [compare_load(one, labels(), criteria=Criteria(strains)) for one in cases]
 
-    done = compared(0.02)
-    summed = total(done)
-    first, second, third = (a.model for a in summed.areas)
+    ranking = rank_over_loads(compared(0.02))
+    first, second, third = (a.model for a in ranking.areas)
     assert (first, {second, third}) == ("right", {"below", "above"})
-    for told in summed.told:
-        order = told.split("apart: ")[1]
+    for statement in ranking.statements:
+        best, order = statement.split(" Further down, not distinguishable: ")
         assert set(order.rstrip(".").split(" and ")) == {"below", "above"}
-        assert "right. It is told apart from all others. Further down, neighbours" in told
-    assert summed.not_told_apart["all loads"] == ((second, third),)
-    assert {frozenset(pair) for one in done for pair in one.not_told_apart()} == {frozenset(("below", "above"))}
-    assert [summed.place(name) for name in (first, second, third, "nobody")] == [(1, 1), (2, 3), (2, 3), None]
+        assert best.endswith("(area metric): right, significantly better than every other.")
+    assert ranking.not_distinguishable["all loads"] == ((second, third),)
+    for load in ("Load1", "Load2"):
+        assert [set(pair) for pair in ranking.not_distinguishable[load]] == [{"below", "above"}]
+    assert [ranking.rank(name) for name in (first, second, third, "nobody")] == [(1, 1), (2, 3), (2, 3), None]
     # a measurement that knows nothing tells none apart, and a sure one tells all
-    assert [total(compared(5.0)).place(name) for name in ("right", "below")] == [(1, 3), (1, 3)]
-    sure = total(compared(1e-4))
-    assert sure.not_told_apart["all loads"] == ()
-    assert all("Further down" not in told for told in sure.told)
-    assert sorted(sure.place(name) for name in ("right", "below", "above")) == [(1, 1), (2, 2), (3, 3)]
+    assert [rank_over_loads(compared(5.0)).rank(name) for name in ("right", "below")] == [(1, 3), (1, 3)]
+    sure = rank_over_loads(compared(1e-4))
+    assert sure.not_distinguishable["all loads"] == ()
+    assert all("Further down" not in statement for statement in sure.statements)
+    assert sorted(sure.rank(name) for name in ("right", "below", "above")) == [(1, 1), (2, 2), (3, 3)]
 
 
 def test_intervals_of_location_hold_the_truth_and_a_perfect_model_is_not_ruled_out() -> None:
     mesh = cube(10)
-    points, volumes, touching = mesh.centroids_mm, mesh.volumes_mm3 / 1000.0, neighbours(mesh)
+    points, cells = mesh.centroids_mm, CellGraph.of(mesh)
 
     def spot(x: float) -> np.ndarray:
         return 0.1 + 0.5 * np.exp(-((points - [x, 10.0, 10.0]) ** 2).sum(axis=1) / (2.0 * 5.0**2))
@@ -319,13 +333,13 @@ def test_intervals_of_location_hold_the_truth_and_a_perfect_model_is_not_ruled_o
     truth, models = spot(8.0), {"equal": spot(8.0), "apart": spot(13.0)}
     tissue, distance = ["fat"] * len(points), np.ones(len(points))
     flat = np.full(len(points), 0.5)
-    ideal = overlap("apart", "l", 0.35, truth, models["apart"], volumes, points, touching)
+    ideal = overlap("apart", "l", 0.35, truth, models["apart"], cells)
     held: list[tuple[bool, ...]] = []
     for seed in range(25):
         noise = 0.5 - TruthDraws(points, flat, tissue, distance, error_table(0.0, 0.03), 100 + seed).drawn()
         draws = TruthDraws(points, truth + 0.02 + noise, tissue, distance, error_table(0.02, 0.03), seed)
-        found = [overlap(n, "l", 0.35, truth + 0.02 + noise, m, volumes, points, touching) for n, m in models.items()]
-        equal, apart = with_intervals(found, list(draws.many(60)), models, volumes, points, touching, 0.1, 1.3)
+        found = [overlap(n, "l", 0.35, truth + 0.02 + noise, m, cells) for n, m in models.items()]
+        equal, apart = with_intervals(found, list(draws.many(60)), models, cells, 0.1, 1.3)
         assert (equal.model, apart.model) == ("equal", "apart")
         held.append(
             (
@@ -338,7 +352,7 @@ def test_intervals_of_location_hold_the_truth_and_a_perfect_model_is_not_ruled_o
         )
     assert (np.mean(held, axis=0) > 0.85).all(), np.mean(held, axis=0)
     # a truth without tissue above the threshold has no place: fewer than half of the draws are not told
-    none, _ = with_intervals(found, [truth, *[0.1 * truth] * 9], models, volumes, points, touching, 0.1, 1.0)
+    none, _ = with_intervals(found, [truth, *[0.1 * truth] * 9], models, cells, 0.1, 1.0)
     assert np.isnan(none.centroids_low_mm)
     assert none.measured_low_ml == 0.0
 
@@ -352,7 +366,7 @@ def test_the_skin_on_the_plate_is_found_from_the_deformed_shape() -> None:
     u = np.zeros_like(points)
     over = shaped.points_mm[:, 0] > 20.5
     u[over, 0] = 20.5 - shaped.points_mm[over, 0]
-    nodes = sole_under_plate(OnMesh(shaped, u), np.array([1.0, 0.0, 0.0]))
+    nodes = skin_on_plate(OnMesh(shaped, u), np.array([1.0, 0.0, 0.0]))
     assert set(np.flatnonzero(over & (points[:, 0] == SIDE))) <= set(nodes)
     assert (shaped.points_mm + u)[nodes, 0].min() > 20.2
 

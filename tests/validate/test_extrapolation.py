@@ -19,12 +19,9 @@ from mrstrain.comparison.level import level
 from phantoms import heel_grid, labels_of, scan
 from tests.blocks import block
 from tests.quick import QUICK
-from tests.validate.test_comparison import cube, error_table, labels, sheared
+from tests.validate.test_comparison import case, cube, error_table, labels, sheared
 from tests.validate.test_measured_boundary import SHEAR, slab
-from validate.comparison import compare
-from validate.extrapolation import LEVELLED, carried_on
-from validate.fe_result import FeResult, read_result
-from validate.mapping import ALL
+from validate import ALL, LEVELLED, FeResult, compare_load, extrapolated, read_result
 
 
 def test_a_model_is_itself_in_its_mesh_at_rest_in_bone_and_smooth_between() -> None:
@@ -32,7 +29,7 @@ def test_a_model_is_itself_in_its_mesh_at_rest_in_bone_and_smooth_between() -> N
     mesh = slab()  # from 0 to 20 mm
     x = grid.points().reshape(*grid.shape, 3)
     bone = x[..., 0] < 0.0
-    field = carried_on(OnMesh(mesh, SHEAR.displacement(mesh.points_mm)), grid, bone)
+    field = extrapolated(OnMesh(mesh, SHEAR.displacement(mesh.points_mm)), grid, bone)
     inside = ((x > 0.0) & (x < 20.0)).all(axis=-1)
     u, H = (v.reshape(*grid.shape, *v.shape[1:]) for v in evaluate_on_grid(field, grid))
     assert np.abs(u - SHEAR.displacement(x.reshape(-1, 3)).reshape(u.shape))[inside].max() < 1e-9
@@ -42,7 +39,7 @@ def test_a_model_is_itself_in_its_mesh_at_rest_in_bone_and_smooth_between() -> N
     steps = np.abs(np.diff(u, axis=1)).max()
     assert steps < 2.5  # mm from voxel to voxel, where 6 mm of the model ends
     with pytest.raises(InputError, match="No voxel"):
-        carried_on(
+        extrapolated(
             OnMesh(mesh, np.zeros_like(mesh.points_mm)),
             Grid((5, 5, 5), np.ones(3), np.full(3, 90.0)),
             np.zeros((5, 5, 5), dtype=bool),
@@ -54,7 +51,7 @@ def test_a_model_that_is_nearly_flat_is_smoothed_until_an_image_can_show_it() ->
     mesh = slab(10)
     u = np.zeros_like(mesh.points_mm)
     u[:, 0] = np.where(mesh.points_mm[:, 0] > 10.5, -1.9, 0.0)  # one layer of 2 mm is pressed to a twentieth
-    field = carried_on(OnMesh(mesh, u), grid, np.zeros(grid.shape, dtype=bool))
+    field = extrapolated(OnMesh(mesh, u), grid, np.zeros(grid.shape, dtype=bool))
     _, H = evaluate_on_grid(field, grid)
     assert np.linalg.det(H + np.eye(3)).min() > 0.0
 
@@ -65,10 +62,8 @@ def test_levelled_models_are_judged_as_found() -> None:
     def of(name: str, gamma: float) -> FeResult:
         return FeResult(name, Path(), OnMesh(mesh, sheared(gamma).displacement(mesh.points_mm)))
 
-    one = compare(
-        "Load1", sheared(0.8), [of("a", 0.6), of("b", 0.5), of("a" + LEVELLED, 0.8)], labels(), bones=["bone"],
-        normal=np.array([1.0, 0.0, 0.0]), table=error_table(0.05, 0.01),
-    )  # fmt: skip
+    results = [of("a", 0.6), of("b", 0.5), of("a" + LEVELLED, 0.8)]
+    one = compare_load(case("Load1", sheared(0.8), results, error_table(0.05, 0.01)), labels())
     assert [a.model for a in one.ranked()] == ["a", "b"]
     area = {a.model: a for a in one.areas if a.tissue == ALL}
     assert area["a" + LEVELLED].ml == pytest.approx(0.0, abs=1e-9)

@@ -15,8 +15,7 @@ from dvc.images.image import Grid
 from dvc.io.meshes.read import read_mesh
 from dvc.mesh import outer_faces
 from tests.meshfiles import TAGS, block, write_abaqus, write_ansys, write_gmsh22
-from validate.fe_result import check_overlap, read_result
-from validate.location import clusters, neighbours
+from validate import CellGraph, check_overlap, read_result
 from validate.tetrahedra import linear_tetrahedra
 
 GRADIENT = np.array([[0.1, 0.05, 0.0], [0.0, -0.08, 0.2], [0.03, 0.0, 0.02]])
@@ -152,8 +151,7 @@ def test_neighbours_of_any_numbering_fit(tmp_path: Path) -> None:
     path = tmp_path / "Load1.vtu"
     meshio.write(path, meshio.Mesh(shuffled, [("hexahedron", number[cells])], {"displacement": moved(shuffled)}))
     mesh = read_result("bricks", path).mesh
-    whole = clusters(np.ones(len(mesh.cells), dtype=bool), np.ones(len(mesh.cells)), mesh.volumes_mm3 / 1000.0,
-                     mesh.centroids_mm, neighbours(mesh))  # fmt: skip
+    whole = CellGraph.of(mesh).clusters(np.ones(len(mesh.cells), dtype=bool), np.ones(len(mesh.cells)))
     assert [c.volume_ml for c in whole] == [pytest.approx(1.728)]
     on_a_side = ((mesh.points_mm == 0.0) | (mesh.points_mm == 12.0)).any(axis=1)
     assert on_a_side[outer_faces(mesh.cells)].all()

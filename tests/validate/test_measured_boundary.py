@@ -20,8 +20,7 @@ from fe import NeoHooke, Ogden, write_tet_mesh
 from mrstrain.cli.app import app
 from tests.blocks import block
 from tests.validate.test_comparison import labels
-from validate.fe_result import read_result
-from validate.measured_boundary import driven, outside, write_boundary
+from validate import boundary_displacement, read_result, simulate_driven, write_boundary_conditions
 
 SIDE = 20.0
 # Isochoric, and at rest where x = 0: simple shear of y and z along x
@@ -38,7 +37,7 @@ def slab(n: int = 6) -> TetMesh:
 def test_one_law_follows_a_homogeneous_deformation_exactly() -> None:
     mesh = slab()
     fat = Ogden.from_ansys(0.0034, 6.2)
-    state = driven(mesh, {"fat": fat, "skin": fat}, SHEAR, "Load1")
+    state = simulate_driven(mesh, {"fat": fat, "skin": fat}, SHEAR, "Load1")
     assert state.reached == 1.0
     assert np.abs(state.u_mm - SHEAR.displacement(mesh.points_mm)).max() < 1e-3
     assert np.abs(state.gradients - (SHEAR.matrix - np.eye(3))).max() < 2e-3
@@ -47,13 +46,13 @@ def test_one_law_follows_a_homogeneous_deformation_exactly() -> None:
 def test_a_stiff_layer_strains_less_than_a_soft_one() -> None:
     mesh = slab()
     laws = {"fat": NeoHooke.of(0.005), "skin": NeoHooke.of(0.25)}
-    state = driven(mesh, laws, SHEAR, "Load1")
+    state = simulate_driven(mesh, laws, SHEAR, "Load1")
     inner = ((mesh.centroids_mm > 5.0) & (mesh.centroids_mm < 15.0))[:, 1:].all(axis=1)
     shear = np.abs(state.gradients[:, 1, 0])
     near = np.abs(mesh.centroids_mm[:, 0] - 10.0) < 5.0
     in_fat, in_skin = (np.isin(np.arange(len(mesh.cells)), mesh.regions[name]) for name in ("fat", "skin"))
     assert shear[inner & near & in_fat].mean() > 1.2 * shear[inner & near & in_skin].mean()
-    nodes, u = outside(mesh, SHEAR)
+    nodes, u = boundary_displacement(mesh, SHEAR)
     assert np.abs(state.u_mm[nodes] - u).max() < 1e-12
 
 
@@ -62,21 +61,21 @@ def test_the_outside_is_where_it_was_measured_and_bone_stays() -> None:
     moved = Affine(SHEAR.matrix, np.array([0.5, 0.0, 0.0]))
     inner = TetMesh(mesh.points_mm, mesh.cells[(np.abs(mesh.centroids_mm - 10.0) < 9.0).all(axis=1)])
     measured = OnMesh(inner, moved.displacement(inner.points_mm))  # its rim is not measured
-    nodes, u = outside(mesh, measured)
+    nodes, u = boundary_displacement(mesh, measured)
     assert np.array_equal(nodes, np.unique(outer_faces(mesh.cells)))
     bone = np.isin(nodes, mesh.facets["bone"])
     assert (u[bone] == 0.0).all()
     assert np.abs(u[~bone] - moved.displacement(mesh.points_mm[nodes])[~bone]).max() < 1.5  # of the nearest that is
     corner = TetMesh(mesh.points_mm, mesh.cells[:60])
     with pytest.raises(InputError, match="does not cover the model"):
-        outside(mesh, OnMesh(corner, np.zeros_like(corner.points_mm)))
+        boundary_displacement(mesh, OnMesh(corner, np.zeros_like(corner.points_mm)))
 
 
 def test_boundary_conditions_say_the_same_in_every_code(tmp_path: Path) -> None:
     mesh = slab()
     numbered = TetMesh(mesh.points_mm, mesh.cells, node_ids=np.arange(len(mesh.points_mm)) + 1001)
-    nodes, u = outside(numbered, SHEAR)
-    abaqus, ansys, febio = write_boundary(tmp_path / "Load1", numbered, nodes, u)
+    nodes, u = boundary_displacement(numbered, SHEAR)
+    abaqus, ansys, febio = write_boundary_conditions(tmp_path / "Load1", numbered, nodes, u)
     rows = [line.split(",") for line in abaqus.read_text().splitlines() if line[0].isdigit()]
     of_abaqus = {(int(n), int(a)): float(v) for n, a, _, v in rows}
     axis = {"UX": 1, "UY": 2, "UZ": 3}
@@ -97,8 +96,8 @@ def test_boundary_conditions_say_the_same_in_every_code(tmp_path: Path) -> None:
 
 def test_boundary_conditions_are_in_the_meshs_own_numbers_unit_and_frame(tmp_path: Path) -> None:
     mesh = slab()  # of a file without numbers: counted from 1
-    nodes, u = outside(mesh, SHEAR)
-    abaqus, _, _ = write_boundary(tmp_path / "Load1", mesh, nodes, u, unit="m", frame="RAS")
+    nodes, u = boundary_displacement(mesh, SHEAR)
+    abaqus, _, _ = write_boundary_conditions(tmp_path / "Load1", mesh, nodes, u, unit="m", frame="RAS")
     text = abaqus.read_text()
     assert "in m, RAS" in text
     rows = [line.split(",") for line in text.splitlines() if line[0].isdigit()]
@@ -113,7 +112,7 @@ def test_calculix_runs_with_them(tmp_path: Path) -> None:
     """By *INCLUDE in a step of its own deck: its outside goes where it was measured, and its inside as ours."""
     mesh = slab()
     fat = NeoHooke.of(0.005, 0.4)
-    write_boundary(tmp_path / "Load1", mesh, *outside(mesh, SHEAR))
+    write_boundary_conditions(tmp_path / "Load1", mesh, *boundary_displacement(mesh, SHEAR))
     (tmp_path / "Load1.inp").rename(tmp_path / "measured.inp")
     lines = ["*NODE, NSET=NALL"] + [f"{n + 1}, {x}, {y}, {z}" for n, (x, y, z) in enumerate(mesh.points_mm.tolist())]
     lines += ["*ELEMENT, TYPE=C3D4, ELSET=EALL"]
@@ -138,7 +137,7 @@ def test_calculix_runs_with_them(tmp_path: Path) -> None:
     theirs = read_result("ccx", tmp_path / "deck.frd").deformation.u_mm
     expected = SHEAR.displacement(mesh.points_mm)
     assert np.abs(theirs - expected).max() < 1e-4
-    ours = driven(mesh, {"fat": fat, "skin": fat}, SHEAR, "Load1").u_mm
+    ours = simulate_driven(mesh, {"fat": fat, "skin": fat}, SHEAR, "Load1").u_mm
     assert np.abs(theirs - ours).max() < 1e-3
 
 

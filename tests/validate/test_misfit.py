@@ -13,23 +13,22 @@ from dvc.images.image import Grid
 from mrstrain.comparison.model_files import ModelFile, Reading
 from tests.validate.test_comparison import SIDE, cube, labels, result, sheared
 from tests.validate.test_fe_result import written
-from validate.mapping import Field, Mapped, mapped
-from validate.misfit import displacement_slip, misfits
+from validate import Field, MappedFields, displacement_slip, map_fields, misfits
 
 
-def pressed() -> Mapped:
+def pressed() -> MappedFields:
     """A block pressed by 0.4 mm along x and sheared by 0.25 mm along y; its cells hardly change their volume."""
-    found = mapped(cube(), labels(), ["bone"], sheared(0.0), {})
+    found = map_fields(cube(), labels(), ["bone"], sheared(0.0), {})
     x, y, z = (found.points_mm / SIDE).T
     u = np.stack([-0.4 * x, 0.25 * x + 0.1 * y * x, 0.12 * (z - 0.4) * x], axis=1)
     return replace(found, measured=moved(found, u))
 
 
-def moved(found: Mapped, u: np.ndarray) -> Field:
+def moved(found: MappedFields, u: np.ndarray) -> Field:
     return Field(u, found.measured.max_shear, found.measured.jacobian)
 
 
-def told(found: Mapped, u: np.ndarray) -> str:
+def told(found: MappedFields, u: np.ndarray) -> str:
     return displacement_slip(replace(found, models={"model": moved(found, u)}), "model")
 
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from dvc.errors import GeometryError
 from dvc.io.meshes.read import read_mesh
 from dvc.mesh import outer_faces
-from validate.fe_result import FeResult, read_result
+from validate import FeResult, read_result
 from validate.tetrahedra import linear_tetrahedra
 
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]

@@ -69,9 +69,10 @@ def with_errors(study: Path, bias: float, sd: float) -> None:
 def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
     with_errors(study, 0.0, 0.02)
     done = compare(study / "measured", [study / "half", study / "right"], on_image=True, **given(study))
-    assert [a.model for a in done.totals] == ["right", "half"]
-    assert done.totals[0].ml == pytest.approx(0.0, abs=1e-3)
-    assert "Nearest over all loads, by the area: right. It is told apart from all others." in done.noise
+    assert [a.model for a in done.comparison.ranking.areas] == ["right", "half"]
+    assert done.comparison.ranking.areas[0].ml == pytest.approx(0.0, abs=1e-3)
+    statements = done.comparison.ranking.statements
+    assert "Best match over all loads (area metric): right, significantly better than every other." in statements
     areas = {(r["model"], r["load"], r["tissue"]): r for r in rows(study / "out" / "areas.csv")}
     # all 8 mL are above 0.2 to 0.43 by the measurement, and to 0.204 by the model, minus what lies at the border
     volume = json.loads((study / "out" / "comparison.json").read_text())["coverage_ml"]["Load1"]["common"]
@@ -86,7 +87,7 @@ def test_models_are_ranked_and_everything_is_written(study: Path) -> None:
     assert float(nothing["low_ml"]) < float(nothing["ml"]) < float(nothing["high_ml"])
     page = (study / "out" / "report.html").read_text()
     assert page.index("<tfoot>") < page.index("no deformation") < page.index("</tfoot>")
-    assert not any("no deformation" in sentence for sentence in done.noise)
+    assert not any("no deformation" in sentence for sentence in statements)
     places = {(r["model"], r["load"], r["threshold"]): r for r in rows(study / "out" / "location.csv")}
     right = places["right", "Load1", "0.3"]
     assert float(right["measured_low_ml"]) <= float(right["measured_ml"]) <= float(right["measured_high_ml"])
@@ -157,28 +158,28 @@ def test_the_report_needs_nothing_else_and_says_what_it_rests_on(study: Path) ->
     text = re.sub(r"\s+", " ", page)
     assert "there is none of displacement" in text
     assert "the displacement was taken as it was given" in text
-    assert "measurement&#39;s error is not known" in text
+    assert "measurement uncertainty is unknown" in text
     assert text.index("Models and loads") < text.index("Volume above a strain")
 
 
 def test_without_an_error_no_difference_counts_as_seen(study: Path) -> None:
     done = compare(study / "measured", [study / "right", study / "half"], **given(study))
-    assert done.noise == ()
-    assert np.isnan(done.totals[0].low_ml)
-    assert all(one.not_told_apart() == (("right", "half"),) for one in done.comparisons)
+    assert done.comparison.ranking.statements == ()
+    assert np.isnan(done.comparison.ranking.areas[0].low_ml)
+    assert set(done.comparison.ranking.not_distinguishable.values()) == {(("right", "half"),)}
     assert "<td>1–2</td>" in (study / "out" / "report.html").read_text()
     with_errors(study, 0.0, 5.0)  # a measurement that knows nothing
     done = compare(study / "measured", [study / "right", study / "half"], **given(study))
-    assert "The measurement does not tell these apart from it by the area: half." in done.noise[0]
+    assert done.comparison.ranking.statements[0].endswith("; not distinguishable from half.")
 
 
 def test_a_load_that_a_model_did_not_carry_is_not_compared(study: Path) -> None:
     outcome = {"outcome": {"Load1": {"reached": 0.42}, "Load2": {"reached": 1.0}}, "parameters": {}}
     (study / "half" / "simulation.json").write_text(json.dumps(outcome))
     done = compare(study / "measured", [study / "right", study / "half"], **given(study))
-    assert "half reached only 42% of Load1, which is not compared." in done.notes
-    assert [a.model for a in done.totals] == ["right"]
-    assert [sorted(one.found.models) for one in done.comparisons] == [["right"], ["half", "right"]]
+    assert "half reached only 42% of Load1, which is not compared." in done.comparison.notes
+    assert [a.model for a in done.comparison.ranking.areas] == ["right"]
+    assert [sorted(one.fields.models) for one in done.comparison.loads] == [["right"], ["half", "right"]]
 
 
 def test_a_law_that_is_unstable_is_told_beside_the_rank(study: Path) -> None:
@@ -187,7 +188,7 @@ def test_a_law_that_is_unstable_is_told_beside_the_rank(study: Path) -> None:
     }
     (study / "half" / "simulation.json").write_text(json.dumps(outcome | {"parameters": {}}))
     done = compare(study / "measured", [study / "right", study / "half"], **given(study))
-    told = [note for note in done.notes if "not stable (Drucker)" in note]
+    told = [note for note in done.comparison.notes if "not stable (Drucker)" in note]
     assert [note.partition(":")[0] for note in told] == ["half, Load1"]
     assert "10.0%" in told[0]
 
@@ -230,7 +231,7 @@ def test_a_model_that_lies_elsewhere_or_is_strange_is_refused_or_told(study: Pat
         ("moving", "mm at the bone"),
         ("swollen", "change their volume by 33%"),
     ):
-        assert any(name in note and words in note for note in done.notes), (name, done.notes)
+        assert any(name in note and words in note for note in done.comparison.notes), (name, done.comparison.notes)
 
 
 def test_each_model_may_have_a_unit_frame_and_mesh_of_its_own(study: Path) -> None:
@@ -246,8 +247,8 @@ def test_each_model_may_have_a_unit_frame_and_mesh_of_its_own(study: Path) -> No
     settings = study / "ansys" / "model.toml"
     settings.write_text('mesh = "heel.vtu"\nunit = "m"\nframe = "RAS"\n')
     done = compare(study / "measured", [study / "half", study / "ansys"], **given(study))
-    assert done.totals[0].model == "ansys"
-    assert done.totals[0].ml == pytest.approx(0.0, abs=1e-3)
+    assert done.comparison.ranking.areas[0].model == "ansys"
+    assert done.comparison.ranking.areas[0].ml == pytest.approx(0.0, abs=1e-3)
     settings.write_text('units = "m"\n')
     with pytest.raises(InputError, match="'units' is none of mesh, unit, frame, to_image"):
         compare(study / "measured", [study / "ansys"], **given(study))
@@ -270,7 +271,7 @@ def test_the_command_takes_one_load_and_one_file(study: Path) -> None:
     argv += ["--names", study / "tissues.csv", "--out", out, "--strains", "0.1", "0.4"]
     ran = CliRunner().invoke(app, [str(a) for a in argv])
     assert ran.exit_code == 0, ran.output
-    assert "Load1: area between the curves, mL, the nearest first: half" in ran.output
+    assert "Load1: area between curves, mL, best first: half" in ran.output
     assert (out / "report.html").is_file()
 
 

@@ -14,14 +14,12 @@ from dvc.deformation.protocol import Affine
 from dvc.deformation.strain import plate_axes
 from dvc.images.image import Grid, LabelMap
 from mrstrain.comparison.compare import compare
-from mrstrain.comparison.page import lowest_bone_point, pictures_of
 from tests.mrstrain.comparison.test_compare import LOADS, given, rows, study, with_errors
-from tests.validate.test_comparison import SIDE, cube, error_table, labels, max_shear, result, sheared
-from validate.agreement import agreement, agreements, travel
-from validate.comparison import compare as compare_load
-from validate.comparison import total
+from tests.validate.test_comparison import SIDE, case, cube, error_table, labels, max_shear, result, sheared
+from validate import ALL, Field, agreements, compare_load, map_fields, rank_over_loads, skin_displacement
+from validate.agreement import agreement
 from validate.figures import slice_panels
-from validate.mapping import ALL, Field, mapped
+from validate.report import draw, lowest_bone_point
 
 __all__ = ["study"]
 X = np.array([1.0, 0.0, 0.0])
@@ -37,8 +35,8 @@ def pressed(along: float, across: float) -> Affine:
 def test_travel_is_positive_towards_the_foot_and_volume_change_that_of_the_map() -> None:
     mesh = cube(6)
     model = result("model", mesh, pressed(0.05, -0.1))
-    found = mapped(mesh, labels(), ["bone"], pressed(0.1, 0.05), {"model": model.deformation})
-    told = travel(found, "model", "Load1", model.deformation, pressed(0.1, 0.05), X)
+    found = map_fields(mesh, labels(), ["bone"], pressed(0.1, 0.05), {"model": model.deformation})
+    told = skin_displacement(found, "model", "Load1", model.deformation, pressed(0.1, 0.05), X)
     inside = SIDE - 1.0  # the skin under the plate is looked at 1 mm inside
     assert (told.measured_mm, told.model_mm) == pytest.approx((0.1 * inside, 0.05 * inside))
     assert (told.measured_along_mm, told.model_along_mm) == pytest.approx((0.05 * inside, 0.1 * inside))
@@ -49,15 +47,15 @@ def test_travel_is_positive_towards_the_foot_and_volume_change_that_of_the_map()
 def test_volume_change_is_that_of_the_fat_alone() -> None:
     mesh = cube(6)
     model = result("model", mesh, pressed(0.05, 0.0))
-    found = mapped(mesh, labels(), ["bone"], pressed(0.1, 0.0), {"model": model.deformation})
+    found = map_fields(mesh, labels(), ["bone"], pressed(0.1, 0.0), {"model": model.deformation})
     jacobian = np.where(found.tissue == "fat", 0.93, 0.5)
     found = replace(found, measured=replace(found.measured, jacobian=jacobian))
-    told = travel(found, "model", "Load1", model.deformation, pressed(0.1, 0.0), X)
+    told = skin_displacement(found, "model", "Load1", model.deformation, pressed(0.1, 0.0), X)
     assert told.measured_volume_change == pytest.approx(-0.07)
 
 
 def test_a_graded_field_has_its_means_by_distance_to_bone() -> None:
-    found = mapped(cube(12), labels(), ["bone"], sheared(0.1), {"model": sheared(0.1)})
+    found = map_fields(cube(12), labels(), ["bone"], sheared(0.1), {"model": sheared(0.1)})
     distance = found.to_bone_mm
     measured = replace(found.measured, max_shear=0.01 * distance)
     double = Field(found.measured.u_mm, 0.02 * distance + 0.1, found.measured.jacobian)
@@ -101,20 +99,17 @@ def test_the_lowest_point_of_bone_is_that_of_a_spur_along_the_outward_normal(
 def test_the_slices_caption_says_where_it_lies(aside: float, words: str) -> None:
     mesh, bone = cube(4), labels()
     model = result("half", mesh, sheared(0.2))
-    one = compare_load("Load1", sheared(0.4), [model], bone, bones=["bone"], normal=X)
+    one = compare_load(case("Load1", sheared(0.4), [model]), bone)
     grid = replace(bone.grid, origin_mm=bone.grid.origin_mm + np.array([0.0, 0.0, aside]))
-    axes = plate_axes(-X, (0.0, 1.0, 0.0))
-    drawn = pictures_of(
-        one, sheared(0.4), [model], replace(bone, grid=grid), ["bone"], axes, (0.2, 0.5), ["half"]
-    )  # fmt: skip
-    assert words in drawn["slices"].caption
+    drawn = draw(replace(one, labels=replace(bone, grid=grid)), ["half"])
+    assert words in drawn.pictures["slices"].caption
 
 
 def test_curves_and_slices_are_drawn_of_each_field_itself() -> None:
     mesh = cube(6)
     gammas = {"half": 0.2, "double": 0.8}
     models = {name: result(name, mesh, sheared(gamma)).deformation for name, gamma in gammas.items()}
-    found = mapped(mesh, labels(), ["bone"], sheared(0.4), models)
+    found = map_fields(mesh, labels(), ["bone"], sheared(0.4), models)
     at = np.array([0.5 * max_shear(g) for g in (0.2, 0.6, 1.2, 2.4)])
     for tissue, volume in ((ALL, 8.0), ("fat", 4.0)):
         drawn = found.curves(tissue, at)
@@ -132,18 +127,17 @@ def test_a_load_that_hardly_strains_does_not_judge_and_a_total_is_a_mean_of_shar
     mesh = cube(6)
     results = [result("a", mesh, sheared(0.5)), result("b", mesh, sheared(0.3))]
     weak, strong = (
-        compare_load(
-            load, sheared(gamma), results, labels(), bones=["bone"], normal=X, table=error_table(0.0, 0.001)
-        )
+        compare_load(case(load, sheared(gamma), results, error_table(0.0, 0.001)), labels())
         for load, gamma in (("Load1", 0.38), ("Load2", 0.6))
-    )  # fmt: skip
+    )
     assert max_shear(0.38) < 0.2 < max_shear(0.5)
     assert (weak.hardly_strained, strong.hardly_strained) == (True, False)
-    summed = total([weak, strong])
-    assert any(told.startswith("Under Load1 hardly any tissue") for told in summed.told)
-    assert not any("Nearest under Load1" in told for told in summed.told)
+    ranking = rank_over_loads([weak, strong])
+    informative, second = [s for s in ranking.statements if "under Load" in s or s.startswith("Load")]
+    assert informative == "Load1: less than 1 % of the tissue exceeds 0.2, so the area metric is not informative."
+    assert second.startswith("Best match under Load2")
     areas = {(a.model, a.load): a for one in (weak, strong) for a in one.areas if a.tissue == ALL}
-    for row in (*summed.areas, summed.nothing):
+    for row in (*ranking.areas, ranking.nothing):
         parts = [areas[row.model, load] for load in ("Load1", "Load2")]
         assert row.share == pytest.approx(0.5 * (parts[0].share + parts[1].share))
         assert row.ml == pytest.approx(parts[0].ml + parts[1].ml)
@@ -160,9 +154,9 @@ def test_what_is_written_is_what_was_found(study: Path) -> None:
     moved = sheared(0.5).displacement(mesh.points_mm)
     meshio.write(study / "part" / "Load1.vtu", meshio.Mesh(mesh.points_mm, [("tetra", kept)], {"u": moved}))
     done = compare(study / "measured" / "Load1", [study / "half", study / "part"], on_image=True, **given(study))
-    assert any(note.startswith("Load1: part covers 50% of the mesh") for note in done.notes)
-    assert not any("half covers" in note for note in done.notes)
-    (one,) = done.comparisons
+    assert any(note.startswith("Load1: part covers 50% of the mesh") for note in done.comparison.notes)
+    assert not any("half covers" in note for note in done.comparison.notes)
+    (one,) = done.comparison.loads
     written = rows(study / "out" / "curves.csv")
     for tissue, band in one.bands.items():
         for edge, values in (("measured, low", band.low_ml), ("measured, high", band.high_ml)):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -13,9 +12,9 @@ import pytest
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.trust.verdict import Verdict
 from mrstrain.comparison.compare import Compared, compare
-from mrstrain.measurement.measured_folder import Measurement, verdict_on
 from tests.mrstrain.comparison.test_compare import given, rows, study, with_errors
 from tests.validate.test_comparison import cube, sheared
+from validate.limitations import verdict_on
 
 __all__ = ["study"]
 
@@ -35,14 +34,14 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
     with_errors(study, 0.0, 0.02)
     judged(study, Load1="trust", Load2="distrust")
     found = done(study)
-    assert found.verdict is not None
-    assert found.verdict.level == "distrust"
+    assert found.comparison.verdict is not None
+    assert found.comparison.verdict.level == "distrust"
     reason = "Load2: its registration is not to be trusted: The map of Load2 folds."
-    assert reason in found.notes
+    assert reason in found.comparison.notes
     summary = found.summary()
-    assert summary[0] == "Verdict on what was given: Do not trust"
+    assert summary[0] == "Verdict on the inputs: Do not trust"
     assert reason in summary
-    over_all, first, second = found.noise
+    over_all, first, second = found.comparison.ranking.statements
     assert over_all.endswith("The registration of Load2, which counts in it, is not to be trusted.")
     assert "not to be trusted" not in first
     assert second.endswith("Its registration is not to be trusted.")
@@ -65,11 +64,11 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
 
 
 def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(study: Path) -> None:
-    sound = [Measurement(load, study, None, Verdict("trust"), "bone") for load in ("Load1", "Load2")]
+    sound = dict.fromkeys(("Load1", "Load2"), Verdict("trust"))
     assert verdict_on(sound) == Verdict(
-        "trust", ("The measurement: 2 registrations are sound. The models are judged below.",)
+        "trust", ("The measurement: 2 registrations are sound. The models are compared below.",)
     )
-    assert verdict_on([replace(one, verdict=None) for one in sound]) is None
+    assert verdict_on(dict.fromkeys(sound)) is None
     assert verdict_on(sound, ["It is mirrored."]) == Verdict("caution", ("It is mirrored.",))
     # a model's displacement in the other frame than its mesh is a reason for care beside the registration's
     judged(study, Load1="distrust", Load2="caution")
@@ -78,9 +77,9 @@ def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(stu
     bent = sheared(0.4).displacement(mesh.points_mm) * [-1.0, -1.0, 1.0]
     meshio.write(study / "turned" / "Load2.vtu", meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"u": bent}))
     found = compare(study / "measured", [study / "right", study / "turned"], **given(study))
-    assert found.verdict is not None
-    assert found.verdict.level == "distrust"
-    first, *others, last = found.verdict.reasons
+    assert found.comparison.verdict is not None
+    assert found.comparison.verdict.level == "distrust"
+    first, *others, last = found.comparison.verdict.reasons
     assert first.startswith("Load1: its registration is not to be trusted")
     slips = [reason for reason in others if "fits far better" in reason]
     assert [slip.split(" (cosine")[0] for slip in slips] == [

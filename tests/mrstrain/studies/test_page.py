@@ -125,14 +125,14 @@ def test_registrations_alone_have_a_methods_text(study: Study) -> None:
     outcomes = ended(study, register_Load1=SOUND)
     measured(study.out / "registration", "Load1")
     page = page_of(study, outcomes)
-    assert "Methods, to be pasted" in page
+    assert "Methods text" in page
     assert "Load1: The loaded image was aligned with the unloaded one rigidly on the bone" in page
     assert "A study of 3 heels." in page
     assert "Tustison NJ" in page
     assert "Models and measurement" not in page
-    closing = (Section("Methods, to be pasted", paragraphs=("All of it.",)),)
+    closing = (Section("Methods text", paragraphs=("All of it.",)),)
     page = page_of(study, ended(study, register_Load1=SOUND, compare=StageResult((), (), closing)))
-    assert page.count("Methods, to be pasted") == 1  # that of the comparison tells the registrations too
+    assert page.count("Methods text") == 1  # that of the comparison tells the registrations too
 
 
 def test_the_error_of_a_phantom_stays_in_the_report_as_long_as_its_registration_does(study: Study) -> None:

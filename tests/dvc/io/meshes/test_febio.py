@@ -13,7 +13,7 @@ from dvc.errors import ImageFileError, InputError
 from dvc.io.meshes.read import read_mesh
 from tests.meshfiles import block, skin
 from tests.validate.test_quadratic_cells import quadratic, reference
-from validate.fe_result import read_result
+from validate import read_result
 
 
 def chunk(tag: int, *parts: bytes) -> bytes:

@@ -1,0 +1,121 @@
+"""A comparison as an object: written and read back, in a notebook, and as plots; and the package's front door."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import astuple, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import validate
+from dvc.trust.verdict import Verdict
+from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, result, sheared
+from validate import ALL, Comparison, Criteria, InputError, compare
+
+GAMMAS = {"half": 0.2, "double": 0.8}
+
+
+@pytest.fixture(scope="module")
+def comparison() -> Comparison:
+    """Shear of two loads, and two models of uniform strain under both."""
+    mesh = cube(4)
+    models = [result(name, mesh, sheared(gamma)) for name, gamma in GAMMAS.items()]
+    cases = [case(load, sheared(gamma), models, error_table(0.0, 0.01)) for load, gamma in
+             (("Load1", 0.45), ("Load2", 0.5))]  # fmt: skip
+    cases[1] = replace(cases[1], verdict=Verdict("caution", ("The images agree poorly.",)))
+    return compare(cases, labels(), criteria=Criteria((0.05, 0.5)), notes=["half is linear."])
+
+
+@pytest.fixture(scope="module")
+def folder(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("compared")
+    comparison.write(place, on_image=True)
+    return place
+
+
+def test_what_is_read_back_is_what_was_written(comparison: Comparison, folder: Path) -> None:
+    back = Comparison.read(folder)
+    for rows in ("areas", "overlaps", "agreements", "skin"):
+        ours, theirs = getattr(comparison, rows), getattr(back, rows)
+        assert len(ours) == len(theirs) > 0
+        for one, other in zip(ours, theirs, strict=True):
+            assert type(one) is type(other)
+            for value, again in zip(astuple(one), astuple(other), strict=True):
+                near = pytest.approx(value, rel=1e-5, abs=1e-12, nan_ok=True) if isinstance(value, float) else value
+                assert again == near, (rows, one)
+                assert type(again) in (type(value), float)
+    for curve, again in zip(comparison.curves, back.curves, strict=True):
+        assert (curve.load, curve.tissue, curve.field) == (again.load, again.tissue, again.field)
+        assert again.max_shear == pytest.approx(curve.max_shear, rel=1e-5)
+        assert again.volume_above_ml == pytest.approx(curve.volume_above_ml, rel=1e-5)
+    assert back.ranking.statements == comparison.ranking.statements
+    assert back.ranking.not_distinguishable == comparison.ranking.not_distinguishable
+    assert [a.model for a in back.ranking.areas] == [a.model for a in comparison.ranking.areas]
+    for same in ("strains", "coverage_ml", "verdict", "verdicts", "notes"):
+        assert getattr(back, same) == getattr(comparison, same), same
+    assert str(back) == str(comparison)
+    assert str(back).startswith("Verdict on the inputs: Use with care\nLoad1: area between curves, mL, best first: ")
+    assert "half is linear." in str(back)
+    assert back._repr_html_().partition("<img")[0] == comparison._repr_html_().partition("<img")[0]
+    with pytest.raises(InputError, match="copy its folder"):
+        back.write(folder)
+    assert (folder / "Load2" / "double_max_shear.nii.gz").is_file()
+
+
+def test_a_folder_without_a_comparison_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"areas\.csv cannot be read"):
+        Comparison.read(tmp_path)
+    for path in folder.glob("*.*"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    Comparison.read(tmp_path)
+    (tmp_path / "comparison.json").write_text('{"parameters": {}}')
+    with pytest.raises(InputError, match=r"comparison\.json is no record of a comparison"):
+        Comparison.read(tmp_path)
+    (tmp_path / "location.csv").write_text("model,load\na,Load1\n")
+    with pytest.raises(InputError, match=r"location\.csv has no column threshold"):
+        Comparison.read(tmp_path)
+
+
+def test_a_notebook_shows_the_answer_the_areas_and_the_curves(comparison: Comparison) -> None:
+    page = comparison._repr_html_()
+    assert f"<b>{comparison.ranking.statements[0]}</b>" in page
+    assert "Use with care" in page
+    best = comparison.ranking.areas[0]
+    (row,) = re.findall(rf"<tr><td>{best.model}</td>(.*?)</tr>", page)
+    cells = re.findall("<td>(.*?)</td>", row)
+    assert cells[0] == "1"
+    assert cells[-1] == f"{best.best_ml:.2f} ({best.low_ml:.2f} to {best.high_ml:.2f})"
+    assert len(cells) == 4
+    image = re.search(r'src="data:image/png;base64,([^"]+)"', page)
+    assert image is not None
+    assert base64.b64decode(image[1]).startswith(b"\x89PNG")
+
+
+def test_plots_draw_the_curves_and_areas_themselves(comparison: Comparison) -> None:
+    figure = comparison.plot()
+    assert [axes.get_title() for axes in figure.axes] == ["Load1", "Load2"]
+    for axes, gamma in zip(figure.axes, (0.45, 0.5), strict=True):
+        lines = {str(line.get_label()): line for line in axes.lines}
+        for name, value in {"measured": gamma, **GAMMAS}.items():
+            at, volume = (np.asarray(lines[name].get_data()[n], dtype=float) for n in (0, 1))
+            assert volume == pytest.approx(8.0 * (max_shear(value) > at), abs=1e-9), name
+    (axes,) = comparison.plot("areas", tissue="fat").axes
+    drawn = {str(line.get_label()): line.get_ydata() for line in axes.lines}
+    for name in GAMMAS:
+        areas = [a.best_ml for a in comparison.areas if (a.model, a.tissue) == (name, "fat")]
+        assert drawn[name] == pytest.approx(areas)
+    with pytest.raises(InputError, match=f"No tissue 'muscle'.*{ALL}"):
+        comparison.plot(tissue="muscle")
+    with pytest.raises(InputError, match="none of 'pie'"):
+        comparison.plot("pie")  # type: ignore[arg-type]
+
+
+def test_the_front_door_offers_what_it_lists() -> None:
+    assert sorted(validate._PLACES) == sorted(validate.__all__)
+    for name in validate.__all__:
+        assert getattr(validate, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = validate.nothing

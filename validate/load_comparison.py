@@ -1,0 +1,268 @@
+"""One load, measured and simulated by several models: areas, location, agreement and skin displacement."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dvc.arrays import BoolArray, FloatArray
+from dvc.deformation.protocol import Deformation
+from dvc.deformation.strain import plate_axes
+from dvc.errors import InputError
+from dvc.images.image import LabelMap
+from dvc.mesh import TetMesh
+from dvc.trust.error_model import ErrorTable
+from dvc.trust.truth_draws import TruthDraws
+from dvc.trust.verdict import Verdict
+from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
+from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
+from validate.extrapolation import LEVELLED
+from validate.fe_result import FeResult
+from validate.location import LEAST_ML, CellGraph, Overlap, Threshold, overlap, read_thresholds
+from validate.location_intervals import LOCATION_DRAWS, with_intervals
+from validate.mapping import ALL, MappedFields, map_fields
+
+_STRAINED = 0.01
+
+NOTHING = "no deformation"
+"""The model that predicts zero strain everywhere: the reference for areas, outside the ranking."""
+
+Fields = tuple[Deformation, Sequence[FeResult]]
+
+
+@dataclass(frozen=True, slots=True)
+class Criteria:
+    """What models are compared by.
+
+    Attributes
+    ----------
+    strains : (low, high)
+        Range of maximum shear strain over which volume-strain curves are compared.
+    thresholds : tuple of Threshold
+        Maximum shear strains above which clusters are compared.
+    least_ml : float
+        Volume of the smallest cluster that counts, mL.
+    seed : int
+        Of the truths drawn from the error model; draws of different loads are independent.
+
+    Raises
+    ------
+    InputError
+        If the range does not rise from 0 or more to 3 or less, or the volume is negative.
+    """
+
+    strains: tuple[float, float] = RANGE
+    thresholds: tuple[Threshold, ...] = field(default_factory=read_thresholds)
+    least_ml: float = LEAST_ML
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        check_range(self.strains)
+        if self.least_ml < 0.0:
+            raise InputError(f"The smallest cluster's volume must be 0 or more; got {self.least_ml:g} mL.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadCase:
+    """One load: the measurement, and what each model predicts.
+
+    Attributes
+    ----------
+    load : str
+    read : callable
+        Gives the measured deformation (tissue relative to its bone, reference configuration, LPS mm) and the models'
+        results. It is called whenever they are needed, so that files may be read again rather than kept in memory.
+    axes : (3, 3)
+        Of the plate, LPS; see `dvc.plate_axes`. By default the plate pushes to superior and shears to anterior.
+    error : ErrorTable or None
+        Error of the measured maximum shear strain; without it no figure has an interval, and no difference is
+        significant.
+    verdict : Verdict or None
+        On the measurement.
+    aligned_on : str
+        What the rigid alignment was computed on: "bone", "image" or "none"; empty if unknown.
+    image : path or None
+        The loaded image, registered, shown in the viewer of the report.
+    """
+
+    load: str
+    read: Callable[[], Fields]
+    axes: FloatArray = field(default_factory=lambda: plate_axes((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)))
+    error: ErrorTable | None = None
+    verdict: Verdict | None = None
+    aligned_on: str = ""
+    image: Path | None = None
+
+    @classmethod
+    def of(
+        cls, load: str, measured: Deformation, results: Sequence[FeResult], error: ErrorTable | None = None
+    ) -> LoadCase:
+        """A load whose fields are in memory; set the rest with `dataclasses.replace`."""
+        return cls(load, lambda: (measured, results), error=error)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadComparison:
+    """Models compared with the measurement of one load.
+
+    Attributes
+    ----------
+    case : LoadCase
+    labels : LabelMap
+        Of the unloaded image.
+    bones : tuple of str
+        Labels of bone.
+    criteria : Criteria
+    fields : MappedFields
+        Measured and simulated, in the cells compared.
+    areas : tuple of Area
+        By model and tissue; that of all soft tissue first. Those of `NOTHING` come last.
+    overlaps : tuple of Overlap
+    agreements : tuple of Agreement
+    skin : tuple of SkinDisplacement
+    bands : mapping of tissue to Band
+        Empty where the measurement uncertainty is unknown.
+    """
+
+    case: LoadCase
+    labels: LabelMap
+    bones: tuple[str, ...]
+    criteria: Criteria
+    fields: MappedFields
+    areas: tuple[Area, ...]
+    overlaps: tuple[Overlap, ...]
+    agreements: tuple[Agreement, ...]
+    skin: tuple[SkinDisplacement, ...]
+    bands: Mapping[str, Band]
+
+    @property
+    def load(self) -> str:
+        """Name of the load."""
+        return self.case.load
+
+    @property
+    def hardly_strained(self) -> bool:
+        """Whether less than 1 % of the tissue is measured above the lower end of the range."""
+        where = self.fields.common
+        volumes = self.fields.volumes_ml[where]
+        above = volumes[self.fields.measured.max_shear[where] > self.criteria.strains[0]].sum()
+        return bool(above < _STRAINED * volumes.sum())
+
+    def ranked(self, tissue: str = ALL) -> list[Area]:
+        """Areas of the ranked models in a tissue, the smallest first: the estimate where the uncertainty is known.
+
+        Levelled models are not ranked, since no bias is removed from their areas; nor is `NOTHING`.
+        """
+        models = (a for a in self.areas if a.tissue == tissue and a.model != NOTHING and not a.model.endswith(LEVELLED))
+        return sorted(models, key=lambda a: a.best_ml)
+
+
+def compare_load(
+    case: LoadCase,
+    labels: LabelMap,
+    bones: Sequence[str] = ("bone",),
+    *,
+    mesh: TetMesh | None = None,
+    criteria: Criteria | None = None,
+) -> LoadComparison:
+    """Compare models with the measurement of one load, at the centroids of one mesh's cells.
+
+    Parameters
+    ----------
+    case : LoadCase
+    labels : LabelMap
+        Of the unloaded image: tissues, and distance to bone.
+    bones : sequence of str
+        Labels of bone.
+    mesh : TetMesh, optional
+        Where fields are compared; the first model's mesh by default.
+    criteria : Criteria, optional
+
+    Raises
+    ------
+    InputError
+        As `validate.mapping.map_fields`.
+    """
+    by = criteria or Criteria()
+    measured, results = case.read()
+    models = {result.name: result.deformation for result in results}
+    fields = map_fields(mesh if mesh is not None else results[0].mesh, labels, bones, measured, models)
+    truths: list[FloatArray] = []
+    known = {} if case.error is None else _bands(fields, case, case.error, by, truths)
+    skin = [skin_displacement(fields, r.name, case.load, r.deformation, measured, -case.axes[:, 0]) for r in results]
+    rows = [row for name in models for row in agreements(fields, name, case.load)]
+    areas, overlaps = _areas(fields, case.load, known, by), _overlaps(fields, case, by, truths)
+    return LoadComparison(
+        case, labels, tuple(bones), by, fields, tuple(areas), tuple(overlaps), tuple(rows), tuple(skin), known
+    )
+
+
+def _tissues(fields: MappedFields) -> dict[str, BoolArray]:
+    """Cells compared: all, and by tissue."""
+    common = fields.common
+    parts = {name: common & (fields.tissue == name) for name in fields.tissues}
+    return {ALL: common} | {name: cells for name, cells in parts.items() if cells.any()}
+
+
+def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Criteria) -> Iterator[Area]:
+    for name, shear in _shears(fields).items():
+        for tissue, where in _tissues(fields).items():
+            volumes = fields.volumes_ml[where]
+            area = area_between(fields.measured.max_shear[where], shear[where], volumes, by.strains)
+            normalised = area / volumes.sum() / (by.strains[1] - by.strains[0])
+            # a levelled model carries the measurement's bias itself: nothing is to be removed
+            estimated = known[tissue].interval(name) if tissue in known and not name.endswith(LEVELLED) else ()
+            yield Area(name, load, tissue, area, normalised, *estimated)
+
+
+def _overlaps(fields: MappedFields, case: LoadCase, by: Criteria, truths: Sequence[FloatArray]) -> Sequence[Overlap]:
+    common, cells = fields.common, CellGraph.of(fields.mesh)
+    measured = np.where(common, fields.measured.max_shear, -1.0)
+    rows = [
+        overlap(
+            name, case.load, threshold.max_shear, measured, np.where(common, model.max_shear, -1.0), cells, by.least_ml
+        )
+        for name, model in fields.models.items()
+        for threshold in by.thresholds
+    ]
+    if case.error is None:
+        return rows
+    shears = {name: model.max_shear[common] for name, model in fields.models.items()}
+    return with_intervals(rows, truths, shears, cells.part(common), by.least_ml, case.error.factor)
+
+
+def _shears(fields: MappedFields) -> dict[str, FloatArray]:
+    """Maximum shear strain of each model, and of none."""
+    return {name: of.max_shear for name, of in fields.models.items()} | {NOTHING: np.zeros(len(fields.points_mm))}
+
+
+def _bands(
+    fields: MappedFields, case: LoadCase, error: ErrorTable, by: Criteria, first: list[FloatArray]
+) -> dict[str, Band]:
+    """Bands by tissue; the ``first`` truths drawn for them are kept, for the intervals of location."""
+    common = fields.common
+    seed = zlib.crc32(case.load.encode()) + by.seed
+    draws = TruthDraws(
+        fields.points_mm[common], fields.measured.max_shear[common], [str(t).lower() for t in fields.tissue[common]],
+        fields.to_bone_mm[common], error, seed,
+    )  # fmt: skip
+
+    def truths() -> Iterator[FloatArray]:
+        for truth in draws.many(DRAWS):
+            if len(first) < LOCATION_DRAWS:
+                first.append(truth.astype(np.float32))
+            yield truth
+
+    return bands(
+        truths(),
+        {name: shear[common] for name, shear in _shears(fields).items()},
+        fields.volumes_ml[common],
+        {name: where[common] for name, where in _tissues(fields).items()},
+        error.factor,
+        draws.narrowed,
+        by.strains,
+    )

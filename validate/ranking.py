@@ -1,0 +1,125 @@
+"""Models ranked by the area between curves, under each load and over all, and which differences are significant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from validate.curves import Area, Band
+from validate.extrapolation import LEVELLED
+from validate.load_comparison import NOTHING, LoadComparison
+from validate.mapping import ALL
+
+Pairs = tuple[tuple[str, str], ...]
+"""Of models, each in the order of their areas."""
+
+ALL_LOADS = "all loads"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranking:
+    """Models over all loads.
+
+    Attributes
+    ----------
+    areas : tuple of Area
+        Over all loads, of the models that have every load, the best first; levelled ones last.
+    nothing : Area
+        Of `NOTHING`.
+    statements : tuple of str
+        Which model fits best and which differences are significant: over all loads, then under each.
+    not_distinguishable : mapping of load to Pairs
+        Pairs whose areas do not differ significantly; those over all loads under `ALL_LOADS`.
+    """
+
+    areas: tuple[Area, ...]
+    nothing: Area
+    statements: tuple[str, ...]
+    not_distinguishable: Mapping[str, Pairs]
+
+    def rank(self, model: str) -> tuple[int, int] | None:
+        """First and last rank over all loads that a model may have; None for one that is not ranked."""
+        names = [a.model for a in _ranked(self.areas)]
+        if model not in names:
+            return None
+        rank, pairs = 1 + names.index(model), self.not_distinguishable[ALL_LOADS]
+        return rank - sum(b == model for _, b in pairs), rank + sum(a == model for a, _ in pairs)
+
+
+def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
+    """Sum the areas over loads, and rank the models.
+
+    Errors of different loads are taken as independent. The normalised area is the mean over loads. Statements name the
+    loads whose registration is not to be trusted.
+    """
+    everywhere = [name for name in loads[0].fields.models if all(name in one.fields.models for one in loads)]
+    band = _summed([one.bands.get(ALL) for one in loads], [*everywhere, NOTHING])
+    rows = []
+    for name in (*everywhere, NOTHING):
+        parts = [a for one in loads for a in one.areas if a.tissue == ALL and a.model == name]
+        estimated = band.interval(name) if band is not None and not name.endswith(LEVELLED) else ()
+        normalised = float(np.mean([a.share for a in parts]))
+        rows.append(Area(name, ALL_LOADS, ALL, sum(a.ml for a in parts), normalised, *estimated))
+    nothing = rows.pop()
+    rows.sort(key=lambda a: (a.model.endswith(LEVELLED), a.best_ml))
+    informative = None if all(one.hardly_strained for one in loads) else band
+    pairs = {ALL_LOADS: _pairs(_ranked(rows), informative)}
+    pairs |= {one.load: _pairs(one.ranked(), None if one.hardly_strained else one.bands.get(ALL)) for one in loads}
+    statements = [_under(one, pairs[one.load]) for one in loads]
+    if len(loads) > 1 and everywhere and informative is not None:
+        distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
+        counted = f" The registration of {', '.join(distrusted)}, which counts in it, is not to be trusted."
+        statements.insert(0, _statement("over all loads", _ranked(rows), pairs[ALL_LOADS], counted * bool(distrusted)))
+    return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs)
+
+
+def _summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
+    """Areas to the truths drawn, over all loads; None where the uncertainty of one is unknown."""
+    known = [band for band in bands if band is not None]
+    if len(known) < len(bands):
+        return None
+    areas = {name: np.sum([band.areas_ml[name] for band in known], axis=0) for name in models}
+    floor, first = float(sum(band.floor_ml for band in known)), known[0]
+    return Band(first.strains, first.low_ml, first.high_ml, areas, floor, max(b.widening for b in known))
+
+
+def _ranked(areas: Sequence[Area]) -> list[Area]:
+    """All but levelled models, whose areas are of another kind."""
+    return [a for a in areas if not a.model.endswith(LEVELLED)]
+
+
+def _pairs(ranked: Sequence[Area], band: Band | None) -> Pairs:
+    """Pairs whose areas do not differ significantly; all where the uncertainty is unknown."""
+    pairs = combinations([a.model for a in ranked], 2)
+    return tuple((a, b) for a, b in pairs if band is None or not (band.surely_below(a, b) or band.surely_below(b, a)))
+
+
+def _under(one: LoadComparison, pairs: Pairs) -> str:
+    """The statement on one load; empty where the uncertainty is unknown."""
+    if one.hardly_strained:
+        low = one.criteria.strains[0]
+        return f"{one.load}: less than 1 % of the tissue exceeds {low:g}, so the area metric is not informative."
+    distrusted = one.case.verdict is not None and one.case.verdict.level == "distrust"
+    caveat = " Its registration is not to be trusted." if distrusted else ""
+    return _statement(f"under {one.load}", one.ranked(), pairs, caveat) if ALL in one.bands else ""
+
+
+def _statement(where: str, ranked: Sequence[Area], pairs: Pairs, caveat: str) -> str:
+    """The best model, those that do not differ significantly from it, and neighbouring ranks that do not; or nothing.
+
+    A single model has no rank.
+    """
+    if len(ranked) < 2:
+        return ""
+    best, *others = (a.model for a in ranked)
+    near = [b for a, b in pairs if a == best]
+    neighbours = [f"{a} and {b}" for a, b in pairwise(others) if (a, b) in pairs]
+    return (
+        f"Best match {where} (area metric): {best}"
+        + (f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other.")
+        + (f" Further down, not distinguishable: {'; '.join(neighbours)}." if neighbours else "")
+        + caveat
+    )

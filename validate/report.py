@@ -1,0 +1,316 @@
+"""The report of a comparison: verdict first, then the table of models and loads, curves, slices and agreement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.deformation.protocol import Deformation, evaluate_on_grid
+from dvc.deformation.strain import StrainField
+from dvc.images.image import LabelMap, Mask
+from dvc.io.images.read import read_voxels
+from dvc.report.page import METHODS, Cell, Picture, Section, Table, caption_of
+from dvc.report.viewer import Viewer, Volume
+from dvc.trust.verdict import Verdict
+from validate import figures
+from validate.curves import Area
+from validate.fe_result import FeResult
+from validate.load_comparison import NOTHING, LoadComparison
+from validate.location import Threshold
+from validate.mapping import ALL, filled_from_nearest
+from validate.ranking import Ranking
+
+_AROUND = 4  # voxels around the tissue in the viewer
+_PANELS = 4  # tissues whose curves are drawn, all soft tissue first
+_AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
+_CLOSING = Section(
+    "How to read this",
+    paragraphs=(
+        "All fields are compared at the centroids of the same cells of one mesh, with the cells' volumes as weights, "
+        "in the reference (unloaded) configuration; cells in which the measurement or a model is undefined are left "
+        "out for all. Strain is Green-Lagrange, maximum shear strain (E1 - E3)/2. Displacement is that of tissue "
+        "relative to its bone, LPS mm.",
+        "The area between two volume-strain curves (the area validation metric, with volume in place of probability) "
+        "is the integral of the absolute difference of the volumes above a strain over the range of strain, in mL; the "
+        "normalised area is divided by the tissue's volume and the width of the range. Curves carry no location: two "
+        "fields may have one curve and differ everywhere. Overlap (Dice), distances of centroids, the Hausdorff "
+        "distance (95th percentile) and the agreement cell by cell show where the fields differ.",
+        "Intervals and the grey band come from the error model of the registration: true fields that are consistent "
+        "with the measured one are drawn, and the model's area to each is computed. If an interval excludes the area "
+        "as measured, noise and smoothing have shifted the measured curve. Two models differ significantly if the area "
+        "of one is the smaller in 97.5 % of the draws, widened as the intervals are.",
+        "A measurement without a label map smooths strain discontinuities at tissue interfaces over about 4 mm, and "
+        "noise raises small shear strains; a model does neither. No comparison can show what the measurement does not: "
+        "scanner distortion, creep during a scan, tissue that slides along a smooth skin or inside a uniform region. "
+        "Thresholds of strain are not thresholds of injury unless their table says so and why.",
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """A load's pictures, by the stem of their files, and its viewer."""
+
+    pictures: Mapping[str, Picture]
+    viewer: Viewer
+
+
+def draw(one: LoadComparison, colours: Sequence[str]) -> Drawn:
+    """Draw one load; ``colours`` names all models in the order of their colours."""
+    measured, results = one.case.read()
+    return Drawn(_pictures(one, measured, results, colours), _viewer(one, measured, results))
+
+
+def _pictures(
+    one: LoadComparison, measured: Deformation, results: Sequence[FeResult], colours: Sequence[str]
+) -> dict[str, Picture]:
+    fields, axes, bone = one.fields, one.case.axes, one.bones[0]
+    displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
+    tissues = [name for name in fields.tissues if any(a.tissue == name for a in one.areas)]
+    curves = figures.volume_strain(fields, one.bands, one.criteria.strains, (ALL, *tissues)[:_PANELS], colours)
+    point = lowest_bone_point(one.labels, bone, axes)
+    across = (fields.mesh.points_mm - point) @ axes[:, 2]
+    through = f"It goes through the lowest point of {bone}."
+    if not across.min() < 0.0 < across.max():
+        point = fields.mesh.bounds_mm.mean(axis=0)
+        through = f"The lowest point of {bone} lies beside the mesh: the slice goes through the mesh's middle instead."
+    slices = figures.slices(fields, measured, displacements, axes, point)
+    shear, u = (figures.differences(fields, one.agreements, quantity) for quantity in ("max_shear", "u_mm"))
+    differences = caption_of(figures.differences)
+    return {
+        "curves": Picture("Volume above a strain", caption_of(figures.volume_strain), curves),
+        "slices": Picture("Where the strain lies", f"{caption_of(figures.slices)} {through}", slices),
+        "agreement": Picture(
+            "Maximum shear strain, cell by cell", caption_of(figures.scatter), figures.scatter(fields)
+        ),
+        "differences_shear": Picture("Differences of maximum shear strain", differences, shear),
+        "differences_u": Picture("Differences of the displacement's magnitude", differences, u),
+    }
+
+
+def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
+    """Point of a bone furthest along the plate's outward normal, LPS mm; the mean of several."""
+    points = labels.grid.points(np.isin(labels.labels, [n for n, name in labels.names.items() if name == bone]))
+    height = points @ axes[:, 0]
+    return np.asarray(points[height < height.min() + 0.5 * labels.grid.spacing_mm.min()].mean(axis=0))
+
+
+def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
+    """A model's displacement at nodes (n, 3) of the compared mesh; as stored if that is the model's own mesh."""
+    if result.mesh.points_mm.shape == points_mm.shape and np.array_equal(result.mesh.points_mm, points_mm):
+        return result.deformation.u_mm
+    return filled_from_nearest(result.deformation.displacement(points_mm), points_mm)
+
+
+def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResult]) -> Viewer:
+    """Measured strain and that of the best model over the image, on the label map's voxels.
+
+    The image is the loaded one as registered, on the unloaded anatomy, if the case has one; else the label map.
+    """
+    labels, scanned = one.labels, one.case.image
+    box = Mask(labels.grid, labels.labels > 0).box(_AROUND)
+    soft = [number for number, name in labels.names.items() if name not in one.bones]
+    grid, inside = labels.grid.part(box), np.isin(labels.labels[box], soft)
+    names = [a.model for a in one.ranked()] or list(one.fields.models)
+    model = next(r for r in results if r.name == names[0])
+    shear = []
+    for field in (measured, model.deformation):
+        values = np.full(grid.shape, np.nan)
+        values[inside] = StrainField.from_gradient(evaluate_on_grid(field, grid, inside)[1]).max_shear
+        shear.append(values)
+    seen, voxels = read_voxels(scanned) if scanned is not None else (None, np.empty(0))
+    if seen is not None and seen.same_as(labels.grid):
+        shown = np.nan_to_num(voxels[box])
+    else:
+        shown = labels.labels[box].astype(np.float64)
+    most = max(0.05, float(np.ceil(20.0 * np.nanquantile(shear[0], 0.99)) / 20.0))
+    return Viewer(
+        "Interactive 3-D viewer",
+        f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and by {model.name}. Drag to "
+        "move through the slices, drag with the right button to rotate; both views follow. Needs WebGL 2.",
+        Volume.of("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
+        (Volume.of("measured", grid, shear[0], most), Volume.of(model.name, grid, shear[1], most)),
+    )
+
+
+def load_sections(one: LoadComparison, drawn: Drawn) -> list[Section]:
+    """A load's part of the report: how much and where, then cell by cell."""
+    verdict = one.case.verdict
+    covered = one.fields.coverage()
+    compared = (
+        f"Compared: {covered['common']:.1f} mL of the mesh's {covered['mesh']:.1f} mL of soft tissue; the "
+        f"measurement is defined in {covered['measured']:.1f} mL."
+    )
+    trust = () if verdict is None else (f"Verdict on its registration: {verdict.words}.",)
+    first = tuple(drawn.pictures[stem] for stem in ("curves", "slices"))
+    others = tuple(picture for stem, picture in drawn.pictures.items() if stem not in ("curves", "slices"))
+    tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
+    return [
+        Section(one.load, doubtful, tables, first, (compared, *trust), (drawn.viewer,)),
+        Section(f"{one.load}, cell by cell", None, (_agreement(one), _by_distance(one)), others),
+    ]
+
+
+def overview(
+    loads: Sequence[LoadComparison], ranking: Ranking, warnings: Sequence[str], notes: Sequence[str]
+) -> Section:
+    """The first part of the report: areas of all models under all loads, with ``warnings`` about models."""
+    slips = Verdict("caution", tuple(warnings)) if warnings else None
+    return Section("Models and loads", slips, (_areas(loads, ranking),), (), (*ranking.statements, *notes))
+
+
+def _head(one: LoadComparison) -> str:
+    """A load's name, with its verdict if that is not trust."""
+    verdict = one.case.verdict
+    return one.load if verdict is None or verdict.level == "trust" else f"{one.load} ({verdict.words.lower()})"
+
+
+def closing_sections(thresholds: Sequence[Threshold], methods: Sequence[str]) -> list[Section]:
+    """How a comparison is read, sources of its thresholds, and paragraphs for a methods section if there are any."""
+    sources = Section(
+        "Thresholds of strain",
+        None,
+        (Table("Thresholds", ("maximum shear strain", "source"), tuple((t.max_shear, t.source) for t in thresholds)),),
+    )
+    return [_CLOSING, sources, *([Section(METHODS, paragraphs=tuple(methods))] if methods else [])]
+
+
+def shown(area: Area) -> str:
+    """An area in mL, with its 95 % interval where the measurement uncertainty is known."""
+    known = not np.isnan(area.low_ml)
+    return f"{area.best_ml:.2f}" + (f" ({area.low_ml:.2f} to {area.high_ml:.2f})" if known else "")
+
+
+def ranks(ranking: Ranking, model: str) -> str:
+    """Rank of a model over all loads: a range if not distinguishable from neighbours, a dash if not ranked."""
+    return "–".join(str(rank) for rank in dict.fromkeys(ranking.rank(model) or ("–",)))
+
+
+def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
+    areas = {(a.model, a.load): a for one in loads for a in one.areas if a.tissue == ALL}
+    sums = {a.model: a for a in (*ranking.areas, ranking.nothing)}
+    low, high = loads[0].criteria.strains
+    names = [*sums, *dict.fromkeys(model for model, _ in areas if model not in sums)]
+    rows: dict[str, tuple[Cell, ...]] = {}
+    for name in names:
+        cells = ["–" if (area := areas.get((name, one.load))) is None else shown(area) for one in loads]
+        rows[name] = (name, ranks(ranking, name), *cells, shown(sums[name]) if name in sums else "–")
+    nothing = rows.pop(NOTHING)
+    return Table(
+        f"Area between the volume-strain curves of soft tissue, strains {low:g} to {high:g}, mL",
+        ("model", "rank", *(_head(one) for one in loads), "all loads"),
+        tuple(rows.values()),
+        "The best model over all loads first; the rank is a range where models are not distinguishable. Where the "
+        "measurement uncertainty is known, the area is the median over the true fields drawn, with a 95 % interval; "
+        "areas as measured, and by tissue, stand below and in areas.csv. Levelled models come last, with their area as "
+        "measured. Below the line: the area of a model that predicts zero strain everywhere.",
+        (nothing,),
+    )
+
+
+def _tissues(one: LoadComparison) -> Table:
+    def cells(areas: Iterable[Area]) -> tuple[tuple[Cell, ...], ...]:
+        return tuple(
+            (a.model, a.tissue, a.ml, 100.0 * a.share, a.estimate_ml, a.low_ml, a.high_ml, a.floor_ml) for a in areas
+        )
+
+    return Table(
+        "Area between the curves, by tissue",
+        ("model", "tissue", "as measured, mL", "normalised, %", "estimate, mL", "95 % from", "to", "perfect model"),
+        cells(a for a in one.areas if a.model != NOTHING),
+        "As measured: with the measurement's noise and smoothing. Estimate and interval: with these removed. Perfect "
+        "model: the area from noise alone; an interval that reaches it begins at 0.",
+        cells(a for a in one.areas if a.model == NOTHING),
+    )
+
+
+def _location(one: LoadComparison) -> Table:
+    rows = tuple(
+        (o.model, o.threshold, _ranged(o.measured_ml, o.measured_low_ml, o.measured_high_ml), o.model_ml,
+         f"{o.measured_clusters} / {o.model_clusters}", f"{_ranged(o.measured_mean)} / {_ranged(o.model_mean)}",
+         _ranged(o.dice, o.dice_low, o.dice_high),
+         _ranged(o.centroids_mm, o.centroids_low_mm, o.centroids_high_mm), o.largest_mm,
+         _ranged(o.hausdorff95_mm, o.hausdorff95_low_mm, o.hausdorff95_high_mm))
+        for o in one.overlaps
+    )  # fmt: skip
+    perfect: dict[float, tuple[Cell, ...]] = {
+        o.threshold: ("perfect", o.threshold, "", "", "", "", _ranged(o.dice_perfect),
+                      _ranged(o.centroids_perfect_mm), "", _ranged(o.hausdorff95_perfect_mm))
+        for o in one.overlaps
+        if not np.isnan(o.measured_low_ml)
+    }  # fmt: skip
+    known = (
+        "In brackets 95 % intervals with the measurement's bias and noise removed, so that one may exclude the value "
+        "as measured; below the line the values of a perfect model, from noise alone: an interval that reaches one is "
+        "extended to 1, or to 0 mm. "
+        if perfect
+        else "The measurement uncertainty is unknown: no intervals. "
+    )
+    return Table(
+        "Tissue above a threshold of strain: volume and location",
+        ("model", "above", "measured, mL", "model, mL", "clusters", "mean max. shear", "Dice", "centroids, mm",
+         "largest, mm", "Hausdorff, mm"),
+        rows,
+        known + "Clusters are connected cells of at least the smallest volume: their number and mean maximum shear "
+        "strain, measured / model's; distances of the centroids of all together, and of the largest; Hausdorff "
+        "distance at its 95th percentile.",
+        tuple(perfect.values()),
+    )  # fmt: skip
+
+
+def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
+    """A value with its interval, if there is one."""
+    if np.isnan(value):
+        return "–"
+    return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.2g}–{high:.2g})"
+
+
+def _agreement(one: LoadComparison) -> Table:
+    rows = _rows_of(one, [ALL, *one.fields.tissues])
+    return Table(
+        "Agreement cell by cell",
+        ("model", "quantity", "tissue", *_AGREED),
+        rows,
+        "Maximum shear strain and displacement u: means, regression of the model on the measurement, Lin's "
+        "concordance, Bland and Altman's limits of agreement. For displacement these are of its magnitude, except "
+        "regression and concordance (the three components pooled) and RMSE (of the difference vector). All as "
+        "measured, without intervals: the error model covers maximum shear strain, and there is none of displacement.",
+    )  # fmt: skip
+
+
+def _by_distance(one: LoadComparison) -> Table:
+    known = (ALL, *one.fields.tissues)
+    return Table(
+        "Agreement by distance to bone",
+        ("model", "quantity", "where", *_AGREED),
+        _rows_of(one, [a.part for a in one.agreements if a.part not in known]),
+        "In all soft tissue, as above.",
+    )
+
+
+def _rows_of(one: LoadComparison, parts: Sequence[str]) -> tuple[tuple[Cell, ...], ...]:
+    return tuple(
+        (a.model, {"max_shear": "shear", "u_mm": "u, mm"}[a.quantity], a.part, a.measured_mean,
+         a.model_mean, a.slope, a.intercept, a.r2, a.rmse, a.concordance, a.bias, a.lower, a.upper)
+        for a in one.agreements
+        if a.part in parts
+    )  # fmt: skip
+
+
+def _skin(one: LoadComparison) -> Table:
+    rows = tuple(
+        (t.model, t.nodes, t.measured_mm, t.model_mm, t.measured_along_mm, t.model_along_mm,
+         100.0 * t.measured_volume_change, 100.0 * t.model_volume_change)
+        for t in one.skin
+    )  # fmt: skip
+    return Table(
+        "Skin under the plate, and volume change of the fat",
+        ("model", "nodes", "inward, measured, mm", "model, mm", "tangential, measured, mm", "model, mm",
+         "fat's volume change, measured, %", "model, %"),
+        rows,
+        "Mean displacement 1 mm inside the skin on the model's plate, against the plate's outward normal and "
+        "tangential to it; mean det F - 1.",
+    )  # fmt: skip

@@ -1,0 +1,179 @@
+"""The files of a comparison: tables of every figure, fields on the mesh, and maps on the image's voxels."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import meshio
+import numpy as np
+
+from dvc.arrays import FloatArray
+from dvc.atomic_files import whole_file, write_whole
+from dvc.deformation.protocol import evaluate_on_grid
+from dvc.deformation.strain import StrainField
+from dvc.errors import InputError
+from dvc.images.image import Image
+from dvc.io.images.write import write_image, write_vectors
+from validate.agreement import Agreement, SkinDisplacement
+from validate.curves import Area
+from validate.load_comparison import LoadComparison
+from validate.location import Overlap
+from validate.mapping import ALL
+
+RECORD = "comparison.json"
+TABLES: Mapping[str, type[Any]] = {
+    "areas.csv": Area,
+    "location.csv": Overlap,
+    "agreement.csv": Agreement,
+    "travel.csv": SkinDisplacement,
+}
+CURVES = "curves.csv"
+LOWER, UPPER = "measured, low", "measured, high"
+"""Fields of the curves that bound the 95 % band of the true one."""
+_CURVE_COLUMNS = ("load", "tissue", "field", "max_shear", "volume_above_ml", "verdict")
+_STEP = 0.005  # of the curves that are written
+_READERS = {"int": int, "float": float, "str": str}
+_Row = TypeVar("_Row")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """A volume-strain curve.
+
+    Attributes
+    ----------
+    load, tissue : str
+    field : str
+        "measured", a model, or an edge of the 95 % band of the true curve: "measured, low", "measured, high".
+    max_shear : (k,)
+        Maximum shear strain.
+    volume_above_ml : (k,)
+        Volume of tissue that exceeds it.
+    """
+
+    load: str
+    tissue: str
+    field: str
+    max_shear: FloatArray
+    volume_above_ml: FloatArray
+
+
+def curves_of(one: LoadComparison) -> list[Curve]:
+    """The curves of one load, from 0 to one and a half times the upper end of the range."""
+    at = np.arange(0.0, 1.5 * one.criteria.strains[1] + _STEP / 2, _STEP)
+    made = []
+    for tissue in (ALL, *one.fields.tissues):
+        if tissue in one.bands:
+            band = one.bands[tissue]
+            for name, edge in ((LOWER, band.low_ml), (UPPER, band.high_ml)):
+                made.append(Curve(one.load, tissue, name, at, np.interp(at, band.strains, edge)))
+        made += [Curve(one.load, tissue, name, at, above) for name, above in one.fields.curves(tissue, at).items()]
+    return made
+
+
+def write_rows(path: Path, rows: Sequence[Any], verdicts: Mapping[str, str]) -> None:
+    """Write rows of one of the `TABLES`, each with the verdict on its load (empty: there is none)."""
+    head = [*(f.name for f in fields(TABLES[path.name])), "verdict"]
+    _write(path, head, ((*astuple(row), verdicts.get(row.load, "")) for row in rows))
+
+
+def read_rows(path: Path, kind: type[_Row]) -> tuple[_Row, ...]:
+    """Read what `write_rows` wrote, to the six digits of the file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read as such a table.
+    """
+    readers = {f.name: _READERS[str(f.type)] for f in fields(kind)}  # type: ignore[arg-type]
+    return tuple(kind(**{name: read(row[name]) for name, read in readers.items()}) for row in _rows(path, readers))
+
+
+def write_curves(path: Path, curves: Iterable[Curve], verdicts: Mapping[str, str]) -> None:
+    """Write curves, a row for each point."""
+    points = (
+        (c.load, c.tissue, c.field, strain, volume, verdicts.get(c.load, ""))
+        for c in curves
+        for strain, volume in zip(c.max_shear.tolist(), c.volume_above_ml.tolist(), strict=True)
+    )
+    _write(path, _CURVE_COLUMNS, points)
+
+
+def read_curves(path: Path) -> tuple[Curve, ...]:
+    """Read what `write_curves` wrote; errors as `read_rows`."""
+    points: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for row in _rows(path, _CURVE_COLUMNS):
+        key = row["load"], row["tissue"], row["field"]
+        points.setdefault(key, []).append((float(row["max_shear"]), float(row["volume_above_ml"])))
+    return tuple(Curve(*key, *np.array(of).T) for key, of in points.items())
+
+
+def _write(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in rows)
+    write_whole(path, text.getvalue())
+
+
+def _rows(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as a table of a comparison ({error}).") from error
+    missing = [name for name in columns if rows and rows[0].get(name) is None]
+    if missing:
+        raise InputError(f"{path} has no column {missing[0]}: it is no table of a comparison by this version.")
+    return rows
+
+
+def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
+    """Remove the files of an earlier comparison, and its folders of loads that are not compared any more."""
+    try:
+        earlier = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["coverage_ml"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    for name in (*TABLES, CURVES, RECORD, "report.html"):
+        (folder / name).unlink(missing_ok=True)
+    for load in earlier:
+        if load not in loads and (folder / load / "fields.vtu").is_file():
+            shutil.rmtree(folder / load)
+
+
+def write_fields(path: Path, one: LoadComparison) -> None:
+    """Measured and simulated maximum shear strain and displacement in the cells compared, for ParaView."""
+    mapped = one.fields
+    arrays: dict[str, FloatArray] = {}
+    for name, field in {"measured": mapped.measured, **mapped.models}.items():
+        arrays |= {f"{name}_max_shear": field.max_shear, f"{name}_u_mm": field.u_mm}
+    arrays["to_bone_mm"] = mapped.to_bone_mm
+    arrays["compared"] = mapped.common.astype(np.float64)
+    mesh = meshio.Mesh(
+        mapped.mesh.points_mm, [("tetra", mapped.mesh.cells)], cell_data={n: [a] for n, a in arrays.items()}
+    )
+    with whole_file(path) as part:
+        meshio.vtu.write(part, mesh, binary=True)
+
+
+def write_on_image(folder: Path, one: LoadComparison) -> None:
+    """Each model's displacement and maximum shear strain on the label map's voxels; NaN outside labels or model."""
+    labels = one.labels
+    inside = labels.labels > 0
+    for result in one.case.read()[1]:
+        u = np.full((*labels.grid.shape, 3), np.nan, dtype=np.float32)
+        shear = np.full(labels.grid.shape, np.nan, dtype=np.float32)
+        u[inside], H = evaluate_on_grid(result.deformation, labels.grid, inside)
+        shear[inside] = StrainField.from_gradient(H).max_shear
+        write_image(folder / f"{result.name}_max_shear.nii.gz", Image(labels.grid, shear))
+        write_vectors(
+            folder / f"{result.name}_displacement.nii.gz", labels.grid, u, ("x", "y", "z"),
+            f"displacement u(X) of tissue in the model {result.name}", "LPS", unit="mm",
+        )  # fmt: skip
