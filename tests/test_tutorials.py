@@ -185,7 +185,7 @@ def anchors(page: Path) -> set[str]:
 def test_every_link_leads_somewhere() -> None:
     links = [
         (page, link)
-        for page in [*PAGES, ROOT / "benchmarks" / "README.md"]
+        for page in [*PAGES, *sorted((ROOT / "benchmarks").glob("*.md"))]
         for link in re.findall(r"\]\(([^)]+)\)", page.read_text())
         if not link.startswith("https://")
     ]
