@@ -1,4 +1,4 @@
-"""Every tutorial does what it says, from its first block to its last, and the number that it asserts is so."""
+"""Every tutorial and page on Python does what it says, from its first block to its last, and so is what it asserts."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0
 
 
 def follow(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
-    """Run the Python blocks of a tutorial one after the other in a folder; the names that they leave."""
+    """Run the Python blocks of a page one after the other in a folder; the names that they leave."""
     monkeypatch.chdir(folder)
-    document = Sybil(parsers=[PythonCodeBlockParser()]).parse(DOCS / "tutorials" / page)
+    document = Sybil(parsers=[PythonCodeBlockParser()]).parse(DOCS / page)
     examples = list(document.examples())
     assert examples, f"{page} has no Python block"
     assert any("assert" in example.parsed for example in examples), f"{page} asserts nothing"
@@ -47,6 +47,14 @@ def quick_phantom(folder: Path, seed: int) -> Path:
     phantom(folder, seed=seed, loads=["Load1"], spacing_mm=1.6)
     (folder / "quick.txt").write_text(QUICK)
     return folder
+
+
+def copy_scans(folder: Path) -> None:
+    """A small heel without load, under Load1, and without load again, with a mask of its bone."""
+    for name in ("Load0", "Load1", "Load0-again"):
+        shutil.copy(GIVEN / f"{name}.nii.gz", folder)
+    bone = read_labels(GIVEN / "tissues.nii.gz", GIVEN / "tissues.csv").region("bone")
+    write_mask(folder / "calcaneus.nii.gz", bone)
 
 
 def write_model(heel: Path, folder: Path, seed: int, share: float) -> None:
@@ -86,10 +94,7 @@ def heel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_lines_of_the_readme(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for load in ("Load0", "Load1"):
-        shutil.copy(GIVEN / f"{load}.nii.gz", tmp_path)
-    bone = read_labels(GIVEN / "tissues.nii.gz", GIVEN / "tissues.csv").region("bone")
-    write_mask(tmp_path / "calcaneus.nii.gz", bone)
+    copy_scans(tmp_path)
     monkeypatch.chdir(tmp_path)
     (block,) = Sybil(parsers=[PythonCodeBlockParser()]).parse(ROOT / "README.md").examples()
     block.evaluate()
@@ -97,29 +102,34 @@ def test_the_lines_of_the_readme(
     assert (tmp_path / "results" / "Load1" / "max_shear.nii.gz").is_file()
 
 
+def test_dvc_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copy_scans(tmp_path)
+    follow("python/dvc.md", tmp_path, monkeypatch)
+
+
 @pytest.mark.full_size
 def test_register(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(heel, tmp_path / "heel")
     shutil.copy(heel / "quick.txt", tmp_path)
-    follow("register.md", tmp_path, monkeypatch)
+    follow("tutorials/register.md", tmp_path, monkeypatch)
 
 
 @pytest.mark.full_size
 def test_validate(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(heel, tmp_path / "heel")
     write_model(heel, tmp_path / "abaqus", 1, 0.8)
-    follow("validate.md", tmp_path, monkeypatch)
+    follow("tutorials/validate.md", tmp_path, monkeypatch)
 
 
 @pytest.mark.full_size
 def test_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "quick.txt").write_text(QUICK)
-    follow("preset.md", tmp_path, monkeypatch)
+    follow("tutorials/preset.md", tmp_path, monkeypatch)
 
 
 def test_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
-    follow("material.md", tmp_path, monkeypatch)
+    follow("tutorials/material.md", tmp_path, monkeypatch)
 
 
 def test_simulate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,7 +148,7 @@ def test_cohort(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         for name, share in (("near", 0.9), ("far", 1.4)):
             write_model(subject, subject / name, seed, share)
             (subject / name / "model.toml").write_text('mesh = "heel.inp"\nunit = "m"\nframe = "RAS"\n')
-    follow("cohort.md", tmp_path, monkeypatch)
+    follow("tutorials/cohort.md", tmp_path, monkeypatch)
 
 
 def commands_told() -> list[tuple[str, str]]:
@@ -189,7 +199,7 @@ def anchors(page: Path) -> set[str]:
 def test_every_link_leads_somewhere() -> None:
     links = [
         (page, link)
-        for page in [*PAGES, ROOT / "benchmarks" / "README.md"]
+        for page in [*PAGES, *sorted((ROOT / "benchmarks").glob("*.md"))]
         for link in re.findall(r"\]\(([^)]+)\)", page.read_text())
         if not link.startswith("https://")
     ]

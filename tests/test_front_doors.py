@@ -1,0 +1,128 @@
+"""What a package offers at its front door is taken from there, by the other packages, the benchmarks and the pages."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from sybil import Sybil
+from sybil.parsers.markdown import PythonCodeBlockParser
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("dvc", "fe", "phantoms", "validate", "mrstrain")
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+
+# What may still pass a front door: (file, module, name). Each entry that is no longer needed is refused, so both become
+# empty: the first when a page's package has a front door, the second stays so.
+ALLOWED_IN_PAGES = {
+    ("docs/tutorials/material.md", "fe.materials", "Ogden"),
+    ("docs/tutorials/material.md", "fe.published", "as_toml"),
+    ("docs/tutorials/material.md", "fe.published", "material_set"),
+    ("docs/tutorials/material.md", "fe.simulate", "LoadStep"),
+    ("docs/tutorials/preset.md", "mrstrain.truth.accuracy", "cases_of"),
+}
+ALLOWED: set[tuple[str, str, str]] = set()
+WITHOUT_DOOR = {"fe", "phantoms", "validate"}  # packages that offer no names yet
+
+
+def sources(folders: tuple[str, ...]) -> list[Path]:
+    return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+def inner_names(source: str) -> Iterator[tuple[str, str]]:
+    """Module and name of everything that is taken from an inner file: imported by name, or by `module.name`."""
+    tree = ast.parse(source)
+    modules = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                whole = alias.name if alias.asname else package_of(alias.name)
+                modules[alias.asname or whole] = whole
+        if isinstance(node, ast.ImportFrom) and node.module and package_of(node.module) in PACKAGES:
+            for alias in node.names:
+                if node.module in PACKAGES and alias.name in names_at(node.module):
+                    continue
+                if is_module(whole := f"{node.module}.{alias.name}"):
+                    modules[alias.asname or alias.name] = whole
+                else:
+                    yield node.module, alias.name
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            head, dot, rest = ast.unparse(node.value).partition(".")
+            module = modules.get(head, "") + dot + rest
+            if "." in module and package_of(module) in PACKAGES and is_module(module):
+                yield module, node.attr
+
+
+def package_of(module: str) -> str:
+    return module.split(".", maxsplit=1)[0]
+
+
+def names_at(package: str) -> list[str]:
+    return getattr(import_module(package), "__all__", [])
+
+
+def is_module(name: str) -> bool:
+    path = ROOT.joinpath(*name.split("."))
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def offered(module: str, name: str) -> bool:
+    """Whether the front door of the module's package has the very thing."""
+    package = package_of(module)
+    return name in names_at(package) and getattr(import_module(package), name) is getattr(import_module(module), name)
+
+
+def past_the_door(source: str, package: str) -> set[tuple[str, str]]:
+    """What a file of a package takes from inner files of the others although their front doors have it."""
+    return {
+        (module, name)
+        for module, name in inner_names(source)
+        if package_of(module) != package and offered(module, name)
+    }
+
+
+def test_packages_and_benchmarks_take_from_the_front_door_what_it_has() -> None:
+    past = {
+        (str(path.relative_to(ROOT)), module, name)
+        for path in sources((*PACKAGES, "benchmarks"))
+        for module, name in past_the_door(path.read_text(), path.relative_to(ROOT).parts[0])
+    }
+    assert not past - ALLOWED, "\n".join(f"{file}: {module}.{name}" for file, module, name in sorted(past - ALLOWED))
+    assert past >= ALLOWED, "no longer needed"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_import_nothing_from_inner_files(page: Path) -> None:
+    blocks = [example.parsed for example in Sybil(parsers=[PythonCodeBlockParser()]).parse(page).examples()]
+    file = str(page.relative_to(ROOT))
+    inner = {(file, module, name) for block in blocks for module, name in inner_names(block)}
+    assert inner == {entry for entry in ALLOWED_IN_PAGES if entry[0] == file}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_front_door_lists_what_it_has_once(package: str) -> None:
+    names = names_at(package)
+    assert bool(names) == (package not in WITHOUT_DOOR)
+    assert len(names) == len(set(names))
+    assert all(hasattr(import_module(package), name) for name in names)
+
+
+def test_every_way_past_the_door_is_seen() -> None:
+    ways = {
+        "from dvc.images.image import Grid": {("dvc.images.image", "Grid")},
+        "from dvc.images import image\nimage.Grid()": {("dvc.images.image", "Grid")},
+        "from dvc.images import image as im\nim.Grid()": {("dvc.images.image", "Grid")},
+        "import dvc.images.image\nx: dvc.images.image.Grid": {("dvc.images.image", "Grid")},
+        "import dvc\ndvc.images.image.Grid": {("dvc.images.image", "Grid")},
+        "def f():\n    from dvc.images.image import Grid as G": {("dvc.images.image", "Grid")},
+        "from dvc import Grid\nimport dvc\ndvc.Grid": set(),
+        "from dvc.arrays import FloatArray": set(),  # not offered
+        "from numpy.linalg import norm": set(),
+    }
+    for source, past in ways.items():
+        assert past_the_door(source, "fe") == past, source
+        assert past_the_door(source, "dvc") == set()
