@@ -24,14 +24,17 @@ from mrstrain.comparison.result_files import clear_earlier, write_fields, write_
 from mrstrain.measurement.measured_folder import Measurement, measurements_in, verdict_on
 from mrstrain.measurement.page import flat
 from mrstrain.models.loads import Vector
+from mrstrain.options.comparison import ComparisonOn, ModelReading
+from mrstrain.options.door import door
+from mrstrain.options.modelling import Directions, LabelMapFile
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, versions, write_json
 from validate.comparison import ALL_LOADS, Comparison, total
 from validate.comparison import compare as compare_load
-from validate.curves import RANGE, Area, check_range
+from validate.curves import Area
 from validate.extrapolation import LEVELLED
 from validate.fe_result import check_overlap
-from validate.location import LEAST_ML, read_thresholds
+from validate.location import read_thresholds
 from validate.mapping import ALL, check_bones
 from validate.misfit import check_in_tissue, displacement_slip, misfits
 
@@ -86,27 +89,19 @@ class Compared:
         return [*lines, *self.noise, *self.notes, f"Report: {self.out / 'report.html'}"]
 
 
+@door
 def compare(
     dvc: Path | str,
     models: Sequence[Path | str],
     *,
-    labels: Path | str,
     out: Path | str,
-    names: Path | str | None = None,
+    labelling: LabelMapFile,
     loads: Sequence[str] = (),
-    bones: Sequence[str] = ("bone",),
-    mesh: Path | str | None = None,
-    model_mesh: Path | str | None = None,
-    model_unit: str = "mm",
-    model_frame: str = "LPS",
+    reading: ModelReading,
     to_image: FloatArray | None = None,
-    plate_normal: Sequence[float] = (0.0, 0.0, -1.0),
-    shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
+    directions: Directions,
     towards: Mapping[str, tuple[Vector, Vector]] | None = None,
-    strains: tuple[float, float] = RANGE,
-    thresholds: Path | str | None = None,
-    least_ml: float = LEAST_ML,
-    on_image: bool = False,
+    comparison: ComparisonOn,
     progress: Told | None = None,
 ) -> Compared:
     """Compare finite-element models with a measurement.
@@ -118,30 +113,16 @@ def compare(
     models : sequence of path
         For each model a folder whose files are called as the loads (Load1.vtu, .vtk, .msh, .frd, or .csv with
         ``model_mesh``), or a file, where there is one load.
-    labels, names : path
-        Label map of the unloaded image and its names: tissues, and distance to bone.
     out : path
         Gets ``report.html``, tables, and a folder for each load.
     loads : sequence of str
         Names of measured loads; all by default.
-    bones : sequence of str
-        Labels of bone.
-    mesh : path, optional
-        Where fields are compared; the first model's mesh by default.
-    model_mesh, model_unit, model_frame, to_image
+    to_image : (4, 4), optional
         As in `validate.fe_result.read_result`.
-    plate_normal, shear_direction : (3,)
-        The plate's outward normal and the direction of shear, LPS.
     towards : mapping, optional
-        The same two for loads, by name, that went in directions of their own.
-    strains : (low, high)
-        Range of maximal shear over which curves are compared.
-    thresholds : path, optional
-        Table of strains above which clusters are looked at, with where each comes from.
-    least_ml : float
-        Volume of the smallest cluster that counts.
-    on_image : bool
-        Also write each model's displacement and maximal shear on the voxels of the label map.
+        ``plate_normal`` and ``shear_direction`` of loads, by name, that went in directions of their own.
+    labelling, reading, directions, comparison
+        Their fields are given as keywords, such as ``strains=...``.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -151,15 +132,14 @@ def compare(
         If measurement and models have no load in common, or as in `validate.comparison.compare`.
     """
     target, tell = Path(out), progress or (lambda *_: None)
-    check_range(strains)
-    if least_ml < 0.0:
-        raise InputError(f"The smallest cluster's volume must be 0 or more; got {least_ml:g} mL.")
-    usual_axes = plate_axes(-np.asarray(plate_normal, dtype=np.float64), shear_direction)
+    labels, mesh = labelling.labels, comparison.mesh
+    names, bones, strains, least_ml = labelling.names, labelling.bones, comparison.strains, comparison.least_ml
+    usual_axes = plate_axes(-np.asarray(directions.plate_normal), directions.shear_direction)
     own_axes = {load: plate_axes(-np.asarray(away), along) for load, (away, along) in (towards or {}).items()}
-    thresholds_used = read_thresholds(None if thresholds is None else Path(thresholds))
+    thresholds_used = read_thresholds(comparison.thresholds)
     tissues = read_labels(labels, names)
     measurements = measurements_in(Path(dvc), loads)
-    usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame, to_image)
+    usual = Reading(reading.model_mesh, reading.model_unit, reading.model_frame, to_image)
     places = [Path(m) for m in models]
     files, notes = model_files([m.load for m in measurements], places, usual)
     every = [file for of in files.values() for file in of]
@@ -167,7 +147,7 @@ def compare(
         *(file.path for file in every),
         *dict.fromkeys(f.reading.mesh for f in every if f.reading.mesh is not None),
     ]
-    refuse_touching_inputs(target, list(files), [*given, *(m.field for m in measurements), Path(labels)])
+    refuse_touching_inputs(target, list(files), [*given, *(m.field for m in measurements), labels])
     for place in (Path(dvc), *(m.folder for m in measurements), *(p for p in places if p.is_dir())):
         if target.resolve() == place.resolve():
             raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
@@ -176,8 +156,8 @@ def compare(
     check_bones(tissues, bones)
     common = None if mesh is None else read_tet_mesh(mesh)
     if mesh is not None and common is not None:
-        check_overlap(Path(mesh), common, tissues.grid)
-        check_in_tissue(Path(mesh), common, tissues, bones)
+        check_overlap(mesh, common, tissues.grid)
+        check_in_tissue(mesh, common, tissues, bones)
     compared = [m for m in measurements if m.load in files]
     for measurement in compared:
         measurement.deformation()
@@ -192,8 +172,8 @@ def compare(
     record = provenance(
         "compare",
         {
-            "measured": [f for m in measurements for f in m.files], "models": given, "labels": Path(labels),
-            "names": [] if names is None else [Path(names)], "mesh": [] if mesh is None else [Path(mesh)],
+            "measured": [f for m in measurements for f in m.files], "models": given, "labels": labels,
+            "names": [] if names is None else [names], "mesh": [] if mesh is None else [mesh],
             "error_models": [f for m in measurements if (f := m.folder / "error_model.json").is_file()],
         },
         {
@@ -201,7 +181,7 @@ def compare(
             "plate_axes_lps_of": {load: own.tolist() for load, own in own_axes.items()},
             "least_cluster_ml": least_ml,
             "thresholds": [[t.max_shear, t.source] for t in thresholds_used],
-            "model_unit": model_unit, "model_frame": model_frame,
+            "model_unit": reading.model_unit, "model_frame": reading.model_frame,
             "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": 1,
             "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
         },
@@ -224,7 +204,7 @@ def compare(
             write_fields(folder / "fields.vtu", one)
             for stem, picture in drawn.items():
                 (folder / f"{stem}.png").write_bytes(picture.png)
-            if on_image:
+            if comparison.on_image:
                 write_on_image(folder, results, tissues)
             write_json(folder / "provenance.json", record | {"verdict": _plain(measurement.verdict)})
         done.append(one)

@@ -20,6 +20,8 @@ from fe import (
 )
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
 from mrstrain.measurement.measured_folder import measurements_in
+from mrstrain.options.door import door
+from mrstrain.options.modelling import MaterialSets, MeshCoordinates
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 from validate.measured_boundary import driven, outside, write_boundary
@@ -41,16 +43,16 @@ class Driven:
         return [*self.lines, f"Results: {self.out}"]
 
 
+@door
 def drive(
     mesh: Path | str,
     dvc: Path | str,
     *,
     out: Path | str,
-    sets: Sequence[str] = ("trebbi",),
+    material: MaterialSets,
     loads: Sequence[str] = (),
     threads: int | None = None,
-    mesh_unit: str = "mm",
-    mesh_frame: str = "LPS",
+    coordinates: MeshCoordinates,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Driven:
     """Drive a mesh by measured displacements of its outside.
@@ -65,14 +67,12 @@ def drive(
         Gets a folder for each set (SET-driven) with ``LOAD.vtu``, as `simulate` writes them and `compare` takes them,
         and a folder ``boundary`` with the displacements of the outside for ANSYS, Abaqus and FEBio, by the mesh's
         node numbers, in its unit and frame.
-    sets : sequence of str
-        Names of published sets, or files of your own (.toml).
+    material, coordinates
+        As in `simulate`.
     loads : sequence of str
         Names of measured loads; all by default.
     threads : int, optional
         Of the solver; all cores by default.
-    mesh_unit, mesh_frame : str
-        Of the mesh file: "mm" or "m", "LPS" or "RAS".
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -82,7 +82,8 @@ def drive(
         If mesh, sets or measurement cannot be used; before anything is computed.
     """
     target, place, tell = Path(out), Path(mesh), progress or (lambda *_: None)
-    read = read_tet_mesh(place, unit=mesh_unit, frame=mesh_frame)
+    unit, frame, sets = coordinates.mesh_unit, coordinates.mesh_frame, material.sets
+    read = read_tet_mesh(place, unit=unit, frame=frame)
     chosen = [material_set(name) for name in sets]
     if not chosen or len({one.name for one in chosen}) < len(chosen):
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
@@ -108,14 +109,14 @@ def drive(
     record = provenance(
         "drive",
         {"mesh": place, "measured": [f for m in found for f in m.files], "sets": own},
-        {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame},
+        coordinates.plain(),
     )
     lines = [
         f"{m.load}: the measurement is judged: {m.verdict.words}" for m in found if m.verdict and m.verdict.reasons
     ]
     complete = True
     for load, (nodes, u) in edges.items():
-        write_boundary(target / BOUNDARY / load, read, nodes, u, unit=mesh_unit, frame=mesh_frame)
+        write_boundary(target / BOUNDARY / load, read, nodes, u, unit=unit, frame=frame)
     total = len(chosen) * len(measured)
     for number, one in enumerate(chosen):
         region_laws, notes = laws[one.name]

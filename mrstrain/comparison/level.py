@@ -18,6 +18,17 @@ from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_o
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.measured_folder import measurements_in
 from mrstrain.measurement.register import register
+from mrstrain.options.comparison import ModelReading
+from mrstrain.options.door import door
+from mrstrain.options.measurement import (
+    EngineOptions,
+    MeshAndAxes,
+    RegistrationOptions,
+    Running,
+    Scans,
+    Seeded,
+    SubjectFiles,
+)
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 from phantoms.twin import loaded_twin
@@ -40,26 +51,17 @@ class Levelled:
         return [*self.lines, f"Levelled model, for compare: {self.folder}"]
 
 
+@door
 def level(
     load0: Path | str,
     model: Path | str,
     *,
     out: Path | str,
-    bone: Path | str | None = None,
-    bone_label: str | None = None,
-    tissue: Path | str | None = None,
-    labels: Path | str | None = None,
-    names: Path | str | None = None,
+    subject_files: SubjectFiles,
     loads: Sequence[str] = (),
-    engine: str | None = None,
-    borders: bool | None = None,
-    preset: str | None = None,
-    parameters: Sequence[Path | str] = (),
-    model_mesh: Path | str | None = None,
-    model_unit: str = "mm",
-    model_frame: str = "LPS",
-    threads: int | None = None,
-    seed: int = 1,
+    engine: EngineOptions,
+    reading: ModelReading,
+    seeded: Seeded,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Levelled:
     """Send a model's deformations through the measurement.
@@ -73,18 +75,16 @@ def level(
     out : path
         Gets a folder called as the model and "-levelled", which `compare` takes beside the model itself, and one ending
         in "-work" with the images that the model would have given and, by load, their registration.
-    bone, bone_label, tissue, labels, names
+    subject_files
         As in `register`; the bone is needed.
     loads : sequence of str
         Names of the loads; all of the model's files by default.
-    engine, borders, preset, parameters
-        Those of the measurement, as in `register`; elastix parameters that are not known are let pass.
-    model_mesh, model_unit, model_frame
+    engine
+        That of the measurement, as in `register`; elastix parameters that are not known are let pass.
+    reading
         As in `compare`.
-    threads : int, optional
-        Of each registration; by default all cores.
-    seed : int
-        Of the noise that is drawn anew, and of the registration.
+    seeded
+        Threads of each registration; the seed is also that of the noise that is drawn anew.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -98,22 +98,21 @@ def level(
     target, place = Path(out), Path(model)
     # Refused now rather than after the images are made.
     # Beyond its mesh a model is carried on without regard to volume: what the images then ask for is no tissue's.
-    volume = volume_kept(engine, preset, parameters)
-    engine_of(
-        engine, preset, parameters, volume=volume, borders=borders, labelled=labels is not None, allow_unknown=True
-    )
+    volume = volume_kept(engine)
+    how = RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
+    engine_of(how, labelled=subject_files.labels is not None)
     if not place.is_dir():
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
-    subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
+    subject = read_subject(load0, subject_files)
     if subject.bone is None:
         raise InputError("Levelling needs the bone (--bone, or --labels and --bone-label): there the model is at rest.")
-    wanted = list(loads) or loads_of(place, model_mesh is not None)
-    usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame)
+    wanted = list(loads) or loads_of(place, reading.model_mesh is not None)
+    usual = Reading(reading.model_mesh, reading.model_unit, reading.model_frame)
     files, notes = model_files(wanted, [place], usual)
     name = place.resolve().name + LEVELLED
     work = name + "-work"
-    given = [Path(p) for p in (load0, bone, tissue, labels, names, model_mesh, *parameters) if p is not None]
-    refuse_touching_inputs(target, [name, work], [*given, *(f.path for of in files.values() for f in of)])
+    given = [p for of in (subject_files, engine, reading) for p in of.paths]
+    refuse_touching_inputs(target, [name, work], [Path(load0), *given, *(f.path for of in files.values() for f in of)])
     results: dict[str, FeResult] = {}
     body = subject.tissue or tissue_mask(subject.reference)
     made = {}
@@ -129,7 +128,7 @@ def level(
                 f"{load}: where the model's cells are nearly flat it was smoothed before it moved the image, by over "
                 f"{_APART_MM:g} mm in {share:.0%} of its cells."
             )
-        made[load] = loaded_twin(subject.reference, body, field, seed=seed)
+        made[load] = loaded_twin(subject.reference, body, field, seed=seeded.seed)
     for folder in (target, target / name, target / work, target / work / "images"):
         make_output(folder)
     for load in results:  # of an earlier run
@@ -139,18 +138,14 @@ def level(
         {
             **subject.files,
             "models": [f.path for of in files.values() for f in of],
-            "parameters": [Path(p) for p in parameters],
+            "parameters": list(engine.parameters),
         },
         {
-            "engine": engine,
+            **engine.model_dump(exclude={"parameters"}),
             "volume": volume,
-            "borders": borders,
-            "preset": preset,
-            "threads": threads,
-            "seed": seed,
-            "bone_label": bone_label,
-            "model_unit": model_unit,
-            "model_frame": model_frame,
+            **seeded.plain(),
+            "bone_label": subject_files.bone_label,
+            **reading.model_dump(exclude={"model_mesh"}),
         },
     )
     write_json(target / name / "provenance.json", record)
@@ -161,11 +156,10 @@ def level(
     make_output(registered)
     for load, result in results.items():  # each in a folder of its own: a study levels several at once
         try:
-            register(
-                load0, [target / work / "images" / f"{load}.nii.gz"], out=registered / load, bone=bone,
-                bone_label=bone_label, tissue=tissue, labels=labels, names=names, engine=engine,
-                volume=volume, borders=borders, preset=preset, parameters=parameters, allow_unknown_parameters=True,
-                threads=threads, seed=seed, progress=progress,
+            register.with_options(
+                load0, [target / work / "images" / f"{load}.nii.gz"], out=registered / load,
+                subject_files=subject_files, registration=how, scans=Scans(), onto=MeshAndAxes(),
+                running=Running(**dict(seeded)), progress=progress,
             )  # fmt: skip
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")
