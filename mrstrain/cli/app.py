@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from mrstrain.cli import measurement, models, studies, truth
+from mrstrain.cli.options import Grouped
 
 app = typer.Typer(
     name="mrstrain",
@@ -59,7 +60,7 @@ for _command in (
     models.converge,
     models.fit,
 ):
-    app.command()(_command)
+    app.command(cls=Grouped)(_command)
 
 
 @app.command()

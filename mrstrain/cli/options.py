@@ -1,91 +1,132 @@
-"""The options that several commands share."""
+"""Models of options as options of the command line, and the help that lists them in groups."""
 
 from __future__ import annotations
 
-from enum import StrEnum
+import functools
+import inspect
+import operator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from types import UnionType
+from typing import Annotated, Any, Protocol, Union, get_args, get_origin, get_type_hints
 
 import typer
+from pydantic.fields import FieldInfo
+from typer.core import TyperCommand
+
+from mrstrain.options.door import models_of
+from mrstrain.options.measurement import Frame
+from mrstrain.options.model import Options, bare
+
+Out = Annotated[Path, typer.Option(help="Folder for the results; made where it is missing.", rich_help_panel="Output")]
 
 
-class Align(StrEnum):
-    """What is aligned rigidly before the non-rigid registration."""
-
-    BONE = "bone"
-    IMAGE = "image"
-    NONE = "none"
-
-
-class Engine(StrEnum):
-    """What finds the non-rigid part of a registration."""
-
-    ELASTIX = "elastix"
-    GAUSS_NEWTON = "gauss-newton"
-
-
-class Frame(StrEnum):
-    """Frame of coordinates in a mesh or landmark file."""
-
-    LPS = "LPS"
-    RAS = "RAS"
-
-
-class Unit(StrEnum):
-    """Unit of lengths in a mesh file."""
-
-    MM = "mm"
-    M = "m"
-
-
-Out = Annotated[Path, typer.Option(help="Folder for the results; made where it is missing.")]
-Bone = Annotated[Path | None, typer.Option(help="Mask of the bone whose motion is taken out, on the unloaded image.")]
-BoneLabel = Annotated[str | None, typer.Option(help="Or: the name of the bone in --labels.")]
-Tissue = Annotated[Path | None, typer.Option(help="Mask of the body; found by a threshold where it is not given.")]
-Labels = Annotated[Path | None, typer.Option(help="Label map of the tissues on the unloaded image.")]
-Names = Annotated[Path | None, typer.Option(help="Names of the labels: ITK-SNAP or Slicer table, or CSV.")]
-Plate = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option(
-        help="The plate's outward normal, away from the foot, LPS; default, patient inferior: --plate-normal 0 0 -1."
-    ),
-]
-Shear = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option(help="Direction of the shear force on the tissue, LPS, such as --shear-direction 0 -1 0 (anterior)."),
-]
-ModelMesh = Annotated[Path | None, typer.Option(help="Mesh of nodal displacements in .csv files.")]
-MeshFile = Annotated[Path | None, typer.Option(help="Mesh to put displacement and strain on.")]
-MeshUnit = Annotated[Unit, typer.Option(help="Unit of the mesh's coordinates.")]
-MeshFrame = Annotated[Frame, typer.Option(help="Frame of the mesh's coordinates.")]
-EngineName = Annotated[
-    Engine | None,
-    typer.Option("--engine", help="What finds the non-rigid part. Default: gauss-newton; with --preset, elastix."),
-]
-Preset = Annotated[str | None, typer.Option(help="Named parameters of elastix, such as heel-mr.")]
-Parameters = Annotated[
-    list[Path] | None, typer.Option(help="elastix parameter file(s) of your own, instead of a preset.")
-]
-Bending = Annotated[
-    float | None,
-    typer.Option(help="gauss-newton: weight of bending, 1/mm. Default: chosen for each pair by cross-validation."),
-]
-Borders = Annotated[
-    bool | None,
-    typer.Option(
-        help="gauss-newton: strain may jump where the tissues of --labels meet. Default: where there are labels; "
-        "--no-borders for labels that are off by more than a voxel."
-    ),
-]
-Volume = Annotated[
-    float | None,
-    typer.Option(help="gauss-newton: weight of the change of volume, 1/mm3. Default: 300, or as the images ask."),
-]
 FieldFrame = Annotated[
-    Frame | None, typer.Option(help="Frame of a displacement image's components, where no JSON beside it tells.")
+    Frame | None,
+    typer.Option(
+        help="Frame of a displacement image's components, where no JSON beside it tells.", rich_help_panel="Inputs"
+    ),
 ]
-Start = Annotated[
-    Path | None,
-    typer.Option(help="What another tool found for one load, to be refined: a transform or displacement image."),
-]
-StartFrame = Annotated[Frame | None, typer.Option(help="Frame of --start, where its file does not tell it.")]
+
+
+class Done(Protocol):
+    """What a function of a command gives."""
+
+    def summary(self) -> list[str]:
+        """A few lines for a person."""
+
+
+def tell(done: Done, complete: bool = True) -> None:
+    """Print what was done, and end with status 1 where it is not all."""
+    for line in done.summary():
+        typer.echo(line)
+    if not complete:
+        raise typer.Exit(1)
+
+
+class Grouped(TyperCommand):
+    """A command whose help lists its options in the groups that they belong to."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write each group under its name."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for one in self.get_params(ctx):
+            usual = "Arguments" if one.param_type_name == "argument" else "Options"
+            if line := one.get_help_record(ctx):
+                groups.setdefault(getattr(one, "rich_help_panel", None) or usual, []).append(line)
+        for name in sorted(groups, key=_place):
+            with formatter.section(name):
+                formatter.write_dl(groups[name])
+
+
+_ORDER = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
+
+
+def _place(group: str) -> int:
+    return _ORDER.index(group)
+
+
+def takes_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Offer the fields of a command's models as options of the command line, and give it the models made of them."""
+    models = models_of(command)
+    hints = get_type_hints(command, include_extras=True)
+
+    @functools.wraps(command)
+    def flat(**given: Any) -> None:
+        made = {name: _made(model, given) for name, model in models.items()}
+        command(**given, **made)
+
+    own = [
+        one.replace(annotation=hints[name], kind=one.KEYWORD_ONLY)
+        for name, one in inspect.signature(command).parameters.items()
+        if name not in models
+    ]
+    offered = [_offered(model, field, info) for model in models.values() for field, info in model.model_fields.items()]
+    flat.__signature__ = inspect.Signature([*own, *offered])  # type: ignore[attr-defined]
+    flat.__annotations__ = {one.name: one.annotation for one in (*own, *offered)} | {"return": None}
+    return flat
+
+
+def _offered(model: type[Options], field: str, info: FieldInfo) -> inspect.Parameter:
+    """A field as a parameter that typer makes an option of."""
+    cli, metadata = model.cli(field), list(info.metadata)
+    kind, default, name = _plain(info.annotation, metadata), info.default, model.option(field)
+    if cli.times != 1.0 and default is not None:
+        default /= cli.times
+    if isinstance(default, tuple) and get_origin(kind) is list:
+        default = list(default) or None
+    if kind is bool:
+        default = default != cli.off
+    option = typer.Option(
+        *(() if kind == bool | None else (name,)),  # without a name typer offers its negation as well
+        help=" ".join((cli.help or info.description or "").split()),
+        rich_help_panel=cli.panel or model.panel,
+        min=next((least for check in metadata if (least := getattr(check, "ge", None)) is not None), None),
+    )
+    return inspect.Parameter(
+        field,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if info.is_required() else default,
+        annotation=Annotated[kind if default is not None or info.is_required() else kind | None, option],
+    )
+
+
+def _plain(annotation: Any, metadata: list[Any]) -> Any:
+    """A type as typer knows it; the checks that pydantic makes beside it are added to ``metadata``."""
+    kind = bare(annotation, metadata)
+    if get_origin(kind) in (Union, UnionType):
+        return functools.reduce(operator.or_, (_plain(one, metadata) for one in get_args(kind)))
+    if isinstance(kind, type) and issubclass(kind, tuple) and hasattr(kind, "_fields"):  # takes its values in a row
+        named = get_type_hints(kind, include_extras=True).values()
+        return tuple[tuple(bare(one, metadata) for one in named)]  # type: ignore[misc]
+    return list[get_args(kind)[0]] if ... in get_args(kind) else kind  # type: ignore[misc]
+
+
+def _made(model: type[Options], given: dict[str, Any]) -> Options:
+    """The model of what the command line gave, whose fields are taken out of it."""
+    chosen: dict[str, Any] = {}
+    for field in model.model_fields:
+        value, cli = given.pop(field), model.cli(field)
+        if value is not None:
+            chosen[field] = not value if cli.off else value * cli.times if cli.times != 1.0 else value
+    return model.of(chosen)

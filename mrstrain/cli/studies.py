@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mrstrain.cli.options import Out
+from mrstrain.cli.options import Out, tell
 
 StudyFile = Annotated[Path, typer.Argument(help="The study file, or its folder.")]
 Scheduler = Annotated[
@@ -24,8 +24,7 @@ def init(
     """Write a study file, with comments, from what a folder holds."""
     from mrstrain.studies.init import init as run
 
-    for line in run(folder, name=name).summary():
-        typer.echo(line)
+    tell(run(folder, name=name))
 
 
 def check(study: StudyFile, workers: Workers = None) -> None:
@@ -33,8 +32,7 @@ def check(study: StudyFile, workers: Workers = None) -> None:
     from mrstrain.studies.check import check as run
 
     done = run(study, workers=workers)
-    for line in done.summary():
-        typer.echo(line)
+    tell(done)
     if done.wrong:
         raise typer.Exit(2)
 
@@ -71,10 +69,7 @@ def run(
             done = start(
                 study, only=only or (), force=force or (), scheduler=scheduler, workers=workers, progress=progress
             )
-    for line in done.summary():
-        typer.echo(line)
-    if not done.complete:
-        raise typer.Exit(1)
+    tell(done, done.complete)
 
 
 def _refuse_idle(why: str, given: Mapping[str, object]) -> None:
@@ -98,10 +93,7 @@ def cohort(
 
     with live(of_all=True) as progress:
         done = start(studies, out=out, scheduler=scheduler, workers=workers, progress=progress)
-    for line in done.summary():
-        typer.echo(line)
-    if not done.complete:
-        raise typer.Exit(1)
+    tell(done, done.complete)
 
 
 def demo(

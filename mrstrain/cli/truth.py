@@ -7,15 +7,8 @@ from typing import Annotated
 
 import typer
 
-from mrstrain.cli.options import (
-    Bone,
-    BoneLabel,
-    FieldFrame,
-    Labels,
-    Names,
-    Out,
-    Tissue,
-)
+from mrstrain.cli.options import FieldFrame, Out, takes_options
+from mrstrain.options.measurement import SubjectFiles
 
 
 def phantom(
@@ -57,6 +50,7 @@ def phantom(
         typer.echo(line)
 
 
+@takes_options
 def twin(
     load0: Annotated[Path, typer.Argument(help="Unloaded image of your own.")],
     deformation: Annotated[
@@ -64,27 +58,19 @@ def twin(
         typer.Argument(help="The whole motion: elastix .txt, ITK transform (.h5, .tfm), or a displacement image."),
     ],
     out: Out,
-    bone: Bone = None,
-    bone_label: BoneLabel = None,
-    tissue: Tissue = None,
-    labels: Labels = None,
-    names: Names = None,
+    subject_files: SubjectFiles,
     frame: FieldFrame = None,
     seed: Annotated[int, typer.Option(min=0, help="Of noise and shading.")] = 1,
 ) -> None:
     """A loaded image made of your own unloaded one, with the truth beside it: to see how well that is found."""
     from mrstrain.truth.twin import twin as run
 
-    made = run(
+    made = run.with_options(
         load0,
         deformation,
         out=out,
-        bone=bone,
-        bone_label=bone_label,
-        tissue=tissue,
-        labels=labels,
-        names=names,
-        frame=None if frame is None else frame.value,
+        subject_files=subject_files,
+        frame=frame,
         seed=seed,
     )
     for line in made.summary():

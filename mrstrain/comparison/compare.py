@@ -20,11 +20,12 @@ from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import ModelFile, Reading, model_files
 from mrstrain.measurement.measured_folder import Measurement, measurements_in
 from mrstrain.models.loads import Vector
+from mrstrain.options.comparison import ComparisonOn, ModelReading
+from mrstrain.options.door import door
+from mrstrain.options.modelling import Directions, LabelMapFile
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 from validate import (
-    LEAST_ML,
-    RANGE,
     Comparison,
     Criteria,
     LoadCase,
@@ -50,27 +51,19 @@ class Compared:
         return [*self.comparison.summary(), f"Report: {self.out / 'report.html'}"]
 
 
+@door
 def compare(
     dvc: Path | str,
     models: Sequence[Path | str],
     *,
-    labels: Path | str,
     out: Path | str,
-    names: Path | str | None = None,
+    labelling: LabelMapFile,
     loads: Sequence[str] = (),
-    bones: Sequence[str] = ("bone",),
-    mesh: Path | str | None = None,
-    model_mesh: Path | str | None = None,
-    model_unit: str = "mm",
-    model_frame: str = "LPS",
+    reading: ModelReading,
     to_image: FloatArray | None = None,
-    plate_normal: Sequence[float] = (0.0, 0.0, -1.0),
-    shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
+    directions: Directions,
     towards: Mapping[str, tuple[Vector, Vector]] | None = None,
-    strains: tuple[float, float] = RANGE,
-    thresholds: Path | str | None = None,
-    least_ml: float = LEAST_ML,
-    on_image: bool = False,
+    comparison: ComparisonOn,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Compared:
     """Compare finite-element models of any code with a measurement; see `validate.compare`.
@@ -81,22 +74,16 @@ def compare(
         Results of `register` or `strain`: a folder for each load, or one of these.
     models : sequence of path
         Folders, with a file named after each load (Load1.vtu ...; .csv with ``model_mesh``), or a single load's file.
-    labels, names : path
-        Label map of the unloaded image and its names: tissues, and distance to bone.
     out : path
         Gets ``report.html``, tables, and a folder for each load.
-    loads, bones : sequence of str
-        Names of measured loads, all by default; labels of bone.
-    mesh : path, optional
-        Where fields are compared; the first model's mesh by default.
-    model_mesh, model_unit, model_frame, to_image
+    loads : sequence of str
+        Names of measured loads; all by default.
+    to_image : (4, 4), optional
         As in `validate.read_result`.
-    plate_normal, shear_direction, towards
-        The plate's outward normal and the direction of shear, LPS (3,); in ``towards`` by load, if in others.
-    strains, thresholds, least_ml
-        As in `validate.Criteria`; ``thresholds`` is a table with columns max_shear and source.
-    on_image : bool
-        Also write each model's displacement and maximum shear strain on the voxels of the label map.
+    towards : mapping, optional
+        Plate's outward normal and direction of shear of single loads, LPS (3,), where they differ.
+    labelling, reading, directions, comparison
+        Their fields are given as keywords, such as ``strains=...``.
     progress : callable, optional
         Gets case, stage, fraction.
 
@@ -105,31 +92,35 @@ def compare(
     InputError
         If measurement and models have no load in common, or as in `validate.compare`.
     """
-    target, tell, tissues = Path(out), progress or (lambda *_: None), read_labels(labels, names)
-    criteria = Criteria(strains, read_thresholds(None if thresholds is None else Path(thresholds)), least_ml)
-    axes = _Axes.of(plate_normal, shear_direction, towards or {})
+    target, tell, tissues = Path(out), progress or (lambda *_: None), read_labels(labelling.labels, labelling.names)
+    criteria = Criteria(comparison.strains, read_thresholds(comparison.thresholds), comparison.least_ml)
+    axes, bones, mesh = (
+        _Axes.of(directions.plate_normal, directions.shear_direction, towards or {}),
+        labelling.bones,
+        comparison.mesh,
+    )
     measurements = measurements_in(Path(dvc), loads)
-    reading = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame, to_image)
-    files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], reading)
-    inputs = _inputs(measurements, files, Path(labels), names, mesh)
+    usual = Reading(reading.model_mesh, reading.model_unit, reading.model_frame, to_image)
+    files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], usual)
+    inputs = _inputs(measurements, files, labelling.labels, labelling.names, mesh)
     refuse_touching_inputs(target, list(files), [path for paths in inputs.values() for path in paths])
     _refuse_as_output(target, [Path(dvc), *(m.folder for m in measurements), *map(Path, models)])
-    common = None if mesh is None else _common_mesh(Path(mesh), tissues, bones)
+    common = None if mesh is None else _common_mesh(mesh, tissues, bones)
     compared = [m for m in measurements if m.load in files]
     cases = [_case(m, files[m.load], tissues.grid, axes[m.load]) for m in compared]
     # Every file is read once before anything is computed or removed, and again in its turn: together they fill memory.
     warnings = check_models(cases, tissues, bones)
     make_output(target)
-    record = provenance("compare", inputs, _parameters(bones, axes, criteria, reading, files))
-    comparison = compare_loads(
+    record = provenance("compare", inputs, _parameters(bones, axes, criteria, usual, files))
+    result = compare_loads(
         cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings,
         progress=lambda fraction: tell("compare", "comparing", fraction),
     )  # fmt: skip
     results = {file.name: file.path for of in files.values() for file in of}
-    paragraphs = methods({m.load: m.folder for m in compared}, results, comparison, criteria)
-    sections, closing = comparison.write(target, record=record, methods=paragraphs, on_image=on_image)
+    paragraphs = methods({m.load: m.folder for m in compared}, results, result, criteria)
+    sections, closing = result.write(target, record=record, methods=paragraphs, on_image=comparison.on_image)
     tell("compare", "comparing", 1.0)
-    return Compared(target, comparison, sections, closing)
+    return Compared(target, result, sections, closing)
 
 
 class _Axes(dict[str, FloatArray]):

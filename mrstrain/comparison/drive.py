@@ -24,6 +24,8 @@ from fe import (
 )
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
 from mrstrain.measurement.measured_folder import Measurement, measurements_in
+from mrstrain.options.door import door
+from mrstrain.options.modelling import MaterialSets, MeshCoordinates
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 from validate import boundary_displacement, simulate_driven, write_boundary_conditions
@@ -45,16 +47,16 @@ class Driven:
         return [*self.lines, f"Results: {self.out}"]
 
 
+@door
 def drive(
     mesh: Path | str,
     dvc: Path | str,
     *,
     out: Path | str,
-    sets: Sequence[str] = ("trebbi",),
+    material: MaterialSets,
     loads: Sequence[str] = (),
     threads: int | None = None,
-    mesh_unit: str = "mm",
-    mesh_frame: str = "LPS",
+    coordinates: MeshCoordinates,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Driven:
     """Simulate a mesh with the measured displacement prescribed on its surface.
@@ -69,14 +71,12 @@ def drive(
         Gets a folder for each material set (SET-driven) with ``LOAD.vtu``, for `compare`, and a folder ``boundary``
         with the displacements as boundary conditions for ANSYS, Abaqus and FEBio, by the mesh's node numbers, in its
         unit and frame.
-    sets : sequence of str
-        Names of published material sets, or files of your own (.toml).
+    material, coordinates
+        As in `simulate`.
     loads : sequence of str
         Names of measured loads; all by default.
     threads : int, optional
         Of the solver; all cores by default.
-    mesh_unit, mesh_frame : str
-        Of the mesh file: "mm" or "m", "LPS" or "RAS".
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -86,7 +86,8 @@ def drive(
         If mesh, sets or measurement cannot be used; before anything is computed.
     """
     target, place, tell = Path(out), Path(mesh), progress or (lambda *_: None)
-    read = read_tet_mesh(place, unit=mesh_unit, frame=mesh_frame)
+    unit, frame, sets = coordinates.mesh_unit, coordinates.mesh_frame, material.sets
+    read = read_tet_mesh(place, unit=unit, frame=frame)
     chosen = [material_set(name) for name in sets]
     if not chosen or len({one.name for one in chosen}) < len(chosen):
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
@@ -102,9 +103,9 @@ def drive(
     _prepare(target, [target / BOUNDARY, *folders.values()])
     inputs = {"mesh": [place], "measured": [f for m in measurements for f in m.files]}
     inputs["sets"] = [Path(s) for s in sets if str(s).endswith(".toml")]
-    record = provenance("drive", inputs, {"mesh_unit": mesh_unit, "mesh_frame": mesh_frame})
+    record = provenance("drive", inputs, coordinates.plain())
     for load, (nodes, u) in prescribed.items():
-        write_boundary_conditions(target / BOUNDARY / load, read, nodes, u, unit=mesh_unit, frame=mesh_frame)
+        write_boundary_conditions(target / BOUNDARY / load, read, nodes, u, unit=unit, frame=frame)
     doubtful = [(m.load, m.verdict) for m in measurements if m.verdict and m.verdict.reasons]
     lines = [f"{load}: verdict on the measurement: {verdict.words}" for load, verdict in doubtful]
     complete = True

@@ -20,6 +20,17 @@ from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_o
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.measured_folder import measurements_in
 from mrstrain.measurement.register import register
+from mrstrain.options.comparison import ModelReading
+from mrstrain.options.door import door
+from mrstrain.options.measurement import (
+    EngineOptions,
+    MeshAndAxes,
+    RegistrationOptions,
+    Running,
+    Scans,
+    Seeded,
+    SubjectFiles,
+)
 from mrstrain.records.inputs import Subject, make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 from phantoms import Acquisition, synthetic_warp
@@ -40,26 +51,17 @@ class Levelled:
         return [*self.lines, f"Levelled model, for compare: {self.folder}"]
 
 
+@door
 def level(
     load0: Path | str,
     model: Path | str,
     *,
     out: Path | str,
-    bone: Path | str | None = None,
-    bone_label: str | None = None,
-    tissue: Path | str | None = None,
-    labels: Path | str | None = None,
-    names: Path | str | None = None,
+    subject_files: SubjectFiles,
     loads: Sequence[str] = (),
-    engine: str | None = None,
-    borders: bool | None = None,
-    preset: str | None = None,
-    parameters: Sequence[Path | str] = (),
-    model_mesh: Path | str | None = None,
-    model_unit: str = "mm",
-    model_frame: str = "LPS",
-    threads: int | None = None,
-    seed: int = 1,
+    engine: EngineOptions,
+    reading: ModelReading,
+    seeded: Seeded,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Levelled:
     """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
@@ -73,12 +75,16 @@ def level(
     out : path
         Gets a folder named as the model and "-levelled", for `compare` beside the model itself, and one ending in
         "-work" with the warped images and, by load, their registration.
-    bone, bone_label, tissue, labels, names, engine, borders, preset, parameters
-        Those of the measurement, as in `register`; the bone is needed. Unknown elastix parameters are accepted.
+    subject_files
+        As in `register`; the bone is needed.
     loads : sequence of str
         Names of the loads; all of the model's files by default.
-    threads, seed : int, optional
-        Of each registration; the seed also of the fresh noise.
+    engine
+        That of the measurement, as in `register`. Unknown elastix parameters are accepted.
+    reading
+        As in `compare`.
+    seeded
+        Threads of each registration; the seed is also that of the fresh noise.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -89,32 +95,32 @@ def level(
     RegistrationError
         If no load could be registered.
     """
-    target, place, mesh = Path(out), Path(model), None if model_mesh is None else Path(model_mesh)
+    target, place = Path(out), Path(model)
     if not place.is_dir():
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
     # The extrapolated displacement outside the model's mesh is not isochoric: volume is kept whatever the images show.
-    volume = volume_kept(engine, preset, parameters)
-    how: dict[str, Any] = {"engine": engine, "volume": volume, "borders": borders, "preset": preset}
-    engine_of(
-        engine, preset, parameters, volume=volume, borders=borders, labelled=labels is not None, allow_unknown=True
-    )  # refused now rather than after the images are made
-    anatomy: dict[str, Any] = {"bone": bone, "bone_label": bone_label, "tissue": tissue, "labels": labels}
-    subject = read_subject(load0, names=names, **anatomy)
+    volume = volume_kept(engine)
+    how = RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
+    engine_of(how, labelled=subject_files.labels is not None)  # refused now rather than after the images are made
+    subject = read_subject(load0, subject_files)
     of_load, notes = model_files(
-        list(loads) or loads_of(place, mesh is not None), [place], Reading(mesh, model_unit, model_frame)
-    )
+        list(loads) or loads_of(place, reading.model_mesh is not None), [place],
+        Reading(reading.model_mesh, reading.model_unit, reading.model_frame),
+    )  # fmt: skip
     files = {load: file for load, (file,) in of_load.items()}
     name = place.resolve().name + LEVELLED
-    inputs = [Path(p) for p in (load0, bone, tissue, labels, names, mesh, *parameters) if p is not None]
+    inputs = [Path(load0), *(p for of in (subject_files, engine, reading) for p in of.paths)]
     refuse_touching_inputs(target, [name, f"{name}-work"], [*inputs, *(f.path for f in files.values())])
     results = {load: file.read(subject.reference.grid) for load, file in files.items()}
-    images, smoothed = _warped_images(subject, results, seed)
-    how |= {"threads": threads, "seed": seed}
-    sources = {"models": [f.path for f in files.values()], "parameters": [Path(p) for p in parameters]}
-    about = how | {"bone_label": bone_label, "model_unit": model_unit, "model_frame": model_frame}
+    images, smoothed = _warped_images(subject, results, seeded.seed)
+    sources = {"models": [f.path for f in files.values()], "parameters": list(engine.parameters)}
+    about = engine.model_dump(exclude={"parameters"}) | {"volume": volume} | seeded.plain()
+    about |= {"bone_label": subject_files.bone_label} | reading.model_dump(exclude={"model_mesh"})
     _prepare(target, name, images, provenance("level", {**subject.files, **sources}, about))
-    how |= anatomy | {"names": names, "parameters": parameters, "allow_unknown_parameters": True}
-    failures = _register_each(load0, results, target / name, how | {"progress": progress})
+    options = {
+        "subject_files": subject_files, "registration": how, "running": Running(**dict(seeded)), "progress": progress
+    }  # fmt: skip
+    failures = _register_each(load0, results, target / name, options)
     return Levelled(target / name, (*notes, *smoothed, *failures))
 
 
@@ -129,7 +135,14 @@ def _register_each(
     for load, result in results.items():
         registered = work / "registered" / load
         try:
-            register(load0, [work / "images" / f"{load}.nii.gz"], out=registered, **options)
+            register.with_options(
+                load0,
+                [work / "images" / f"{load}.nii.gz"],
+                out=registered,
+                scans=Scans(),
+                onto=MeshAndAxes(),
+                **options,
+            )
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")
         else:

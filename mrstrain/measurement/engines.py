@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 from dvc.errors import InputError, ParameterError
 from dvc.registration.elastix.engine import Elastix
 from dvc.registration.elastix.presets import load_preset, read_parameter_file
@@ -12,31 +9,22 @@ from dvc.registration.engine import Engine
 from dvc.registration.engines import DEFAULT, ENGINES
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
+from mrstrain.options.measurement import EngineOptions, RegistrationOptions
 
 GAUSS_NEWTON, ELASTIX = GaussNewton.family, Elastix.family
 
 
-def _asked(engine: str | None, preset: str | None, parameters: Sequence[Path | str]) -> str:
+def _asked(how: EngineOptions) -> str:
     """The engine asked for; where none is, elastix if a preset or parameter files are given, else the default."""
-    return engine or (ELASTIX if preset or parameters else DEFAULT)
+    return how.engine or (ELASTIX if how.preset or how.parameters else DEFAULT)
 
 
-def volume_kept(engine: str | None, preset: str | None, parameters: Sequence[Path | str]) -> float | None:
+def volume_kept(how: EngineOptions) -> float | None:
     """The weight ``volume`` with which an engine keeps volume whatever the images ask for; None for one without it."""
-    return USUAL_VOLUME if _asked(engine, preset, parameters) == GAUSS_NEWTON else None
+    return USUAL_VOLUME if _asked(how) == GAUSS_NEWTON else None
 
 
-def engine_of(
-    engine: str | None,
-    preset: str | None,
-    parameters: Sequence[Path | str] = (),
-    *,
-    bending: float | None = None,
-    volume: float | None = None,
-    borders: bool | None = None,
-    labelled: bool = False,
-    allow_unknown: bool = False,
-) -> Engine:
+def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
     """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused.
 
     The Gauss-Newton engine lets strain jump at tissue interfaces where ``labelled``, a label map tells them, unless
@@ -48,9 +36,8 @@ def engine_of(
     InputError
         For tissue interfaces that no label map tells.
     """
-    name = _asked(engine, preset, parameters)
-    if name not in {ELASTIX, *ENGINES}:
-        raise ParameterError(f"No engine '{name}'; there are {ELASTIX} and {GAUSS_NEWTON}.")
+    name, preset, parameters = _asked(how), how.preset, how.parameters
+    bending, volume, borders = how.bending, how.volume, how.borders
     if name != ELASTIX and (parameters or preset):
         raise ParameterError(
             f"Presets and parameter files are elastix'; the engine {name} takes weights: bending and volume. "
@@ -69,5 +56,5 @@ def engine_of(
         return ENGINES[name]()
     if parameters and preset:
         raise ParameterError(f"Give the preset {preset} or parameter files, not both: only one of them would be used.")
-    files = tuple(read_parameter_file(p, allow_unknown=allow_unknown) for p in parameters)
+    files = tuple(read_parameter_file(p, allow_unknown=how.allow_unknown_parameters) for p in parameters)
     return Elastix(files or (load_preset(preset or "heel-mr"),))

@@ -15,7 +15,6 @@ from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationEr
 from dvc.images.image import Image, Mask
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.read import read_image
-from dvc.registration.align import AlignOn
 from dvc.registration.engines import DEFAULT
 from dvc.registration.register import Registration, Settings, refuse_one_image_twice
 from dvc.registration.register import register as register_pair
@@ -27,6 +26,8 @@ from mrstrain.measurement.page import write_series_report
 from mrstrain.measurement.results import Case, write_case
 from mrstrain.measurement.strain import read_any, without_motion
 from mrstrain.measurement.twin_check import TwinCheck, twin_check
+from mrstrain.options.door import door
+from mrstrain.options.measurement import EngineOptions, MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
 from mrstrain.records.inputs import (
     Subject,
     case_names,
@@ -40,6 +41,8 @@ from mrstrain.records.provenance import provenance, write_json
 Told = Callable[[str, str, float], None]
 REPEAT = "repeat"
 """Name of a repeat scan's results."""
+_SETTINGS = {*EngineOptions.model_fields, "align", "bending", "volume", "allow_unknown_parameters", "error_model"}
+"""Options of a registration that its record has as settings, or by the file's hash."""
 _BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plate's axes
 
 
@@ -68,40 +71,17 @@ class Series:
         return [*lines, f"Report: {self.out / 'report.html'}"]
 
 
+@door
 def register(
     load0: Path | str,
     loads: Sequence[Path | str],
     *,
     out: Path | str,
-    bone: Path | str | None = None,
-    bone_label: str | None = None,
-    tissue: Path | str | None = None,
-    labels: Path | str | None = None,
-    names: Path | str | None = None,
-    align: AlignOn = "bone",
-    engine: str | None = None,
-    bending: float | None = None,
-    volume: float | None = None,
-    borders: bool | None = None,
-    preset: str | None = None,
-    parameters: Sequence[Path | str] = (),
-    allow_unknown_parameters: bool = False,
-    chain: bool = False,
-    start: Path | str | None = None,
-    start_frame: str | None = None,
-    repeat: Path | str | None = None,
-    landmarks: Path | str | None = None,
-    mesh: Path | str | None = None,
-    mesh_unit: str = "mm",
-    mesh_frame: str = "LPS",
-    plate_normal: Sequence[float] | None = None,
-    shear_direction: Sequence[float] | None = None,
-    error_model: Path | str | None = None,
-    twin: bool = False,
-    allow_missing: bool = False,
-    workers: int | None = None,
-    threads: int | None = None,
-    seed: int = 1,
+    subject_files: SubjectFiles,
+    registration: RegistrationOptions,
+    scans: Scans,
+    onto: MeshAndAxes,
+    running: Running,
     progress: Told | None = None,
 ) -> Series:
     """Register loaded images to the unloaded one and write displacement, strain, quality and a report.
@@ -113,47 +93,8 @@ def register(
     loads : paths
         Loaded images. Each gets a folder in ``out`` named after its file.
     out : path
-    bone : path, optional
-        Mask of the bone to align on, on the unloaded image; or ``bone_label``, its name in ``labels``.
-    tissue : path, optional
-        Mask of the body, bone included; found by a threshold where it is not given.
-    labels, names : path, optional
-        Label map of the tissues on the unloaded image and the table of its names, for statistics by region, and for
-        ``borders``.
-    align : {"bone", "image", "none"}
-    engine : {"gauss-newton", "elastix"}, optional
-        What finds the non-rigid part: our own, unless a preset or parameter files of elastix are given. ``bending``
-        (1/mm) and ``volume`` (1/mm3) fix our own engine's weights, which are otherwise chosen for each pair.
-    borders : bool, optional
-        Our own engine: strain may jump where the tissues of ``labels`` meet, and the bone stays exactly at rest. By
-        default where labels are given; False for a label map that is off by more than a voxel.
-    preset : str, optional
-        Named parameters of elastix, heel-mr by default; or ``parameters``, files of your own, applied one after the
-        other.
-    chain : bool
-        Start each load from the result of the one before, in the order given.
-    start : path, optional
-        What any tool has found for a single loaded image, to be refined by our own engine: a transform or displacement
-        image, as in `strain`, with ``start_frame`` ("LPS" or "RAS") where a displacement image does not tell it.
-    repeat : path, optional
-        A second unloaded image; its apparent strain is the noise floor.
-    landmarks : path, optional
-        CSV of point pairs (x0, y0, z0, x1, y1, z1; LPS mm), for a single loaded image.
-    mesh : path, optional
-        Displacement and strain are written at its nodes and cells.
-    plate_normal, shear_direction : (3,), optional
-        LPS. The plate's outward normal (default: inferior) finds the bone's lowest point; with a shear direction,
-        strain is written in the plate's axes as well.
-    error_model : path, optional
-        Error model of the preset or parameters, as `accuracy` writes it; by default the one that comes with the preset.
-    twin : bool
-        Also register each pair's twin, the unloaded image moved by what was found: its true strain is known, and error
-        bars that do not hold there are made wider. Twice the time.
-    allow_missing : bool
-        Leave NaN or infinite voxels out instead of refusing the image.
-    workers, threads : int, optional
-        Loads at once, and threads of each; by default all cores are used.
-    seed : int
+    subject_files, registration, scans, onto, running
+        Their fields are given as keywords, such as ``labels=...``.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -170,55 +111,40 @@ def register(
     target = Path(out)
     paths = [Path(p) for p in loads]
     cases = case_names(paths)
-    if repeat is not None:
+    if scans.repeat is not None:
         if REPEAT in cases:
             raise InputError(
                 f"A loaded image is called '{REPEAT}', the folder name kept for the repeat scan: rename it."
             )
-        cases, paths = [*cases, REPEAT], [*paths, Path(repeat)]
+        cases, paths = [*cases, REPEAT], [*paths, scans.repeat]
     if not paths:
         raise InputError("Give at least one loaded image.")
-    for option, value in (("--landmarks", landmarks), ("--start", start)):
+    for option, value in (("--landmarks", scans.landmarks), ("--start", scans.start)):
         if value is not None and len(loads) != 1:
             raise InputError(f"{option}: belongs to one loaded image; {len(loads)} are given. Register that one alone.")
-    chosen = engine_of(
-        engine, preset, parameters, bending=bending, volume=volume, borders=borders, labelled=labels is not None,
-        allow_unknown=allow_unknown_parameters,
-    )  # fmt: skip
-    if start_frame is not None and start is None:
+    chosen = engine_of(registration, labelled=subject_files.labels is not None)
+    if scans.start_frame is not None and scans.start is None:
         raise ParameterError("--start-frame is the frame of --start, which is not given.")
-    if start is not None and not chosen.starts_anywhere:
+    if scans.start is not None and not chosen.starts_anywhere:
         raise ParameterError(
             f"--start is for --engine {DEFAULT}; {chosen.family} begins at results of its own (--chain)."
         )
-    files = (load0, *paths, bone, tissue, labels, names, landmarks, start, mesh, error_model)
-    given = [Path(p) for p in files if p is not None]
-    refuse_touching_inputs(target, cases, given)
-    subject = read_subject(
-        load0,
-        bone=bone,
-        bone_label=bone_label,
-        tissue=tissue,
-        labels=labels,
-        names=names,
-        mesh=mesh,
-        mesh_unit=mesh_unit,
-        mesh_frame=mesh_frame,
-        plate_normal=plate_normal,
-        shear_direction=shear_direction,
-        allow_missing=allow_missing,
-    )
+    given = [p for of in (subject_files, registration, scans, onto) for p in of.paths]
+    refuse_touching_inputs(target, cases, [Path(load0), *paths, *given])
+    subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
+    align, chain, twin = registration.align, registration.chain, registration.twin
     if align == "bone" and subject.bone is None:
         raise InputError(
             "Aligning on the bone needs it: give --bone, or --bone-label with --labels, or another --align."
         )
-    images = {name: read_image(path, allow_missing=allow_missing) for name, path in zip(cases, paths, strict=True)}
+    missing = scans.allow_missing
+    images = {name: read_image(path, allow_missing=missing) for name, path in zip(cases, paths, strict=True)}
     # Read now: what is wrong with it must not be found after an hour.
-    model = None if error_model is None else read_error_model(error_model)
-    points = None if landmarks is None else read_landmarks(landmarks)[:2]
+    model = None if registration.error_model is None else read_error_model(registration.error_model)
+    points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
     body = subject.tissue or tissue_mask(subject.reference)
     held = {"bone": subject.bone, "image": body, "none": None}[align]
-    begun_at = None if start is None else without_motion(read_any(start, start_frame), held)[0]
+    begun_at = None if scans.start is None else without_motion(read_any(scans.start, scans.start_frame), held)[0]
     refuse_one_image_twice(
         [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
     )
@@ -227,29 +153,25 @@ def register(
     refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
     make_output(target)
     cores = usable_cores()
-    at_once = 1 if chain else min(workers or cores, cores, len(cases))
-    each = threads or max(1, cores // at_once)
-    settings = Settings(chosen, align, seed, each)
+    at_once = 1 if chain else min(running.workers or cores, cores, len(cases))
+    each = running.threads or max(1, cores // at_once)
+    settings = Settings(chosen, align, running.seed, each)
     model = model or error_model_of(chosen.name)
     record = record_of(
         subject,
         {
             "loads": paths[: len(loads)],
-            "repeat": paths[len(loads) :],
-            "landmarks": [] if landmarks is None else [Path(landmarks)],
-            "start": [] if start is None else [Path(start)],
-            "error_model": [] if error_model is None else [Path(error_model)],
+            **{role: scans.files.get(role, []) for role in ("repeat", "landmarks", "start")},
         },
         settings,
+        registration,
         {
-            "chain": chain,
-            "twin": twin,
-            "start_frame": start_frame,
-            "bone_label": bone_label,
-            "shear_direction_lps": None if shear_direction is None else list(shear_direction),
-            "mesh_unit": mesh_unit,
-            "mesh_frame": mesh_frame,
-            "allow_missing": allow_missing,
+            "start_frame": scans.start_frame,
+            "bone_label": subject_files.bone_label,
+            "shear_direction_lps": onto.plain()["shear_direction"],
+            "mesh_unit": onto.mesh_unit,
+            "mesh_frame": onto.mesh_frame,
+            "allow_missing": scans.allow_missing,
         },
     )
     run = _Run(
@@ -267,12 +189,16 @@ def register(
 
 
 def record_of(
-    subject: Subject, files: Mapping[str, list[Path]], settings: Settings, more: Mapping[str, object]
+    subject: Subject,
+    files: Mapping[str, list[Path]],
+    settings: Settings,
+    how: RegistrationOptions,
+    more: Mapping[str, object],
 ) -> dict[str, object]:
-    """What a registration is made from; ``more`` are parameters beside the settings."""
+    """What a registration is made from; ``more`` are parameters beside those of the registration."""
     return provenance(
         "register",
-        {**subject.files, **files},
+        {**subject.files, **files, "error_model": how.files.get("error_model", [])},
         {
             "align": settings.align_on,
             "seed": settings.seed,
@@ -280,6 +206,7 @@ def record_of(
             "plate_normal_lps": subject.plate_normal.tolist(),
             "engine": settings.engine.family,
             **settings.engine.record(),
+            **{name: value for name, value in how.plain().items() if name not in _SETTINGS},
             **more,
         },
     )

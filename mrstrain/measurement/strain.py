@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,8 @@ from dvc.io.transforms.read import read_transform
 from dvc.registration.align import motion_of
 from mrstrain.measurement.page import write_series_report
 from mrstrain.measurement.results import Case, Measured, write_measured
+from mrstrain.options.door import door
+from mrstrain.options.measurement import Frame, MeshAndAxes, SubjectFiles
 from mrstrain.records.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance, write_json
 
@@ -97,22 +99,15 @@ class Strained:
         return [*self.case.summary(), f"Report: {self.out / 'report.html'}"]
 
 
+@door
 def strain(
     reference: Path | str,
     deformation: Path | str,
     *,
     out: Path | str,
-    bone: Path | str | None = None,
-    bone_label: str | None = None,
-    tissue: Path | str | None = None,
-    labels: Path | str | None = None,
-    names: Path | str | None = None,
-    frame: str | None = None,
-    mesh: Path | str | None = None,
-    mesh_unit: str = "mm",
-    mesh_frame: str = "LPS",
-    plate_normal: Sequence[float] | None = None,
-    shear_direction: Sequence[float] | None = None,
+    subject_files: SubjectFiles,
+    frame: Frame | None = None,
+    onto: MeshAndAxes,
 ) -> Strained:
     """Strain maps of a deformation that was found elsewhere.
 
@@ -124,13 +119,12 @@ def strain(
         An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), a spline with borders of
         tissues (.npz), or a displacement image. All map points of the reference to points of the loaded image.
     out : path
-    bone, bone_label, labels, names
-        With a bone, its rigid motion (least squares over its voxels) is taken out of the displacement.
-    tissue : path, optional
-        Where strain is wanted; found by a threshold where it is not given.
+    subject_files
+        With a bone, its rigid motion (least squares over its voxels) is taken out of the displacement; ``tissue`` is
+        where strain is wanted.
     frame : {"LPS", "RAS"}, optional
         Frame of a displacement image's components, where no JSON file beside it tells.
-    mesh, mesh_unit, mesh_frame, plate_normal, shear_direction
+    onto
         As in `register`.
 
     Returns
@@ -138,30 +132,18 @@ def strain(
     Strained
     """
     target, source = Path(out), Path(deformation)
-    subject = read_subject(
-        reference,
-        bone=bone,
-        bone_label=bone_label,
-        tissue=tissue,
-        labels=labels,
-        names=names,
-        mesh=mesh,
-        mesh_unit=mesh_unit,
-        mesh_frame=mesh_frame,
-        plate_normal=plate_normal,
-        shear_direction=shear_direction,
-    )
+    subject = read_subject(reference, subject_files, onto)
     given = read_deformation(
         subject,
         deformation,
         frame=frame,
         command="strain",
         parameters={
-            "bone_label": bone_label,
+            "bone_label": subject_files.bone_label,
             "plate_normal_lps": subject.plate_normal.tolist(),
-            "shear_direction_lps": None if shear_direction is None else list(shear_direction),
-            "mesh_unit": mesh_unit,
-            "mesh_frame": mesh_frame,
+            "shear_direction_lps": onto.plain()["shear_direction"],
+            "mesh_unit": onto.mesh_unit,
+            "mesh_frame": onto.mesh_frame,
         },
     )
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"

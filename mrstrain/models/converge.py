@@ -14,10 +14,21 @@ import numpy as np
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.io.images.labels import read_labels
-from fe import BONE, Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
+from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
 from mrstrain.models.loads import LOADS
 from mrstrain.models.mesh import mesh as make_mesh
 from mrstrain.models.simulate import Progress, simulate
+from mrstrain.options.door import door
+from mrstrain.options.measurement import Cores
+from mrstrain.options.modelling import (
+    Directions,
+    Followed,
+    Labelling,
+    MeshCoordinates,
+    Meshing,
+    PlateOptions,
+    SimulationOptions,
+)
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import file_hash, provenance, write_json
 
@@ -54,18 +65,16 @@ class Converged:
         return [*lines, f"Results: {self.out}"]
 
 
+@door
 def converge(
     labels: Path | str,
     edges_mm: Sequence[float],
     *,
     out: Path | str,
-    names: Path | str | None = None,
-    bones: Sequence[str] = (BONE,),
-    region: str = "fat",
-    material: str = "trebbi",
+    labelling: Labelling,
+    followed: Followed,
     loads: Sequence[LoadStep] = LOADS,
-    plate_normal: Sequence[float] = (0.0, 0.0, -1.0),
-    shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
+    directions: Directions,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Converged:
@@ -73,16 +82,14 @@ def converge(
 
     Parameters
     ----------
-    labels, names, bones
+    labels, labelling
         As in `mesh`.
     edges_mm : sequence of float
         Three edge lengths or more, mm.
     out : path
         Gets ``mesh-E.vtu`` and ``simulated-E`` for each edge length E, ``convergence.csv`` and ``convergence.png``. A
         mesh that is there already and was made from the same label map is used again.
-    region : str
-        Region whose maximal shear is followed.
-    material, loads, plate_normal, shear_direction, workers, progress
+    followed, loads, directions, workers, progress
         As in `simulate`, with one material set.
 
     Raises
@@ -96,28 +103,30 @@ def converge(
     if len(edges) < _FEWEST:
         raise InputError(f"A study of convergence needs {_FEWEST} edge lengths or more; got {len(edges)}.")
     target = Path(out)
-    inputs = {"labels": Path(labels)} | ({} if names is None else {"names": Path(names)})
+    inputs = {"labels": Path(labels)} | ({} if labelling.names is None else {"names": labelling.names})
     refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], list(inputs.values()))
     make_output(target)
-    tell = progress or (lambda *_: None)
-    known = list(read_labels(labels, names).names.values())
-    if region not in known or region in bones:
+    tell, region, material = progress or (lambda *_: None), followed.region, followed.material
+    known = list(read_labels(labels, labelling.names).names.values())
+    if region not in known or region in labelling.bones:
         raise InputError(f"No soft tissue '{region}' in the label map to follow; it has {', '.join(known)}.")
-    material_set(material).for_regions([name for name in known if name not in bones])  # before hours of meshing
+    material_set(material).for_regions(
+        [name for name in known if name not in labelling.bones]
+    )  # before hours of meshing
     places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
     values = []
     for edge, place in places.items():
-        if not _is_of(place, inputs, bones):
-            make_mesh(
-                labels, out=place, edge_mm=edge, names=names, bones=bones,
+        if not _is_of(place, inputs, labelling.bones):
+            make_mesh.with_options(
+                labels, out=place, labelling=labelling, meshing=Meshing(edge_mm=edge),
                 watch=lambda share, edge=edge: tell(f"{edge:g} mm", "meshing", share),  # type: ignore[misc]
             )  # fmt: skip
     sizes = [cell_size_mm(read_tet_mesh(place)) for place in places.values()]
     extrapolate(np.array(sizes), np.array(sizes))  # refuses sizes that tell nothing, before anything is simulated
     for edge, place in places.items():
-        made = simulate(
-            place, out=target / f"simulated-{edge:g}", sets=[material], loads=loads, plate_normal=plate_normal,
-            shear_direction=shear_direction, workers=workers,
+        made = simulate.with_options(
+            place, out=target / f"simulated-{edge:g}", simulation=SimulationOptions(sets=(material,)), loads=loads,
+            plate_options=PlateOptions(**dict(directions)), coordinates=MeshCoordinates(), cores=Cores(workers=workers),
             progress=lambda case, stage, share, edge=edge: tell(f"{edge:g} mm, {case}", stage, share),  # type: ignore[misc]
         )  # fmt: skip
         if not made.complete:

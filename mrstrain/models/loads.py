@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -48,3 +49,8 @@ def load_named(text: str) -> LoadStep:
     if not name.strip() or not re.fullmatch(r"[\w. -]+", name.strip()):
         raise InputError(f"A load needs a name of letters, digits, dots, blanks or dashes; got '{name}'.")
     return LoadStep(name.strip(), **values)
+
+
+def loads_named(texts: Sequence[str] | None) -> Sequence[LoadStep]:
+    """The loads that a person types, as `load_named` reads each; the published experiment's where none is typed."""
+    return [load_named(text) for text in texts] if texts else LOADS

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dvc.errors import InputError, OutputError
 from dvc.io.images.labels import read_labels
 from dvc.mesh import TetMesh
-from fe import BONE, SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
+from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
+from mrstrain.options.door import door
+from mrstrain.options.modelling import Labelling, Meshing
 from mrstrain.records.inputs import is_bones_name, make_output
 from mrstrain.records.provenance import provenance
 
@@ -60,26 +62,24 @@ class Meshed:
         return [*lines, f"Mesh: {self.out}"]
 
 
+@door
 def mesh(
     labels: Path | str,
     *,
     out: Path | str,
-    edge_mm: float = 2.0,
-    names: Path | str | None = None,
-    bones: Sequence[str] = (BONE,),
-    finer: tuple[str, float] | None = None,
-    limit_s: float = 3600.0,
+    labelling: Labelling,
+    meshing: Meshing,
     watch: Callable[[float], None] = lambda _: None,
 ) -> Meshed:
     """Mesh the soft tissues of a label map.
 
     Parameters
     ----------
-    labels, names : path
+    labels : path
         As in `register`.
     out : path
         The mesh, ending in .vtu; beside it a .json with names and quality, and a .png.
-    edge_mm, bones, finer, limit_s, watch
+    labelling, meshing, watch
         As in `fe.mesh_labels`.
 
     Raises
@@ -90,15 +90,17 @@ def mesh(
     target = Path(out)
     if target.suffix.lower() != ".vtu":
         raise InputError(f"--out is the mesh itself and ends in .vtu; got {target}.")
-    inputs = {"labels": Path(labels)} | ({} if names is None else {"names": Path(names)})
+    inputs = {"labels": Path(labels)} | ({} if labelling.names is None else {"names": labelling.names})
     written = [target, target.with_suffix(".json"), target.with_suffix(".png")]
     for path in inputs.values():
         if path.resolve() in [w.resolve() for w in written]:
             raise OutputError(f"{path} would be replaced by a result. Choose another --out.")
-    given = read_labels(labels, names)
+    given = read_labels(labels, labelling.names)
     make_output(target.parent)
-    made, quality = mesh_labels(given, edge_mm, bones=bones, finer=finer, limit_s=limit_s, watch=watch)
-    record = provenance("mesh", inputs, {"edge_mm": edge_mm, "bones": list(bones), "finer": finer})
+    how = meshing.model_dump()
+    made, quality = mesh_labels(given, **how, bones=labelling.bones, watch=watch)
+    del how["limit_s"]  # no mesh depends on it
+    record = provenance("mesh", inputs, how | {"bones": list(labelling.bones)})
     write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
     plate = Plate(_INFERIOR, _FORWARD)
     figures.write_figure(target.with_suffix(".png"), figures.mesh_slice(made, plate))

@@ -30,6 +30,9 @@ from fe import (
 from fe.restart import ENDING
 from mrstrain.models.load_path import solve_in_folder
 from mrstrain.models.loads import LOADS, Vector
+from mrstrain.options.door import door
+from mrstrain.options.measurement import Cores
+from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 
@@ -56,27 +59,17 @@ class Simulations:
         return [*lines, f"Results: {self.out}"]
 
 
+@door
 def simulate(
     mesh: Path | str,
     *,
     out: Path | str,
-    sets: Sequence[str] = ("trebbi",),
+    simulation: SimulationOptions,
     loads: Sequence[LoadStep] = LOADS,
-    plate_normal: Sequence[float] = (0.0, 0.0, -1.0),
-    shear_direction: Sequence[float] = (0.0, -1.0, 0.0),
+    plate_options: PlateOptions,
     towards: Mapping[str, tuple[Vector, Vector]] | None = None,
-    taped: bool = True,
-    gap_mm: float = 0.0,
-    turns: bool = False,
-    pivot_mm: Sequence[float] | None = None,
-    fixed: Sequence[str] = (),
-    element: str = "P1",
-    mesh_unit: str = "mm",
-    mesh_frame: str = "LPS",
-    decks: bool = False,
-    limit_s: float | None = None,
-    workers: int | None = None,
-    threads: int | None = None,
+    coordinates: MeshCoordinates,
+    cores: Cores,
     progress: Progress | None = None,
 ) -> Simulations:
     """Simulate a plate that presses and shears soft tissue on fixed bone.
@@ -88,33 +81,13 @@ def simulate(
     out : path
         Gets a folder for each set: a VTU file for each load, ``curve.csv`` (force and travel of the plate),
         ``regions.csv``, ``simulation.json`` and pictures.
-    sets : sequence of str
-        Names of published sets, or files of your own (.toml).
     loads : sequence of LoadStep
         Loads with the same normal force lie on one path, in the order of their shear; by default those of the
         published experiment.
-    plate_normal, shear_direction : (3,)
-        The plate's outward normal, and the direction of the shear force on the tissue, LPS.
     towards : mapping, optional
-        The same two for loads, by name, that go in directions of their own.
-    taped : bool
-        Whether skin that has touched the plate holds to it; if not, it slides without friction.
-    gap_mm : float
-        Distance of the plate from the skin at the start, which its travel begins with.
-    turns : bool
-        Whether the plate turns freely about its pivot once it presses.
-    pivot_mm : (3,), optional
-        As in `fe.Plate`.
-    fixed : sequence of str
-        Facets that do not move, beside the bone's; case does not count.
-    element : {"P1", "MINI", "P2"}
-        As in `fe.elements`.
-    decks : bool
-        Also write each load as decks for CalculiX (C3D10) and FEBio 4 (tet10); see `fe.decks`.
-    limit_s : float, optional
-        Time after which a set's path of loads ends at its last equilibrium; with more time it goes on from there.
-    workers, threads : int, optional
-        Simulations at once, and threads of each; by default all cores are used.
+        ``plate_normal`` and ``shear_direction`` of loads, by name, that go in directions of their own.
+    simulation, plate_options, coordinates, cores
+        Their fields are given as keywords, such as ``sets=...``. See `fe.elements`, `fe.Plate` and `fe.decks`.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -124,39 +97,37 @@ def simulate(
         If the mesh, a set or a load cannot be used; before anything is computed.
     """
     place, target, tell = Path(mesh), Path(out), progress or (lambda *_: None)
-    if limit_s is not None and not limit_s > 0.0:
-        raise InputError(f"The limit of time must be above 0; got {limit_s:g} s.")
-    read = read_tet_mesh(place, unit=mesh_unit, frame=mesh_frame)
+    sets, limit_s = simulation.sets, simulation.limit_s
+    read = read_tet_mesh(place, unit=coordinates.mesh_unit, frame=coordinates.mesh_frame)
     chosen = [material_set(name) for name in sets]
     if not chosen or len({one.name for one in chosen}) < len(chosen):
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
     towards = dict(towards or {})
     if strangers := towards.keys() - {load.name for load in loads}:
         raise InputError(f"Directions are given for {', '.join(sorted(strangers))}, which is none of the loads.")
-    plates = {
-        load.name: Plate(*towards.get(load.name, (plate_normal, shear_direction)), gap_mm, taped, turns, pivot_mm)
-        for load in loads
-    }
-    held = fixed_facets(read, fixed)
+    usual = (plate_options.plate_normal, plate_options.shear_direction)
+    contact = plate_options.model_dump(exclude={"plate_normal", "shear_direction"})
+    plates = {load.name: Plate(*towards.get(load.name, usual), **contact) for load in loads}
+    held = fixed_facets(read, simulation.fixed)
     jobs = [
         (one, problem)
         for one in chosen
-        for problem in problems_of(read, one.for_regions(read.regions)[0], plates, loads, held, element)
+        for problem in problems_of(read, one.for_regions(read.regions)[0], plates, loads, held, simulation.element)
     ]
     refuse_touching_inputs(target, [one.name for one in chosen], [place])
     make_output(target)
     for one in chosen:
         _make_empty(target / one.name, loads)
-    files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if str(s).endswith(".toml")]}
+    files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if s.endswith(".toml")]}
     given = {
-        "mesh_unit": mesh_unit, "mesh_frame": mesh_frame, "taped": taped, "gap_mm": gap_mm, "fixed": list(held),
-        "limit_s": limit_s, "turns": turns, "pivot_mm": None if pivot_mm is None else list(pivot_mm),
-        "mesh_made": _mesh_made(place),
+        **coordinates.plain(), **contact, "fixed": list(held), "limit_s": limit_s, "mesh_made": _mesh_made(place),
     }  # fmt: skip
-    at_once = max(1, min(workers or usable_cores(), len(jobs)))
-    each = threads or max(1, usable_cores() // at_once)
+    at_once = max(1, min(cores.workers or usable_cores(), len(jobs)))
+    each = cores.threads or max(1, usable_cores() // at_once)
     options = SolverOptions(each, np.inf if limit_s is None else limit_s)
-    run = _Run(target, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)
+    run = _Run(
+        target, jobs, lambda one: provenance("simulate", files, given | one.parameters()), simulation.decks, tell
+    )
     each_in_workers(jobs, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
     if not run.done:
         raise MrstrainError("No simulation ended. " + " ".join(f"{n}: {r}" for n, r in run.failures.items()))

@@ -18,6 +18,7 @@ from dvc.io.images.labels import fit_mask, read_labels, read_mask
 from dvc.io.images.read import read_image
 from dvc.io.images.write import refuse_overwriting_inputs
 from dvc.io.meshes.read import MeshFile, read_mesh
+from mrstrain.options.measurement import MeshAndAxes, SubjectFiles
 
 IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 _BONES = {
@@ -67,57 +68,37 @@ class Subject:
 
 
 def read_subject(
-    load0: Path | str,
-    *,
-    bone: Path | str | None = None,
-    bone_label: str | None = None,
-    tissue: Path | str | None = None,
-    labels: Path | str | None = None,
-    names: Path | str | None = None,
-    mesh: Path | str | None = None,
-    mesh_unit: str = "mm",
-    mesh_frame: str = "LPS",
-    plate_normal: Sequence[float] | None = None,
-    shear_direction: Sequence[float] | None = None,
-    allow_missing: bool = False,
+    load0: Path | str, files: SubjectFiles, onto: MeshAndAxes | None = None, *, allow_missing: bool = False
 ) -> Subject:
     """Read the unloaded image, its masks, labels and mesh; refuse what does not fit together."""
-    files = {"load0": Path(load0)}
+    onto = onto or MeshAndAxes()
     reference = read_image(load0, allow_missing=allow_missing)
     label_map = None
-    if labels is not None:
-        files["labels"] = Path(labels)
-        if names is not None:
-            files["names"] = Path(names)
-        label_map = fit_mask(read_labels(labels, names), reference.grid, str(labels))
-    elif names is not None or bone_label is not None:
+    if files.labels is not None:
+        label_map = fit_mask(read_labels(files.labels, files.names), reference.grid, str(files.labels))
+    elif files.names is not None or files.bone_label is not None:
         raise InputError("--names and --bone-label speak of a label map: give it with --labels.")
-    if bone is not None and bone_label is not None:
+    if files.bone is not None and files.bone_label is not None:
         raise InputError("Give the bone once: as a mask (--bone) or as a label of the map (--bone-label).")
-    bone_mask = None
-    if bone is not None:
-        files["bone"] = Path(bone)
-        bone_mask = read_mask(bone, reference.grid)
-    elif bone_label is not None and label_map is not None:
-        bone_mask = label_map.region(bone_label)
-    tissue_given = None
-    if tissue is not None:
-        files["tissue"] = Path(tissue)
-        tissue_given = read_mask(tissue, reference.grid)
-    mesh_file = None
-    if mesh is not None:
-        files["mesh"] = Path(mesh)
-        mesh_file = read_mesh(mesh, unit=mesh_unit, frame=mesh_frame)
-        if not reference.grid.contains(mesh_file.points_mm).any():
-            low, high = mesh_file.bounds_mm
+    bone = None if files.bone is None else read_mask(files.bone, reference.grid)
+    if files.bone_label is not None and label_map is not None:
+        bone = label_map.region(files.bone_label)
+    tissue = None if files.tissue is None else read_mask(files.tissue, reference.grid)
+    mesh = None
+    if onto.mesh is not None:
+        mesh = read_mesh(onto.mesh, unit=onto.mesh_unit, frame=onto.mesh_frame)
+        if not reference.grid.contains(mesh.points_mm).any():
+            low, high = mesh.bounds_mm
             raise InputError(
-                f"{mesh}: no node lies in the unloaded image. The mesh spans {np.round(low, 1).tolist()} to "
+                f"{onto.mesh}: no node lies in the unloaded image. The mesh spans {np.round(low, 1).tolist()} to "
                 f"{np.round(high, 1).tolist()} mm (LPS); the image: {reference.grid}. Check --mesh-unit and "
                 "--mesh-frame."
             )
-    normal = _unit("--plate-normal", _INFERIOR if plate_normal is None else plate_normal)
-    axes = None if shear_direction is None else plate_axes(normal, _unit("--shear-direction", shear_direction))
-    return Subject(reference, bone_mask, tissue_given, label_map, mesh_file, normal, axes, files)
+    normal = _unit("--plate-normal", onto.plate_normal or _INFERIOR)
+    shear = onto.shear_direction
+    axes = None if shear is None else plate_axes(normal, _unit("--shear-direction", shear))
+    given = {role: paths[0] for role, paths in {"load0": [Path(load0)], **files.files, **onto.files}.items()}
+    return Subject(reference, bone, tissue, label_map, mesh, normal, axes, given)
 
 
 def _unit(name: str, vector: Sequence[float]) -> FloatArray:

@@ -22,9 +22,10 @@ from fe import LoadStep, MaterialSet, Plate, Problem, check_loads, check_meshing
 from mrstrain.comparison.model_files import Reading, model_files
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.register import REPEAT
+from mrstrain.options.model import Vector
 from mrstrain.records.inputs import is_bones_name
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
-from mrstrain.studies.file import Study, Vector, read_study
+from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
 from mrstrain.studies.plan import Stage, labels_to_mesh, load_steps, plan, towards
@@ -120,7 +121,7 @@ def _shared(study: Study, found: _Findings, stages: Sequence[Stage] | None) -> t
     reference = _reference(study, found) if asked("register", "level") else None
     labels = _labels(study, found, reference) if asked("register", "level", "compare") else None
     every, own = asked("simulate", "drive", "compare"), towards(study)
-    shared = (study.plate.normal, study.plate.shear_direction)
+    shared = (study.plate.plate_normal, study.plate.shear_direction)
     loads = [load for load in study.loads if every or asked(f"register {load}")]
     for normal, shear in dict.fromkeys(own.get(load, shared) for load in loads):
         found.tried(plate_axes, -np.asarray(normal), shear)
@@ -155,14 +156,14 @@ def _labels(study: Study, found: _Findings, reference: Image | None) -> LabelMap
     if labels is not None:
         found.notes.append(f"Labels: {', '.join(labels.names.values())}")
         if reference is not None:
-            labels = found.tried(fit_mask, labels, reference.grid, study.images.labels) or labels
+            labels = found.tried(fit_mask, labels, reference.grid, str(study.images.labels)) or labels
     return labels
 
 
 def _loaded(study: Study, found: _Findings, reference: Image | None) -> None:
     """Look at the loaded images and the repeat scan."""
     images = study.images
-    others = {load: one.image for load, one in study.loads.items()}
+    others: dict[str, str | Path] = {load: one.image for load, one in study.loads.items()}
     if images.repeat is not None:
         others[REPEAT] = images.repeat
     hashes: dict[str, str] = {}
@@ -179,20 +180,17 @@ def _loaded(study: Study, found: _Findings, reference: Image | None) -> None:
 
 def _registration(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> None:
     """Look at bone and masks, engine, parameters and error model."""
-    images, how = study.images, study.registration
-    if images.bone_mask is None and study.bone is not None and labels is not None:
-        found.tried(labels.region, study.bone)
-    for mask in (images.bone_mask, images.tissue):
+    subject, how = study.subject_files, study.registration.located(study.place)
+    if subject.bone_label is not None and labels is not None:
+        found.tried(labels.region, subject.bone_label)
+    for mask in (subject.bone, subject.tissue):
         if mask is not None and reference is not None:
-            found.tried(read_mask, study.path(mask), reference.grid)
-    engine = found.tried(
-        engine_of, how.engine, how.preset, [study.path(p) for p in how.parameters], bending=how.bending,
-        volume=how.volume, borders=how.borders, labelled=True,
-    )  # fmt: skip
+            found.tried(read_mask, mask, reference.grid)
+    engine = found.tried(engine_of, how, labelled=True)
     if engine is None:
         return
     own = how.error_model
-    model = error_model_of(engine.name) if own is None else found.tried(read_error_model, study.path(own))
+    model = error_model_of(engine.name) if own is None else found.tried(read_error_model, own)
     if model is None:
         found.notes.append(f"{engine.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
     elif model.preset != engine.name:
@@ -214,7 +212,7 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, laws: 
     by_direction: dict[tuple[Vector, Vector], list[LoadStep]] = {}
     forced = found.tried(load_steps, study) or {}
     for name, step in forced.items():
-        by_direction.setdefault(own.get(name, (given.normal, given.shear_direction)), []).append(step)
+        by_direction.setdefault(own.get(name, (given.plate_normal, given.shear_direction)), []).append(step)
     forceless = [name for name in study.loads if forced and name not in forced]
     if forceless:
         found.notes.append(f"{', '.join(forceless)}: no force, so measured and not simulated.")
@@ -255,8 +253,7 @@ def _meshing(study: Study, found: _Findings) -> None:
     labels = found.tried(read_labels, *labels_to_mesh(study))
     if labels is not None:
         how = study.mesh
-        finer = None if how.finer is None else (how.finer.region, how.finer.edge_mm)
-        found.tried(check_meshing, labels, how.edge_mm, how.bones, finer)
+        found.tried(check_meshing, labels, how.edge_mm, how.bones, how.finer)
         found.notes += [
             f"CARE: {name} will be meshed as soft tissue, and is called as a bone is: [mesh] bones leaves it out."
             for name in _soft(study, labels)
@@ -297,14 +294,14 @@ def _soft(study: Study, labels: LabelMap) -> list[str]:
     return [name for n, name in labels.names.items() if n != 0 and n in numbers and name not in study.mesh.bones]
 
 
-def _image(study: Study, given: str) -> Image:
+def _image(study: Study, given: str | Path) -> Image:
     place = study.path(given)
     if not place.exists():
         raise InputError(f"{place}: there is no such file.")
     return read_image(place, allow_missing=study.images.allow_missing)
 
 
-def _optional(study: Study, given: str | None) -> Path | None:
+def _optional(study: Study, given: Path | None) -> Path | None:
     return None if given is None else study.path(given)
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from dvc.errors import InputError
 from fe import BONE, MaterialSet, material_set
 from mrstrain.measurement.engines import engine_of
+from mrstrain.options.measurement import EngineOptions
+from mrstrain.options.modelling import MINUTE_S
 from mrstrain.records.provenance import file_hash
 from mrstrain.studies.file import Load, Study
 
@@ -70,21 +72,17 @@ def unlike(studies: Sequence[Study]) -> list[str]:
 
 
 def _registered(study: Study) -> str:
-    how = study.registration
-    own = [study.path(file) for file in how.parameters]
-    engine = engine_of(
-        how.engine, how.preset, own, bending=how.bending, volume=how.volume, borders=how.borders, labelled=True
-    )
-    weights = {name: value for name in ("bending", "volume") if (value := getattr(how, name)) is not None}
-    files = [*own, *([] if how.error_model is None else [study.path(how.error_model)])]
-    said = [
-        engine.name,
-        *(f"{name} {value:g}" for name, value in weights.items()),
-        *(word for word in ("chain", "twin") if getattr(how, word)),
-        *(["aligned on the image"] if how.align == "image" else []),
-        *(f"{file.name} {file_hash(file)[:8]}" for file in files),
-    ]
-    return " ".join(said)
+    how = study.registration.located(study.place)
+    said = [engine_of(how, labelled=True).name]
+    for name, value in how:
+        usual = type(how).model_fields[name].default
+        if name == "align":
+            said += ["aligned on the image"] if value == "image" else []
+        elif isinstance(value, bool):
+            said += [name] if value and not usual else []
+        elif value != usual and name not in EngineOptions.model_fields and name not in how.files:
+            said.append(f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}")
+    return " ".join([*said, *(f"{file.name} {file_hash(file)[:8]}" for file in how.paths)])
 
 
 def _plate(study: Study) -> str:
@@ -103,7 +101,7 @@ def _mesh(study: Study) -> str:
 
 def _solved(study: Study) -> str:
     fixed = sorted({name.casefold() for name in study.models.fixed} - {BONE})
-    limit = study.models.limit_minutes
+    limit = (study.models.limit_s or 0.0) / MINUTE_S
     return (
         study.models.element
         + (f" with {', '.join(fixed)} fixed" if fixed else "")

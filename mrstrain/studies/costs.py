@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -121,15 +122,13 @@ def _longest(left: Sequence[Stage], seconds: Sequence[float]) -> float:
     return max(until.values())
 
 
-def mesh_given(study: Study, file: str) -> TetMesh:
+def mesh_given(study: Study, file: Path) -> TetMesh:
     """The mesh made elsewhere that a study names."""
-    return read_tet_mesh(study.path(file), unit=study.mesh.unit, frame=study.mesh.frame)
+    return read_tet_mesh(study.path(file), unit=study.mesh.mesh_unit, frame=study.mesh.mesh_frame)
 
 
 def _cost(study: Study) -> Cost:
-    how = study.registration
-    files = [study.path(file) for file in how.parameters]
-    return engine_of(how.engine, how.preset, files, borders=how.borders, labelled=True).cost
+    return engine_of(study.registration.located(study.place), labelled=True).cost
 
 
 def costs(

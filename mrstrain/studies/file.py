@@ -8,18 +8,28 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
-from validate import RANGE, check_range
+from mrstrain.options.comparison import ComparisonOptions
+from mrstrain.options.measurement import Frame, RegistrationOptions, SubjectFiles, Unit
+from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
+from mrstrain.options.modelling import (
+    MINUTE_S,
+    Finer,
+    Labelling,
+    MeshCoordinates,
+    Meshing,
+    PlateOptions,
+    SimulationOptions,
+)
 
 FILE = "study.toml"
 
-Real = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-Whole = Annotated[int, Strict()]
-Flag = Annotated[bool, Strict()]
-Vector = tuple[Real, Real, Real]
+
+def _seconds(minutes: float | None) -> float | None:
+    return None if minutes is None else MINUTE_S * minutes
 
 
 def as_folder(text: str) -> str:
@@ -34,22 +44,7 @@ def as_folder(text: str) -> str:
     return text
 
 
-def _new(names: tuple[str, ...]) -> tuple[str, ...]:
-    if len(set(names)) < len(names):
-        raise ValueError("each only once")
-    return names
-
-
-def _rising(strains: tuple[float, float]) -> tuple[float, float]:
-    try:
-        check_range(strains)
-    except InputError as wrong:
-        raise ValueError(str(wrong)) from wrong
-    return strains
-
-
 Name = Annotated[str, AfterValidator(as_folder)]
-Names = Annotated[tuple[str, ...], AfterValidator(_new)]
 
 
 class _Part(BaseModel):
@@ -71,36 +66,24 @@ class About(_Part):
 
     name: Annotated[str, Field(min_length=1)]
     out: str = "results"
-    seed: Annotated[Whole, Field(ge=1)] = 1
+    seed: Count = 1
 
 
-class Images(_Part):
-    """The unloaded image and what is known of it; paths from the study file's folder.
+class Images(SubjectFiles):
+    """The unloaded image and what is known of it; paths from the study file's folder."""
 
-    Attributes
-    ----------
-    load0 : str
-        Unloaded image.
-    labels, names : str
-        Label map of the tissues on it, and the table of its names.
-    bone : str, optional
-        Name of the label to align on, "bone" if it is not said; or ``bone_mask``, a mask of it.
-    repeat : str, optional
-        A second unloaded image: the noise floor.
-    tissue : str, optional
-        Mask of the body, bone included.
-    allow_missing : bool
-        Whether voxels that are NaN or infinite are left out, not refused.
-    """
-
-    load0: str
-    labels: str
-    names: str | None = None
-    bone: str | None = None
-    bone_mask: str | None = None
-    repeat: str | None = None
-    tissue: str | None = None
+    load0: Path
+    """Unloaded image."""
+    labels: Path
+    """Label map of the tissues on it."""
+    bone_label: str | None = Field(default=None, validation_alias="bone")
+    """Name of the label to align on, "bone" if it is not said."""
+    bone: Path | None = Field(default=None, validation_alias="bone_mask")
+    """Or: a mask of it."""
+    repeat: Path | None = None
+    """A second unloaded image: the noise floor."""
     allow_missing: Flag = False
+    """Whether voxels that are NaN or infinite are left out, not refused."""
 
 
 class Load(_Part):
@@ -111,119 +94,66 @@ class Load(_Part):
     """
 
     image: str
-    normal_n: Annotated[Real, Field(gt=0.0)] | None = None
+    normal_n: Positive | None = None
     shear_n: Real | None = None
-    normal_mm: Annotated[Real, Field(gt=0.0)] | None = None
+    normal_mm: Positive | None = None
     shear_mm: Real | None = None
     plate_normal: Vector | None = None
     shear_direction: Vector | None = None
 
 
-class PlateOf(_Part):
-    """The plate: outward normal (away from the foot) and direction of the shear force on the tissue, LPS."""
+class Plate(PlateOptions):
+    """The plate."""
 
-    normal: Vector = (0.0, 0.0, -1.0)
-    shear_direction: Vector = (0.0, -1.0, 0.0)
-    taped: Flag = True
-    turns: Flag = False
-    pivot_mm: Vector | None = None
-    gap_mm: Annotated[Real, Field(ge=0.0)] = 0.0
+    plate_normal: Vector = Field(default=(0.0, 0.0, -1.0), validation_alias="normal")
+    """Its outward normal, away from the foot, LPS."""
 
 
-class Registering(_Part):
+class Registering(RegistrationOptions):
     """How images are registered; as the options of `register`."""
 
-    engine: Literal["gauss-newton", "elastix"] | None = None
-    borders: Flag | None = None
-    bending: Annotated[Real, Field(gt=0.0)] | None = None
-    volume: Annotated[Real, Field(ge=0.0)] | None = None
-    preset: str | None = None
-    parameters: tuple[str, ...] = ()
-    chain: Flag = False
     align: Literal["bone", "image"] = "bone"
-    error_model: str | None = None
-    twin: Flag = False
+    """What to align rigidly first."""
 
 
-class Finer(_Part):
-    """Another length of edges in one tissue."""
+class Mesh(Meshing, Labelling, MeshCoordinates):
+    """The mesh: made from the label map (or one of its own), or a file."""
 
-    region: str
-    edge_mm: Annotated[Real, Field(gt=0.0)]
-
-
-class Meshing(_Part):
-    """The mesh: made from the label map (or one of its own), or a file.
-
-    Attributes
-    ----------
-    edge_mm : float
-    labels, names : str, optional
-        Another label map than that of the images, such as one without toes.
-    bones : tuple of str
-        Labels that are cut out, and whose surface is fixed; slices go through the lowest point of the first.
-    finer : Finer, optional
-    limit_minutes : float
-        Time after which meshing is given up.
-    file : str, optional
-        A mesh made elsewhere, instead; its lengths in ``unit``, its axes those of ``frame``.
-    """
-
-    edge_mm: Annotated[Real, Field(gt=0.0)] = 2.0
-    labels: str | None = None
-    names: str | None = None
-    bones: Annotated[Names, Field(min_length=1)] = ("bone",)
-    finer: Finer | None = None
-    limit_minutes: Annotated[Real, Field(gt=0.0)] = 60.0
-    file: str | None = None
-    unit: Literal["mm", "m"] = "mm"
-    frame: Literal["LPS", "RAS"] = "LPS"
+    labels: Path | None = None
+    """Another label map than that of the images, such as one without toes; with ``names``."""
+    limit_s: Annotated[Positive, AfterValidator(_seconds)] = Field(
+        default=60.0, validation_alias="limit_minutes", validate_default=True
+    )
+    """Time after which meshing is given up, minutes in the file."""
+    file: Path | None = None
+    """A mesh made elsewhere, instead; its lengths in ``unit``, its axes those of ``frame``."""
+    mesh_unit: Unit = Field(default="mm", validation_alias="unit")
+    """Unit of that mesh's coordinates."""
+    mesh_frame: Frame = Field(default="LPS", validation_alias="frame")
+    """Frame of that mesh's coordinates."""
 
     @model_validator(mode="after")
-    def _of_a_file(self) -> Meshing:
-        if self.file is None and (self.unit, self.frame) != ("mm", "LPS"):
+    def _of_a_file(self) -> Mesh:
+        if self.file is None and (self.mesh_unit, self.mesh_frame) != ("mm", "LPS"):
             raise ValueError("unit and frame are those of a mesh made elsewhere, and no 'file' names one")
         return self
 
 
-class Models(_Part):
-    """The models that are judged.
-
-    Attributes
-    ----------
-    sets : tuple of str
-        Published material sets to simulate, or files of your own (.toml).
-    results : tuple of str
-        Folders with results of other codes, a file for each load, as `compare` takes them.
-    element : {"P1", "MINI", "P2"}
-    fixed : tuple of str
-        Surfaces that do not move, beside the bone's.
-    drive : bool
-        Also the sets driven by the measured displacement of the outside.
-    level : bool
-        Also every simulated set sent through the measurement.
-    decks : bool
-        Also write each load as decks for CalculiX and FEBio.
-    limit_minutes : float, optional
-        Time after which a set's path of loads ends at its last equilibrium.
-    """
+class Models(SimulationOptions):
+    """The models that are judged."""
 
     sets: Names = ()
+    """Published material sets to simulate, or files of your own (.toml)."""
     results: Names = ()
-    element: Literal["P1", "MINI", "P2"] = "P1"
-    fixed: Names = ()
+    """Folders with results of other codes, a file for each load, as `compare` takes them."""
     drive: Flag = False
+    """Also the sets driven by the measured displacement of the outside."""
     level: Flag = False
-    decks: Flag = False
-    limit_minutes: Annotated[Real, Field(gt=0.0)] | None = None
-
-
-class Comparing(_Part):
-    """How models are compared with the measurement; as the options of `compare`."""
-
-    strains: Annotated[tuple[Real, Real], AfterValidator(_rising)] = RANGE
-    thresholds: str | None = None
-    least_ml: Annotated[Real, Field(ge=0.0)] = 0.1
+    """Also every simulated set sent through the measurement."""
+    limit_s: Annotated[Positive | None, AfterValidator(_seconds)] = Field(
+        default=None, validation_alias="limit_minutes"
+    )
+    """Time after which a set's path of loads ends at its last equilibrium, minutes in the file."""
 
 
 class Study(_Part):
@@ -241,11 +171,11 @@ class Study(_Part):
     study: About
     images: Images
     loads: Annotated[dict[Name, Load], Field(min_length=1)]
-    plate: PlateOf = PlateOf()
+    plate: Plate = Plate()
     registration: Registering = Registering()
-    mesh: Meshing = Meshing()
+    mesh: Mesh = Mesh()
     models: Models = Models()
-    compare: Comparing = Comparing()
+    compare: ComparisonOptions = ComparisonOptions()
 
     @property
     def out(self) -> Path:
@@ -255,9 +185,15 @@ class Study(_Part):
     @property
     def bone(self) -> str | None:
         """Name of the bone's label; None where the whole image is aligned on and none is named."""
-        return self.images.bone or ("bone" if self.registration.align == "bone" else None)
+        return self.images.bone_label or ("bone" if self.registration.align == "bone" else None)
 
-    def path(self, given: str) -> Path:
+    @property
+    def subject_files(self) -> SubjectFiles:
+        """What is known of the unloaded image; the bone by its mask, or else by its label."""
+        files = self.images.narrowed(SubjectFiles).located(self.place)
+        return files if files.bone else files.model_copy(update={"bone_label": self.bone})
+
+    def path(self, given: str | Path) -> Path:
         """A path of the file, from the study's folder."""
         return self.place / given
 
@@ -306,15 +242,20 @@ def _sentence(error: Any, told: Mapping[str, Any]) -> str:
     at: Sequence[str | int] = error["loc"]
     names = [str(part) for part in at]
     table = f"[{'.'.join(names[:-1])}] " if len(names) > 1 else ""
-    if error["type"] == "extra_forbidden":
+    if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = list(_fields_at(names[:-1]))
         near = difflib.get_close_matches(names[-1], known, 1, 0.5)
         advice = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}."
         return f"{table}'{names[-1]}' is no key here; {advice}"
-    if error["type"] == "missing":
+    if error["type"] in ("missing", "missing_argument"):
         return f"{table}'{names[-1]}' is missing."
-    got = error["input"]
-    return f"{table}'{names[-1]}': {error['msg'].removeprefix('Value error, ')}; got {got!r}."
+    return f"{table}'{names[-1]}': {reason(error)}."
+
+
+def keys_of(table: type[BaseModel]) -> dict[str, FieldInfo]:
+    """Keys that a table of the study file has, with their fields."""
+    fields = {str(info.validation_alias or name): info for name, info in table.model_fields.items()}
+    return {key: info for key, info in fields.items() if key != "place"}
 
 
 def _fields_at(names: Sequence[str]) -> list[str]:
@@ -323,12 +264,12 @@ def _fields_at(names: Sequence[str]) -> list[str]:
     for name in names:
         fields: dict[str, FieldInfo] = getattr(model, "model_fields", {})
         model = Load if model is None or name not in fields else _model_of(fields[name].annotation)
-    return [key for key in model.model_fields if key != "place"]
+    return list(model._fields if issubclass(model, tuple) else keys_of(model))
 
 
 def _model_of(annotation: Any) -> Any:
     """The model that a field holds; None for a table of models by name (the loads)."""
     for kind in (annotation, *getattr(annotation, "__args__", ())):
-        if isinstance(kind, type) and issubclass(kind, _Part) and kind is not Load:
+        if isinstance(kind, type) and issubclass(kind, BaseModel | Finer) and kind is not Load:
             return kind
     return None

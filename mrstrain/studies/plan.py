@@ -12,13 +12,14 @@ from fe import BONE, LoadStep, material_set
 from mrstrain.comparison.drive import ENDING
 from mrstrain.comparison.model_files import files_named
 from mrstrain.measurement.register import REPEAT
-from mrstrain.studies.file import Study, Vector, as_folder
+from mrstrain.options.measurement import EngineOptions
+from mrstrain.options.model import Vector
+from mrstrain.options.modelling import Directions, MeshCoordinates, Meshing, PlateOptions, SimulationOptions
+from mrstrain.studies.file import Study, as_folder
 from validate import LEVELLED
 
 KINDS = ("register", "mesh", "simulate", "drive", "level", "compare")
 """Kinds of stages, in the order in which they come."""
-
-_AS_MEASURED = ("load0", "images", "bone", "engine", "borders", "preset", "parameters", "seed")
 
 REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison", "mesh/mesh.vtu"
 
@@ -129,38 +130,24 @@ def _refuse_mixing(study: Study, stages: Sequence[Stage]) -> None:
 
 
 def _registrations(study: Study) -> list[Stage]:
-    images, how = study.images, study.registration
-    aside = {
-        key: str(study.path(given))
-        for key in ("labels", "names", "tissue", "bone_mask")
-        if (given := getattr(images, key)) is not None
-    }
+    images = study.images
+    how, subject = study.registration.located(study.place), study.subject_files
     load0 = study.path(images.load0)
-    own = [study.path(p) for p in how.parameters]
-    error_model = [] if how.error_model is None else [study.path(how.error_model)]
     shared: dict[str, Any] = {
-        "load0": str(load0), "images": aside, "bone": study.bone, "align": how.align,
-        "engine": how.engine, "borders": how.borders, "preset": how.preset,
-        "parameters": [str(p) for p in own], "error_model": str(error_model[0]) if error_model else None,
-        "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
-        "seed": study.study.seed, "threads": 1,
+        "load0": str(load0), **subject.plain(), **how.plain(), **_directions(study),
+        "allow_missing": images.allow_missing, "seed": study.study.seed, "threads": 1,
     }  # fmt: skip
-    shared |= {"allow_missing": True} if images.allow_missing else {}
-    weights = {"bending": how.bending, "volume": how.volume}
-    shared |= {name: weight for name, weight in weights.items() if weight is not None}
-    files = (load0, *(Path(p) for p in aside.values()), *own, *error_model)
+    files = (load0, *subject.paths, *how.paths)
     folder, own_directions = study.out / REGISTRATION, towards(study)
 
-    def one(load: str, image: str, repeat: bool, after: str | None) -> Stage:
+    def one(load: str, image: str | Path, repeat: bool, after: str | None) -> Stage:
         place = study.path(image)
         more: dict[str, Any] = {
-            "load": str(place), "out": str(folder / load),
-            "after": None if after is None else str(folder / after),
+            "load": str(place), "out": str(folder / load), "after": None if after is None else str(folder / after),
+            "chain": after is not None, "twin": how.twin and load != REPEAT,
         }  # fmt: skip
         if load in own_directions:
             more["plate_normal"], more["shear_direction"] = own_directions[load]
-        if how.twin and load != REPEAT:
-            more["twin"] = True
         waits = () if after is None else (f"register {after}",)
         floor = {"repeat": {f"register {REPEAT}": str(folder / REPEAT)} if repeat else {}}
         return Stage(f"register {load}", shared | more, (*files, place), (folder / load,), waits, {}, floor)
@@ -173,6 +160,10 @@ def _registrations(study: Study) -> list[Stage]:
     return stages
 
 
+def _directions(study: Study) -> dict[str, Vector]:
+    return study.plate.narrowed(Directions).model_dump()
+
+
 def mesh_place(study: Study) -> Path:
     """The mesh on which sets are simulated: one made here, or a file."""
     return study.out / MESH if study.mesh.file is None else study.path(study.mesh.file)
@@ -180,20 +171,17 @@ def mesh_place(study: Study) -> Path:
 
 def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:
     """The label map that is meshed, and the table of its names."""
-    own = study.mesh.labels
-    labels, names = (own, study.mesh.names) if own else (study.images.labels, study.images.names)
-    return study.path(labels), None if names is None else study.path(names)
+    of = study.mesh if study.mesh.labels else study.images
+    return study.path(of.labels or ""), None if of.names is None else study.path(of.names)
 
 
 def _mesh(study: Study) -> list[Stage]:
-    how = study.mesh
-    if how.file is not None:
+    if study.mesh.file is not None:
         return []
     labels, names = labels_to_mesh(study)
     arguments = {
-        "out": str(study.out / MESH), "labels": str(labels), "names": None if names is None else str(names),
-        "edge_mm": how.edge_mm, "bones": how.bones, "limit_s": 60.0 * how.limit_minutes,
-        "finer": None if how.finer is None else how.finer.model_dump(),
+        "out": str(study.out / MESH), "labels": str(labels), **study.mesh.narrowed(Meshing).plain(),
+        "names": None if names is None else str(names), "bones": study.mesh.bones,
     }  # fmt: skip
     files = (labels,) if names is None else (labels, names)
     return [Stage("mesh", arguments, files, ((study.out / MESH).parent,))]
@@ -215,16 +203,11 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         raise InputError(f"The material set '{name}' of {one} needs {wrong}.") from wrong
     steps = load_steps(study)
     arguments = {
-        "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "material": study.set_given(one),
+        "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), **study.mesh.narrowed(MeshCoordinates).plain(),
+        **study.models.narrowed(SimulationOptions).plain(), **study.plate.narrowed(PlateOptions).model_dump(),
+        "sets": (study.set_given(one),), "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))),
         "loads": [asdict(step) for step in steps.values()],
-        "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
         "towards": {name: of for name, of in towards(study).items() if name in steps},
-        "taped": study.plate.taped, "turns": study.plate.turns, "pivot_mm": study.plate.pivot_mm,
-        "gap_mm": study.plate.gap_mm,
-        "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))), "element": study.models.element,
-        "decks": study.models.decks,
-        "limit_s": None if study.models.limit_minutes is None else 60.0 * study.models.limit_minutes,
-        "mesh_unit": study.mesh.unit, "mesh_frame": study.mesh.frame,
     }  # fmt: skip
     return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
 
@@ -233,7 +216,7 @@ def towards(study: Study) -> dict[str, tuple[Vector, Vector]]:
     """Plate's normal and direction of shear of the loads that go in directions of their own."""
     plate = study.plate
     return {
-        name: (load.plate_normal or plate.normal, load.shear_direction or plate.shear_direction)
+        name: (load.plate_normal or plate.plate_normal, load.shear_direction or plate.shear_direction)
         for name, load in study.loads.items()
         if load.plate_normal is not None or load.shear_direction is not None
     }
@@ -264,28 +247,30 @@ def load_steps(study: Study) -> dict[str, LoadStep]:
 def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured: Mapping[str, str]) -> Stage:
     arguments = {
         "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "dvc": str(study.out / REGISTRATION),
-        "material": study.set_given(one), "mesh_unit": study.mesh.unit, "mesh_frame": study.mesh.frame,
+        "sets": (study.set_given(one),), **study.mesh.narrowed(MeshCoordinates).plain(),
     }  # fmt: skip
     gives = (study.out / MODELS / (name + ENDING),)
     return Stage(f"drive {name}", arguments, _own(study, one), gives, meshed, {"loads": measured})
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
-    if study.bone is None and study.images.bone_mask is None:
+    if study.bone is None and study.images.bone is None:
         raise InputError("[models] level = true needs a bone, where models are at rest: [images] bone, or bone_mask.")
-    sent = _registrations(study)[-1].arguments
-    arguments = {key: sent[key] for key in _AS_MEASURED}
-    arguments |= {"out": str(study.out / MODELS), "model": str(folder), "load": load}
-    own = [Path(p) for p in (arguments["load0"], *arguments["images"].values(), *arguments["parameters"])]
+    engine, subject = study.registration.located(study.place).narrowed(EngineOptions), study.subject_files
+    load0 = study.path(study.images.load0)
+    arguments = {
+        "load0": str(load0), **subject.plain(), **engine.plain(), "seed": study.study.seed,
+        "out": str(study.out / MODELS), "model": str(folder), "load": load,
+    }  # fmt: skip
     gives = (folder.with_name(folder.name + LEVELLED) / f"{load}.vtu",)
-    return Stage(f"level {folder.name} {load}", arguments, tuple(own), gives, (f"simulate {folder.name}",))
+    own = (load0, *subject.paths, *engine.paths)
+    return Stage(f"level {folder.name} {load}", arguments, own, gives, (f"simulate {folder.name}",))
 
 
 def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, str]) -> Stage:
-    how = study.compare
+    how = study.compare.located(study.place)
     labels = study.path(study.images.labels)
     names = None if study.images.names is None else study.path(study.images.names)
-    thresholds = None if how.thresholds is None else study.path(how.thresholds)
     elsewhere = [study.path(place) for place in study.models.results]
     taken = {Path(place).name for place in models.values()}
     twice = [place.name for place in elsewhere if place.name in taken]
@@ -294,13 +279,11 @@ def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, 
     arguments = {
         "dvc": str(study.out / REGISTRATION), "out": str(study.out / COMPARISON), "labels": str(labels),
         "names": None if names is None else str(names), "bones": study.mesh.bones,
-        "plate_normal": study.plate.normal, "shear_direction": study.plate.shear_direction,
-        "towards": towards(study), "strains": how.strains,
-        "thresholds": None if thresholds is None else str(thresholds),
-        "least_ml": how.least_ml, "elsewhere": [str(place) for place in elsewhere],
+        **_directions(study), "towards": towards(study), **how.plain(),
+        "elsewhere": [str(place) for place in elsewhere],
     }  # fmt: skip
     named = [file for place in elsewhere if place.exists() for file in files_named(place)]
-    files = [p for p in (labels, names, thresholds, *elsewhere, *named) if p is not None]
+    files = [p for p in (labels, names, *how.paths, *elsewhere, *named) if p is not None]
     some: dict[str, Mapping[str, str]] = {"loads": measured}
     if models:
         some["models"] = models

@@ -15,7 +15,6 @@ from dvc.report.page import Section
 from dvc.worker import Worker
 
 Tell = Callable[[str, float], None]
-Paths = Mapping[str, str | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,50 +45,23 @@ class StageResult:
     timed_out: bool = False
 
 
-def register(
-    tell: Tell, *, out: str, load0: str, load: str, images: Paths, bone: str | None, **options: Any
-) -> StageResult:
+def register(tell: Tell, *, out: str, load0: str, load: str, repeat: Sequence[str], **options: Any) -> StageResult:
     """One loaded image against the unloaded one; as `mrstrain.measurement.register_one.register_one`."""
     from mrstrain.measurement.register_one import register_one
 
-    mask = images.get("bone_mask")
-    case = register_one(
-        Path(load0),
-        Path(load),
-        out=Path(out),
-        labels=Path(str(images["labels"])),
-        names=_path(images.get("names")),
-        bone=bone if mask is None else Path(mask),
-        tissue=_path(images.get("tissue")),
-        parameters=[Path(p) for p in options.pop("parameters")],
-        error_model=_path(options.pop("error_model")),
-        repeat=_path(next(iter(options.pop("repeat")), None)),
-        after=_path(options.pop("after")),
-        tell=tell,
-        **options,
-    )
+    after, floor = _path(options.pop("after")), _path(next(iter(repeat), None))
+    case = register_one(Path(load0), Path(load), out=Path(out), repeat=floor, after=after, tell=tell, **options)
     return StageResult(tuple(case.summary()), (case.section,))
 
 
-def mesh(tell: Tell, *, out: str, labels: str, names: str | None, **options: Any) -> StageResult:
+def mesh(tell: Tell, *, labels: str, **options: Any) -> StageResult:
     """A label map's soft tissue as tetrahedra; as `mrstrain.mesh`."""
     from mrstrain.models.mesh import mesh as run
 
-    finer = options.pop("finer")
-    made = run(
-        labels,
-        out=out,
-        names=names,
-        finer=None if finer is None else (finer["region"], finer["edge_mm"]),
-        watch=lambda share: tell("meshing", share),
-        **options,
-    )
-    return StageResult(tuple(made.summary()))
+    return StageResult(tuple(run(labels, watch=lambda share: tell("meshing", share), **options).summary()))
 
 
-def simulate(
-    tell: Tell, *, out: str, mesh: str, material: str, loads: Sequence[Mapping[str, Any]], **options: Any
-) -> StageResult:
+def simulate(tell: Tell, *, mesh: str, loads: Sequence[Mapping[str, Any]], **options: Any) -> StageResult:
     """One material set under all loads; as `mrstrain.simulate`."""
     from fe import LoadStep
     from mrstrain.models.simulate import simulate as run
@@ -101,49 +73,34 @@ def simulate(
         begun[case] = fraction
         tell(stage, sum(begun.values()) / max(len(begun), 2 if len(loads) > 1 else 1))
 
-    done = run(mesh, out=out, sets=[material], loads=steps, workers=1, threads=1, progress=told, **options)
+    done = run(mesh, loads=steps, workers=1, threads=1, progress=told, **options)
     timed_out = any(one.timed_out for one in done.sets)  # one set, if it did not fail
     return StageResult(
         tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), timed_out=timed_out
     )
 
 
-def drive(
-    tell: Tell, *, out: str, mesh: str, dvc: str, material: str, loads: Sequence[str], **options: Any
-) -> StageResult:
+def drive(tell: Tell, *, mesh: str, dvc: str, sets: Sequence[str], **options: Any) -> StageResult:
     """One material set whose outside goes where it was measured; as `mrstrain.drive`."""
     with Worker(threads=1) as worker:
-        done = worker.run(f"driving {material}", _driven, mesh, dvc, out, material, tuple(loads), options)
+        done = worker.run(f"driving {sets[0]}", _driven, mesh, dvc, options | {"sets": sets})
     return StageResult(tuple(done.summary()[:-1]), complete=done.complete)
 
 
-def _driven(mesh: str, dvc: str, out: str, material: str, loads: Sequence[str], options: Mapping[str, Any]) -> Any:
+def _driven(mesh: str, dvc: str, options: Mapping[str, Any]) -> Any:
     from mrstrain.comparison.drive import drive as run
 
-    return run(mesh, dvc, out=out, sets=[material], loads=loads, threads=1, **options)
+    return run(mesh, dvc, threads=1, **options)
 
 
-def level(
-    tell: Tell, *, out: str, load0: str, model: str, load: str, images: Paths, bone: str | None, **options: Any
-) -> StageResult:
+def level(tell: Tell, *, load0: str, model: str, load: str, **options: Any) -> StageResult:
     """One model's load sent through the measurement; as `mrstrain.level`."""
     from mrstrain.comparison.level import level as run
 
-    mask = images.get("bone_mask")
-    done = run(
-        load0,
-        model,
-        out=out,
-        bone=mask,
-        bone_label=bone if mask is None else None,
-        labels=images["labels"],
-        names=images.get("names"),
-        tissue=images.get("tissue"),
-        loads=[load],
-        threads=1,
-        progress=lambda _, stage, fraction: tell(stage, fraction),
-        **options,
-    )
+    def told(_: str, stage: str, fraction: float) -> None:
+        tell(stage, fraction)
+
+    done = run(load0, model, loads=[load], threads=1, progress=told, **options)
     return StageResult(tuple(done.summary()[:-1]))
 
 
@@ -156,9 +113,8 @@ def compare(tell: Tell, **options: Any) -> StageResult:
 def _compared(options: dict[str, Any]) -> StageResult:
     from mrstrain.comparison.compare import compare as run
 
-    strains = options.pop("strains")
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
-    done = run(options.pop("dvc"), models, strains=(strains[0], strains[1]), **options)
+    done = run(options.pop("dvc"), models, **options)
     return StageResult(tuple(done.summary()[:-1]), done.sections, done.closing)
 
 

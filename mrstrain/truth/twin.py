@@ -8,6 +8,8 @@ from pathlib import Path
 from dvc.io.images.write import write_image
 from mrstrain.measurement.results import Case, write_measured
 from mrstrain.measurement.strain import read_deformation
+from mrstrain.options.door import door
+from mrstrain.options.measurement import Frame, SubjectFiles
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import write_json
 from phantoms import Acquisition, synthetic_warp
@@ -36,17 +38,14 @@ class TwinFiles:
         ]
 
 
+@door
 def twin(
     load0: Path | str,
     deformation: Path | str,
     *,
     out: Path | str,
-    bone: Path | str | None = None,
-    bone_label: str | None = None,
-    tissue: Path | str | None = None,
-    labels: Path | str | None = None,
-    names: Path | str | None = None,
-    frame: str | None = None,
+    subject_files: SubjectFiles,
+    frame: Frame | None = None,
     seed: int = 1,
 ) -> TwinFiles:
     """Warp an unloaded image by a deformation, as if it had been scanned under load, and write the truth.
@@ -60,7 +59,7 @@ def twin(
         ``TransformParameters.1.txt`` of a registered load. It maps points of ``load0`` to the loaded image, LPS mm.
     out : path
         Gets ``twin.nii.gz`` and ``truth/twin`` in the layout of `register`'s results.
-    bone, bone_label, labels, names, tissue, frame
+    subject_files, frame
         As in `strain`; the truth is relative to the bone. ``tissue`` is also all that the made image shows.
     seed : int
         Of noise and receive field.
@@ -75,10 +74,9 @@ def twin(
         Before anything is written: if the inputs do not fit together, or the deformation folds or leaves the image.
     """
     target = Path(out)
-    subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
-    given = read_deformation(
-        subject, deformation, frame=frame, command="twin", parameters={"bone_label": bone_label, "seed": seed}
-    )
+    subject = read_subject(load0, subject_files)
+    recorded = {"bone_label": subject_files.bone_label, "seed": seed}
+    given = read_deformation(subject, deformation, frame=frame, command="twin", parameters=recorded)
     refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], given.files)
     measured = given.measured(_TRUTH.name)
     make_output(target)
@@ -88,8 +86,7 @@ def twin(
     (target / _TRUTH).parent.mkdir(exist_ok=True)
     case = write_measured(target / _TRUTH, measured, given.record)
     write_json(target / "provenance.json", given.record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
-    options = {"--bone": bone, "--bone-label": bone_label, "--tissue": tissue, "--labels": labels, "--names": names}
-    told = " ".join(f"{option} {value}" for option, value in options.items() if value is not None)
-    align = "" if bone is not None or bone_label is not None else " --align none"
+    told = " ".join(f"{subject_files.option(name)} {value}" for name, value in subject_files if value is not None)
+    align = " --align none" if subject.bone is None else ""
     command = f"mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}"
     return TwinFiles(target / _IMAGE, target / _TRUTH, case, made.shown, command)

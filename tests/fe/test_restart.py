@@ -123,7 +123,7 @@ def test_a_stage_tells_that_nothing_but_time_was_lacking(
 ) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
     given = stages.simulate(
-        lambda *_: None, out=str(tmp_path / "out"), mesh=str(tmp_path / "dome.vtu"), material="luboz",
+        lambda *_: None, out=str(tmp_path / "out"), mesh=str(tmp_path / "dome.vtu"), sets=["luboz"],
         loads=[asdict(load) for load in LOADS[:1]], plate_normal=DOWN, shear_direction=ALONG, limit_s=limit_s,
     )  # fmt: skip
     assert given.timed_out is timed_out

@@ -24,6 +24,7 @@ from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInt
 from dvc.registration.register import Settings
 from mrstrain.comparison.methods import methods
 from mrstrain.measurement.register import record_of
+from mrstrain.options.measurement import RegistrationOptions, SubjectFiles
 from mrstrain.records.inputs import read_subject
 from validate import ALL, Criteria
 
@@ -267,8 +268,8 @@ def test_formats_are_those_of_the_record_that_register_makes(tmp_path: Path) -> 
     dvc.write_image(load0, dvc.Image(grid, values))
     dvc.write_mask(bone, dvc.Mask(grid, half))
     dvc.write_labels(labels, dvc.LabelMap(grid, half.astype(int), {1: "fat"}))
-    subject = read_subject(load0, bone=bone, labels=labels, names=tmp_path / "labels.csv")
-    record = record_of(subject, {"loads": [load0]}, Settings.of(), {})
+    subject = read_subject(load0, SubjectFiles(bone=bone, labels=labels, names=tmp_path / "labels.csv"))
+    record = record_of(subject, {"loads": [load0]}, Settings.of(), RegistrationOptions(), {})
     (tmp_path / "provenance.json").write_text(json.dumps(record))
     assert "Images (MetaImage, NIfTI, NRRD) were read" in told({"Load1": tmp_path}, {})
 

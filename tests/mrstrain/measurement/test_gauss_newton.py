@@ -22,6 +22,7 @@ from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.page import weights_table
 from mrstrain.measurement.register import register as run
 from mrstrain.measurement.register_one import register_one
+from mrstrain.options.measurement import RegistrationOptions
 from phantoms import Heel, scan
 
 
@@ -173,17 +174,18 @@ def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkey
 
 def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_path):
     (tmp_path / "mine.txt").write_text(load_preset("heel-mr").text)
-    assert engine_of(None, None) == GaussNewton()
-    assert engine_of(None, None, bending=2.0) == GaussNewton(bending=2.0)
-    assert engine_of(None, None, labelled=True) == GaussNewtonWithInterfaces()
-    assert engine_of(None, None, labelled=True, borders=False) == GaussNewton()
-    assert engine_of("elastix", None, labelled=True) == engine_of("elastix", None)
+    asked = RegistrationOptions
+    assert engine_of(asked()) == GaussNewton()
+    assert engine_of(asked(bending=2.0)) == GaussNewton(bending=2.0)
+    assert engine_of(asked(), labelled=True) == GaussNewtonWithInterfaces()
+    assert engine_of(asked(borders=False), labelled=True) == GaussNewton()
+    assert engine_of(asked(engine="elastix"), labelled=True) == engine_of(asked(engine="elastix"))
     for engine, preset, files, name in (
         (None, "heel-mr", [], "heel-mr"),
         ("elastix", None, [], "heel-mr"),
         (None, None, [tmp_path / "mine.txt"], "mine.txt"),
     ):
-        chosen = engine_of(engine, preset, files)
+        chosen = engine_of(asked(engine=engine, preset=preset, parameters=files))
         assert (chosen.family, chosen.name) == ("elastix", name)
 
 

@@ -35,6 +35,7 @@ from mrstrain.measurement.measured_folder import measurements_in, spline_in
 from mrstrain.measurement.register import register as run
 from mrstrain.measurement.register_one import register_one
 from mrstrain.measurement.strain import read_any, strain
+from mrstrain.options.measurement import RegistrationOptions
 from phantoms import Heel, distances_mm, labels_of, random_foot_motion, scan, sliding
 from tests.dvc.deformation.test_bordered_spline import scanned, sheared
 
@@ -201,7 +202,7 @@ def test_a_study_begins_a_load_where_the_one_before_ended(pad, out, monkeypatch)
         raise RegistrationError("enough")
 
     monkeypatch.setattr("mrstrain.measurement.register_one.register_pair", never)
-    more = {"labels": pad.folder / "tissues.nrrd", "names": pad.folder / "tissues.csv", "bone": "bone"}
+    more = {"labels": pad.folder / "tissues.nrrd", "names": pad.folder / "tissues.csv", "bone_label": "bone"}
     with pytest.raises(RegistrationError, match="enough"):
         register_one(
             pad.folder / "Load0.nii.gz", pad.folder / "Load1.nii.gz", out=pad.folder / "one", after=out / "Load1",
@@ -326,9 +327,9 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
     with pytest.raises(ParameterError, match="must be above 0"):
         GaussNewtonWithInterfaces(skin=0.0)
     with pytest.raises(ParameterError, match="borders are for the engine gauss-newton"):
-        engine_of(None, "heel-mr", borders=True)
+        engine_of(RegistrationOptions(preset="heel-mr", borders=True))
     with pytest.raises(InputError, match="Borders need the tissues"):
-        engine_of(None, None, borders=True)
+        engine_of(RegistrationOptions(borders=True))
     for wrong, kind, said in (
         ({"bone": pad.folder / "bone.nrrd"}, InputError, "label map"),
         (asked(pad, preset="heel-mr"), ParameterError, "borders are for"),

@@ -42,7 +42,7 @@ def test_values_and_paths_start_from_the_file(tmp_path):
     assert study.loads["Load1"].normal_n == 140.0
     assert study.path(study.images.load0) == tmp_path / "Load0.nii.gz"
     assert study.out == tmp_path / "results"
-    assert study.plate.normal == (0.0, 0.0, -1.0)
+    assert study.plate.plate_normal == (0.0, 0.0, -1.0)
     assert read_study(tmp_path / "study.toml") == study
 
 
@@ -141,7 +141,7 @@ def test_weights_of_the_engine_and_the_plates_pivot_reach_their_stages(tmp_path)
     text = WHOLE + "[registration]\nvolume = 3.0\n[plate]\npivot_mm = [1.0, 2.0, 3.0]\n"
     stages = {stage.name: stage.arguments for stage in plan(read_study(written(tmp_path, text)))}
     assert stages["register Load1"]["volume"] == 3.0
-    assert "bending" not in stages["register Load1"]
+    assert stages["register Load1"]["bending"] is None
     assert stages["simulate trebbi"]["pivot_mm"] == (1.0, 2.0, 3.0)
 
 

@@ -1,0 +1,166 @@
+"""What every model of options can do, and the kinds of values that options have."""
+
+from __future__ import annotations
+
+import functools
+import numbers
+import operator
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike, fspath
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, ClassVar, Self, TypeVar, Union, get_args, get_origin
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, Strict, ValidationError
+from pydantic.fields import FieldInfo
+
+
+@dataclass(frozen=True, slots=True)
+class Cli:
+    """How the command line calls a field, where it does not call it by its name.
+
+    Attributes
+    ----------
+    name : str, optional
+        The option, with its dashes.
+    help : str, optional
+        In place of the field's own.
+    panel : str, optional
+        Part of the help that it stands in, in place of its model's.
+    off : bool
+        Whether the option is a flag that turns the field off.
+    times : float
+        Factor from the option's unit to the field's.
+    """
+
+    name: str | None = None
+    help: str | None = None
+    panel: str | None = None
+    off: bool = False
+    times: float = 1.0
+
+
+def _number(given: Any) -> Any:
+    """A number of NumPy as Python's; anything else as it is, for the check that follows."""
+    return float(given) if not isinstance(given, bool) and isinstance(given, numbers.Real) else given
+
+
+def _whole(given: Any) -> Any:
+    return int(given) if not isinstance(given, bool) and isinstance(given, numbers.Integral) else given
+
+
+def _listed(given: Any) -> object:
+    return given.tolist() if hasattr(given, "tolist") else given
+
+
+def _text(given: object) -> object:
+    return fspath(given) if isinstance(given, PathLike) else given
+
+
+def _once(names: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(names)) < len(names):
+        raise ValueError("each only once")
+    return names
+
+
+Real = Annotated[float, BeforeValidator(_number), Strict(), Field(allow_inf_nan=False)]
+Positive = Annotated[Real, Field(gt=0.0)]
+NotNegative = Annotated[Real, Field(ge=0.0)]
+Count = Annotated[int, BeforeValidator(_whole), Strict(), Field(ge=1)]
+Flag = Annotated[bool, Strict()]
+Vector = Annotated[tuple[Real, Real, Real], BeforeValidator(_listed)]
+Text = Annotated[str, BeforeValidator(_text)]
+Names = Annotated[tuple[Text, ...], AfterValidator(_once)]
+
+
+_M = TypeVar("_M", bound="Options")
+
+
+class Options(BaseModel):
+    """One concern's options, checked when they are given; a field's help is the text below it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    panel: ClassVar[str] = "Options"
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Self:
+        """The options given by name, the others by default.
+
+        Raises
+        ------
+        ParameterError
+            With each option that cannot be used, why, and what was given.
+        """
+        try:
+            return cls(**given)
+        except ValidationError as wrong:
+            from dvc.errors import ParameterError
+
+            raise ParameterError(
+                " ".join(f"{cls.option(str(e['loc'][0]))}: {reason(e)}." for e in wrong.errors(include_url=False))
+            ) from wrong
+
+    @classmethod
+    def option(cls, name: str) -> str:
+        """What the command line calls a field."""
+        return cls.cli(name).name or "--" + name.replace("_", "-")
+
+    @classmethod
+    def cli(cls, name: str) -> Cli:
+        """How the command line takes a field."""
+        return next((m for m in cls.model_fields[name].metadata if isinstance(m, Cli)), Cli())
+
+    def located(self, folder: Path) -> Self:
+        """The same with every path from a folder."""
+        return self.model_copy(update={name: _located(value, folder) for name, value in self if _paths(value)})
+
+    @property
+    def files(self) -> dict[str, list[Path]]:
+        """Fields that are given as paths."""
+        return {name: paths for name, value in self if (paths := _paths(value))}
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All of them."""
+        return tuple(path for paths in self.files.values() for path in paths)
+
+    def narrowed(self, model: type[_M]) -> _M:
+        """The part of these options that another model, one of their bases, has."""
+        return model.model_validate({field: getattr(self, field) for field in model.model_fields})
+
+    def plain(self) -> dict[str, Any]:
+        """Values that JSON holds."""
+        return self.model_dump(mode="json")
+
+
+def _paths(value: Any) -> list[Path]:
+    return [one for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, Path)]
+
+
+def _located(value: Any, folder: Path) -> Any:
+    return tuple(folder / one for one in value) if isinstance(value, tuple) else folder / value
+
+
+def reason(error: Mapping[str, Any]) -> str:
+    """Why pydantic refuses a value, and the value."""
+    if error["type"] == "missing":
+        return "it is needed"
+    why = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "literal_error":
+        why = f"there are {error['ctx']['expected'].replace(' or ', ' and ').replace(chr(39), '')}"
+    return f"{why}; got {error['input']!r}"
+
+
+def bare(annotation: Any, metadata: list[Any]) -> Any:
+    """A type without what pydantic is told beside it, which is added to ``metadata``."""
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        for told in inner[1:]:
+            metadata += told.metadata if isinstance(told, FieldInfo) else [told]
+        return bare(inner[0], metadata)
+    if origin in (Union, UnionType):
+        return functools.reduce(operator.or_, (bare(one, metadata) for one in inner))
+    if origin is tuple:
+        return tuple[tuple(one if one is ... else bare(one, metadata) for one in inner)]  # type: ignore[misc]
+    return annotation
