@@ -1,8 +1,13 @@
 """Measured deformation: MR images, alignment on bone, B-spline registration, strain, and how far to trust it.
 
 The public surface. All geometry is LPS mm in the reference (unloaded) configuration unless a docstring says otherwise.
+What draws figures is loaded when it is first asked for: `measure` and the `Measurement` that it gives.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from dvc import errors
 from dvc.deformation.bordered_spline import BorderedSpline
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import (
@@ -30,9 +35,15 @@ from dvc.registration.align import Alignment
 from dvc.registration.elastix.presets import Preset, load_preset, preset_names, read_parameter_file
 from dvc.registration.gauss_newton.with_borders import AtBorders
 from dvc.registration.register import Registration, Settings, register
+from dvc.trust.assessment import Similarity, assess
 from dvc.trust.landmarks import read_landmarks, target_registration_error
-from dvc.trust.quality import Quality, assess, noise_floor
+from dvc.trust.quality import Quality, noise_floor
 from dvc.trust.verdict import Verdict
+
+if TYPE_CHECKING:
+    from dvc.measurement.measure import measure
+    from dvc.measurement.measurement import Evidence, Measurement
+    from dvc.measurement.subject import Subject
 
 __all__ = [
     "Affine",
@@ -42,10 +53,12 @@ __all__ = [
     "BorderedSpline",
     "Composed",
     "Deformation",
+    "Evidence",
     "Grid",
     "Image",
     "LabelMap",
     "Mask",
+    "Measurement",
     "MeshFile",
     "Preset",
     "Quality",
@@ -53,16 +66,20 @@ __all__ = [
     "RigidMotion",
     "SampledDisplacement",
     "Settings",
+    "Similarity",
     "StrainField",
     "StrainMaps",
+    "Subject",
     "TetMesh",
     "Verdict",
     "Within",
     "assess",
+    "errors",
     "evaluate_on_grid",
     "fit_mask",
     "load_preset",
     "local_correlation",
+    "measure",
     "noise_floor",
     "plate_axes",
     "preset_names",
@@ -84,3 +101,16 @@ __all__ = [
     "write_mask",
     "write_vectors",
 ]
+
+_WITH_FIGURES = {
+    "Evidence": "measurement",
+    "Measurement": "measurement",
+    "Subject": "subject",
+    "measure": "measure",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _WITH_FIGURES:
+        return getattr(import_module(f"dvc.measurement.{_WITH_FIGURES[name]}"), name)
+    raise AttributeError(f"dvc has no attribute {name!r}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -94,6 +94,11 @@ class Section:
     pictures: tuple[Picture, ...] = ()
     paragraphs: tuple[str, ...] = ()
     viewers: tuple[Viewer, ...] = ()
+
+
+def caption_of(draw: Callable[..., bytes]) -> str:
+    """A figure's docstring: it says how the figure is read."""
+    return " ".join((draw.__doc__ or "").split())
 
 
 def shown(value: Cell) -> str:

@@ -9,23 +9,23 @@ from pathlib import Path
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.atomic_files import whole_folder
+from dvc.atomic_files import whole_folder, write_json
 from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
 from dvc.io.images.labels import read_labels
+from dvc.io.result_folder import ERROR_MODEL, PROVENANCE, REPORT, ResultFolder, result_folders
 from dvc.report.page import Picture, Section, write_report
 from dvc.report.viewer import Viewer
-from dvc.trust.verdict import Verdict
+from dvc.trust.verdict import Verdict, verdict_on_loads
 from fe.mesh_file import read_tet_mesh
 from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import Reading, model_files
 from mrstrain.comparison.page import closing_sections, page_sections, pictures_of, shown, viewer_of
 from mrstrain.comparison.result_files import clear_earlier, write_fields, write_on_image, write_tables
-from mrstrain.measurement.measured_folder import Measurement, measurements_in, verdict_on
 from mrstrain.measurement.page import flat
 from mrstrain.models.loads import Vector
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.provenance import provenance, versions, write_json
+from mrstrain.records.provenance import provenance, versions
 from validate.comparison import ALL_LOADS, Comparison, total
 from validate.comparison import compare as compare_load
 from validate.curves import RANGE, Area, check_range
@@ -83,7 +83,7 @@ class Compared:
             ]
         if len(self.comparisons) > 1 and self.totals:
             lines.append("All loads: " + ", ".join(f"{a.model} {shown(a)}" for a in self.totals))
-        return [*lines, *self.noise, *self.notes, f"Report: {self.out / 'report.html'}"]
+        return [*lines, *self.noise, *self.notes, f"Report: {self.out / REPORT}"]
 
 
 def compare(
@@ -158,7 +158,7 @@ def compare(
     own_axes = {load: plate_axes(-np.asarray(away), along) for load, (away, along) in (towards or {}).items()}
     thresholds_used = read_thresholds(None if thresholds is None else Path(thresholds))
     tissues = read_labels(labels, names)
-    measurements = measurements_in(Path(dvc), loads)
+    measurements = result_folders(Path(dvc), loads)
     usual = Reading(None if model_mesh is None else Path(model_mesh), model_unit, model_frame, to_image)
     places = [Path(m) for m in models]
     files, notes = model_files([m.load for m in measurements], places, usual)
@@ -194,7 +194,7 @@ def compare(
         {
             "measured": [f for m in measurements for f in m.files], "models": given, "labels": Path(labels),
             "names": [] if names is None else [Path(names)], "mesh": [] if mesh is None else [Path(mesh)],
-            "error_models": [f for m in measurements if (f := m.folder / "error_model.json").is_file()],
+            "error_models": [f for m in measurements if (f := m.folder / ERROR_MODEL).is_file()],
         },
         {
             "bones": list(bones), "plate_axes_lps": usual_axes.tolist(), "strains": list(strains),
@@ -208,7 +208,7 @@ def compare(
     )  # fmt: skip
     colours = list(dict.fromkeys(file.name for file in every))
     done: list[Comparison] = []
-    told: list[tuple[Comparison, Measurement, dict[str, Picture], Viewer]] = []
+    told: list[tuple[Comparison, ResultFolder, dict[str, Picture], Viewer]] = []
     for number, measurement in enumerate(compared):
         load = measurement.load
         axes = own_axes.get(load, usual_axes)
@@ -226,10 +226,11 @@ def compare(
                 (folder / f"{stem}.png").write_bytes(picture.png)
             if on_image:
                 write_on_image(folder, results, tissues)
-            write_json(folder / "provenance.json", record | {"verdict": _plain(measurement.verdict)})
+            write_json(folder / PROVENANCE, record | {"verdict": _plain(measurement.verdict)})
         done.append(one)
         told.append((one, measurement, drawn, viewer_of(one, measured, results, tissues, bones, measurement.folder)))
-    verdict = verdict_on(compared, strange)
+    verdicts = {m.load: m.verdict for m in compared if m.verdict is not None}
+    verdict = verdict_on_loads(verdicts, strange)
     doubts = () if verdict is None or verdict.level == "trust" else verdict.reasons
     notes += doubts
     notes += [
@@ -251,7 +252,7 @@ def compare(
     notes += _covered(done)
     levels = {m.load: "" if m.verdict is None else m.verdict.level for m in compared}
     summed = total(done, [load for load, level in levels.items() if level == "distrust"])
-    whole = verdict_on(compared)
+    whole = verdict_on_loads(verdicts)
     levels[ALL_LOADS] = "" if whole is None else whole.level
     write_tables(target, done, [*summed.areas, summed.nothing], strains, levels)
     write_json(
@@ -272,7 +273,7 @@ def compare(
     beside = [note for note in notes if note not in doubts]  # these stand in the verdict
     sections = page_sections(told, summed, beside, strange, strains)
     closing = closing_sections(thresholds_used, done_how)
-    write_report(target / "report.html", "Models against the measurement", verdict, sections, closing, flat(record))
+    write_report(target / REPORT, "Models against the measurement", verdict, sections, closing, flat(record))
     tell("compare", "comparing", 1.0)
     return Compared(
         target, tuple(done), summed.areas, summed.told, tuple(notes), verdict, tuple(sections), tuple(closing)

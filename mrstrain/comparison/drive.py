@@ -6,18 +6,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
+from dvc.io.result_folder import result_folders
 from dvc.worker import usable_cores
 from fe.mesh_file import read_tet_mesh
 from fe.published import material_set
 from fe.result import region_figures, write_regions_csv, write_state
 from fe.simulate import check_laws
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
-from mrstrain.measurement.measured_folder import measurements_in
 from mrstrain.models.simulate import clear
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 from validate.measured_boundary import driven, outside, write_boundary
 
 BOUNDARY, ENDING = "boundary", "-driven"
@@ -85,7 +85,7 @@ def drive(
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
         check_laws(read, region_laws)
-    found = measurements_in(Path(dvc), loads)
+    found = result_folders(Path(dvc), loads)
     loose = [m.load for m in found if m.aligned_on == "none"]
     if loose:
         raise InputError(

@@ -10,18 +10,18 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
+from dvc.io.result_folder import result_folders
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from dvc.registration.register import GAUSS_NEWTON
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, settings_of
-from mrstrain.measurement.measured_folder import measurements_in
 from mrstrain.measurement.register import register
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 from phantoms.twin import loaded_twin
 from validate.extrapolation import LEVELLED, carried_on
 from validate.fe_result import FeResult
@@ -182,7 +182,7 @@ def level(
 def _write(path: Path, result: FeResult, registered: Path) -> None:
     """The measured displacement at the nodes of the model's mesh; where it is not defined, that of the nearest node."""
     mesh = result.mesh
-    (measured,) = measurements_in(registered)
+    (measured,) = result_folders(registered)
     u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)
     region = np.zeros(len(mesh.cells), dtype=np.int64)
     for number, cells in enumerate(mesh.regions.values(), start=1):

@@ -13,11 +13,10 @@ from dvc.deformation.protocol import Deformation, evaluate_on_grid
 from dvc.deformation.strain import StrainField
 from dvc.images.image import LabelMap, Mask
 from dvc.io.images.read import read_voxels
-from dvc.report.page import Cell, Picture, Section, Table
+from dvc.report.page import Cell, Picture, Section, Table, caption_of
 from dvc.report.viewer import Viewer, Volume
 from dvc.trust.verdict import Verdict
 from mrstrain.comparison.methods import METHODS
-from mrstrain.measurement.page import said
 from validate import figures
 from validate.comparison import NOTHING, Comparison, Total
 from validate.curves import Area
@@ -84,11 +83,11 @@ def pictures_of(
             f"The lowest point of {bones[0]} lies beside the mesh: the slice goes through the mesh's middle instead."
         )
     slices = figures.slices(found, measured, displacements, axes, point)
-    apart = said(figures.differences)
+    apart = caption_of(figures.differences)
     return {
-        "curves": Picture("Volume above a strain", said(figures.volume_strain), curves),
-        "slices": Picture("Where the strain lies", f"{said(figures.slices)} {through}", slices),
-        "agreement": Picture("Maximal shear, cell by cell", said(figures.scatter), figures.scatter(found)),
+        "curves": Picture("Volume above a strain", caption_of(figures.volume_strain), curves),
+        "slices": Picture("Where the strain lies", f"{caption_of(figures.slices)} {through}", slices),
+        "agreement": Picture("Maximal shear, cell by cell", caption_of(figures.scatter), figures.scatter(found)),
         "differences_shear": Picture(
             "Differences of maximal shear", apart, figures.differences(found, one.agreements, "max_shear")
         ),

@@ -6,18 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from dvc.images.tissue import tissue_mask
 from dvc.io.images.read import read_image
+from dvc.io.result_folder import QUALITY, REPEAT, spline_in
+from dvc.measurement.measurement import Evidence
 from dvc.registration.align import AlignOn
-from dvc.registration.register import register as register_pair
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.trust.quality import read_noise_floor
 from dvc.worker import Worker
+from mrstrain.measurement.case import Case
 from mrstrain.measurement.engines import settings_of
-from mrstrain.measurement.measured_folder import spline_in
-from mrstrain.measurement.register import REPEAT, record_of
-from mrstrain.measurement.results import Case, write_case
-from mrstrain.measurement.twin_check import twin_check
+from mrstrain.measurement.plan import Plan, record_of
 from mrstrain.records.inputs import read_subject
 
 
@@ -84,7 +82,7 @@ def register_one(
         threads=threads,
     )
     model = error_model_of(settings.name) if error_model is None else read_error_model(error_model)
-    floor = None if repeat is None else read_noise_floor(repeat / "quality.json")
+    floor = None if repeat is None else read_noise_floor(repeat / QUALITY)
     start = None if after is None else spline_in(after)
     record = record_of(
         subject,
@@ -98,19 +96,7 @@ def register_one(
             "shear_direction_lps": None if shear_direction is None else list(shear_direction),
         },
     )
-    body = subject.tissue or tissue_mask(subject.reference)
-    is_repeat = out.name == REPEAT
+    plan = Plan(replace(subject, tissue=subject.body()), settings, Evidence(error_model=model), record, twin)
     with Worker(threads) as worker:
-        found = register_pair(
-            subject.reference,
-            loaded,
-            bone=subject.bone,
-            tissue=body,
-            labels=subject.labels,
-            settings=settings.of_repeat() if is_repeat else settings,
-            start=start,
-            worker=worker,
-            progress=tell,
-        )
-        made = twin_check(found, subject, start, worker, tell) if twin and not is_repeat else None
-    return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model, twin=made)
+        done = plan.register(loaded, start, worker, tell, is_repeat=out.name == REPEAT)
+    return plan.write(out, done, floor)[0]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_json, write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.io.images.labels import read_labels
 from fe import figures
@@ -24,7 +24,7 @@ from mrstrain.models.loads import LOADS
 from mrstrain.models.mesh import mesh as make_mesh
 from mrstrain.models.simulate import simulate
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.provenance import file_hash, provenance, write_json
+from mrstrain.records.provenance import file_hash, provenance
 
 Told = Callable[[str, str, float], None]
 

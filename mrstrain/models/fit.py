@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_json, write_whole
 from fe import figures
 from fe.fitting import Fit, read_curves
 from fe.fitting import fit as fit_law
@@ -17,7 +17,7 @@ from fe.hyperelastic import OGDEN
 from fe.materials import Material, Ogden
 from fe.published import as_toml
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 
 _FILES = ["fit.json", "fit.csv", "fit.png", "material.toml"]
 

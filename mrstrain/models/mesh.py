@@ -9,13 +9,14 @@ from pathlib import Path
 from dvc.atomic_files import whole_file
 from dvc.errors import InputError, OutputError
 from dvc.io.images.labels import read_labels
+from dvc.measurement.subject import is_bones_name
 from dvc.mesh import TetMesh
 from fe import figures
 from fe.mesh_file import write_tet_mesh
 from fe.meshing import MeshQuality, mesh_labels
 from fe.plate import Plate
 from fe.surface_sets import BONE, SKIN
-from mrstrain.records.inputs import is_bones_name, make_output
+from mrstrain.records.inputs import make_output
 from mrstrain.records.provenance import provenance
 
 _CARE_VOLUME, _CARE_ANGLE_DEG = 0.02, 10.0

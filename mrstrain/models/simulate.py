@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import whole_file
+from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError, MrstrainError
 from dvc.mesh import TetMesh
 from dvc.worker import Worker, each_in_workers, usable_cores
@@ -37,7 +37,7 @@ from fe.surface_sets import fixed_facets
 from mrstrain.models.load_path import simulated_path
 from mrstrain.models.loads import LOADS, Vector, paths_of
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 
 Told = Callable[[str, str, float], None]
 

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError
-from dvc.report.page import Picture, Section, Table, write_report
+from dvc.io.result_folder import REPEAT
+from dvc.report.page import Picture, Section, Table, caption_of, write_report
 from dvc.trust.verdict import Verdict, worst
-from mrstrain.measurement.page import flat, said
-from mrstrain.measurement.register import REPEAT
+from mrstrain.measurement.page import flat
 from mrstrain.records.inputs import make_output
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
 from mrstrain.studies.file import FILE, read_study
 from mrstrain.studies.plan import COMPARISON
@@ -249,7 +249,9 @@ def _write_page(
         ("subject", *order),
         tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in names),
     )
-    drawn = Picture("Distribution over subjects", said(figures.over_subjects), figures.over_subjects(shares, order))
+    drawn = Picture(
+        "Distribution over subjects", caption_of(figures.over_subjects), figures.over_subjects(shares, order)
+    )
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for one in ran:
         failed = [f"{o.stage}: {o.words}. {o.reason}" for o in one.outcomes.values() if o.record is None]

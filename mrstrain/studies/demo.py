@@ -11,7 +11,7 @@ from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
 from dvc.io.images.labels import read_labels, read_mask
 from dvc.io.images.write import write_labels
-from mrstrain.measurement.measured_folder import spline_in
+from dvc.io.result_folder import spline_in
 from mrstrain.models.loads import LOADS
 from mrstrain.studies.file import FILE
 from mrstrain.studies.page import write_run_report

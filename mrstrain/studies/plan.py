@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from dvc.errors import InputError
+from dvc.io.result_folder import REPEAT
 from fe.published import material_set
 from fe.simulate import LoadStep
 from fe.surface_sets import BONE
 from mrstrain.comparison.drive import ENDING
 from mrstrain.comparison.model_files import files_named
-from mrstrain.measurement.register import REPEAT
 from mrstrain.studies.file import Study, Vector, as_folder
 from validate.extrapolation import LEVELLED
 

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.registration.register import AT_BORDERS, GAUSS_NEWTON, Settings
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 from mrstrain.truth.accuracy_page import write_study_report
 from phantoms.accuracy_run import Case, Samples, measure, motion_named
 from phantoms.anatomy import Heel

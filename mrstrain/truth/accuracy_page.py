@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from dvc.report.page import Picture, Section, Table, write_report
+from dvc.report.page import Picture, Section, Table, caption_of, write_report
 from dvc.trust.error_model import POOLED
-from mrstrain.measurement.page import flat, said
+from mrstrain.measurement.page import flat
 from phantoms import figures
 from phantoms.error_model import CoverageRow
 from phantoms.error_tables import ErrorRow, FloorRow, ResolutionRow, wavelength_recovered
@@ -70,7 +70,9 @@ def _sections(
             ),
         )  # fmt: skip
         pictures = tuple(
-            Picture(f"Error by {by.split(',')[0]}", said(figures.errors_by_place), figures.errors_by_place(rows, by))
+            Picture(
+                f"Error by {by.split(',')[0]}", caption_of(figures.errors_by_place), figures.errors_by_place(rows, by)
+            )
             for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
         )
         zero = [f for f in floors if (f.preset, f.voxel_mm, f.snr) == (preset, voxel, snr)]
@@ -137,10 +139,10 @@ def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow
             )
         )
     columns = ("preset", "voxel", "SNR", "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
-    pictures = [Picture("Spatial resolution", said(figures.resolution), figures.resolution(rows))]
+    pictures = [Picture("Spatial resolution", caption_of(figures.resolution), figures.resolution(rows))]
     if floors:
         pictures.append(
-            Picture("Noise against resolution", said(figures.trade_off), figures.trade_off(floors, rows, POOLED))
+            Picture("Noise against resolution", caption_of(figures.trade_off), figures.trade_off(floors, rows, POOLED))
         )
     table = Table("Spatial resolution and noise in soft tissue", columns, tuple(told))
     return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import whole_folder
+from dvc.atomic_files import whole_folder, write_json
 from dvc.deformation.protocol import RigidMotion
 from dvc.deformation.strain_maps import StrainMaps, strain_maps
 from dvc.errors import InputError
@@ -18,7 +18,7 @@ from dvc.io.images.write import write_image, write_labels, write_mask
 from dvc.io.result_folder import write_maps
 from dvc.trust.regions import region_statistics, write_regions_csv
 from mrstrain.records.inputs import make_output, refuse_small_disk
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 from phantoms.anatomy import Heel
 from phantoms.heel import (
     LOADS,

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from dvc.atomic_files import write_json
 from dvc.io.images.write import write_image
-from mrstrain.measurement.results import Case, write_measured
+from dvc.io.result_folder import PROVENANCE
 from mrstrain.measurement.strain import read_deformation
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
-from mrstrain.records.provenance import write_json
 from phantoms.twin import loaded_twin
 
 _TRUTH = Path("truth") / "twin"
@@ -18,20 +18,19 @@ _IMAGE = "twin.nii.gz"
 
 @dataclass(frozen=True, slots=True)
 class Twinned:
-    """What `twin` gave: the made image, the folder of its truth, and the truth's case."""
+    """What `twin` gave: the made image, the folder of its truth, and the truth in a line."""
 
     image: Path
     truth: Path
-    case: Case
+    strain: str
     shown: float
     register: str
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
-        shear = ", ".join(f"{region} {p50:.3f} / {p95:.3f}" for region, (p50, p95) in self.case.shear.items())
         return [
             f"Made image: {self.image}; {self.shown:.0%} of the tissue is in it. Truth: {self.truth}",
-            f"True maximal shear, median / 95th percentile: {shear}",
+            f"True {self.strain}",
             f"To register it: {self.register}",
         ]
 
@@ -76,19 +75,21 @@ def twin(
     """
     target = Path(out)
     subject = read_subject(load0, bone=bone, bone_label=bone_label, tissue=tissue, labels=labels, names=names)
+    body = subject.body()
+    subject = replace(subject, tissue=body)
     given = read_deformation(
         subject, deformation, frame=frame, command="twin", parameters={"bone_label": bone_label, "seed": seed}
     )
     refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], given.files)
     measured = given.measured(_TRUTH.name)
     make_output(target)
-    made = loaded_twin(subject.reference, measured.tissue, given.whole, near=measured.bone_motion, seed=seed)
+    made = loaded_twin(subject.reference, body, given.whole, near=measured.bone_motion, seed=seed)
     write_image(target / _IMAGE, made.image)
     (target / _TRUTH).parent.mkdir(exist_ok=True)
-    case = write_measured(target / _TRUTH, measured, given.record)
-    write_json(target / "provenance.json", given.record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
+    measured.write(target / _TRUTH, given.record)
+    write_json(target / PROVENANCE, given.record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
     options = {"--bone": bone, "--bone-label": bone_label, "--tissue": tissue, "--labels": labels, "--names": names}
     told = " ".join(f"{option} {value}" for option, value in options.items() if value is not None)
     align = "" if bone is not None or bone_label is not None else " --align none"
     command = f"mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}"
-    return Twinned(target / _IMAGE, target / _TRUTH, case, made.shown, command)
+    return Twinned(target / _IMAGE, target / _TRUTH, measured.strain_line, made.shown, command)

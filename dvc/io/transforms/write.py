@@ -20,6 +20,8 @@ from dvc.io.transforms.elastix_text import Value, format_parameters
 
 StrPath = str | os.PathLike[str]
 
+ELASTIX_FILES = ("TransformParameters.0.txt", "TransformParameters.1.txt")
+"""Names of the files of a chain: a B-spline, and the rigid motion that follows."""
 _NO_INITIAL = "NoInitialTransform"
 
 
@@ -49,7 +51,6 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
     OutputError
         If a file cannot be written; nothing is left under its name.
     """
-    names = ["TransformParameters.0.txt", "TransformParameters.1.txt"]
     control = bspline.control
     stages: list[dict[str, Sequence[Value]]] = [
         {
@@ -73,7 +74,7 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
                 "Transform": ["EulerTransform"],
                 "NumberOfParameters": [6],
                 "TransformParameters": [*_euler_angles(then.rotation), *then.translation_mm.tolist()],
-                "InitialTransformParameterFileName": [names[0]],
+                "InitialTransformParameterFileName": [ELASTIX_FILES[0]],
                 "CenterOfRotationPoint": [0.0, 0.0, 0.0],
                 "ComputeZYX": [False],
             }
@@ -99,7 +100,7 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
         "CompressResultImage": [True],
     }
     written = []
-    for name, stage in zip(names, stages, strict=False):
+    for name, stage in zip(ELASTIX_FILES, stages, strict=False):
         path = Path(folder) / name
         write_whole(path, format_parameters({**stage, **image}))
         written.append(path)

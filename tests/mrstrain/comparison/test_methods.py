@@ -22,7 +22,7 @@ from dvc.registration.gauss_newton.fit import GaussNewton
 from dvc.registration.gauss_newton.with_borders import AtBorders
 from dvc.registration.register import Settings
 from mrstrain.comparison.methods import methods
-from mrstrain.measurement.register import record_of
+from mrstrain.measurement.plan import record_of
 from mrstrain.records.inputs import read_subject
 
 VERSIONS = {"mrstrain": "9.8.7", "itk-elastix": "0.1.2", "SimpleITK": "3.4.5", "nibabel": "5.4", "pydicom": "7.8"}

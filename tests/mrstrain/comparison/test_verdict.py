@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -11,9 +10,8 @@ import numpy as np
 import pytest
 
 from dvc.errors import GeometryError, ImageFileError, InputError
-from dvc.trust.verdict import Verdict
+from dvc.trust.verdict import Verdict, verdict_on_loads
 from mrstrain.comparison.compare import Compared, compare
-from mrstrain.measurement.measured_folder import Measurement, verdict_on
 from tests.mrstrain.comparison.test_compare import given, rows, study, with_errors
 from tests.validate.test_comparison import cube, sheared
 
@@ -65,12 +63,12 @@ def test_do_not_trust_is_said_in_everything(study: Path) -> None:
 
 
 def test_trust_is_in_the_measurement_alone_and_care_is_told_with_all_reasons(study: Path) -> None:
-    sound = [Measurement(load, study, None, Verdict("trust"), "bone") for load in ("Load1", "Load2")]
-    assert verdict_on(sound) == Verdict(
+    sound = {load: Verdict("trust") for load in ("Load1", "Load2")}
+    assert verdict_on_loads(sound) == Verdict(
         "trust", ("The measurement: 2 registrations are sound. The models are judged below.",)
     )
-    assert verdict_on([replace(one, verdict=None) for one in sound]) is None
-    assert verdict_on(sound, ["It is mirrored."]) == Verdict("caution", ("It is mirrored.",))
+    assert verdict_on_loads({}) is None
+    assert verdict_on_loads(sound, ["It is mirrored."]) == Verdict("caution", ("It is mirrored.",))
     # a model's displacement in the other frame than its mesh is a reason for care beside the registration's
     judged(study, Load1="distrust", Load2="caution")
     mesh = cube(6)

@@ -21,6 +21,7 @@ from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.io.images.labels import read_mask
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_labels
+from dvc.io.result_folder import result_folders, spline_in
 from dvc.io.transforms.bordered_spline import NAME
 from dvc.io.transforms.read import read_transform
 from dvc.registration.align import not_aligned
@@ -30,7 +31,6 @@ from dvc.registration.gauss_newton.with_borders import USUAL_SKIN, AtBorders
 from dvc.registration.register import Settings, register
 from dvc.worker import Worker
 from mrstrain.measurement.engines import settings_of
-from mrstrain.measurement.measured_folder import measurements_in, spline_in
 from mrstrain.measurement.register import register as run
 from mrstrain.measurement.register_one import register_one
 from mrstrain.measurement.strain import read_any, strain
@@ -165,7 +165,7 @@ def test_the_bone_that_is_held_is_judged_by_what_the_images_would_have_it_do(out
 
 def test_what_is_read_again_has_the_jumps_that_the_maps_have(pad, out):
     """Displacements at voxels, differentiated, miss the shear by over .1 somewhere (above)."""
-    (measured,) = measurements_in(out)
+    (measured,) = result_folders(out)
     valid = read_mask(out / "Load1" / "valid.nii.gz").inside
     X = GRID.points().reshape(-1, 3)
     u, H = measured.deformation().evaluate(X)
@@ -201,7 +201,7 @@ def test_a_study_begins_a_load_where_the_one_before_ended(pad, out, monkeypatch)
         used.update(given)
         raise RegistrationError("enough")
 
-    monkeypatch.setattr("mrstrain.measurement.register_one.register_pair", never)
+    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", never)
     more = {"labels": pad.folder / "tissues.nrrd", "names": pad.folder / "tissues.csv", "bone": "bone"}
     with pytest.raises(RegistrationError, match="enough"):
         register_one(
