@@ -24,7 +24,7 @@ from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image, Mask
 from dvc.io.images.labels import read_mask
 from dvc.io.images.nifti import read_nifti_header
-from dvc.io.images.read import read_image
+from dvc.io.images.read import read_voxels
 from dvc.io.images.write import write_image, write_mask, write_vectors
 from dvc.io.meshes.read import MeshFile
 from dvc.io.meshes.write import write_nodal_displacements, write_on_mesh
@@ -229,9 +229,9 @@ def read_maps(folder: Path) -> StrainMaps:
 
 def read_scalar(path: Path, grid: Grid | None = None) -> Image:
     """Read a map or an image of the folder, on the grid of the others; NaN where not defined."""
-    image = read_image(_there(path), allow_missing=True)
-    _same_grid(path, image.grid, image.grid if grid is None else grid)
-    return image
+    found, voxels = read_voxels(_there(path))
+    _same_grid(path, found, found if grid is None else grid)
+    return Image(found, np.ascontiguousarray(voxels, dtype=np.float32))
 
 
 def _components(path: Path, grid: Grid, count: int) -> Float32Array:

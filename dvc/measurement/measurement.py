@@ -24,6 +24,7 @@ from dvc.io.transforms.write import write_elastix_transform, write_itk_transform
 from dvc.measurement import notebook, page
 from dvc.measurement.error_bars import ErrorBars, TwinCheck, error_bars
 from dvc.measurement.judgement import CarriedImages, carried_images, maps_of, quality_of
+from dvc.measurement.notebook import Scalar
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
@@ -296,7 +297,7 @@ class Measurement:
         point_mm: npt.ArrayLike | None = None,
         largest: float | None = None,
     ) -> Figure:
-        """Draw a quantity in colour over the unloaded image.
+        """Draw a quantity in colour over the unloaded image; thin white lines are the borders of its labels.
 
         Parameters
         ----------
@@ -317,10 +318,11 @@ class Measurement:
             If the point lies outside the image.
         """
         values = notebook.values_of(quantity, self.maps, self.sigma)
-        return notebook.figure(self._view(point_mm), self.image, quantity, values, planes, largest)
+        outline = None if self.source is None else self.source.subject.labels
+        return notebook.figure(self._view(point_mm), self.image, Scalar(quantity, values, outline), planes, largest)
 
     def _repr_html_(self) -> str:
-        table = page.region_table(self._rows("max_shear"))
+        table = page.short_table(self.regions, self.intervals)
         return notebook.html(self.name, self.verdict, self.plot(), table, self.error_bars.summary)
 
     def section(self, pictures: Mapping[str, Picture]) -> Section:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 from dvc.arrays import Float32Array
 from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps
 from dvc.errors import InputError
-from dvc.images.image import Image
+from dvc.images.image import Image, LabelMap
 from dvc.report import figures
 from dvc.report.figures import Scale
 from dvc.report.page import Picture, Table, shown
@@ -53,11 +54,19 @@ def values_of(quantity: str, maps: StrainMaps, sigma: Float32Array | None) -> Fl
     return known[quantity]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Scalar:
+    """Values (ni, nj, nk) of a quantity, and the labels whose borders are drawn with it, if any."""
+
+    quantity: str
+    values: Float32Array
+    outline: LabelMap | None = None
+
+
 def figure(
     view: View,
     image: Image | None,
-    quantity: str,
-    values: Float32Array,
+    drawn: Scalar,
     planes: Sequence[Plane] = PLANES,
     largest: float | None = None,
 ) -> Figure:
@@ -73,8 +82,8 @@ def figure(
         raise InputError(f"Planes are among {', '.join(PLANES)}; got {', '.join(map(str, chosen)) or 'none'}.")
     if largest is not None and not largest > 0.0:
         raise InputError(f"The end of the colours must be above zero; got {largest}.")
-    scale = _scale(quantity, view.shown(values), largest)
-    return figures.coloured(view, image, values, scale, planes=chosen).finished()
+    scale = _scale(drawn.quantity, view.shown(drawn.values), largest)
+    return figures.coloured(view, image, drawn.values, scale, planes=chosen, outline=drawn.outline).finished()
 
 
 def _scale(quantity: str, values: Float32Array, largest: float | None) -> Scale:
@@ -126,7 +135,8 @@ def html(name: str, verdict: Verdict, drawn: Figure, table: Table, notes: Sequen
         f'{escape(name)}: <strong style="color:{tone}">{verdict.words}</strong>'
         + (f"<ul>{reasons}</ul></div>" if reasons else "</div>")
         + f'<img src="{picture.data}" width="{picture.width}" alt="{escape(table.title)}" style="max-width:100%">'
-        f'<table style="border-collapse:collapse;font-variant-numeric:tabular-nums"><caption style="text-align:left">'
-        f"{escape(table.title)}</caption><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        f'<table style="border-collapse:collapse;font-variant-numeric:tabular-nums;margin:.6em 0">'
+        f'<caption style="text-align:left;color:#4f5b69">{escape(table.title)}</caption>'
+        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
         f"{''.join(f'<p>{escape(note)}</p>' for note in notes)}</div>"
     )

@@ -13,9 +13,9 @@ from dvc.measurement.judgement import CarriedImages
 from dvc.measurement.subject import Subject
 from dvc.registration.gauss_newton.fit import Choice
 from dvc.report import figures
-from dvc.report.page import Cell, Picture, Table, caption_of
+from dvc.report.page import Cell, Picture, Table, caption_of, shown
 from dvc.report.planes import View
-from dvc.trust.error_model import Uncertainty
+from dvc.trust.error_model import Interval, Uncertainty
 from dvc.trust.quality import Quality
 from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
 from dvc.trust.twin_judgement import Judged
@@ -193,6 +193,22 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
         tuple(rows),
         "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, and volumes above a value.",
     )
+
+
+def short_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
+    """Tell median and 95th percentile of the maximal shear by region, each with its interval where it is known."""
+    known = {(i.region, i.figure): f"{shown(i.low)} to {shown(i.high)}" for i in intervals}
+
+    def own(region: str, figure: str) -> tuple[str, ...]:
+        return (known.get((region, figure), "–"),) if known else ()
+
+    rows: tuple[tuple[Cell, ...], ...] = tuple(
+        (r.region, r.volume_ml, r.median, *own(r.region, "median"), r.p95, *own(r.region, "p95"))
+        for r in regions
+        if r.quantity == "max_shear"
+    )
+    interval = ("95 % interval",) * bool(known)
+    return Table("Maximal shear", ("region", "volume, mL", "median", *interval, "95th percentile", *interval), rows)
 
 
 def error_tables(bars: ErrorBars) -> list[Table]:

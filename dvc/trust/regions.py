@@ -230,9 +230,12 @@ def _row_of(cells: Mapping[str, str]) -> RegionRow:
         for name, cell in cells.items()
         if name.startswith(before) and cell
     }
+    mean, sd, median, *higher = (float(cells[name]) for name in _NUMBERS)
     counts = int(cells["voxels"]), float(cells["volume_ml"]), int(cells["defined_voxels"])
-    numbers = {name: float(cells[name]) for name in _NUMBERS}
-    return RegionRow(cells["region"], cells["quantity"], *counts, **numbers, volume_above_ml=above)
+    p5, p90, p95, p99, most = higher
+    return RegionRow(
+        cells["region"], cells["quantity"], *counts, mean, sd, median, p5, p90, p95, p99, most, volume_above_ml=above
+    )
 
 
 def _plain(cell: object) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
-from dvc.io.result_folder import result_folders
+from dvc.io.result_folder import REGIONS, result_folders
 from dvc.worker import usable_cores
 from fe.mesh_file import read_tet_mesh
 from fe.published import material_set
@@ -137,7 +137,7 @@ def drive(
             told = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p90:.3f}" for r in rows if r.load == load)
             part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the displacement was reached;"
             lines.append(f"{one.name}, {load}:{part} maximal shear, median / 90th percentile: {told}")
-        write_regions_csv(folders[one.name] / "regions.csv", rows)
+        write_regions_csv(folders[one.name] / REGIONS, rows)
         write_whole(folders[one.name] / SETTINGS, IN_IMAGE)
         write_whole(folders[one.name] / "log.txt", "\n".join(log) + "\n")
         regions = {str(n): name for n, name in enumerate(read.regions, start=1)}

@@ -14,7 +14,7 @@ from dvc.atomic_files import whole_file, write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
-from dvc.io.result_folder import result_folders
+from dvc.io.result_folder import PROVENANCE, result_folders
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from dvc.registration.register import GAUSS_NEWTON
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
@@ -155,7 +155,7 @@ def level(
             "model_frame": model_frame,
         },
     )
-    write_json(target / name / "provenance.json", record)
+    write_json(target / name / PROVENANCE, record)
     for load, twin in made.items():
         write_image(target / work / "images" / f"{load}.nii.gz", twin.image)
     write_whole(target / name / SETTINGS, IN_IMAGE)

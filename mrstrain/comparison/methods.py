@@ -9,6 +9,7 @@ from typing import Any
 
 from dvc.errors import ParameterError
 from dvc.io.images.read import format_of
+from dvc.io.result_folder import PROVENANCE, QUALITY
 from dvc.io.transforms.elastix_text import parse_parameters
 from dvc.report.viewer import NIIVUE
 from fe.simulate import LoadStep
@@ -116,7 +117,7 @@ def _measured(measured: Mapping[str, Path]) -> str:
     """How displacement was measured; loads that were registered alike go into one sentence."""
     groups: dict[str, list[str]] = {}
     for load, folder in measured.items():
-        record = _record(folder / "provenance.json")
+        record = _record(folder / PROVENANCE)
         groups.setdefault(_registration(record) + _files(record), []).append(load)
     told = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
@@ -232,7 +233,7 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
             driven.append(_driven(name, record))
             published = published or record["set"] in _PUBLISHED
             continue
-        if _record(path.parent / "provenance.json").get("command") == "level":
+        if _record(path.parent / PROVENANCE).get("command") == "level":
             levelled.setdefault(_levelled(path, measured), []).append(name)
             continue
         if record.get("command") != "simulate" or "set" not in given:
@@ -270,8 +271,8 @@ def _driven(name: str, record: Record) -> str:
 def _levelled(path: Path, measured: Mapping[str, Path]) -> str:
     """How a model's file came out of the measurement that it was sent through."""
     work = path.parent.with_name(path.parent.name + "-work") / "registered" / path.stem / path.stem
-    how = _registration(_record(work / "provenance.json"))
-    same = how in {_registration(_record(folder / "provenance.json")) for folder in measured.values()}
+    how = _registration(_record(work / PROVENANCE))
+    same = how in {_registration(_record(folder / PROVENANCE)) for folder in measured.values()}
     return (
         "the model was sent through the measurement: its displacement moved the unloaded image, freed of noise; noise "
         "and a receive field were drawn anew; and the pair was registered"
@@ -351,4 +352,4 @@ def _twins(measured: Mapping[str, Path]) -> str:
 
 def _errors(measured: Mapping[str, Path]) -> dict[str, Record]:
     """What each registration tells of the error of its maximal shear."""
-    return {load: _record(folder / "quality.json").get("error_of_max_shear", {}) for load, folder in measured.items()}
+    return {load: _record(folder / QUALITY).get("error_of_max_shear", {}) for load, folder in measured.items()}

@@ -13,6 +13,7 @@ from dvc.deformation.protocol import Deformation, evaluate_on_grid
 from dvc.deformation.strain import StrainField
 from dvc.images.image import LabelMap, Mask
 from dvc.io.images.read import read_voxels
+from dvc.io.result_folder import REGISTERED
 from dvc.report.page import Cell, Picture, Section, Table, caption_of
 from dvc.report.viewer import Viewer, Volume
 from dvc.trust.verdict import Verdict
@@ -133,7 +134,7 @@ def viewer_of(
         values = np.full(grid.shape, np.nan)
         values[inside] = StrainField.from_gradient(evaluate_on_grid(field, grid, inside)[1]).max_shear
         shear.append(values)
-    scanned = folder / "registered.nii.gz"
+    scanned = folder / REGISTERED
     seen, voxels = read_voxels(scanned) if scanned.is_file() else (None, np.empty(0))
     if seen is not None and seen.same_as(labels.grid):
         shown = np.nan_to_num(voxels[box])

@@ -20,6 +20,7 @@ from dvc.deformation.protocol import evaluate_on_grid
 from dvc.deformation.strain import StrainField
 from dvc.images.image import Image, LabelMap
 from dvc.io.images.write import write_image, write_vectors
+from dvc.io.result_folder import REPORT
 from validate.agreement import Agreement, Travel
 from validate.comparison import Comparison
 from validate.curves import Area
@@ -38,7 +39,7 @@ def clear_earlier(target: Path, loads: Sequence[str]) -> None:
         old = list(json.loads(told.read_text(encoding="utf-8"))["coverage_ml"])
     except (OSError, ValueError, KeyError, TypeError):
         return
-    for name in (*_TABLES, told.name, "report.html"):
+    for name in (*_TABLES, told.name, REPORT):
         (target / name).unlink(missing_ok=True)
     for load in old:
         if load not in loads and (target / load / "fields.vtu").is_file():

@@ -13,6 +13,7 @@ import numpy as np
 
 from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError, MrstrainError
+from dvc.io.result_folder import REGIONS
 from dvc.mesh import TetMesh
 from dvc.worker import Worker, each_in_workers, usable_cores
 from fe import figures
@@ -41,7 +42,7 @@ from mrstrain.records.provenance import provenance
 
 Told = Callable[[str, str, float], None]
 
-_TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
+_TABLES = (REGIONS, "curve.csv", "slices.png", "force_travel.png")
 _FAR = 0.05  # det F of a patch further from 1 than this is counted
 _MUCH = 0.05  # share of the volume above which that is told
 _CROWD = 0.01  # share of a region's volume, squeezed flat, above which that is told
@@ -351,7 +352,7 @@ def _written(
                 write_febio(folder / f"{state.load.name}.feb", mesh, laws, state, fixed=decks_fixed, quadratic=True)
         except InputError as refused:
             notes += (f"No decks: {refused}",)
-    write_regions_csv(folder / "regions.csv", rows)
+    write_regions_csv(folder / REGIONS, rows)
     write_curve_csv(folder / "curve.csv", states)
     outcome = {}
     for state in states:

@@ -12,7 +12,7 @@ import numpy as np
 
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError
-from dvc.io.result_folder import REPEAT
+from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
 from dvc.report.page import Picture, Section, Table, caption_of, write_report
 from dvc.trust.verdict import Verdict, worst
 from mrstrain.measurement.page import flat
@@ -66,7 +66,7 @@ class Cohort:
             + ("" if place == 1 or s.told_apart else "; not told from the first")
             for place, s in enumerate(self.ranking, start=1)
         ]
-        return [*lines, *self.notes, f"Report: {self.out / 'report.html'}"]
+        return [*lines, *self.notes, f"Report: {self.out / REPORT}"]
 
 
 def cohort(
@@ -123,8 +123,8 @@ def cohort(
     _write_tables(target, areas, ranking)
     files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
     record = provenance("cohort", {"studies": files}, {"subjects": names})
-    write_json(target / "provenance.json", record)
-    _write_page(target / "report.html", ran, shares, ranking, notes, record)
+    write_json(target / PROVENANCE, record)
+    _write_page(target / REPORT, ran, shares, ranking, notes, record)
     return Cohort(target, tuple(ran), ranking, tuple(notes))
 
 

@@ -11,13 +11,13 @@ from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
 from dvc.io.images.labels import read_labels, read_mask
 from dvc.io.images.write import write_labels
-from dvc.io.result_folder import spline_in
+from dvc.io.result_folder import REPORT, VALID, spline_in
 from mrstrain.models.loads import LOADS
 from mrstrain.studies.file import FILE
 from mrstrain.studies.page import write_run_report
 from mrstrain.studies.pipeline import Outcome
 from mrstrain.studies.plan import REGISTRATION
-from mrstrain.studies.run import REPORT, Ran, run
+from mrstrain.studies.run import Ran, run
 from mrstrain.studies.true_error import TABLE, read_errors, write_errors
 from mrstrain.truth.phantom import phantom
 from phantoms.anatomy import Heel
@@ -157,7 +157,7 @@ def _errors(
         if ran.outcomes[f"register {load}"].record is None:
             continue
         found = spline_in(folder)
-        valid = read_mask(folder / "valid.nii.gz").inside
+        valid = read_mask(folder / VALID).inside
         errors[load] = errors_by_tissue(labels, under_load(heel, load), found, valid)
     return errors
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dvc.atomic_files import write_json
+from dvc.io.result_folder import PROVENANCE
 from dvc.report.page import Section, Table, write_report
 from dvc.trust.verdict import Verdict, worst
 from mrstrain.comparison.methods import METHODS, methods_of_registrations
@@ -39,7 +40,7 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, Outcome]) 
     made = {name: o.record for name, o in outcomes.items() if o.record is not None}
     record["inputs"] = {"inputs": _inputs(made)}
     parts = {name: {"made_utc": one.made_utc, **one.made_from} for name, one in made.items()}
-    write_json(path.with_name("provenance.json"), record | {"stages": parts})
+    write_json(path.with_name(PROVENANCE), record | {"stages": parts})
     write_report(
         path,
         study.study.name,

@@ -12,6 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from dvc.errors import InputError, OutputError, ParameterError
+from dvc.io.result_folder import REPORT
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import ALL
 from mrstrain.studies.check import wrong_with
@@ -24,7 +25,7 @@ from mrstrain.studies.plan import KINDS, Stage, plan
 
 Told = Callable[[str, str, float], None]
 
-LOG, REPORT = "study.log", "report.html"
+LOG = "study.log"
 _USUAL_VOXELS, _USUAL_CELLS = 2e6, 70e3
 _NOTHING = ("nothing",)  # to be run: everything is taken as it is
 

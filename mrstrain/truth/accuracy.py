@@ -14,6 +14,7 @@ import numpy as np
 
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
+from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.registration.register import AT_BORDERS, GAUSS_NEWTON, Settings
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers, usable_cores
@@ -88,7 +89,7 @@ class Study:
             if r.by == "all" and r.tissue == "fat"
         ]
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
-        return [*lines, f"Report: {self.out / 'report.html'}"]
+        return [*lines, f"Report: {self.out / REPORT}"]
 
 
 def cases_of(
@@ -298,8 +299,8 @@ def _write(target: Path, runs: Sequence[Samples], failures: dict[str, str]) -> S
             "seconds_of_registration": {r.case.name: round(r.seconds, 1) for r in runs},
         },
     )
-    write_json(target / "provenance.json", record)
-    write_study_report(target / "report.html", errors, floors, resolution, coverage, failures, record)
+    write_json(target / PROVENANCE, record)
+    write_study_report(target / REPORT, errors, floors, resolution, coverage, failures, record)
     return Study(target, tuple(errors), tuple(floors), tuple(resolution), failures)
 
 

@@ -15,7 +15,7 @@ from dvc.deformation.strain_maps import StrainMaps, strain_maps
 from dvc.errors import InputError
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.io.images.write import write_image, write_labels, write_mask
-from dvc.io.result_folder import write_maps
+from dvc.io.result_folder import PROVENANCE, REGIONS, write_maps
 from dvc.trust.regions import region_statistics, write_regions_csv
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.provenance import provenance
@@ -179,5 +179,5 @@ def _write_truth(folder: Path, maps: StrainMaps, labels: LabelMap, record: dict[
     folder.parent.mkdir(exist_ok=True)
     with whole_folder(folder) as partial:
         write_maps(partial, maps)
-        write_regions_csv(partial / "regions.csv", region_statistics(labels, maps.by_quantity))
-        write_json(partial / "provenance.json", record)
+        write_regions_csv(partial / REGIONS, region_statistics(labels, maps.by_quantity))
+        write_json(partial / PROVENANCE, record)
