@@ -42,7 +42,8 @@ from dvc.trust.verdict import Verdict
 
 if TYPE_CHECKING:
     from dvc.measurement.measure import measure
-    from dvc.measurement.measurement import Evidence, Measurement
+    from dvc.measurement.measurement import Measurement
+    from dvc.measurement.source import Evidence
     from dvc.measurement.subject import Subject
 
 __all__ = [
@@ -103,7 +104,7 @@ __all__ = [
 ]
 
 _WITH_FIGURES = {
-    "Evidence": "measurement",
+    "Evidence": "source",
     "Measurement": "measurement",
     "Subject": "subject",
     "measure": "measure",

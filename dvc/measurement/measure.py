@@ -8,7 +8,8 @@ from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.io.meshes.read import MeshFile
-from dvc.measurement.measurement import Evidence, Measurement
+from dvc.measurement.measurement import Measurement
+from dvc.measurement.source import Evidence
 from dvc.measurement.subject import Subject, plate_directions
 from dvc.registration.register import AT_BORDERS, GAUSS_NEWTON, Settings, register
 from dvc.trust.error_model import ErrorModel, error_model_of

@@ -10,73 +10,28 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from dvc.arrays import Float32Array, FloatArray
+from dvc.arrays import Float32Array
 from dvc.atomic_files import whole_folder, write_json
-from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation, RigidMotion, Within
 from dvc.deformation.strain_maps import StrainMaps, strain_maps
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
 from dvc.io import result_folder as files
-from dvc.io.images.write import write_image
-from dvc.io.transforms.bordered_spline import write_bordered_spline
-from dvc.io.transforms.write import write_elastix_transform, write_itk_transform
 from dvc.measurement import notebook, page
-from dvc.measurement.error_bars import ErrorBars, TwinCheck, error_bars
-from dvc.measurement.judgement import CarriedImages, carried_images, maps_of, quality_of
+from dvc.measurement.error_bars import ErrorBars, error_bars
+from dvc.measurement.judgement import carried_images, maps_of, quality_of
 from dvc.measurement.notebook import Scalar
+from dvc.measurement.source import Evidence, Source, alignment_of, motion_as_dict, write_images_and_transforms
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
 from dvc.report.page import Picture, Section
 from dvc.report.planes import PLANES, Plane, View
 from dvc.trust.assessment import assess
-from dvc.trust.error_model import ErrorModel, Interval
-from dvc.trust.quality import NoiseFloor, Quality, noise_floor
+from dvc.trust.error_model import Interval
+from dvc.trust.quality import Quality, noise_floor
 from dvc.trust.regions import RegionRow, read_regions_csv, region_statistics, write_regions_csv
 from dvc.trust.verdict import Verdict
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
-    """What a registration is judged by, beside its two images.
-
-    Attributes
-    ----------
-    landmarks : ((n, 3), (n, 3)), optional
-        Points of the unloaded image and the same of the loaded one, LPS mm.
-    noise_floor : NoiseFloor, optional
-        Of a repeat scan.
-    error_model : ErrorModel, optional
-        Of the engine or preset that is used; without one there are no error bars.
-    twin : TwinCheck, optional
-        What came back from a synthetic warp of the unloaded image by what was measured.
-    """
-
-    landmarks: tuple[FloatArray, FloatArray] | None = None
-    noise_floor: NoiseFloor | None = None
-    error_model: ErrorModel | None = None
-    twin: TwinCheck | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Source:
-    """What a measurement was made from; one that was read from a folder has it no more.
-
-    Attributes
-    ----------
-    subject : Subject
-    tissue : Mask
-        Soft tissue and bone, on the unloaded image's grid.
-    registration : Registration or None
-        None where the deformation was found elsewhere; then there are no images, either.
-    images : CarriedImages or None
-    """
-
-    subject: Subject
-    tissue: Mask
-    registration: Registration | None = None
-    images: CarriedImages | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,7 +118,7 @@ class Measurement:
             name,
             found.deformation,
             maps,
-            _alignment(found),
+            alignment_of(found),
             quality_of(found, maps, images.similarity, more.landmarks, floor),
             tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity)),
             error_bars(found, subject, maps, more.error_model, more.twin),
@@ -195,7 +150,7 @@ class Measurement:
             name,
             relative,
             maps,
-            {"on": "none" if subject.bone is None else "bone", **_motion(motion)},
+            {"on": "none" if subject.bone is None else "bone", **motion_as_dict(motion)},
             assess(maps, body, subject.bone),
             tuple(region_statistics(subject.regions(body), maps.by_quantity)),
             ErrorBars(None, ""),
@@ -398,7 +353,7 @@ class Measurement:
             if made.subject.mesh is not None:
                 told["mesh"] = files.write_mesh_results(partial, made.subject.mesh, self.deformation, verdict)
             if found is not None and made.images is not None:
-                _write_images_and_transforms(partial, found, made.images)
+                write_images_and_transforms(partial, found, made.images)
             if self.error_bars.uncertainty is not None:
                 files.write_uncertainty(
                     partial, self.maps.grid, self.error_bars.uncertainty, self.error_bars.model, verdict
@@ -436,46 +391,8 @@ class Measurement:
         return View.through(grid, point, valid if valid.any() else None)
 
 
-def _write_images_and_transforms(folder: Path, found: Registration, images: CarriedImages) -> None:
-    grid, motion = found.reference.grid, found.alignment.motion
-    write_image(folder / files.ALIGNED, Image(grid, images.aligned))
-    write_image(folder / files.REGISTERED, Image(grid, images.registered))
-    if isinstance(found.bspline, BSpline):
-        write_elastix_transform(folder, found.bspline, motion, grid)
-    else:
-        write_bordered_spline(folder / files.SPLINE_WITH_BORDERS, found.bspline)
-    write_itk_transform(folder / files.ITK_TRANSFORM, found.bspline, motion)
-
-
 def _deformation_in(folder: Path, maps: StrainMaps) -> Deformation:
     """The spline that was found, where it is valid; the displacement at voxels where it was found elsewhere."""
     if any((folder / name).is_file() for name in (files.SPLINE, files.SPLINE_WITH_BORDERS)):
         return Within(files.spline_in(folder), Mask(maps.grid, maps.valid), margin_voxels=0)
     return files.ResultFolder(folder).deformation()
-
-
-def _motion(motion: RigidMotion) -> dict[str, object]:
-    return {
-        "rotation_deg": motion.angle_deg,
-        "rotation": motion.rotation.tolist(),
-        "translation_lps_mm": motion.translation_mm.tolist(),
-    }
-
-
-def _alignment(found: Registration) -> dict[str, object]:
-    alignment = found.alignment
-
-    def plain(value: float) -> float | None:
-        return value if np.isfinite(value) else None
-
-    return {
-        "on": alignment.on,
-        **_motion(alignment.motion),
-        "bone_shift_lps_mm": alignment.bone_shift_mm.tolist(),
-        "similarity_before": plain(alignment.similarity_before),
-        "similarity": plain(alignment.similarity),
-        "repeatability_rms_mm": plain(alignment.repeatability_mm),
-        "control_spacing_mm": found.bspline.control.spacing_mm.tolist(),
-        "engine": found.settings.engine,
-        "seconds": round(found.seconds, 1),
-    }

@@ -9,7 +9,8 @@ from pathlib import Path
 from dvc.deformation.protocol import Deformation
 from dvc.images.image import Image
 from dvc.measurement.error_bars import TwinCheck
-from dvc.measurement.measurement import Evidence, Measurement
+from dvc.measurement.measurement import Measurement
+from dvc.measurement.source import Evidence
 from dvc.measurement.subject import Subject
 from dvc.registration.register import Registration, Settings
 from dvc.registration.register import register as register_pair

@@ -16,7 +16,7 @@ from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationEr
 from dvc.images.image import Image
 from dvc.io.images.read import read_image
 from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
-from dvc.measurement.measurement import Evidence
+from dvc.measurement.source import Evidence
 from dvc.registration.align import AlignOn, without_motion
 from dvc.registration.register import GAUSS_NEWTON, refuse_one_image_twice
 from dvc.trust.error_model import error_model_of, read_error_model

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dvc.io.images.read import read_image
 from dvc.io.result_folder import QUALITY, REPEAT, spline_in
-from dvc.measurement.measurement import Evidence
+from dvc.measurement.source import Evidence
 from dvc.registration.align import AlignOn
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.trust.quality import read_noise_floor
