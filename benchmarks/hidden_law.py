@@ -26,12 +26,12 @@ from dvc.deformation.protocol import SampledDisplacement, evaluate_on_grid
 from dvc.images.image import Grid, LabelMap
 from dvc.io.images.labels import read_labels, read_mask
 from dvc.io.images.write import write_image, write_labels
+from dvc.io.result_folder import spline_in
 from dvc.mesh import TetMesh
 from dvc.trust.random_field import GaussianField
 from fe import read_tet_mesh, write_tet_mesh
 from mrstrain import mesh as make_mesh
 from mrstrain import run, simulate
-from mrstrain.measurement.measured_folder import spline_in
 from mrstrain.models.loads import LOADS
 from mrstrain.records.provenance import versions
 from phantoms import (

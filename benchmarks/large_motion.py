@@ -18,7 +18,7 @@ from pathlib import Path
 from dvc.deformation.protocol import Composed, Motion
 from dvc.io.images.labels import read_labels, read_mask
 from dvc.io.images.write import write_image, write_labels
-from mrstrain.measurement.measured_folder import spline_in
+from dvc.io.result_folder import spline_in
 from mrstrain.measurement.register import register
 from mrstrain.records.provenance import versions
 from phantoms import (

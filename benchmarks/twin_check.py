@@ -18,11 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc.atomic_files import write_json
 from dvc.io.images.labels import read_labels
 from dvc.io.images.read import read_image
 from dvc.trust.error_model import read_error_model, to_surface_mm
 from mrstrain import phantom, register
-from mrstrain.records.provenance import versions, write_json
+from mrstrain.records.provenance import versions
 from phantoms import RIGID
 
 HEELS = ((1, 6.0, "Load1"), (2, 12.0, "Load1"), (3, 6.0, "Load3"))

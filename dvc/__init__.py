@@ -1,8 +1,13 @@
 """Measured deformation: MR images, alignment on bone, B-spline registration, strain, and how far to trust it.
 
 The public surface. All geometry is LPS mm in the reference (unloaded) configuration unless a docstring says otherwise.
+What draws figures is loaded when it is first asked for: `measure` and the `Measurement` that it gives.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from dvc import errors
 from dvc.deformation.bordered_spline import BorderedSpline
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import (
@@ -33,9 +38,16 @@ from dvc.registration.engine import AlignedPair, Engine
 from dvc.registration.engines import engine_named
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Registration, Settings, register
+from dvc.trust.assessment import Similarity, assess
 from dvc.trust.landmarks import read_landmarks, target_registration_error
-from dvc.trust.quality import Quality, assess, noise_floor
+from dvc.trust.quality import Quality, noise_floor
 from dvc.trust.verdict import Verdict
+
+if TYPE_CHECKING:
+    from dvc.measurement.measure import measure
+    from dvc.measurement.measurement import Measurement
+    from dvc.measurement.source import Evidence
+    from dvc.measurement.subject import Subject
 
 __all__ = [
     "Affine",
@@ -47,12 +59,14 @@ __all__ = [
     "Deformation",
     "Elastix",
     "Engine",
+    "Evidence",
     "GaussNewton",
     "GaussNewtonWithInterfaces",
     "Grid",
     "Image",
     "LabelMap",
     "Mask",
+    "Measurement",
     "MeshFile",
     "Preset",
     "Quality",
@@ -60,17 +74,21 @@ __all__ = [
     "RigidMotion",
     "SampledDisplacement",
     "Settings",
+    "Similarity",
     "StrainField",
     "StrainMaps",
+    "Subject",
     "TetMesh",
     "Verdict",
     "Within",
     "assess",
     "engine_named",
+    "errors",
     "evaluate_on_grid",
     "fit_mask",
     "load_preset",
     "local_correlation",
+    "measure",
     "noise_floor",
     "plate_axes",
     "preset_names",
@@ -92,3 +110,16 @@ __all__ = [
     "write_mask",
     "write_vectors",
 ]
+
+_WITH_FIGURES = {
+    "Evidence": "source",
+    "Measurement": "measurement",
+    "Subject": "subject",
+    "measure": "measure",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _WITH_FIGURES:
+        return getattr(import_module(f"dvc.measurement.{_WITH_FIGURES[name]}"), name)
+    raise AttributeError(f"dvc has no attribute {name!r}")

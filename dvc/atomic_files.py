@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -41,6 +42,11 @@ def write_whole(path: Path, text: str) -> None:
     """Write a text file (UTF-8, lines ending as they are given), whole or not at all; errors as `whole_file`."""
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8", newline="")
+
+
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write JSON whole or not at all; NaN is refused, as JSON has none."""
+    write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 @contextmanager

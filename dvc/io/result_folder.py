@@ -1,24 +1,179 @@
-"""The folder of results of one loaded image."""
+"""The folder of results of one loaded image: the names of its files, what writes them and what reads them.
+
+No other file names one of them by a literal.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dvc.arrays import Float32Array, FloatArray
-from dvc.deformation.protocol import Deformation
+from dvc.atomic_files import write_whole
+from dvc.deformation.protocol import Deformation, RigidMotion, Within
 from dvc.deformation.strain import StrainField
 from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps
+from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image, Mask
+from dvc.io.images.labels import read_mask
+from dvc.io.images.nifti import read_nifti_header
+from dvc.io.images.read import read_voxels
 from dvc.io.images.write import write_image, write_mask, write_vectors
 from dvc.io.meshes.read import MeshFile
 from dvc.io.meshes.write import write_nodal_displacements, write_on_mesh
+from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE
+from dvc.io.transforms.displacement_image import read_displacement
+from dvc.io.transforms.read import read_transform
+from dvc.io.transforms.write import ELASTIX_FILES
+from dvc.trust.error_model import ErrorModel, ErrorTable, Interval, Uncertainty, read_error_model
 from dvc.trust.verdict import Verdict
 
+DISPLACEMENT, DISPLACEMENT_NRRD = "displacement.nii.gz", "displacement.nrrd"
+GREEN_LAGRANGE, GREEN_LAGRANGE_PLATE = "green_lagrange.nii.gz", "green_lagrange_plate.nii.gz"
+MAX_SHEAR, JACOBIAN, VALID = "max_shear.nii.gz", "jacobian.nii.gz", "valid.nii.gz"
+ALIGNED, REGISTERED = "aligned.nii.gz", "registered.nii.gz"
+SPLINE, SPLINE_WITH_BORDERS = ELASTIX_FILES[0], BORDERED_SPLINE
+ITK_TRANSFORM = "transform.h5"
+SIGMA, INTERVALS, ERROR_MODEL = "sigma_max_shear.nii.gz", "intervals.csv", "error_model.json"
+REGIONS, QUALITY, PROVENANCE = "regions.csv", "quality.json", "provenance.json"
+ON_MESH, AT_NODES = "mesh.vtu", "nodal_displacements.csv"
+FIGURES, REPORT = "figures", "report.html"
+REPEAT = "repeat"
+"""Name of the folder of a repeat scan's results."""
+
+AGAIN = "Register this load again, or get a whole copy of the folder."
 _DISPLACEMENT = "displacement of tissue relative to its bone: u(X) = x - X at the voxels of the unloaded image"
 _GREEN_LAGRANGE = "Green-Lagrange strain E = (F^T F - I) / 2"
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResultFolder:
+    """The folder of one load as `register` or `strain` wrote it; its arrays are read when they are asked for.
+
+    Attributes
+    ----------
+    folder : Path
+    table : ErrorTable or None
+        Error of the maximal shear, where it is known.
+    verdict : Verdict or None
+        On the registration.
+    aligned_on : str
+        "bone", "image" or "none"; empty where it is not told.
+    """
+
+    folder: Path
+    table: ErrorTable | None = None
+    verdict: Verdict | None = None
+    aligned_on: str = ""
+
+    @classmethod
+    def at(cls, folder: Path) -> ResultFolder:
+        """Open a folder.
+
+        Raises
+        ------
+        InputError
+            If its quality or its error model cannot be read.
+        """
+        model, verdict, aligned_on = folder / ERROR_MODEL, None, ""
+        if (folder / QUALITY).is_file():
+            told = read_quality(folder)
+            verdict, aligned_on = verdict_in(told, folder), str(told.get("alignment", {}).get("on", ""))
+        return cls(folder, read_error_model(model).tables[0] if model.is_file() else None, verdict, aligned_on)
+
+    @property
+    def load(self) -> str:
+        """The folder's name."""
+        return self.folder.resolve().name
+
+    @property
+    def field(self) -> Path:
+        """The displacement image."""
+        return self.folder / DISPLACEMENT
+
+    @property
+    def files(self) -> list[Path]:
+        """What is read of the displacement."""
+        borders = self.folder / SPLINE_WITH_BORDERS
+        return [borders, self.folder / VALID] if borders.is_file() else [self.field]
+
+    def deformation(self) -> Deformation:
+        """Displacement of tissue relative to its bone: with its jumps of strain at borders, where it has any."""
+        if (self.folder / SPLINE_WITH_BORDERS).is_file():
+            return Within(spline_in(self.folder), read_mask(self.folder / VALID), margin_voxels=0)
+        return read_displacement(self.field)
+
+
+def result_folders(place: Path, loads: Sequence[str] = ()) -> list[ResultFolder]:
+    """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is; or some of them by name.
+
+    Raises
+    ------
+    InputError
+        If there is none, or one that is asked for is missing.
+    """
+    folders = [place] if (place / DISPLACEMENT).is_file() else sorted(p.parent for p in place.glob(f"*/{DISPLACEMENT}"))
+    folders = [f for f in folders if f == place or f.name != REPEAT]
+    if not folders:
+        raise InputError(
+            f"{place}: no results of `register` or `strain` here (LOAD/{DISPLACEMENT}). Give the folder they wrote."
+        )
+    absent = [load for load in loads if load not in [f.resolve().name for f in folders]]
+    if absent:
+        raise InputError(f"{place} has no results of {', '.join(absent)}.")
+    return [ResultFolder.at(folder) for folder in folders if not loads or folder.resolve().name in loads]
+
+
+def spline_in(folder: Path) -> Deformation:
+    """The displacement of tissue relative to its bone that `register` found for one load.
+
+    With its own gradient, where the engine has a file that holds it; otherwise its displacement image.
+    """
+    for name in (SPLINE_WITH_BORDERS, SPLINE):
+        if (folder / name).is_file():
+            return read_transform(folder / name)
+    if (folder / ITK_TRANSFORM).is_file() and (folder / DISPLACEMENT).is_file():
+        return read_displacement(folder / DISPLACEMENT)
+    raise InputError(f"{folder} has neither {SPLINE_WITH_BORDERS} nor {SPLINE}: register this load again.")
+
+
+def read_quality(folder: Path) -> dict[str, Any]:
+    """What ``quality.json`` tells.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is no JSON object.
+    """
+    path = folder / QUALITY
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(told, dict):
+            raise ValueError(f"a {type(told).__name__}, not an object")
+    except (OSError, ValueError) as failure:
+        raise InputError(f"{path}: the quality of a registration cannot be read ({failure}). {AGAIN}") from failure
+    return told
+
+
+def verdict_in(told: dict[str, Any], folder: Path) -> Verdict:
+    """The verdict in ``quality.json``."""
+    try:
+        return Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"]))
+    except (KeyError, TypeError, InputError) as failure:
+        raise InputError(f"{folder / QUALITY}: no verdict is told in it ({failure!r}). {AGAIN}") from failure
+
+
+def motion_in(alignment: dict[str, Any]) -> RigidMotion:
+    """The bone's rigid motion, as ``quality.json`` tells it."""
+    return RigidMotion(np.array(alignment["rotation"]), np.array(alignment["translation_lps_mm"]))
 
 
 def write_maps(
@@ -36,7 +191,7 @@ def write_maps(
     """
     write_displacement(folder, maps.grid, maps.displacement_mm, verdict)
     write_vectors(
-        folder / "green_lagrange.nii.gz",
+        folder / GREEN_LAGRANGE,
         maps.grid,
         maps.green_lagrange,
         TENSOR_COMPONENTS,
@@ -46,7 +201,7 @@ def write_maps(
     )
     if plate_axes is not None:
         write_vectors(
-            folder / "green_lagrange_plate.nii.gz",
+            folder / GREEN_LAGRANGE_PLATE,
             maps.grid,
             in_axes(maps.green_lagrange, plate_axes),
             ("nn", "ns", "nt", "ss", "st", "tt"),
@@ -56,14 +211,55 @@ def write_maps(
             unit="1",
             verdict=verdict,
         )
-    write_image(folder / "max_shear.nii.gz", Image(maps.grid, maps.max_shear))
-    write_image(folder / "jacobian.nii.gz", Image(maps.grid, maps.jacobian))
-    write_mask(folder / "valid.nii.gz", Mask(maps.grid, maps.valid))
+    write_image(folder / MAX_SHEAR, Image(maps.grid, maps.max_shear))
+    write_image(folder / JACOBIAN, Image(maps.grid, maps.jacobian))
+    write_mask(folder / VALID, Mask(maps.grid, maps.valid))
+
+
+def read_maps(folder: Path) -> StrainMaps:
+    """Read what `write_maps` wrote.
+
+    Raises
+    ------
+    InputError, ImageFileError
+        If a file is missing, damaged, or on another grid than the others.
+    """
+    shear = read_scalar(folder / MAX_SHEAR)
+    grid = shear.grid
+    jacobian, valid = read_scalar(folder / JACOBIAN, grid), read_mask(_there(folder / VALID))
+    displacement = _components(folder / DISPLACEMENT, grid, 3)
+    tensor = _components(folder / GREEN_LAGRANGE, grid, len(TENSOR_COMPONENTS))
+    _same_grid(folder / VALID, valid.grid, grid)
+    return StrainMaps(grid, valid.inside, displacement, tensor, shear.values, jacobian.values)
+
+
+def read_scalar(path: Path, grid: Grid | None = None) -> Image:
+    """Read a map or an image of the folder, on the grid of the others; NaN where not defined."""
+    found, voxels = read_voxels(_there(path))
+    _same_grid(path, found, found if grid is None else grid)
+    return Image(found, np.ascontiguousarray(voxels, dtype=np.float32))
+
+
+def _components(path: Path, grid: Grid, count: int) -> Float32Array:
+    stored = read_nifti_header(_there(path), vectors=True, components=count)
+    _same_grid(path, stored.grid, grid)
+    return np.ascontiguousarray(stored.load(), dtype=np.float32)
+
+
+def _there(path: Path) -> Path:
+    if not path.is_file():
+        raise InputError(f"{path}: this file of a measurement's folder is missing. {AGAIN}")
+    return path
+
+
+def _same_grid(path: Path, found: Grid, wanted: Grid) -> None:
+    if not found.same_as(wanted):
+        raise ImageFileError(f"{path}: on another grid than {MAX_SHEAR} beside it. {AGAIN}")
 
 
 def write_displacement(folder: Path, grid: Grid, displacement_mm: Float32Array, verdict: Verdict | None = None) -> None:
     """Write the displacement as NIfTI and as NRRD, LPS mm."""
-    for name in ("displacement.nrrd", "displacement.nii.gz"):  # the JSON beside them names the last
+    for name in (DISPLACEMENT_NRRD, DISPLACEMENT):  # the JSON beside them names the last
         write_vectors(
             folder / name, grid, displacement_mm, ("x", "y", "z"), _DISPLACEMENT, "LPS", unit="mm", verdict=verdict
         )
@@ -81,6 +277,48 @@ def in_axes(tensor: Float32Array, axes: FloatArray) -> Float32Array:
     return np.stack([turned[..., i, j] for i, j in _UPPER], axis=-1)
 
 
+def write_uncertainty(
+    folder: Path, grid: Grid, uncertainty: Uncertainty, model: ErrorModel | None, verdict: Verdict
+) -> None:
+    """Write the map of the standard deviation, the intervals, and the error model that was used.
+
+    The registration's verdict stands beside every interval: of one that failed they tell nothing.
+    """
+    if model is not None:
+        model.write(folder / ERROR_MODEL)
+    write_image(folder / SIGMA, Image(grid, uncertainty.sigma))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*(f.name for f in fields(Interval)), "verdict"])
+    writer.writerows(
+        [*(f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)), verdict.words]
+        for row in uncertainty.intervals
+    )
+    write_whole(folder / INTERVALS, text.getvalue())
+
+
+def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel] | None:
+    """Read what `write_uncertainty` wrote; None where the error was not known.
+
+    Raises
+    ------
+    InputError, ImageFileError
+        If a file is missing or damaged.
+    """
+    if not (folder / ERROR_MODEL).is_file():
+        return None
+    model, sigma = read_error_model(folder / ERROR_MODEL), read_scalar(folder / SIGMA, grid)
+    path = _there(folder / INTERVALS)
+    names = [f.name for f in fields(Interval)]
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [[row[name] for name in names] for row in csv.DictReader(file)]
+        intervals = tuple(Interval(region, figure, *map(float, rest)) for region, figure, *rest in rows)
+    except (OSError, ValueError, KeyError, TypeError) as failure:
+        raise InputError(f"{path}: no table of intervals ({failure!r}). {AGAIN}") from failure
+    return Uncertainty(sigma.values, intervals, model.tables[0]), model
+
+
 def write_mesh_results(
     folder: Path, mesh: MeshFile, deformation: Deformation, verdict: Verdict | None = None
 ) -> dict[str, int]:
@@ -91,31 +329,27 @@ def write_mesh_results(
     dict
         ``nodes`` and ``cells``, and how many of each have no value.
     """
-    u, H = deformation.evaluate(mesh.points_mm)
-    at_nodes = StrainField.from_gradient(H)
-    u_cells, H_cells = deformation.evaluate(mesh.centroids_mm)
-    in_cells = StrainField.from_gradient(H_cells)
-    write_on_mesh(
-        folder / "mesh.vtu",
-        mesh,
-        {
-            "displacement_mm": u,
-            "green_lagrange": at_nodes.green_lagrange,
-            "max_shear": at_nodes.max_shear,
-            "jacobian": at_nodes.jacobian,
-        },
-        {
-            "displacement_mm": u_cells,
-            "green_lagrange": in_cells.green_lagrange,
-            "max_shear": in_cells.max_shear,
-            "jacobian": in_cells.jacobian,
-        },
-        verdict,
-    )
-    missing = write_nodal_displacements(folder / "nodal_displacements.csv", mesh, u, verdict)
+    u, strain = _evaluated(deformation, mesh.points_mm)
+    u_cells, in_cells = _evaluated(deformation, mesh.centroids_mm)
+    write_on_mesh(folder / ON_MESH, mesh, _fields(u, strain), _fields(u_cells, in_cells), verdict)
+    missing = write_nodal_displacements(folder / AT_NODES, mesh, u, verdict)
     return {
         "nodes": len(u),
         "nodes_without_value": missing,
         "cells": mesh.cell_count,
         "cells_without_value": int(np.count_nonzero(~in_cells.valid)),
+    }
+
+
+def _evaluated(deformation: Deformation, points_mm: FloatArray) -> tuple[FloatArray, StrainField]:
+    u, H = deformation.evaluate(points_mm)
+    return u, StrainField.from_gradient(H)
+
+
+def _fields(u: FloatArray, strain: StrainField) -> dict[str, FloatArray]:
+    return {
+        "displacement_mm": u,
+        "green_lagrange": strain.green_lagrange,
+        "max_shear": strain.max_shear,
+        "jacobian": strain.jacobian,
     }

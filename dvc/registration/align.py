@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from dvc.arrays import BoolArray, FloatArray
-from dvc.deformation.protocol import Deformation, RigidMotion
+from dvc.deformation.protocol import Composed, Deformation, RigidMotion
 from dvc.errors import InputError, RegistrationError
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import carry, fill_missing, smoothed
@@ -190,6 +190,20 @@ def motion_of(deformation: Deformation, mask: Mask) -> RigidMotion:
     rotation, _ = Rotation.align_vectors(x - x.mean(axis=0), X - X.mean(axis=0))
     R = rotation.as_matrix()
     return RigidMotion(R, x.mean(axis=0) - R @ X.mean(axis=0))
+
+
+def without_motion(whole: Deformation, bone: Mask | None) -> tuple[Deformation, RigidMotion]:
+    """A deformation without the rigid motion of a mask's voxels (least squares), and that motion; whole without one.
+
+    Raises
+    ------
+    InputError
+        If it is not defined in the mask.
+    """
+    if bone is None:
+        return whole, RigidMotion.identity()
+    motion = motion_of(whole, bone)
+    return Composed([whole, motion.inverse()]), motion
 
 
 def _midway(motions: list[RigidMotion], centre: FloatArray) -> RigidMotion:

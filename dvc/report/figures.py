@@ -7,6 +7,8 @@ drawn as zero: the loaded image is dark blue there, a map leaves the image below
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,12 +24,15 @@ from scipy.ndimage import map_coordinates
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Image, LabelMap
-from dvc.report.planes import AXES, Plane, Values, View
+from dvc.report.planes import AXES, PLANES, Plane, Values, View
 from dvc.report.sheet import DPI, FONT, INK, SHADOW, UNSEEN, WIDTH_IN, Sheet, levelled, png_bytes, window_of
 from dvc.trust.regions import volume_above
 
 # The palette of Okabe and Ito, told apart by all common kinds of colour vision.
 REGION_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+MAX_SHEAR = "maximal shear strain (E₁ − E₃)/2, no unit"
+SIGMA = "standard deviation of the maximal shear, no unit"
+VOLUME_RATIO = "volume ratio det F, no unit"
 _STAGES = ("After the rigid alignment", "After the whole registration")
 _CHECK_MM = 12.0
 _LINE_MM = 5.0
@@ -85,8 +90,8 @@ def strain_slices(
     """
     if not largest > 0:
         raise InputError(f"The end of the colour bar for maximal shear must be positive; got {largest}.")
-    told = "maximal shear strain (E₁ − E₃)/2, no unit"
-    return _coloured(view, reference, max_shear, largest, "viridis", told, outline)
+    scale = Scale(MAX_SHEAR, "viridis", 0.0, largest)
+    return coloured(view, reference, max_shear, scale, outline=outline).png()
 
 
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
@@ -94,25 +99,47 @@ def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: flo
 
     The image stays plain grey where there is no result, and in bone.
     """
-    told = "standard deviation of the maximal shear, no unit"
-    return _coloured(view, reference, sigma, largest, "cividis", told, None)
+    return coloured(view, reference, sigma, Scale(SIGMA, "cividis", 0.0, largest)).png()
 
 
-def _coloured(
-    view: View, reference: Image, values: Float32Array, largest: float, shades: str, told: str, outline: LabelMap | None
-) -> bytes:
-    sheet = Sheet(view, [""], bar=True)
-    window = window_of(view, reference.values)
-    colours, norm = colormaps[shades], Normalize(0.0, largest)
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Colours of a scalar: what it is with its unit, the name of the colour map, and the values at its ends."""
+
+    told: str
+    shades: str
+    low: float
+    high: float
+
+
+def coloured(
+    view: View,
+    image: Image | None,
+    values: Values,
+    scale: Scale,
+    *,
+    planes: Sequence[Plane] = PLANES,
+    outline: LabelMap | None = None,
+) -> Sheet:
+    """A scalar in colour over an image, where there is one, in some planes; not yet finished."""
+    sheet = Sheet(view, [""], planes, bar=True)
+    colours, norm = colormaps[scale.shades], Normalize(scale.low, scale.high)
+    window = (0.0, 1.0) if image is None else window_of(view, image.values)
     for plane, axes in sheet.rows[0].items():
-        sheet.grey(plane, axes, reference.values, window)
+        if image is not None:
+            sheet.grey(plane, axes, image.values, window)
         sheet.colours(plane, axes, values, colours, norm)
         if outline is not None:
             labels = view.cut(outline.labels, plane)
             sheet.outlines(plane, axes, (labels == label for label in outline.names))
-    beyond = bool((view.shown(values) > largest).any())
-    sheet.bar(colours, norm, told, "max" if beyond else "neither")
-    return sheet.png()
+    shown = view.shown(values)
+    sheet.bar(colours, norm, scale.told, _ends(bool((shown < scale.low).any()), bool((shown > scale.high).any())))
+    return sheet
+
+
+def _ends(below: bool, above: bool) -> str:
+    """Which ends of a colour bar are pointed: values lie beyond."""
+    return {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}[below, above]
 
 
 def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> bytes:
@@ -123,8 +150,7 @@ def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> byt
     sheet = Sheet(view, [""], bar=True)
     window = window_of(view, reference.values)
     shown = view.shown(jacobian)
-    change = np.abs(shown[shown > 0.0] - 1.0)
-    reach = float(np.clip(np.ceil(np.percentile(change, 99.0) * 10) / 10, 0.1, 0.8)) if change.size else 0.1
+    reach = volume_reach(shown)
     shades, norm = colormaps["PuOr_r"], Normalize(1.0 - reach, 1.0 + reach)
     for plane, axes in sheet.rows[0].items():
         sheet.grey(plane, axes, reference.values, window)
@@ -137,10 +163,15 @@ def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> byt
             told = f"folded: {np.count_nonzero(folded)} voxels"
             style: dict[str, Any] = {"color": "#FF8A80", "weight": "bold", "path_effects": SHADOW}
             axes.text(0.5, 0.08, told, transform=axes.transAxes, ha="center", **style, **FONT)
-    ends = (bool((shown < 1.0 - reach).any()), bool((shown > 1.0 + reach).any()))
-    extend = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}[ends]
-    sheet.bar(shades, norm, "volume ratio det F, no unit", extend)
+    ends = _ends(bool((shown < 1.0 - reach).any()), bool((shown > 1.0 + reach).any()))
+    sheet.bar(shades, norm, VOLUME_RATIO, ends)
     return sheet.png()
+
+
+def volume_reach(jacobian: Values) -> float:
+    """How far from 1 the colours of a volume ratio reach: to a tenth, 99 % of it, 0.1 to 0.8."""
+    change = np.abs(jacobian[jacobian > 0.0] - 1.0)
+    return float(np.clip(np.ceil(np.percentile(change, 99.0) * 10) / 10, 0.1, 0.8)) if change.size else 0.1
 
 
 def similarity_slices(view: View, rigid: Float32Array, registered: Float32Array) -> bytes:
@@ -241,7 +272,7 @@ def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float |
     for axes, scale in zip(panels, ("linear", "logarithmic"), strict=True):
         axes.set_xlim(0.0, _HIGHEST_SHEAR)
         axes.set_title(f"Volume above a strain, {scale} axis", loc="left", color=INK, fontsize=10)
-        axes.set_xlabel("maximal shear strain (E₁ − E₃)/2, no unit", color=INK, **FONT)
+        axes.set_xlabel(MAX_SHEAR, color=INK, **FONT)
         axes.set_ylabel("volume above, mL", color=INK, **FONT)
         axes.grid(True, color="#d9dee4", linewidth=0.6)
         axes.set_axisbelow(True)

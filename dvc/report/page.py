@@ -100,6 +100,11 @@ class Section:
     viewers: tuple[Viewer, ...] = ()
 
 
+def caption_of(draw: Callable[..., bytes]) -> str:
+    """A figure's docstring: it says how the figure is read."""
+    return " ".join((draw.__doc__ or "").split())
+
+
 def shown(value: Cell) -> str:
     """Return a table cell as people read it.
 
@@ -113,11 +118,6 @@ def shown(value: Cell) -> str:
     if isinstance(value, float | np.floating):
         return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
     return str(value)
-
-
-def caption_of(draw: Callable[..., bytes]) -> str:
-    """A figure's caption: the docstring of the function that draws it."""
-    return " ".join((draw.__doc__ or "").split())
 
 
 def record_lines(record: Mapping[str, object]) -> dict[str, str]:

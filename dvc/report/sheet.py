@@ -115,7 +115,11 @@ class Sheet:
         bar.ax.tick_params(labelsize=9, length=3, pad=2)
 
     def png(self) -> bytes:
-        """Add letters, marks and the scale bar, and return the file's bytes."""
+        """Finish the sheet and return the file's bytes."""
+        return png_bytes(self.finished())
+
+    def finished(self) -> Figure:
+        """Add letters, marks and the scale bar, and return the figure."""
         spacing = self.view.grid.toward_lps().spacing_mm
         for row in self.rows:
             for number, (plane, axes) in enumerate(row.items()):
@@ -142,7 +146,7 @@ class Sheet:
                     ends = [0.03, 0.03 + length / (right - left)]
                     axes.plot(ends, [0.035, 0.035], linewidth=2.5, solid_capstyle="butt", **white)
                     axes.text(0.03, 0.05, f"{length:g} mm", va="bottom", fontsize=9, **white)
-        return png_bytes(self.figure)
+        return self.figure
 
 
 def _beside(mark: float) -> float:

@@ -20,6 +20,8 @@ from dvc.trust.verdict import Verdict
 
 SHEAR_THRESHOLDS = (0.2, 0.3, 0.4, 0.5)
 _THRESHOLDS: Mapping[str, Sequence[float]] = MappingProxyType({"max_shear": SHEAR_THRESHOLDS})
+_NUMBERS = ("mean", "sd", "median", "p5", "p90", "p95", "p99", "max")
+_ABOVE = "volume_above_{:g}_ml"
 _PERCENTILES = (50.0, 5.0, 90.0, 95.0, 99.0)
 
 
@@ -189,9 +191,8 @@ def write_regions_csv(path: Path, rows: Sequence[RegionRow], verdict: Verdict | 
         If the file cannot be written.
     """
     thresholds = sorted({t for row in rows for t in row.volume_above_ml})
-    numbers = ("mean", "sd", "median", "p5", "p90", "p95", "p99", "max")
-    header = ["region", "quantity", "voxels", "volume_ml", "defined_voxels", "defined_fraction", *numbers]
-    header += [f"volume_above_{t:g}_ml" for t in thresholds]
+    header = ["region", "quantity", "voxels", "volume_ml", "defined_voxels", "defined_fraction", *_NUMBERS]
+    header += [_ABOVE.format(t) for t in thresholds]
     told = [] if verdict is None else [verdict.words]
     header += ["verdict"] if told else []
     text = io.StringIO()
@@ -199,10 +200,42 @@ def write_regions_csv(path: Path, rows: Sequence[RegionRow], verdict: Verdict | 
     writer.writerow(header)
     for row in rows:
         cells: list[object] = [row.region, row.quantity, row.voxels, row.volume_ml, row.defined_voxels]
-        cells += [row.defined_fraction, *(getattr(row, name) for name in numbers)]
+        cells += [row.defined_fraction, *(getattr(row, name) for name in _NUMBERS)]
         cells += [*(row.volume_above_ml.get(t, "") for t in thresholds), *told]
         writer.writerow([_plain(cell) for cell in cells])
     write_whole(path, text.getvalue())
+
+
+def read_regions_csv(path: Path) -> list[RegionRow]:
+    """Read what `write_regions_csv` wrote: nine digits of every number.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is another table.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return [_row_of(cells) for cells in csv.DictReader(file)]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as failure:
+        raise InputError(
+            f"{path}: no statistics by region ({failure!r}). Register this load again, or get a whole copy of the file."
+        ) from failure
+
+
+def _row_of(cells: Mapping[str, str]) -> RegionRow:
+    before, after = _ABOVE.split("{:g}")
+    above = {
+        float(name.removeprefix(before).removesuffix(after)): float(cell)
+        for name, cell in cells.items()
+        if name.startswith(before) and cell
+    }
+    mean, sd, median, *higher = (float(cells[name]) for name in _NUMBERS)
+    counts = int(cells["voxels"]), float(cells["volume_ml"]), int(cells["defined_voxels"])
+    p5, p90, p95, p99, most = higher
+    return RegionRow(
+        cells["region"], cells["quantity"], *counts, mean, sd, median, p5, p90, p95, p99, most, volume_above_ml=above
+    )
 
 
 def _plain(cell: object) -> str:

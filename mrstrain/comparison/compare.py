@@ -13,12 +13,12 @@ from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
 from dvc.images.image import Grid, LabelMap
 from dvc.io.images.labels import read_labels
+from dvc.io.result_folder import ResultFolder, result_folders
 from dvc.mesh import TetMesh
 from dvc.report.page import Section
 from fe import read_tet_mesh
 from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import ModelFile, Reading, model_files
-from mrstrain.measurement.measured_folder import Measurement, measurements_in
 from mrstrain.models.loads import Vector
 from mrstrain.options.comparison import ComparisonOn, ModelReading
 from mrstrain.options.door import door
@@ -99,7 +99,7 @@ def compare(
         labelling.bones,
         comparison.mesh,
     )
-    measurements = measurements_in(Path(dvc), loads)
+    measurements = result_folders(Path(dvc), loads)
     usual = Reading(reading.model_mesh, reading.model_unit, reading.model_frame, to_image)
     files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], usual)
     inputs = _inputs(measurements, files, labelling.labels, labelling.names, mesh)
@@ -139,7 +139,7 @@ class _Axes(dict[str, FloatArray]):
 
 
 def _inputs(
-    measurements: Sequence[Measurement],
+    measurements: Sequence[ResultFolder],
     files: Mapping[str, Sequence[ModelFile]],
     labels: Path,
     names: Path | str | None,
@@ -192,7 +192,7 @@ def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
     return mesh
 
 
-def _case(measurement: Measurement, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> LoadCase:
+def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> LoadCase:
     image = measurement.folder / "registered.nii.gz"
     return LoadCase(
         measurement.load,

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_json, write_whole
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, MrstrainError
+from dvc.io.result_folder import ResultFolder, result_folders
 from dvc.mesh import TetMesh
 from dvc.worker import usable_cores
 from fe import (
@@ -23,11 +24,10 @@ from fe import (
     write_state,
 )
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
-from mrstrain.measurement.measured_folder import Measurement, measurements_in
 from mrstrain.options.door import door
 from mrstrain.options.modelling import MaterialSets, MeshCoordinates
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 from validate import boundary_displacement, simulate_driven, write_boundary_conditions
 
 BOUNDARY, ENDING = "boundary", "-driven"
@@ -94,7 +94,7 @@ def drive(
     laws = {one.name: one.for_regions(read.regions) for one in chosen}
     for region_laws, _ in laws.values():
         check_materials(read, region_laws)
-    measurements = measurements_in(Path(dvc), loads)
+    measurements = result_folders(Path(dvc), loads)
     _refuse_bone_motion(measurements)
     measured = {m.load: m.deformation() for m in measurements}
     prescribed = {load: boundary_displacement(read, field) for load, field in measured.items()}
@@ -131,7 +131,7 @@ def _prepare(target: Path, folders: Sequence[Path]) -> None:
         clear_simulation(folder)
 
 
-def _refuse_bone_motion(measurements: Sequence[Measurement]) -> None:
+def _refuse_bone_motion(measurements: Sequence[ResultFolder]) -> None:
     loose = [m.load for m in measurements if m.aligned_on == "none"]
     if loose:
         raise InputError(

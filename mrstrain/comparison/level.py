@@ -11,14 +11,15 @@ from typing import Any
 import meshio
 import numpy as np
 
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.images.image import Image
 from dvc.images.tissue import tissue_mask
 from dvc.io.images.write import write_image
+from dvc.io.result_folder import result_folders
+from dvc.measurement.subject import Subject
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
-from mrstrain.measurement.measured_folder import measurements_in
 from mrstrain.measurement.register import register
 from mrstrain.options.comparison import ModelReading
 from mrstrain.options.door import door
@@ -31,8 +32,8 @@ from mrstrain.options.measurement import (
     Seeded,
     SubjectFiles,
 )
-from mrstrain.records.inputs import Subject, make_output, read_subject, refuse_touching_inputs
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
 from validate import LEVELLED, FeResult, extrapolated, filled_from_nearest
 
@@ -188,7 +189,7 @@ def _prepare(target: Path, name: str, images: Mapping[str, Image], record: Mappi
 def _write(path: Path, result: FeResult, registered: Path) -> None:
     """Write the registered displacement at the nodes of the model's mesh; where undefined, that of the nearest node."""
     mesh = result.mesh
-    (measured,) = measurements_in(registered)
+    (measured,) = result_folders(registered)
     u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)
     region = np.zeros(len(mesh.cells), dtype=np.int64)
     for number, cells in enumerate(mesh.regions.values(), start=1):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dvc.io.images.read import format_of
+from dvc.io.result_folder import PROVENANCE
 from dvc.registration.engines import methods_of
 from dvc.report.viewer import NIIVUE
 from fe import LoadStep
@@ -101,7 +102,7 @@ def _measured(measured: Mapping[str, Path]) -> str:
     """How displacement was measured; loads that were registered in the same way share a sentence."""
     groups: dict[str, list[str]] = {}
     for load, folder in measured.items():
-        record = _record(folder / "provenance.json")
+        record = _record(folder / PROVENANCE)
         groups.setdefault(_registration(record) + _files(record), []).append(load)
     sentences = " ".join(f"{_listed(loads)}: {sentence}" for sentence, loads in groups.items())
     return (
@@ -159,7 +160,7 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
             driven.append(_driven(name, record))
             published = published or record["set"] in _PUBLISHED
             continue
-        if _record(path.parent / "provenance.json").get("command") == "level":
+        if _record(path.parent / PROVENANCE).get("command") == "level":
             levelled.setdefault(_levelled(path, measured), []).append(name)
             continue
         if record.get("command") != "simulate" or "set" not in parameters:
@@ -197,8 +198,8 @@ def _driven(name: str, record: Record) -> str:
 def _levelled(path: Path, measured: Mapping[str, Path]) -> str:
     """How a model's file came out of the measurement that it was sent through."""
     work = path.parent.with_name(path.parent.name + "-work") / "registered" / path.stem / path.stem
-    how = _registration(_record(work / "provenance.json"))
-    same = how in {_registration(_record(folder / "provenance.json")) for folder in measured.values()}
+    how = _registration(_record(work / PROVENANCE))
+    same = how in {_registration(_record(folder / PROVENANCE)) for folder in measured.values()}
     return (
         "the model was sent through the measurement: its displacement moved the unloaded image, freed of noise; noise "
         "and a receive field were drawn anew; and the pair was registered"

@@ -3,46 +3,36 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import FloatArray
+from dvc.atomic_files import write_json
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
-from dvc.images.image import Image, Mask
-from dvc.images.tissue import tissue_mask
+from dvc.images.image import Image
 from dvc.io.images.read import read_image
+from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
+from dvc.measurement.source import Evidence
+from dvc.registration.align import without_motion
 from dvc.registration.engines import DEFAULT
-from dvc.registration.register import Registration, Settings, refuse_one_image_twice
-from dvc.registration.register import register as register_pair
-from dvc.trust.error_model import ErrorModel, error_model_of, read_error_model
+from dvc.registration.register import Settings, refuse_one_image_twice
+from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.trust.landmarks import read_landmarks
+from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker, each_in_workers, usable_cores
+from mrstrain.measurement.case import Case
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.page import write_series_report
-from mrstrain.measurement.results import Case, write_case
-from mrstrain.measurement.strain import read_any, without_motion
-from mrstrain.measurement.twin_check import TwinCheck, twin_check
+from mrstrain.measurement.plan import Plan, Registered, record_of
+from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
-from mrstrain.options.measurement import EngineOptions, MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
-from mrstrain.records.inputs import (
-    Subject,
-    case_names,
-    make_output,
-    read_subject,
-    refuse_small_disk,
-    refuse_touching_inputs,
-)
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
+from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_small_disk, refuse_touching_inputs
 
 Told = Callable[[str, str, float], None]
-REPEAT = "repeat"
-"""Name of a repeat scan's results."""
-_SETTINGS = {*EngineOptions.model_fields, "align", "bending", "volume", "allow_unknown_parameters", "error_model"}
-"""Options of a registration that its record has as settings, or by the file's hash."""
 _BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plate's axes
 
 
@@ -68,7 +58,7 @@ class Series:
         """A few lines for a person."""
         lines = [line for case in self.cases for line in case.summary()]
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
-        return [*lines, f"Report: {self.out / 'report.html'}"]
+        return [*lines, f"Report: {self.out / REPORT}"]
 
 
 @door
@@ -142,8 +132,8 @@ def register(
     # Read now: what is wrong with it must not be found after an hour.
     model = None if registration.error_model is None else read_error_model(registration.error_model)
     points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
-    body = subject.tissue or tissue_mask(subject.reference)
-    held = {"bone": subject.bone, "image": body, "none": None}[align]
+    subject = replace(subject, tissue=subject.body())
+    held = {"bone": subject.bone, "image": subject.tissue, "none": None}[align]
     begun_at = None if scans.start is None else without_motion(read_any(scans.start, scans.start_frame), held)[0]
     refuse_one_image_twice(
         [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
@@ -174,66 +164,27 @@ def register(
             "allow_missing": scans.allow_missing,
         },
     )
-    run = _Run(
-        target, subject, images, settings, body, record, points, model, begun_at, twin, progress or (lambda *_: None)
-    )
+    plan = Plan(subject, settings, Evidence(points, error_model=model), record, twin)
+    run = _Run(target, plan, images, begun_at, progress or (lambda *_: None))
     run.all(at_once, chain)
     finished = [run.cases[name] for name in cases if name in run.cases]
     if not finished:
         raise RegistrationError(
             "No load could be registered. " + " ".join(f"{n}: {r}" for n, r in run.failures.items())
         )
-    write_json(target / "provenance.json", record)
-    write_series_report(target / "report.html", [case.section for case in finished], run.failures, record)
+    write_json(target / PROVENANCE, record)
+    write_series_report(target / REPORT, [case.section for case in finished], run.failures, record)
     return Series(target, tuple(finished), run.failures)
-
-
-def record_of(
-    subject: Subject,
-    files: Mapping[str, list[Path]],
-    settings: Settings,
-    how: RegistrationOptions,
-    more: Mapping[str, object],
-) -> dict[str, object]:
-    """What a registration is made from; ``more`` are parameters beside those of the registration."""
-    return provenance(
-        "register",
-        {**subject.files, **files, "error_model": how.files.get("error_model", [])},
-        {
-            "align": settings.align_on,
-            "seed": settings.seed,
-            "threads": settings.threads,
-            "plate_normal_lps": subject.plate_normal.tolist(),
-            "engine": settings.engine.family,
-            **settings.engine.record(),
-            **{name: value for name, value in how.plain().items() if name not in _SETTINGS},
-            **more,
-        },
-    )
 
 
 class _Run:
     """The loads of one series: registered in worker processes, each written as soon as it is finished."""
 
-    def __init__(
-        self,
-        out: Path,
-        subject: Subject,
-        images: dict[str, Image],
-        settings: Settings,
-        body: Mask,
-        record: dict[str, object],
-        landmarks: tuple[FloatArray, FloatArray] | None,
-        model: ErrorModel | None,
-        start: Deformation | None,
-        twin: bool,
-        tell: Told,
-    ) -> None:
-        self.out, self.subject, self.images, self.settings, self.body = out, subject, images, settings, body
-        self.record, self.landmarks, self.model, self.start = record, landmarks, model, start
-        self.twin, self._tell = twin, tell
+    def __init__(self, out: Path, plan: Plan, images: dict[str, Image], start: Deformation | None, tell: Told) -> None:
+        self.out, self.plan, self.images, self.start, self._tell = out, plan, images, start, tell
         self.cases: dict[str, Case] = {}
         self.failures: dict[str, str] = {}
+        self._floor: NoiseFloor | None = None
         self._telling, self._writing = threading.Lock(), threading.Lock()
         self._floor_known = threading.Event()
         if REPEAT not in images:
@@ -243,55 +194,34 @@ class _Run:
         last: list[Deformation] = []
 
         def one(name: str, worker: Worker) -> None:
-            start = None if name == REPEAT else last[-1] if chain and last else self.start
+            is_repeat = name == REPEAT
+            start = None if is_repeat else last[-1] if chain and last else self.start
 
             def told(stage: str, fraction: float) -> None:
                 self._told(name, stage, fraction)
 
             try:
-                found = register_pair(
-                    self.subject.reference,
-                    self.images[name],
-                    bone=self.subject.bone,
-                    tissue=self.body,
-                    labels=self.subject.labels,
-                    settings=self.settings.of_repeat() if name == REPEAT else self.settings,
-                    start=start,
-                    worker=worker,
-                    progress=told,
-                )
-                made = None
-                if name != REPEAT:
-                    last.append(found.displacement)
-                    made = twin_check(found, self.subject, start, worker, told) if self.twin else None
+                done = self.plan.register(self.images[name], start, worker, told, is_repeat=is_repeat)
+                if not is_repeat:
+                    last.append(done.found.displacement)
                     self._floor_known.wait()
-                self._write(name, found, made)
+                self._write(name, done)
             except MrstrainError as error:
                 self.failures[name] = str(error)
             finally:
-                if name == REPEAT:
+                if is_repeat:
                     self._floor_known.set()
 
         names = sorted(self.images, key=lambda name: name != REPEAT)  # its floor is waited for
-        each_in_workers(names, one, at_once=at_once, threads=self.settings.threads)
+        each_in_workers(names, one, at_once=at_once, threads=self.plan.settings.threads)
 
-    def _write(self, name: str, found: Registration, twin: TwinCheck | None) -> None:
+    def _write(self, name: str, done: Registered) -> None:
         stage = "strain and figures"
         with self._writing:
             self._told(name, stage, 0.0)
-            floor = self.cases[REPEAT].own_floor if REPEAT in self.cases else None
-            self.cases[name] = write_case(
-                self.out / name,
-                name,
-                self.subject,
-                found,
-                self.record,
-                None if name == REPEAT else self.landmarks,
-                floor,
-                is_repeat=name == REPEAT,
-                model=self.model,
-                twin=twin,
-            )
+            self.cases[name], floor = self.plan.write(self.out / name, done, self._floor)
+            if done.is_repeat:
+                self._floor = floor
             self._told(name, stage, 1.0)
 
     def _told(self, case: str, stage: str, fraction: float) -> None:

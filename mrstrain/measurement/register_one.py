@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
-from dvc.images.tissue import tissue_mask
 from dvc.io.images.read import read_image
+from dvc.io.result_folder import QUALITY, REPEAT, spline_in
+from dvc.measurement.source import Evidence
 from dvc.registration.register import Settings
-from dvc.registration.register import register as register_pair
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.trust.quality import read_noise_floor
 from dvc.worker import Worker
+from mrstrain.measurement.case import Case
 from mrstrain.measurement.engines import engine_of
-from mrstrain.measurement.measured_folder import spline_in
-from mrstrain.measurement.register import REPEAT, record_of
-from mrstrain.measurement.results import Case, write_case
-from mrstrain.measurement.twin_check import twin_check
+from mrstrain.measurement.plan import Plan, record_of
 from mrstrain.options.door import door
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, SubjectFiles
 from mrstrain.records.inputs import read_subject
@@ -59,7 +58,7 @@ def register_one(
     chosen = engine_of(how, labelled=True)
     settings = Settings(chosen, how.align, running.seed, threads)
     model = error_model_of(chosen.name) if how.error_model is None else read_error_model(how.error_model)
-    floor = None if repeat is None else read_noise_floor(repeat / "quality.json")
+    floor = None if repeat is None else read_noise_floor(repeat / QUALITY)
     start = None if after is None else spline_in(after)
     record = record_of(
         subject,
@@ -72,19 +71,7 @@ def register_one(
             "shear_direction_lps": onto.plain()["shear_direction"],
         },
     )
-    body = subject.tissue or tissue_mask(subject.reference)
-    is_repeat = out.name == REPEAT
+    plan = Plan(replace(subject, tissue=subject.body()), settings, Evidence(error_model=model), record, how.twin)
     with Worker(threads) as worker:
-        found = register_pair(
-            subject.reference,
-            loaded,
-            bone=subject.bone,
-            tissue=body,
-            labels=subject.labels,
-            settings=settings.of_repeat() if is_repeat else settings,
-            start=start,
-            worker=worker,
-            progress=tell,
-        )
-        made = twin_check(found, subject, start, worker, tell) if how.twin and not is_repeat else None
-    return write_case(out, out.name, subject, found, record, None, floor, is_repeat=is_repeat, model=model, twin=made)
+        done = plan.register(loaded, start, worker, tell, is_repeat=out.name == REPEAT)
+    return plan.write(out, done, floor)[0]

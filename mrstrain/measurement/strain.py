@@ -6,19 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvc.deformation.protocol import Composed, Deformation, RigidMotion
+from dvc.atomic_files import write_json
+from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError
-from dvc.images.image import Mask
-from dvc.images.tissue import tissue_mask
+from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.io.transforms.displacement_image import read_displacement
 from dvc.io.transforms.read import read_transform
-from dvc.registration.align import motion_of
+from dvc.measurement.measurement import Measurement
+from dvc.measurement.subject import Subject
+from mrstrain.measurement.case import Case
 from mrstrain.measurement.page import write_series_report
-from mrstrain.measurement.results import Case, Measured, write_measured
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, MeshAndAxes, SubjectFiles
-from mrstrain.records.inputs import Subject, case_names, make_output, read_subject, refuse_touching_inputs
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.provenance import provenance
 
 _TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm", ".npz")
 
@@ -47,25 +48,9 @@ class Given:
         """All files that were read."""
         return [self.source, *self.subject.files.values()]
 
-    def measured(self, name: str) -> Measured:
-        """The deformation of tissue relative to its bone, where there is one."""
-        relative, motion = without_motion(self.whole, self.subject.bone)
-        body = self.subject.tissue or tissue_mask(self.subject.reference)
-        return Measured(name, self.subject, body, relative, motion)
-
-
-def without_motion(whole: Deformation, bone: Mask | None) -> tuple[Deformation, RigidMotion]:
-    """A deformation without the rigid motion of a mask's voxels (least squares), and that motion; whole without one.
-
-    Raises
-    ------
-    InputError
-        If it is not defined in the mask.
-    """
-    if bone is None:
-        return whole, RigidMotion.identity()
-    motion = motion_of(whole, bone)
-    return Composed([whole, motion.inverse()]), motion
+    def measured(self, name: str) -> Measurement:
+        """The strain of it; relative to the bone, where there is one."""
+        return Measurement.from_deformation(self.whole, self.subject, name=name)
 
 
 def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
@@ -96,7 +81,7 @@ class Strained:
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
-        return [*self.case.summary(), f"Report: {self.out / 'report.html'}"]
+        return [*self.case.summary(), f"Report: {self.out / REPORT}"]
 
 
 @door
@@ -150,7 +135,7 @@ def strain(
     refuse_touching_inputs(target, [name], given.files)
     measured = given.measured(name)
     make_output(target)
-    case = write_measured(target / name, measured, given.record)
-    write_json(target / "provenance.json", given.record)
-    write_series_report(target / "report.html", [case.section], {}, given.record)
+    case = Case.of(measured, target / name, given.record)
+    write_json(target / PROVENANCE, given.record)
+    write_series_report(target / REPORT, [case.section], {}, given.record)
     return Strained(target, case)

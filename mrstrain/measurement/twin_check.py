@@ -3,38 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from dvc.arrays import Float32Array
 from dvc.deformation.protocol import Deformation
-from dvc.deformation.strain_maps import strain_maps
 from dvc.errors import InputError, MrstrainError
 from dvc.images.noise import signal_to_noise
-from dvc.images.resample import shows
 from dvc.images.tissue import tissue_mask
+from dvc.measurement.error_bars import TwinCheck
+from dvc.measurement.judgement import maps_of
+from dvc.measurement.subject import Subject
 from dvc.registration.register import Registration, register
 from dvc.worker import Worker
-from mrstrain.records.inputs import Subject
 from phantoms import Acquisition, synthetic_warp
 
 _FOLDED = 1e-3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TwinCheck:
-    """What came back from the twin, or why nothing did.
-
-    Attributes
-    ----------
-    max_shear : (ni, nj, nk) or None
-        Found in the twin, on the unloaded image's grid; NaN where not defined.
-    failure : str
-    """
-
-    max_shear: Float32Array | None
-    failure: str = ""
 
 
 def twin_check(
@@ -84,8 +67,7 @@ def twin_check(
         )
     except MrstrainError as reason:
         return TwinCheck(None, str(reason))
-    placed, edge = again.alignment.motion, float(again.displacement.spacing_mm.min())
-    maps = strain_maps(again.deformation, again.tissue, lambda x: shows(twin, placed.apply(x), edge))
+    maps = maps_of(again)
     folded = float(np.mean(maps.jacobian[found.tissue.inside] <= 0.0))
     if folded > _FOLDED:
         return TwinCheck(None, f"Its registration folds in {folded:.1%} of the tissue, so it tells nothing.")

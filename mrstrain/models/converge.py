@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.io.images.labels import read_labels
 from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
@@ -30,7 +30,7 @@ from mrstrain.options.modelling import (
     SimulationOptions,
 )
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.provenance import file_hash, provenance, write_json
+from mrstrain.records.provenance import file_hash, provenance
 
 _FEWEST = 3
 

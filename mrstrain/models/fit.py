@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 import fe
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_json, write_whole
 from fe import Fit, Material, Ogden, as_toml, figures, read_curves
 from fe.hyperelastic import OGDEN
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 
 _FILES = ["fit.json", "fit.csv", "fit.png", "material.toml"]
 

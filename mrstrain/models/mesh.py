@@ -8,11 +8,12 @@ from pathlib import Path
 
 from dvc.errors import InputError, OutputError
 from dvc.io.images.labels import read_labels
+from dvc.measurement.subject import is_bones_name
 from dvc.mesh import TetMesh
 from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
 from mrstrain.options.door import door
 from mrstrain.options.modelling import Labelling, Meshing
-from mrstrain.records.inputs import is_bones_name, make_output
+from mrstrain.records.inputs import make_output
 from mrstrain.records.provenance import provenance
 
 _CARE_VOLUME, _CARE_ANGLE_DEG = 0.02, 10.0

@@ -2,69 +2,23 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError, OutputError
-from dvc.images.image import Image, LabelMap, Mask
 from dvc.io.images.labels import fit_mask, read_labels, read_mask
 from dvc.io.images.read import read_image
 from dvc.io.images.write import refuse_overwriting_inputs
-from dvc.io.meshes.read import MeshFile, read_mesh
+from dvc.io.meshes.read import read_mesh
+from dvc.io.result_folder import REPORT
+from dvc.measurement.subject import Subject, plate_directions
 from mrstrain.options.measurement import MeshAndAxes, SubjectFiles
 
 IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
-_BONES = {
-    "bone", "bones", "ankle", "calcaneus", "talus", "tibia", "fibula", "navicular", "cuboid", "cuneiform", "metatarsal",
-    "femur", "trochanter", "patella", "pelvis", "sacrum", "coccyx", "ilium", "ischium", "pubis", "vertebra",
-}  # fmt: skip
-_SOFT = {"fat", "pad", "muscle", "skin", "tendon", "ligament", "fascia", "aponeurosis", "tissue", "cartilage"}
-_INFERIOR = (0.0, 0.0, -1.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Subject:
-    """The unloaded image and what is known about it.
-
-    Attributes
-    ----------
-    reference : Image
-    bone, tissue : Mask or None
-        On the reference grid.
-    labels : LabelMap or None
-        On the reference grid.
-    mesh : MeshFile or None
-    plate_normal : (3,)
-        The plate's outward unit normal, away from the foot, LPS.
-    axes : (3, 3) or None
-        Columns: plate normal, shear direction, and the third; where a shear direction was given.
-    files : dict
-        Role to the file it came from, for provenance.
-    """
-
-    reference: Image
-    bone: Mask | None
-    tissue: Mask | None
-    labels: LabelMap | None
-    mesh: MeshFile | None
-    plate_normal: FloatArray
-    axes: FloatArray | None
-    files: dict[str, Path] = field(default_factory=dict)
-
-    @property
-    def lowest_bone_point_mm(self) -> FloatArray | None:
-        """The bone's voxel that lies furthest along the plate's outward normal, LPS mm."""
-        if self.bone is None:
-            return None
-        points = self.bone.points()
-        return np.asarray(points[int(np.argmax(points @ self.plate_normal))])
 
 
 def read_subject(
@@ -94,19 +48,9 @@ def read_subject(
                 f"{np.round(high, 1).tolist()} mm (LPS); the image: {reference.grid}. Check --mesh-unit and "
                 "--mesh-frame."
             )
-    normal = _unit("--plate-normal", onto.plate_normal or _INFERIOR)
-    shear = onto.shear_direction
-    axes = None if shear is None else plate_axes(normal, _unit("--shear-direction", shear))
+    normal, axes = plate_directions(onto.plate_normal, onto.shear_direction)
     given = {role: paths[0] for role, paths in {"load0": [Path(load0)], **files.files, **onto.files}.items()}
     return Subject(reference, bone, tissue, label_map, mesh, normal, axes, given)
-
-
-def _unit(name: str, vector: Sequence[float]) -> FloatArray:
-    direction = np.asarray(vector, dtype=np.float64)
-    length = float(np.linalg.norm(direction))
-    if direction.shape != (3,) or not np.isfinite(length) or length < 1e-6:
-        raise InputError(f"{name} must be three finite numbers (LPS) that are not all zero; got {list(vector)}.")
-    return direction / length
 
 
 def read_matrix(path: Path) -> FloatArray:
@@ -153,7 +97,7 @@ def case_names(loads: Sequence[Path]) -> list[str]:
 
 def refuse_touching_inputs(out: Path, case_folders: Sequence[str], inputs: Sequence[Path]) -> None:
     """Refuse an output folder in which a result would replace an input, or the folder that an input lies in."""
-    refuse_overwriting_inputs([out / c for c in case_folders] + [out / "report.html"], inputs)
+    refuse_overwriting_inputs([out / c for c in case_folders] + [out / REPORT], inputs)
     for path in inputs:
         for case in case_folders:
             if (out / case).resolve() in path.resolve().parents:
@@ -181,18 +125,6 @@ def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "", op
             f"{out}: {what} about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. Free some, choose "
             f"another {option}{instead}."
         )
-
-
-def is_bones_name(name: str) -> bool:
-    """Whether a label is called as a bone is.
-
-    Examples
-    --------
-    >>> [is_bones_name(name) for name in ("Talus", "tibia_left", "Sacrum", "fat pad", "calcaneus tendon")]
-    [True, True, True, False, False]
-    """
-    words = set(re.split(r"[^a-z]+", name.lower()))
-    return bool(words & _BONES) and not words & _SOFT
 
 
 def make_output(out: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import platform
 import re
@@ -12,7 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from dvc.atomic_files import write_whole
 from dvc.software import distribution_versions
 from dvc.worker import usable_cores
 from mrstrain.records.doctor import usable_memory_bytes
@@ -105,11 +103,6 @@ def provenance(
         "inputs": files,
         "parameters": dict(parameters),
     }
-
-
-def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write JSON atomically; NaN is refused, because JSON has none."""
-    write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def without_folders(value: Any, home: Path) -> Any:

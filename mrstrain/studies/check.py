@@ -15,15 +15,15 @@ from dvc.errors import InputError, MrstrainError
 from dvc.images.image import Image, LabelMap
 from dvc.io.images.labels import fit_mask, read_labels, read_mask
 from dvc.io.images.read import read_image
+from dvc.io.result_folder import REPEAT
+from dvc.measurement.subject import is_bones_name
 from dvc.mesh import TetMesh
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.worker import usable_cores
 from fe import LoadStep, MaterialSet, Plate, Problem, check_loads, check_meshing, fixed_facets, material_set
 from mrstrain.comparison.model_files import Reading, model_files
 from mrstrain.measurement.engines import engine_of
-from mrstrain.measurement.register import REPEAT
 from mrstrain.options.model import Vector
-from mrstrain.records.inputs import is_bones_name
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc.atomic_files import write_json
 from dvc.errors import InputError
+from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
 from dvc.report.page import Picture, Section, Table, caption_of, record_lines, write_report
 from dvc.trust.verdict import worst
-from mrstrain.measurement.register import REPEAT
 from mrstrain.records.inputs import make_output
 from mrstrain.records.progress import OnProgress
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 from mrstrain.records.tables import write_csv
 from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
 from mrstrain.studies.file import FILE, read_study
@@ -61,7 +62,7 @@ class Cohort:
             + ("" if place == 1 or s.differs_from_best else "; not told from the first")
             for place, s in enumerate(self.ranking, start=1)
         ]
-        return [*lines, *self.notes, f"Report: {self.out / 'report.html'}"]
+        return [*lines, *self.notes, f"Report: {self.out / REPORT}"]
 
 
 def cohort(
@@ -118,8 +119,8 @@ def cohort(
     _write_tables(target, areas, ranking)
     files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
     record = provenance("cohort", {"studies": files}, {"subjects": names})
-    write_json(target / "provenance.json", record)
-    _write_page(target / "report.html", ran, shares, ranking, notes, record)
+    write_json(target / PROVENANCE, record)
+    _write_page(target / REPORT, ran, shares, ranking, notes, record)
     return Cohort(target, tuple(ran), ranking, tuple(notes))
 
 

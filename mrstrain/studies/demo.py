@@ -10,14 +10,14 @@ from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
 from dvc.io.images.labels import read_labels, read_mask
 from dvc.io.images.write import write_labels
-from mrstrain.measurement.measured_folder import spline_in
+from dvc.io.result_folder import REPORT, spline_in
 from mrstrain.models.loads import LOADS
 from mrstrain.records.progress import OnProgress
 from mrstrain.studies.file import FILE
 from mrstrain.studies.page import write_run_report
 from mrstrain.studies.pipeline import StageOutcome
 from mrstrain.studies.plan import REGISTRATION
-from mrstrain.studies.run import REPORT, StudyRun, run
+from mrstrain.studies.run import StudyRun, run
 from mrstrain.studies.true_error import TABLE, read_errors, write_errors
 from mrstrain.truth.phantom import phantom
 from phantoms import Heel, TissueError, errors_by_tissue, heel_grid, labels_of, labels_to_mesh, under_load

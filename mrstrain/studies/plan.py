@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from dvc.errors import InputError
+from dvc.io.result_folder import REPEAT
 from fe import BONE, LoadStep, material_set
 from mrstrain.comparison.drive import ENDING
 from mrstrain.comparison.model_files import files_named
-from mrstrain.measurement.register import REPEAT
 from mrstrain.options.measurement import EngineOptions
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import Directions, MeshCoordinates, Meshing, PlateOptions, SimulationOptions

@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from dvc.atomic_files import write_json
 from dvc.errors import InputError, MrstrainError
+from dvc.io.result_folder import REPORT
 from dvc.registration.engines import DEFAULT, engine_named
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import OnProgress
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 from mrstrain.records.tables import write_csv
 from mrstrain.truth.accuracy_page import write_accuracy_report
 from phantoms import (
@@ -88,7 +90,7 @@ class AccuracyStudy:
             if r.by == "all" and r.tissue == "fat"
         ]
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
-        return [*lines, f"Report: {self.out / 'report.html'}"]
+        return [*lines, f"Report: {self.out / REPORT}"]
 
 
 def cases_of(

@@ -10,17 +10,17 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 
-from dvc.atomic_files import whole_folder
+from dvc.atomic_files import whole_folder, write_json
 from dvc.deformation.protocol import Motion, RigidMotion
 from dvc.deformation.strain_maps import StrainMaps, strain_maps
 from dvc.errors import InputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.io.images.write import write_image, write_labels, write_mask
-from dvc.io.result_folder import write_maps
+from dvc.io.result_folder import PROVENANCE, REGIONS, write_maps
 from dvc.trust.regions import region_statistics, write_regions_csv
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import OnProgress
-from mrstrain.records.provenance import provenance, write_json
+from mrstrain.records.provenance import provenance
 from phantoms import LOADS, Heel, covering, heel_grid, labels_of, labels_to_mesh, random_foot_motion, scan, under_load
 
 _BYTES_PER_VOXEL = 12  # measured: files of one load, image and truth
@@ -172,5 +172,5 @@ def _write_truth(folder: Path, maps: StrainMaps, labels: LabelMap, record: dict[
     folder.parent.mkdir(exist_ok=True)
     with whole_folder(folder) as partial:
         write_maps(partial, maps)
-        write_regions_csv(partial / "regions.csv", region_statistics(labels, maps.by_quantity))
-        write_json(partial / "provenance.json", record)
+        write_regions_csv(partial / REGIONS, region_statistics(labels, maps.by_quantity))
+        write_json(partial / PROVENANCE, record)

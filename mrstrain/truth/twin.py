@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from dvc.atomic_files import write_json
 from dvc.io.images.write import write_image
-from mrstrain.measurement.results import Case, write_measured
+from dvc.io.result_folder import PROVENANCE
 from mrstrain.measurement.strain import read_deformation
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, SubjectFiles
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
-from mrstrain.records.provenance import write_json
 from phantoms import Acquisition, synthetic_warp
 
 _TRUTH = Path("truth") / "twin"
@@ -20,20 +20,19 @@ _IMAGE = "twin.nii.gz"
 
 @dataclass(frozen=True, slots=True)
 class TwinFiles:
-    """What `twin` wrote: the warped image, the folder of the truth, and the truth's case."""
+    """What `twin` wrote: the warped image, the folder of the truth, and the truth in a line."""
 
     image: Path
     truth: Path
-    case: Case
+    strain: str
     shown: float
     register: str
 
     def summary(self) -> list[str]:
         """Summary, with the command that registers the image."""
-        shear = ", ".join(f"{region} {p50:.3f} / {p95:.3f}" for region, (p50, p95) in self.case.shear.items())
         return [
             f"Warped image: {self.image}; it shows {self.shown:.0%} of the tissue. Truth: {self.truth}",
-            f"True max. shear, median / 95th percentile: {shear}",
+            f"True {self.strain}",
             f"To register it: {self.register}",
         ]
 
@@ -75,18 +74,19 @@ def twin(
     """
     target = Path(out)
     subject = read_subject(load0, subject_files)
+    subject = replace(subject, tissue=subject.body())
     recorded = {"bone_label": subject_files.bone_label, "seed": seed}
     given = read_deformation(subject, deformation, frame=frame, command="twin", parameters=recorded)
     refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], given.files)
     measured = given.measured(_TRUTH.name)
     make_output(target)
     acquisition = Acquisition(seed)
-    made = synthetic_warp(subject.reference, measured.tissue, given.whole, acquisition, near=measured.bone_motion)
+    made = synthetic_warp(subject.reference, subject.body(), given.whole, acquisition, near=measured.bone_motion)
     write_image(target / _IMAGE, made.image)
     (target / _TRUTH).parent.mkdir(exist_ok=True)
-    case = write_measured(target / _TRUTH, measured, given.record)
-    write_json(target / "provenance.json", given.record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
+    measured.write(target / _TRUTH, given.record)
+    write_json(target / PROVENANCE, given.record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
     told = " ".join(f"{subject_files.option(name)} {value}" for name, value in subject_files if value is not None)
     align = " --align none" if subject.bone is None else ""
     command = f"mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}"
-    return TwinFiles(target / _IMAGE, target / _TRUTH, case, made.shown, command)
+    return TwinFiles(target / _IMAGE, target / _TRUTH, measured.strain_line, made.shown, command)

@@ -37,7 +37,7 @@ _ROUNDING = 4e-7  # of b^2 + c^2 + d^2 in single precision, with a margin
 
 
 def read_nifti_header(
-    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
+    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False, components: int = 3
 ) -> StoredVolume:
     """Read what a NIfTI-1 or NIfTI-2 file holds, and where its voxels lie in LPS mm.
 
@@ -45,7 +45,8 @@ def read_nifti_header(
     ----------
     path : .nii or .nii.gz
     volume : which volume of a 4D file, from 0
-    vectors : whether a file of three components per voxel, (ni, nj, nk, 1, 3), is needed in place of a scalar one
+    vectors : whether a file of several components per voxel, (ni, nj, nk, 1, c), is needed in place of a scalar one
+    components : how many, c
 
     Raises
     ------
@@ -54,8 +55,8 @@ def read_nifti_header(
         sform that disagree, is sheared, is not 3D, or its voxels are not real numbers.
     """
     header = _header(path)
-    shape, count = (_vector_sizes(path, header), 1) if vectors else _sizes(path, header)
-    layout = (*shape, 3) if vectors else shape
+    shape, count = (_vector_sizes(path, header, components), 1) if vectors else _sizes(path, header)
+    layout = (*shape, components) if vectors else shape
     # Size and count come first: a header that is wrong there is not worth a look at its geometry.
     refuse_if_too_large(path, layout, max_bytes)
     chosen = pick_volume(path, count, volume)
@@ -145,10 +146,10 @@ def _sizes(path: Path, header: Any) -> tuple[tuple[int, int, int], int]:
     return (sizes[0], sizes[1], sizes[2]), sizes[3] if len(sizes) == 4 else 1
 
 
-def _vector_sizes(path: Path, header: Any) -> tuple[int, int, int]:
+def _vector_sizes(path: Path, header: Any, components: int) -> tuple[int, int, int]:
     sizes = _dimensions(header)
-    if sizes[3:5] != [1, 3] or any(n not in (0, 1) for n in sizes[5:]):
-        raise ImageFileError(f"{path}: a NIfTI of shape {tuple(sizes)}; vectors are (ni, nj, nk, 1, 3).")
+    if sizes[3:5] != [1, components] or any(n not in (0, 1) for n in sizes[5:]):
+        raise ImageFileError(f"{path}: a NIfTI of shape {tuple(sizes)}; (ni, nj, nk, 1, {components}) is needed.")
     return sizes[0], sizes[1], sizes[2]
 
 

@@ -17,7 +17,8 @@ from dvc.deformation.bspline import BSpline
 from dvc.errors import InputError, MrstrainError
 from dvc.images.image import Grid
 
-NAME = "spline_with_borders.npz"
+FILE = "spline_with_borders.npz"
+"""Its name in a folder of results."""
 _FORMAT = 1
 _UNREADABLE = OSError, EOFError, zlib.error, zipfile.BadZipFile, ValueError, KeyError, TypeError
 

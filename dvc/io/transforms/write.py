@@ -18,12 +18,14 @@ from dvc.deformation.protocol import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.images.itk_image import to_sitk
-from dvc.io.transforms.bordered_spline import NAME as BORDERED_SPLINE
+from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE
 from dvc.io.transforms.bordered_spline import write_bordered_spline
 from dvc.io.transforms.elastix_text import Value, format_parameters
 
 StrPath = str | os.PathLike[str]
 
+ELASTIX_FILES = ("TransformParameters.0.txt", "TransformParameters.1.txt")
+"""Names of the files of a chain: a B-spline, and the rigid motion that follows."""
 _NO_INITIAL = "NoInitialTransform"
 
 

@@ -12,7 +12,7 @@ from dvc.deformation.strain import StrainField, plate_axes
 from dvc.deformation.strain_maps import strain_maps
 from dvc.images.image import Grid, Image, Mask
 from dvc.io.result_folder import in_axes
-from mrstrain.records.inputs import Subject
+from dvc.measurement.subject import Subject
 
 GRID = Grid((5, 6, 7), np.array([1.0, 1.5, 2.0]), np.array([-3.0, 4.0, 8.0]))
 MATRIX = np.array([[1.08, 0.11, -0.05], [0.02, 0.93, 0.17], [-0.09, 0.04, 1.03]])

@@ -11,7 +11,8 @@ from dvc.deformation.strain_maps import strain_maps
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.noise import noise_in_air
 from dvc.images.similarity import brightness_offset, local_correlation, most_similarity
-from dvc.trust.quality import assess, noise_floor
+from dvc.trust.assessment import Similarity, assess
+from dvc.trust.quality import noise_floor
 
 GRID = Grid((24, 20, 16), np.array([1.0, 1.2, 1.5]), np.array([-10.0, 5.0, 0.0]))
 WHOLE = Mask(GRID, np.ones(GRID.shape, dtype=bool))
@@ -52,12 +53,15 @@ def test_row_11_folding_is_found_with_its_place_and_not_trusted():
     middle = GRID.points_at(np.array([12.0, 10.0, 8.0]))
     u[..., 0] = -3.0 * (X[..., 0] - middle[0]) * np.exp(-np.sum((X - middle) ** 2, axis=-1) / 8.0)
     maps = strain_maps(SampledDisplacement(GRID, u), WHOLE)
-    quality = assess(maps, WHOLE, None, similarity=(0.5, 0.7, 0.95))
+    quality = assess(maps, WHOLE, None, similarity=Similarity((0.5, 0.7, 0.95)))
     assert quality.folded_voxels > 0
     assert quality.verdict.level == "distrust"
     assert "folds" in quality.verdict.reasons[0]
     np.testing.assert_allclose(quality.lowest_jacobian_at_mm, middle, atol=1.6)
-    assert assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.5, 0.7, 0.95)).verdict.level == "trust"
+    assert (
+        assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=Similarity((0.5, 0.7, 0.95))).verdict.level
+        == "trust"
+    )
 
 
 @pytest.mark.parametrize(
@@ -70,7 +74,7 @@ def test_row_11_folding_is_found_with_its_place_and_not_trusted():
     ],
 )
 def test_a_poor_or_falling_similarity_costs_trust(similarity, level):
-    assert assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=similarity).verdict.level == level
+    assert assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=Similarity(similarity)).verdict.level == level
 
 
 def test_noise_says_how_alike_two_scans_can_be():
@@ -101,8 +105,8 @@ def test_noise_says_how_alike_two_scans_can_be():
 )
 def test_what_noise_does_not_explain_costs_trust(lacks: float, with_more_noise: float, level: str) -> None:
     verdict = assess(
-        strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.3, 0.5, 0.7),
-        most_similarity=lambda factor: 0.7 + (lacks if factor == 1.0 else with_more_noise),
+        strain_maps(STRETCH, WHOLE), WHOLE, None,
+        similarity=Similarity((0.3, 0.5, 0.7), lambda factor: 0.7 + (lacks if factor == 1.0 else with_more_noise)),
     ).verdict  # fmt: skip
     assert verdict.level == level
     assert all("same foot" in reason for reason in verdict.reasons)
@@ -133,8 +137,8 @@ def test_an_offset_is_told_from_a_gain_that_varies(noise: float, offset: float) 
 )
 def test_an_offset_between_the_images_costs_trust(offset: float, with_more_noise: float, level: str) -> None:
     quality = assess(
-        strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=(0.3, 0.5, 0.9),
-        offset=lambda factor: offset if factor == 1.0 else with_more_noise,
+        strain_maps(STRETCH, WHOLE), WHOLE, None,
+        similarity=Similarity((0.3, 0.5, 0.9), offset=lambda factor: offset if factor == 1.0 else with_more_noise),
     )  # fmt: skip
     assert quality.verdict.level == level
 
@@ -143,19 +147,19 @@ def test_an_offset_between_the_images_costs_trust(offset: float, with_more_noise
 def test_thick_slices_cost_trust(slice_mm: float, level: str) -> None:
     grid = Grid((6, 6, 6), (0.8, 0.8, slice_mm), (0.0, 0.0, 0.0))
     whole = Mask(grid, np.ones(grid.shape, dtype=bool))
-    verdict = assess(strain_maps(STRETCH, whole), whole, None, similarity=(0.3, 0.5, 0.9)).verdict
+    verdict = assess(strain_maps(STRETCH, whole), whole, None, similarity=Similarity((0.3, 0.5, 0.9))).verdict
     assert verdict.level == level
     assert all("Slices are" in reason for reason in verdict.reasons)
 
 
 def test_a_bone_that_moves_costs_trust():
     shifted = strain_maps(RigidMotion(np.eye(3), np.array([0.5, 0.0, 0.0])), WHOLE)
-    quality = assess(shifted, WHOLE, core(), similarity=(0.3, 0.5, 0.9))
+    quality = assess(shifted, WHOLE, core(), similarity=Similarity((0.3, 0.5, 0.9)))
     assert quality.bone_shift_mm == pytest.approx(0.5, rel=1e-6)
     assert quality.verdict.level == "caution"
     at_rest = strain_maps(RigidMotion.identity(), WHOLE)
     for in_bone, level in (((0.0, 0.0), "trust"), ((0.5, 0.0), "caution"), ((0.0, 0.3), "distrust")):
-        held = assess(at_rest, WHOLE, core(), similarity=(0.3, 0.5, 0.9), in_bone=in_bone)
+        held = assess(at_rest, WHOLE, core(), similarity=Similarity((0.3, 0.5, 0.9)), in_bone=in_bone)
         assert held.verdict.level == level
         assert (held.bone_shift_mm, held.bone_shear_p95, held.bone_held) == (*in_bone, True)
 
@@ -165,7 +169,7 @@ def test_no_evidence_is_no_trust():
     assert "No images" in assess(maps, core(), None).verdict.reasons[0]
     elsewhere = np.zeros(GRID.shape, dtype=bool)
     elsewhere[0, 0, 0] = True
-    quality = assess(maps, core(), Mask(GRID, elsewhere), similarity=(0.3, 0.5, 0.9))
+    quality = assess(maps, core(), Mask(GRID, elsewhere), similarity=Similarity((0.3, 0.5, 0.9)))
     assert quality.verdict.level == "caution"
     assert "bone has no result" in quality.verdict.reasons[0]
     assert noise_floor(maps, elsewhere) is None

@@ -23,7 +23,7 @@ from dvc.registration.gauss_newton import fit as gaussnewton
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Settings
 from mrstrain.comparison.methods import methods
-from mrstrain.measurement.register import record_of
+from mrstrain.measurement.plan import record_of
 from mrstrain.options.measurement import RegistrationOptions, SubjectFiles
 from mrstrain.records.inputs import read_subject
 from validate import ALL, Criteria

@@ -21,7 +21,7 @@ from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.io.images.labels import read_mask
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_labels
-from dvc.io.transforms.bordered_spline import NAME
+from dvc.io.result_folder import SPLINE_WITH_BORDERS, result_folders, spline_in
 from dvc.io.transforms.read import read_transform
 from dvc.registration.engine import AlignedPair
 from dvc.registration.engines import engine_named
@@ -31,7 +31,6 @@ from dvc.registration.gauss_newton.with_interfaces import USUAL_SKIN
 from dvc.registration.register import Settings, register
 from dvc.worker import Worker
 from mrstrain.measurement.engines import engine_of
-from mrstrain.measurement.measured_folder import measurements_in, spline_in
 from mrstrain.measurement.register import register as run
 from mrstrain.measurement.register_one import register_one
 from mrstrain.measurement.strain import read_any, strain
@@ -165,7 +164,7 @@ def test_the_bone_that_is_held_is_judged_by_what_the_images_would_have_it_do(out
 
 def test_what_is_read_again_has_the_jumps_that_the_maps_have(pad, out):
     """Displacements at voxels, differentiated, miss the shear by over .1 somewhere (above)."""
-    (measured,) = measurements_in(out)
+    (measured,) = result_folders(out)
     valid = read_mask(out / "Load1" / "valid.nii.gz").inside
     X = GRID.points().reshape(-1, 3)
     u, H = measured.deformation().evaluate(X)
@@ -173,18 +172,18 @@ def test_what_is_read_again_has_the_jumps_that_the_maps_have(pad, out):
     np.testing.assert_allclose(shear[valid], shear_of(out / "Load1")[valid], atol=1e-5)
     assert np.isnan(shear[~valid]).all()
     assert np.isnan(u.reshape(*GRID.shape, 3)[~valid]).all()
-    spline = read_any(out / "Load1" / NAME)
+    spline = read_any(out / "Load1" / SPLINE_WITH_BORDERS)
     assert isinstance(spline, BorderedSpline)
     assert spline.borders.rest >= 0
-    assert [file.name for file in measured.files] == [NAME, "valid.nii.gz"]
+    assert [file.name for file in measured.files] == [SPLINE_WITH_BORDERS, "valid.nii.gz"]
 
 
 def test_a_damaged_spline_is_refused_by_name(out, tmp_path, monkeypatch):
-    whole = (out / "Load1" / NAME).read_bytes()
-    place = tmp_path / NAME
+    whole = (out / "Load1" / SPLINE_WITH_BORDERS).read_bytes()
+    place = tmp_path / SPLINE_WITH_BORDERS
     for damaged in (whole[: len(whole) // 2], b"", b"PK"):
         place.write_bytes(damaged)
-        with pytest.raises(InputError, match=NAME):
+        with pytest.raises(InputError, match=SPLINE_WITH_BORDERS):
             read_transform(place)
     place.write_bytes(whole)
     monkeypatch.setattr("dvc.io.transforms.bordered_spline.NUMBERS", {"blur": 2.0})

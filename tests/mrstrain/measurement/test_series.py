@@ -23,10 +23,12 @@ from dvc.registration.gauss_newton.fit import control_grid, spline_through
 from dvc.registration.register import Registration, Settings
 from dvc.registration.register import register as register_pair
 from dvc.report.page import Section
+from dvc.trust.quality import NoiseFloor
 from dvc.trust.verdict import Verdict
 from dvc.worker import Worker
+from mrstrain.measurement.case import Case
+from mrstrain.measurement.plan import Plan, Registered
 from mrstrain.measurement.register import Series, register
-from mrstrain.measurement.results import Case
 from phantoms import Heel, pressed, scan
 from tests.quick import QUICK
 
@@ -77,12 +79,12 @@ class Spy:
 def spy(monkeypatch, scans, tiny_pair) -> Spy:
     control = control_grid(tiny_pair.reference.grid, np.full(3, 8.0))
     one = Spy(scans, BSpline(control, spline_through(tiny_pair.deformation, control)), [], [], {})
-    monkeypatch.setattr("mrstrain.measurement.register.register_pair", one.register)
+    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", one.register)
 
-    def written(_folder: Path, name: str, *_: object, **__: object) -> Case:
-        return Case(name, Section(name, Verdict("trust")), Verdict("trust"), {}, None)
+    def written(_plan: Plan, folder: Path, _done: Registered, _floor: NoiseFloor | None) -> tuple[Case, None]:
+        return Case(folder, Section(folder.name, Verdict("trust")), ()), None
 
-    monkeypatch.setattr("mrstrain.measurement.register.write_case", written)
+    monkeypatch.setattr(Plan, "write", written)
     return one
 
 

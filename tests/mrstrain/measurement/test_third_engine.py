@@ -16,11 +16,11 @@ from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.images.image import Grid, Image, Mask
 from dvc.io.images.write import write_image, write_mask
+from dvc.io.result_folder import result_folders, spline_in
 from dvc.io.transforms.read import read_transform
 from dvc.registration.engine import AlignedPair, Engine, Found
 from dvc.registration.engines import ENGINES, methods_of
 from dvc.registration.register import Settings, register
-from mrstrain.measurement.measured_folder import measurements_in, spline_in
 
 GRID = Grid((24, 22, 20), (1.5, 1.5, 1.5), (-18.0, -16.0, -15.0))
 SHIFT = np.array([1.5, -3.0, 0.0])
@@ -109,7 +109,7 @@ def test_its_results_are_written_read_and_told(tmp_path: Path, monkeypatch) -> N
     assert "mrstrain accuracy --preset centroids" in quality["error_of_max_shear"]["reason"]
     assert not (folder / "TransformParameters.0.txt").exists()
     X = GRID.points(BODY.inside)
-    for read in (read_transform(folder / "transform.h5"), spline_in(folder), measurements_in(folder)[0].deformation()):
+    for read in (read_transform(folder / "transform.h5"), spline_in(folder), result_folders(folder)[0].deformation()):
         np.testing.assert_allclose(read.displacement(X), np.tile(SHIFT, (len(X), 1)), atol=1e-5)
     assert methods_of(record["parameters"], record["versions"]).startswith("with the engine centroids of mrstrain")
     with pytest.raises(InputError, match="centroids has none"):

@@ -1,52 +1,32 @@
-"""The error bars of a registered load: its preset's error model put on its strain map."""
+"""The error bars of a registered load: its preset's error model applied to its strain map."""
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, fields, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from dvc.arrays import BoolArray, FloatArray
-from dvc.atomic_files import write_whole
+from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.errors import InputError
-from dvc.images.image import Image
 from dvc.images.noise import signal_to_noise
 from dvc.images.tissue import tissue_mask
-from dvc.io.images.write import write_image
+from dvc.measurement.subject import Subject, is_bones_name
 from dvc.registration.register import Registration
-from dvc.report import figures
-from dvc.report.page import Picture, Table, caption_of
-from dvc.report.planes import View
 from dvc.trust.error_model import (
     POOLED,
     ErrorModel,
     ErrorTable,
-    Interval,
     Uncertainty,
     to_surface_mm,
     uncertainty_of,
 )
 from dvc.trust.twin_judgement import Judged, judged
-from dvc.trust.verdict import Verdict
-from mrstrain.measurement.twin_check import TwinCheck
-from mrstrain.records.inputs import Subject, is_bones_name
 
 _MOSTLY = 0.5
-_SIGMA_SCALE = 0.1
-_TWIN = (
-    "The unloaded image was moved by what was measured, its noise drawn anew, and the pair registered as the real one: "
-    "its true strain is the one above. What came back tells what the noise and texture of these images cost. Strain "
-    "that a registration smooths away before it is measured does not come back, which makes the twin's error smaller "
-    "than the true one; what denoising takes of the texture makes it larger. A tissue in which fewer voxels lie within "
-    "the claimed error than are expected of any registration, or a percentile does not come back within its interval, "
-    "has its error bars made wider by the factor; none are made narrower."
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +37,7 @@ class ErrorBars:
     ----------
     uncertainty : Uncertainty or None
     told : str
-        Where the figures come from, or the reason why there are none.
+        Where the figures come from, or the reason why there are none; empty where no images were registered.
     model : ErrorModel or None
         With the one table that was used.
     twin : tuple of Judged
@@ -83,45 +63,39 @@ class ErrorBars:
         voxel = table.spacing_mm.tolist()
         return {"known": True, "source": self.told, "voxel_mm": voxel, "snr": round(table.snr, 1)} | twin
 
-    def write(self, folder: Path, maps: StrainMaps, verdict: Verdict) -> None:
-        """Write ``sigma_max_shear.nii.gz``, ``intervals.csv`` and the ``error_model.json`` used, if there are any.
+    @classmethod
+    def from_dict(
+        cls, told: Mapping[str, Any], uncertainty: Uncertainty | None = None, model: ErrorModel | None = None
+    ) -> ErrorBars:
+        """The error bars of which `as_dict` told, with their arrays."""
+        twin = tuple(Judged(**row) for row in told.get("twin", ()))
+        return cls(uncertainty, str(told.get("source", told.get("reason", ""))), model, twin, told.get("of_twin", ""))
 
-        The registration's verdict stands beside every interval: of one that failed they tell nothing.
-        """
-        if self.uncertainty is None:
-            return
-        if self.model is not None:
-            self.model.write(folder / "error_model.json")
-        write_image(folder / "sigma_max_shear.nii.gz", Image(maps.grid, self.uncertainty.sigma))
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([*(f.name for f in fields(Interval)), "verdict"])
-        writer.writerows(
-            [*(f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)), verdict.words]
-            for row in self.uncertainty.intervals
-        )
-        write_whole(folder / "intervals.csv", text.getvalue())
+    @property
+    def missing(self) -> str:
+        """Why there are none; empty where there are, or where nothing is to be told."""
+        return self.told if self.uncertainty is None else ""
 
-    def tables(self) -> list[Table]:
-        """The intervals, and what came back from the twin, as the report shows them."""
-        tables = []
-        if self.uncertainty is not None:
-            rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in self.uncertainty.intervals)
-            columns = ("region", "figure", "as found", "95 % from", "to")
-            tables.append(Table("Maximal shear with its error", columns, rows, self.told))
-        if self.twin:
-            claims = self.uncertainty is not None
-            head = ("region", "error (rms)", "bias", *(("within the claim", "expected, at least", "wider") * claims))
-            lines = tuple((row.region, row.rms_error, row.bias, *_against_claims(row)) for row in self.twin)
-            tables.append(Table("The twin of this pair, measured again", head, lines, _TWIN))
-        return tables
+    @property
+    def summary(self) -> list[str]:
+        """Why there are none, and what the twin did to them, for a person."""
+        lines = [f"no error bars: {self.missing}"] * bool(self.missing)
+        return lines + [f"error bars: {self.of_twin}"] * bool(self.of_twin)
 
-    def pictures(self, view: View, reference: Image) -> dict[str, Picture]:
-        """The map of the standard deviation."""
-        if self.uncertainty is None:
-            return {}
-        drawn = figures.sigma_slices(view, reference, self.uncertainty.sigma, _SIGMA_SCALE)
-        return {"sigma": Picture("How sure the maximal shear is", caption_of(figures.sigma_slices), drawn)}
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwinCheck:
+    """What came back from the pair's twin, or why nothing did.
+
+    Attributes
+    ----------
+    max_shear : (ni, nj, nk) or None
+        Found in the twin, on the unloaded image's grid; NaN where not defined.
+    failure : str
+    """
+
+    max_shear: Float32Array | None
+    failure: str = ""
 
 
 def error_bars(
@@ -249,16 +223,3 @@ def _bone_and_tissues(
     if not soft:
         soft = {POOLED: tissue & ~bone}
     return bone, {name: inside & ~bone for name, inside in soft.items()}
-
-
-def _against_claims(row: Judged) -> tuple[str | float, ...]:
-    """What the twin says of a tissue's error bars, as a table shows it; nothing where there are none."""
-    if row.held is None or row.expected is None or row.factor is None:
-        return ()
-    return f"{row.held:.0%}", f"{row.expected:.0%}", row.factor
-
-
-def _words(figure: str) -> str:
-    if figure.startswith("volume_above_"):
-        return f"volume above {figure.removeprefix('volume_above_').removesuffix('_ml')}, mL"
-    return {"median": "median", "p90": "90th percentile", "p95": "95th percentile"}[figure]

@@ -1,0 +1,95 @@
+"""From a pair of images to a measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from dvc.arrays import FloatArray
+from dvc.deformation.protocol import Deformation
+from dvc.images.image import Image, LabelMap, Mask
+from dvc.io.meshes.read import MeshFile
+from dvc.measurement.measurement import Measurement
+from dvc.measurement.source import Evidence
+from dvc.measurement.subject import Subject, plate_directions
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+from dvc.registration.register import Settings, register
+from dvc.trust.error_model import ErrorModel, error_model_of
+from dvc.worker import Worker
+
+
+def measure(
+    reference: Image,
+    loaded: Image,
+    *,
+    bone: Mask | None = None,
+    tissue: Mask | None = None,
+    labels: LabelMap | None = None,
+    settings: Settings | None = None,
+    start: Deformation | None = None,
+    repeat: Image | None = None,
+    landmarks: tuple[FloatArray, FloatArray] | None = None,
+    error_model: ErrorModel | None = None,
+    mesh: MeshFile | None = None,
+    plate_normal: Sequence[float] | None = None,
+    shear_direction: Sequence[float] | None = None,
+    name: str = "load",
+    worker: Worker | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Measurement:
+    """Measure the strain of a loaded image against the unloaded one, with its verdict and error bars.
+
+    Arrays in, arrays out: no file is read or written (`Measurement.write` does).
+
+    Parameters
+    ----------
+    reference, loaded : Image
+        Unloaded and loaded image, each in the frame of its own file (LPS mm).
+    bone, tissue, labels, start
+        As in `dvc.register`: on the reference grid. Labels give statistics by region, and let strain jump at their
+        borders.
+    settings : Settings, optional
+        By default the Gauss-Newton engine, with strain discontinuities at tissue interfaces where there are labels; one
+        thread.
+    repeat : Image, optional
+        A second unloaded image: its apparent strain is the noise floor.
+    landmarks : ((n, 3), (n, 3)), optional
+        Points of the unloaded image and the same of the loaded one, LPS mm.
+    error_model : ErrorModel, optional
+        By default the one that comes with the engine or preset.
+    mesh : MeshFile, optional
+        Displacement and strain are written at its nodes and cells.
+    plate_normal, shear_direction : (3,), optional
+        LPS. The plate's outward normal (default: inferior) finds the bone's lowest point; with a shear direction,
+        strain is written in the plate's axes as well.
+    name : str
+        Of the load.
+    worker : Worker, optional
+        Process to compute in; a new one by default.
+    progress : callable, optional
+        ``progress(stage, fraction)``.
+
+    Returns
+    -------
+    Measurement
+
+    Raises
+    ------
+    InputError, ParameterError, RegistrationError, WorkerError
+        As `dvc.register`.
+    """
+    normal, axes = plate_directions(plate_normal, shear_direction)
+    subject = Subject(reference, bone, tissue, labels, mesh, normal, axes)
+    chosen = settings or Settings(GaussNewton() if labels is None else GaussNewtonWithInterfaces())
+    body, own = subject.body(), None if worker is not None else Worker(chosen.threads)
+    try:
+        given = {"bone": bone, "tissue": body, "labels": labels, "worker": worker or own, "progress": progress}
+        floor = None
+        if repeat is not None:
+            again = register(reference, repeat, settings=chosen.of_repeat(), **given)  # type: ignore[arg-type]
+            floor = Measurement.from_registration(again, subject, is_repeat=True).quality.noise_floor
+        found = register(reference, loaded, settings=chosen, start=start, **given)  # type: ignore[arg-type]
+    finally:
+        if own is not None:
+            own.close()
+    evidence = Evidence(landmarks, floor, error_model or error_model_of(chosen.engine.name))
+    return Measurement.from_registration(found, subject, evidence, name=name)

@@ -1,0 +1,398 @@
+"""A pair of images as it was measured: arrays, quality, verdict and error bars; written, read and shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from dvc.arrays import Float32Array
+from dvc.atomic_files import whole_folder, write_json
+from dvc.deformation.protocol import Deformation, RigidMotion, Within
+from dvc.deformation.strain_maps import StrainMaps, strain_maps
+from dvc.errors import InputError
+from dvc.images.image import Image, Mask
+from dvc.io import result_folder as files
+from dvc.measurement import notebook, page
+from dvc.measurement.error_bars import ErrorBars, error_bars
+from dvc.measurement.judgement import carried_images, maps_of, quality_of
+from dvc.measurement.notebook import Scalar
+from dvc.measurement.source import Evidence, Source, alignment_of, motion_as_dict, write_images_and_transforms
+from dvc.measurement.subject import Subject
+from dvc.registration.align import without_motion
+from dvc.registration.register import Registration
+from dvc.report.page import Picture, Section
+from dvc.report.planes import PLANES, Plane, View
+from dvc.trust.assessment import assess
+from dvc.trust.error_model import Interval
+from dvc.trust.quality import Quality, noise_floor
+from dvc.trust.regions import RegionRow, read_regions_csv, region_statistics, write_regions_csv
+from dvc.trust.verdict import Verdict
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """Deformation and strain of one loaded image against the unloaded one, and how far they may be trusted.
+
+    Everything lies on the unloaded image's voxels, in the reference configuration, LPS mm; NaN where not defined.
+
+    Attributes
+    ----------
+    name : str
+        Of the load.
+    deformation : Deformation
+        Displacement of tissue relative to its bone.
+    maps : StrainMaps
+        Displacement, Green-Lagrange strain, maximal shear, det F, and where they are valid.
+    alignment : mapping
+        The bone's rigid motion between the scans and how well it is known, as plain values.
+    quality : Quality
+        The figures behind the verdict.
+    regions : tuple of RegionRow
+        Statistics of maximal shear, det F and displacement by region.
+    error_bars : ErrorBars
+        Standard deviation and intervals of the maximal shear, or why there are none.
+    image : Image or None
+        What maps are shown over: the unloaded image; the registered one where a folder was read.
+    source : Source or None
+        What it was made from; None where a folder was read.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from dvc import Affine, Grid, Image
+    >>> grid = Grid((8, 8, 8), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    >>> values = np.zeros(grid.shape, dtype=np.float32)
+    >>> values[2:6, 2:6, 2:6] = 1.0
+    >>> subject = Subject(Image(grid, values), tissue=Mask(grid, values > 0))
+    >>> stretched = Measurement.from_deformation(Affine(np.diag([1.2, 1.0, 1.0]), np.zeros(3)), subject)
+    >>> round(float(np.nanmean(stretched.max_shear)), 3)
+    0.11
+    >>> with TemporaryDirectory() as folder:
+    ...     _ = stretched.write(Path(folder) / "stretched")
+    ...     again = Measurement.read(Path(folder) / "stretched")
+    >>> again.verdict.words
+    'Use with care'
+    """
+
+    name: str
+    deformation: Deformation
+    maps: StrainMaps
+    alignment: Mapping[str, object]
+    quality: Quality
+    regions: tuple[RegionRow, ...]
+    error_bars: ErrorBars
+    image: Image | None = None
+    source: Source | None = None
+
+    @classmethod
+    def from_registration(
+        cls,
+        found: Registration,
+        subject: Subject,
+        evidence: Evidence | None = None,
+        *,
+        name: str = "load",
+        is_repeat: bool = False,
+    ) -> Measurement:
+        """Judge a registered pair.
+
+        Parameters
+        ----------
+        found : Registration
+        subject : Subject
+            Of its unloaded image.
+        evidence : Evidence, optional
+        name : str
+        is_repeat : bool
+            The loaded image is a second scan without load: its own strain is the noise floor that it is judged by.
+        """
+        more = evidence or Evidence()
+        maps, images = maps_of(found), carried_images(found)
+        floor = noise_floor(maps, subject.soft(found.tissue)) if is_repeat else more.noise_floor
+        return cls(
+            name,
+            found.deformation,
+            maps,
+            alignment_of(found),
+            quality_of(found, maps, images.similarity, more.landmarks, floor),
+            tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity)),
+            error_bars(found, subject, maps, more.error_model, more.twin),
+            found.reference,
+            Source(subject, found.tissue, found, images),
+        )
+
+    @classmethod
+    def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Measurement:
+        """Strain of a deformation that was found elsewhere; no images are compared.
+
+        Parameters
+        ----------
+        whole : Deformation
+            Of points of the unloaded image to points of the loaded one, LPS mm. Of a subject with a bone, the bone's
+            rigid motion (least squares over its voxels) is taken out.
+        subject : Subject
+        name : str
+
+        Raises
+        ------
+        InputError
+            If it is not defined in the bone.
+        """
+        relative, motion = without_motion(whole, subject.bone)
+        body = subject.body()
+        maps = strain_maps(relative, body)
+        return cls(
+            name,
+            relative,
+            maps,
+            {"on": "none" if subject.bone is None else "bone", **motion_as_dict(motion)},
+            assess(maps, body, subject.bone),
+            tuple(region_statistics(subject.regions(body), maps.by_quantity)),
+            ErrorBars(None, ""),
+            subject.reference,
+            Source(subject, body),
+        )
+
+    @classmethod
+    def read(cls, folder: Path | str, image: Image | None = None) -> Measurement:
+        """Read the folder of one load that `write` or ``mrstrain register`` wrote.
+
+        Parameters
+        ----------
+        folder : path
+        image : Image, optional
+            The unloaded image, to show maps over; it is not in the folder, where the registered one stands for it.
+
+        Raises
+        ------
+        InputError, ImageFileError
+            If a file is missing or damaged, with its name and what to do.
+        """
+        place = Path(folder)
+        told = files.read_quality(place)
+        try:
+            quality, alignment = Quality.from_dict(told), dict(told["alignment"])
+            files.motion_in(alignment)
+        except (KeyError, TypeError, ValueError) as failure:
+            raise InputError(
+                f"{place / files.QUALITY}: not as `write` leaves it ({failure!r}). {files.AGAIN}"
+            ) from failure
+        maps = files.read_maps(place)
+        known = files.read_uncertainty(place, maps.grid)
+        uncertainty, model = (None, None) if known is None else known
+        if image is None and (place / files.REGISTERED).is_file():
+            image = files.read_scalar(place / files.REGISTERED, maps.grid)
+        return cls(
+            place.resolve().name,
+            _deformation_in(place, maps),
+            maps,
+            alignment,
+            quality,
+            tuple(read_regions_csv(place / files.REGIONS)),
+            ErrorBars.from_dict(told.get("error_of_max_shear", {}), uncertainty, model),
+            image,
+        )
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the registration may be trusted, and why (not)."""
+        return self.quality.verdict
+
+    @property
+    def max_shear(self) -> Float32Array:
+        """(ni, nj, nk): (E_1 - E_3) / 2."""
+        return self.maps.max_shear
+
+    @property
+    def sigma(self) -> Float32Array | None:
+        """(ni, nj, nk): standard deviation of the maximal shear, where its error is known."""
+        known = self.error_bars.uncertainty
+        return None if known is None else known.sigma
+
+    @property
+    def intervals(self) -> tuple[Interval, ...]:
+        """95 % intervals of percentiles and volumes above a strain by tissue; empty where the error is not known."""
+        known = self.error_bars.uncertainty
+        return () if known is None else known.intervals
+
+    @property
+    def bone_motion(self) -> RigidMotion:
+        """The bone's motion between the scans, which is taken out of the displacement."""
+        return files.motion_in(dict(self.alignment))
+
+    @property
+    def strain_line(self) -> str:
+        """The maximal shear by region, in a line."""
+        rows = [r for r in self._rows("max_shear") if np.isfinite(r.median)]
+        shear = ", ".join(f"{r.region} {r.median:.3f} / {r.p95:.3f}" for r in rows)
+        return f"maximal shear, median / 95th percentile: {shear}"
+
+    def summary(self) -> list[str]:
+        """The verdict with its reasons and the strain, for a person."""
+        return [
+            f"{self.name}: {self.verdict.words}.",
+            *(f"    {reason}" for reason in self.verdict.reasons),
+            f"    {self.strain_line}",
+            *(f"    {line}" for line in self.error_bars.summary),
+        ]
+
+    def __str__(self) -> str:
+        return "\n".join(self.summary())
+
+    def plot(
+        self,
+        quantity: str = "max_shear",
+        planes: Sequence[Plane] = PLANES,
+        *,
+        point_mm: npt.ArrayLike | None = None,
+        largest: float | None = None,
+    ) -> Figure:
+        """Draw a quantity in colour over the unloaded image; thin white lines are the borders of its labels.
+
+        Parameters
+        ----------
+        quantity : str
+            "max_shear", "sigma", "jacobian", "displacement_mm" (its length), or a component of the Green-Lagrange
+            strain: "xx", "xy", "xz", "yy", "yz", "zz".
+        planes : sequence of {"sagittal", "coronal", "axial"}
+        point_mm : (3,), optional
+            LPS mm: where the planes meet; by default the lowest point of the bone, or the middle of the tissue.
+        largest : float, optional
+            End of the colours, in the quantity's unit.
+
+        Raises
+        ------
+        InputError
+            If there is no such quantity or plane, or the standard deviation is asked for and not known.
+        GeometryError
+            If the point lies outside the image.
+        """
+        values = notebook.values_of(quantity, self.maps, self.sigma)
+        outline = None if self.source is None else self.source.subject.labels
+        return notebook.figure(self._view(point_mm), self.image, Scalar(quantity, values, outline), planes, largest)
+
+    def _repr_html_(self) -> str:
+        table = page.short_table(self.regions, self.intervals)
+        return notebook.html(self.name, self.verdict, self.plot(), table, self.error_bars.summary)
+
+    def section(self, pictures: Mapping[str, Picture]) -> Section:
+        """Its part of a report."""
+        choice = None if (found := self._registration) is None else found.choice
+        note = "" if found is None else found.settings.engine.note
+        tables = [page.key_figures(self.quality, self.alignment), page.region_table(self.regions)]
+        tables += [] if choice is None else [page.weights_table(choice)]
+        return Section(
+            self.name,
+            self.verdict,
+            (*tables, *page.error_tables(self.error_bars)),
+            tuple(pictures.values()),
+            (
+                *((note,) if note else ()),
+                *((f"No error bars. {self.error_bars.missing}",) if self.error_bars.missing else ()),
+                *((f"Error bars: {self.error_bars.of_twin}",) if self.error_bars.of_twin else ()),
+            ),
+        )
+
+    def pictures(self) -> dict[str, Picture]:
+        """The figures of a report, by the name of their file.
+
+        Raises
+        ------
+        InputError
+            Of a measurement that was read from a folder: its figures lie there.
+        """
+        made = self._made_from()
+        view, floor = self._view(), self.quality.noise_floor
+        labels = made.subject.regions(made.tissue)
+        agreement = {} if made.images is None else page.agreement_pictures(view, made.subject.reference, made.images)
+        return {
+            **agreement,
+            **page.strain_pictures(
+                view, made.subject, labels, self.maps, made.images, None if floor is None else floor.shear_p95
+            ),
+            **page.sigma_pictures(view, made.subject.reference, self.error_bars.uncertainty),
+        }
+
+    def write(self, folder: Path | str, provenance: Mapping[str, object] | None = None) -> Section:
+        """Write everything to a folder, whole or not at all; an older folder of that name is replaced.
+
+        Parameters
+        ----------
+        folder : path
+            Its parent is there already.
+        provenance : mapping, optional
+            What it was made from, as plain values, kept as ``provenance.json``.
+
+        Returns
+        -------
+        Section
+            Its part of a report, with the figures that were written.
+
+        Raises
+        ------
+        InputError
+            Of a measurement that was read from a folder: copy that one.
+        OutputError
+            If it cannot be written.
+        """
+        made, pictures, verdict = self._made_from(), self.pictures(), self.verdict
+        told = self.quality.as_dict() | {"alignment": dict(self.alignment)}
+        found = made.registration
+        if found is not None:
+            if found.choice is not None:
+                told["regularisation"] = found.choice.as_dict()
+            told["error_of_max_shear"] = self.error_bars.as_dict()
+        with whole_folder(Path(folder)) as partial:
+            files.write_maps(partial, self.maps, made.subject.axes, verdict)
+            write_regions_csv(partial / files.REGIONS, self.regions, verdict)
+            if made.subject.mesh is not None:
+                told["mesh"] = files.write_mesh_results(partial, made.subject.mesh, self.deformation, verdict)
+            if found is not None and made.images is not None:
+                write_images_and_transforms(partial, found, made.images)
+            if self.error_bars.uncertainty is not None:
+                files.write_uncertainty(
+                    partial, self.maps.grid, self.error_bars.uncertainty, self.error_bars.model, verdict
+                )
+            write_json(partial / files.QUALITY, told)
+            if provenance is not None:
+                write_json(partial / files.PROVENANCE, provenance)
+            (partial / files.FIGURES).mkdir()
+            for stem, picture in pictures.items():
+                (partial / files.FIGURES / f"{stem}.png").write_bytes(picture.png)
+        return self.section(pictures)
+
+    @property
+    def _registration(self) -> Registration | None:
+        return None if self.source is None else self.source.registration
+
+    def _made_from(self) -> Source:
+        if self.source is None:
+            raise InputError(
+                f"The measurement {self.name} was read from a folder and holds no images to draw or write again: copy "
+                "that folder."
+            )
+        return self.source
+
+    def _rows(self, quantity: str) -> list[RegionRow]:
+        return [row for row in self.regions if row.quantity == quantity]
+
+    def _view(self, point_mm: npt.ArrayLike | None = None) -> View:
+        """The slices through a point, through the bone's lowest point, or through the tissue's middle."""
+        grid, valid = self.maps.grid, self.maps.valid
+        point = point_mm if self.source is None or point_mm is not None else self.source.subject.lowest_bone_point_mm
+        if point is None:
+            points = grid.points(valid if valid.any() else np.ones(grid.shape, dtype=bool))
+            point = points[int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+        return View.through(grid, point, valid if valid.any() else None)
+
+
+def _deformation_in(folder: Path, maps: StrainMaps) -> Deformation:
+    """The spline that was found, where it is valid; the displacement at voxels where it was found elsewhere."""
+    if any((folder / name).is_file() for name in (files.SPLINE, files.SPLINE_WITH_BORDERS)):
+        return Within(files.spline_in(folder), Mask(maps.grid, maps.valid), margin_voxels=0)
+    return files.ResultFolder(folder).deformation()

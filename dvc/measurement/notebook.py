@@ -1,0 +1,142 @@
+"""A measurement at a glance: a figure of any of its quantities, and what a notebook shows of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dvc.arrays import Float32Array
+from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps
+from dvc.errors import InputError
+from dvc.images.image import Image, LabelMap
+from dvc.report import figures
+from dvc.report.figures import Scale
+from dvc.report.page import Picture, Table, shown
+from dvc.report.planes import PLANES, Plane, View
+from dvc.report.sheet import png_bytes
+from dvc.trust.verdict import Level, Verdict
+
+_RISING = {
+    "max_shear": (figures.MAX_SHEAR, "viridis"),
+    "sigma": (figures.SIGMA, "cividis"),
+    "displacement_mm": ("length of the displacement relative to the bone, mm", "viridis"),
+}
+_TONES: dict[Level, tuple[str, str]] = {
+    "trust": ("#17693f", "#e9f5ee"),
+    "caution": ("#8a5300", "#fdf3e0"),
+    "distrust": ("#a91e17", "#fcebe9"),
+}
+_STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+_SHOWN_PERCENT = 99.0
+
+
+def values_of(quantity: str, maps: StrainMaps, sigma: Float32Array | None) -> Float32Array:
+    """A scalar (ni, nj, nk) by its name; NaN where not defined.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name, or the standard deviation is not known.
+    """
+    if quantity == "sigma":
+        if sigma is None:
+            raise InputError("sigma: the error of this measurement is not known; its `error_bars` tell why.")
+        return sigma
+    if quantity in TENSOR_COMPONENTS:
+        return maps.green_lagrange[..., TENSOR_COMPONENTS.index(quantity)]
+    known = maps.by_quantity
+    if quantity not in known:
+        raise InputError(f"No quantity '{quantity}'; there are {', '.join((*known, 'sigma', *TENSOR_COMPONENTS))}.")
+    return known[quantity]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scalar:
+    """Values (ni, nj, nk) of a quantity, and the labels whose borders are drawn with it, if any."""
+
+    quantity: str
+    values: Float32Array
+    outline: LabelMap | None = None
+
+
+def figure(
+    view: View,
+    image: Image | None,
+    drawn: Scalar,
+    planes: Sequence[Plane] = PLANES,
+    largest: float | None = None,
+) -> Figure:
+    """Draw a scalar in colour over an image, where there is one.
+
+    Raises
+    ------
+    InputError
+        If there is no such plane, or ``largest`` is not above zero.
+    """
+    chosen: tuple[Plane, ...] = (planes,) if isinstance(planes, str) else tuple(planes)  # type: ignore[assignment]
+    if not chosen or any(plane not in PLANES for plane in chosen):
+        raise InputError(f"Planes are among {', '.join(PLANES)}; got {', '.join(map(str, chosen)) or 'none'}.")
+    if largest is not None and not largest > 0.0:
+        raise InputError(f"The end of the colours must be above zero; got {largest}.")
+    scale = _scale(drawn.quantity, view.shown(drawn.values), largest)
+    return figures.coloured(view, image, drawn.values, scale, planes=chosen, outline=drawn.outline).finished()
+
+
+def _scale(quantity: str, values: Float32Array, largest: float | None) -> Scale:
+    """Colours that 99 % of the values shown lie within, ending at a round number."""
+    if quantity == "jacobian":
+        reach = largest or figures.volume_reach(values)
+        return Scale(figures.VOLUME_RATIO, "PuOr_r", 1.0 - reach, 1.0 + reach)
+    known = np.abs(values[np.isfinite(values)])
+    end = largest or _round_up(float(np.percentile(known, _SHOWN_PERCENT)) if known.size else 0.0)
+    if quantity in _RISING:
+        return Scale(*_RISING[quantity], 0.0, end)
+    return Scale(f"Green-Lagrange strain, component {quantity} in LPS, no unit", "PuOr_r", -end, end)
+
+
+def _round_up(value: float) -> float:
+    """The next number of one digit or so.
+
+    Examples
+    --------
+    >>> [_round_up(v) for v in (0.173, 0.0449, 7.2, 0.0)]
+    [0.2, 0.05, 8.0, 1.0]
+    """
+    if not value > 0.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(f"{next(s for s in _STEPS if s * power >= value * (1 - 1e-9)) * power:.3g}")
+
+
+def html(name: str, verdict: Verdict, drawn: Figure, table: Table, notes: Sequence[str]) -> str:
+    """What a notebook shows: the verdict with its reasons, a picture, a table, and notes; all text is escaped."""
+    tone, wash = _TONES[verdict.level]
+    picture = Picture(name, "", png_bytes(drawn))
+    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
+    cell = "padding:.2em .8em;border-bottom:1px solid #dde3ea;text-align:"
+    sides = ["right" if numeric else "left" for numeric in table.numeric]
+    head = "".join(
+        f'<th style="{cell}{side};font-weight:600">{escape(c)}</th>'
+        for c, side in zip(table.columns, sides, strict=True)
+    )
+    rows = "".join(
+        "<tr>"
+        + "".join(f'<td style="{cell}{side}">{escape(shown(c))}</td>' for c, side in zip(row, sides, strict=True))
+        + "</tr>"
+        for row in table.rows
+    )
+    return (
+        '<div style="background:#fff;color:#1b2430;padding:.6em;max-width:66rem">'
+        f'<div style="border-left:6px solid {tone};background:{wash};padding:.5em .9em;border-radius:4px">'
+        f'{escape(name)}: <strong style="color:{tone}">{verdict.words}</strong>'
+        + (f"<ul>{reasons}</ul></div>" if reasons else "</div>")
+        + f'<img src="{picture.data}" width="{picture.width}" alt="{escape(table.title)}" style="max-width:100%">'
+        f'<table style="border-collapse:collapse;font-variant-numeric:tabular-nums;margin:.6em 0">'
+        f'<caption style="text-align:left;color:#4f5b69">{escape(table.title)}</caption>'
+        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        f"{''.join(f'<p>{escape(note)}</p>' for note in notes)}</div>"
+    )

@@ -1,0 +1,222 @@
+"""What the report says of a measurement: its pictures and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dvc.deformation.strain_maps import StrainMaps
+from dvc.images.image import Image, LabelMap
+from dvc.measurement.error_bars import ErrorBars
+from dvc.measurement.judgement import CarriedImages
+from dvc.measurement.subject import Subject
+from dvc.registration.engine import Regularisation
+from dvc.report import figures
+from dvc.report.page import Cell, Picture, Table, caption_of, shown
+from dvc.report.planes import View
+from dvc.trust.error_model import Interval, Uncertainty
+from dvc.trust.quality import Quality
+from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
+from dvc.trust.twin_judgement import Judged
+
+SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
+"""Upper ends of the colours for maximal shear and its standard deviation."""
+_TWIN = (
+    "The unloaded image was moved by what was measured, its noise drawn anew, and the pair registered as the real one: "
+    "its true strain is the one above. What came back tells what the noise and texture of these images cost. Strain "
+    "that a registration smooths away before it is measured does not come back, which makes the twin's error smaller "
+    "than the true one; what denoising takes of the texture makes it larger. A tissue in which fewer voxels lie within "
+    "the claimed error than are expected of any registration, or a percentile does not come back within its interval, "
+    "has its error bars made wider by the factor; none are made narrower."
+)
+
+
+def agreement_pictures(view: View, reference: Image, images: CarriedImages) -> dict[str, Picture]:
+    """Draw how well the images agree, after the rigid part and after all."""
+    pair = reference, images.aligned, images.registered
+    return {
+        "overlay": Picture("Before and after", caption_of(figures.overlay), figures.overlay(view, *pair)),
+        "checkerboard": Picture("Checkerboard", caption_of(figures.checkerboard), figures.checkerboard(view, *pair)),
+        "similarity": Picture(
+            "Where the images agree",
+            caption_of(figures.similarity_slices),
+            figures.similarity_slices(view, images.local_rigid, images.local_after),
+        ),
+    }
+
+
+def strain_pictures(
+    view: View, subject: Subject, labels: LabelMap, maps: StrainMaps, images: CarriedImages | None, floor: float | None
+) -> dict[str, Picture]:
+    """Draw strain, curves, grid and volume ratio; the grid over the loaded image where there is one.
+
+    ``floor`` is the 95th percentile of a repeat scan's maximal shear.
+    """
+    reference, bone = subject.reference, subject.bone
+    below = reference.values if images is None else images.aligned
+    return {
+        "strain": Picture(
+            "Maximal shear",
+            caption_of(figures.strain_slices) + " Slices through the bone's lowest point along the plate's normal.",
+            figures.strain_slices(view, reference, maps.max_shear, SHEAR_SCALE, labels),
+        ),
+        "curves": Picture(
+            "Volume above a strain",
+            caption_of(figures.shear_curves),
+            figures.shear_curves(maps.max_shear, labels, floor),
+        ),
+        "deformed_grid": Picture(
+            "Deformed grid",
+            caption_of(figures.deformed_grid),
+            figures.deformed_grid(view, below, maps.displacement_mm, None if bone is None else bone.inside),
+        ),
+        "jacobian": Picture(
+            "Volume ratio",
+            caption_of(figures.jacobian_slices),
+            figures.jacobian_slices(view, reference, maps.jacobian),
+        ),
+    }
+
+
+def sigma_pictures(view: View, reference: Image, uncertainty: Uncertainty | None) -> dict[str, Picture]:
+    """Draw the map of the standard deviation, where it is known."""
+    if uncertainty is None:
+        return {}
+    drawn = figures.sigma_slices(view, reference, uncertainty.sigma, SIGMA_SCALE)
+    return {"sigma": Picture("How sure the maximal shear is", caption_of(figures.sigma_slices), drawn)}
+
+
+def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
+    """Tell what the verdict rests on."""
+    rows: list[tuple[str, Cell, str]] = [
+        ("Rotation of the bone between the scans", _number(alignment["rotation_deg"]), "degrees"),
+    ]
+    if "bone_shift_lps_mm" in alignment:
+        shift = np.asarray(alignment["bone_shift_lps_mm"], dtype=np.float64)
+        rows += [
+            ("Shift of the bone between the scans", float(np.linalg.norm(shift)), "mm"),
+            (
+                "Correlation in and around the bone, before alignment",
+                _number(alignment["similarity_before"]),
+                "",
+            ),
+            ("Correlation in and around the bone, after alignment", _number(alignment["similarity"]), ""),
+            (
+                "Spread of the rigid fits of halves of the bone (rms over the bone; largest of six pairs)",
+                _number(alignment["repeatability_rms_mm"]),
+                "mm",
+            ),
+        ]
+        spacing = np.asarray(alignment["control_spacing_mm"], dtype=np.float64)
+        rows.append(("Engine of the non-rigid registration", str(alignment["engine"]), ""))
+        rows.append(("Spacing of the B-spline's control points", " x ".join(f"{s:.3g}" for s in spacing), "mm"))
+    if quality.similarity is not None:
+        for said, value in zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True):
+            rows.append((f"Local similarity in the tissue, {said}", float(value), ""))
+        rows.append(("Local similarity that noise as in the air allows, about", quality.most_similarity, ""))
+    bone = "in the bone, before it was held at rest" if quality.bone_held else "left in the bone"
+    rows += [
+        (f"Displacement {bone} (truth: 0), rms", quality.bone_shift_mm, "mm"),
+        (f"Apparent maximal shear {bone} (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
+        ("Folded voxels (det F <= 0)", quality.folded_voxels, "voxels"),
+        ("Lowest det F", quality.lowest_jacobian, ""),
+        ("Tissue without a result", 100.0 * quality.undefined_fraction, "%"),
+    ]
+    if quality.landmark_errors_mm is not None:
+        errors = quality.landmark_errors_mm
+        known = errors[np.isfinite(errors)]
+        rows += [
+            ("Landmark error, median", float(np.median(known)) if known.size else None, "mm"),
+            ("Landmark error, largest", float(known.max()) if known.size else None, "mm"),
+            ("Landmarks without a result", int(errors.size - known.size), f"of {errors.size}"),
+        ]
+    if quality.noise_floor is not None:
+        floor = quality.noise_floor
+        rows += [
+            ("Noise floor (repeat scan): maximal shear, median", floor.shear_p50, ""),
+            ("Noise floor (repeat scan): maximal shear, 95th percentile", floor.shear_p95, ""),
+            ("Noise floor: MAER", floor.maer, ""),
+            ("Noise floor: SDER", floor.sder, ""),
+        ]
+    return Table("Key figures", ("figure", "value", "unit"), tuple(rows))
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) else None
+
+
+def weights_table(choice: Regularisation) -> Table:
+    """Tell the weights of the prior, and of those that were tried what they left of half of the voxels."""
+    columns = ("penalty on", "weight", "unit", "residual left out, % above the least")
+    return Table("Weights of the registration", columns, tuple(choice.rows()), choice.caption)
+
+
+def region_table(regions: Sequence[RegionRow]) -> Table:
+    """Tell the maximal shear of every region."""
+    rows = [
+        (
+            r.region,
+            r.volume_ml,
+            100.0 * r.defined_fraction,
+            r.median,
+            r.p90,
+            r.p95,
+            r.p99,
+            *(r.volume_above_ml.get(t) for t in SHEAR_THRESHOLDS),
+        )
+        for r in regions
+        if r.quantity == "max_shear"
+    ]
+    columns = ("region", "volume, mL", "defined, %", "median", "p90", "p95", "p99")
+    above = tuple(f"> {t:g}, mL" for t in SHEAR_THRESHOLDS)
+    return Table(
+        "Maximal shear by region",
+        columns + above,
+        tuple(rows),
+        "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, and volumes above a value.",
+    )
+
+
+def short_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
+    """Tell median and 95th percentile of the maximal shear by region, each with its interval where it is known."""
+    known = {(i.region, i.figure): f"{shown(i.low)} to {shown(i.high)}" for i in intervals}
+
+    def own(region: str, figure: str) -> tuple[str, ...]:
+        return (known.get((region, figure), "–"),) if known else ()
+
+    rows: tuple[tuple[Cell, ...], ...] = tuple(
+        (r.region, r.volume_ml, r.median, *own(r.region, "median"), r.p95, *own(r.region, "p95"))
+        for r in regions
+        if r.quantity == "max_shear"
+    )
+    interval = ("95 % interval",) * bool(known)
+    return Table("Maximal shear", ("region", "volume, mL", "median", *interval, "95th percentile", *interval), rows)
+
+
+def error_tables(bars: ErrorBars) -> list[Table]:
+    """Tell the intervals, and what came back from the twin."""
+    tables = []
+    if bars.uncertainty is not None:
+        rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in bars.uncertainty.intervals)
+        columns = ("region", "figure", "as found", "95 % from", "to")
+        tables.append(Table("Maximal shear with its error", columns, rows, bars.told))
+    if bars.twin:
+        claims = bars.uncertainty is not None
+        head = ("region", "error (rms)", "bias", *(("within the claim", "expected, at least", "wider") * claims))
+        lines = tuple((row.region, row.rms_error, row.bias, *_against_claims(row)) for row in bars.twin)
+        tables.append(Table("The twin of this pair, measured again", head, lines, _TWIN))
+    return tables
+
+
+def _against_claims(row: Judged) -> tuple[str | float, ...]:
+    """What the twin says of a tissue's error bars, as a table shows it; nothing where there are none."""
+    if row.held is None or row.expected is None or row.factor is None:
+        return ()
+    return f"{row.held:.0%}", f"{row.expected:.0%}", row.factor
+
+
+def _words(figure: str) -> str:
+    if figure.startswith("volume_above_"):
+        return f"volume above {figure.removeprefix('volume_above_').removesuffix('_ml')}, mL"
+    return {"median": "median", "p90": "90th percentile", "p95": "95th percentile"}[figure]

@@ -1,0 +1,53 @@
+"""A load that was measured and written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvc.measurement.measurement import Measurement
+from dvc.report.page import Section
+from dvc.trust.verdict import Verdict
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """A measurement that was written: its folder and its part of the report, in place of its arrays.
+
+    Attributes
+    ----------
+    folder : Path
+    section : Section
+        Of the report.
+    lines : tuple of str
+        For a person.
+    """
+
+    folder: Path
+    section: Section
+    lines: tuple[str, ...]
+
+    @classmethod
+    def of(cls, measurement: Measurement, folder: Path, record: Mapping[str, object]) -> Case:
+        """Write a measurement, with its provenance; its folder is there whole or not at all."""
+        return cls(folder, measurement.write(folder, record), tuple(measurement.summary()))
+
+    @property
+    def name(self) -> str:
+        """Of the load."""
+        return self.section.title
+
+    @property
+    def verdict(self) -> Verdict:
+        """On the registration."""
+        assert self.section.verdict is not None
+        return self.section.verdict
+
+    def measurement(self) -> Measurement:
+        """The measurement, read from its folder."""
+        return Measurement.read(self.folder)
+
+    def summary(self) -> list[str]:
+        """The verdict with its reasons and the strain, for a person."""
+        return list(self.lines)

@@ -1,0 +1,229 @@
+"""A measurement from arrays, without a file; written and read again; as a notebook and a figure show it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import dvc
+from dvc.errors import ImageFileError, InputError
+from dvc.io import result_folder as files
+from dvc.registration.register import Settings
+from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
+from dvc.trust.twin_judgement import Judged
+
+GRID = dvc.Grid((14, 16, 18), (1.5, 1.2, 1.0), (-8.0, 3.0, 5.0))
+ATTACK = "<script>alert('x')</script>"
+
+
+@pytest.fixture(scope="module")
+def measured(tiny_pair, worker) -> dvc.Measurement:
+    """A pressed heel of 2.5 mm: with labels but one smooth spline, for speed, and by weights fixed beforehand."""
+    settings = Settings.of("gauss-newton").of_repeat()
+    flat = np.full((2, 1, 2), 0.02)
+    table = ErrorTable(np.full(3, 2.5), 25.0, np.array([0.0, 0.5]), np.zeros(1), {POOLED: flat}, ({POOLED: flat},), 4.0)
+    digest = hashlib.sha256(settings.text.encode()).hexdigest()
+    return dvc.measure(
+        tiny_pair.reference,
+        tiny_pair.loaded,
+        bone=tiny_pair.bone,
+        labels=tiny_pair.labels,
+        settings=settings,
+        error_model=ErrorModel("gauss-newton", digest, (table,), "made up"),
+        repeat=tiny_pair.repeat,
+        shear_direction=(0.0, -1.0, 0.0),
+        name="Load1",
+        worker=worker,
+    )
+
+
+@pytest.fixture(scope="module")
+def written(measured, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("measured") / "Load1"
+    measured.write(folder, {"command": "test"})
+    return folder
+
+
+@pytest.fixture
+def stretched() -> dvc.Measurement:
+    """A stretch of a tenth along x, found elsewhere."""
+    values = np.zeros(GRID.shape, dtype=np.float32)
+    values[3:-3, 3:-3, 3:-3] = 100.0
+    tissue = dvc.Mask(GRID, values > 0)
+    labels = dvc.LabelMap(GRID, tissue.inside.astype(int), {1: f"fat {ATTACK}"})
+    subject = dvc.Subject(dvc.Image(GRID, values), tissue=tissue, labels=labels)
+    motion = dvc.Affine(np.diag([1.1, 1.0, 1.0]), np.zeros(3))
+    return dvc.Measurement.from_deformation(motion, subject, name=f"{ATTACK}")
+
+
+def test_arrays_in_and_arrays_out(measured, tiny_pair):
+    assert measured.maps.grid.same_as(tiny_pair.reference.grid)
+    fat = tiny_pair.labels.region("fat").inside & measured.maps.valid
+    truth = dvc.strain_maps(tiny_pair.deformation, dvc.Mask(tiny_pair.reference.grid, fat)).max_shear
+    assert np.corrcoef(measured.max_shear[fat], truth[fat])[0, 1] > 0.7
+    moved = measured.bone_motion.displacement(tiny_pair.bone.points())
+    np.testing.assert_allclose(moved, tiny_pair.foot_motion.displacement(tiny_pair.bone.points()), atol=0.6)
+    assert measured.quality.noise_floor.shear_p95 > 0.0
+    assert measured.sigma is not None
+    assert {i.region for i in measured.intervals} >= {"fat", "muscle"}
+    assert str(measured).startswith(f"Load1: {measured.verdict.words}.\n")
+    assert "maximal shear, median / 95th percentile: " in str(measured)
+
+
+def test_what_is_written_is_read_again(measured, written):
+    again = dvc.Measurement.read(written)
+    for name in ("valid", "displacement_mm", "green_lagrange", "max_shear", "jacobian"):
+        np.testing.assert_array_equal(getattr(again.maps, name), getattr(measured.maps, name), err_msg=name)
+    assert again.maps.grid.same_as(measured.maps.grid)
+    assert (again.name, again.verdict, again.quality.as_dict()) == (
+        "Load1",
+        measured.verdict,
+        measured.quality.as_dict(),
+    )
+    np.testing.assert_array_equal(again.sigma, measured.sigma)
+    for one, other in zip(again.intervals, measured.intervals, strict=True):
+        assert (one.region, one.figure) == (other.region, other.figure)
+        assert list(asdict(one).values())[2:] == pytest.approx(list(asdict(other).values())[2:], rel=1e-5)
+    for row, kept in zip(again.regions, measured.regions, strict=True):
+        above = row.volume_above_ml, kept.volume_above_ml
+        assert dict(above[0]) == pytest.approx(dict(above[1]), rel=1e-8)
+        (region, quantity, *numbers, _), (*names, _) = (list(asdict(one).values()) for one in (row, kept))
+        assert (region, quantity) == tuple(names[:2])
+        assert numbers == pytest.approx(names[2:], rel=1e-8, nan_ok=True)
+    assert again.alignment == measured.alignment
+    assert str(again) == str(measured)
+    X = measured.maps.grid.points(measured.maps.valid)[::50]
+    u, H = again.deformation.evaluate(X)
+    v, J = measured.deformation.evaluate(X)
+    np.testing.assert_allclose(u, v, atol=1e-6)
+    np.testing.assert_allclose(H, J, atol=1e-6)
+    with pytest.raises(InputError, match="copy that folder"):
+        again.write(written.parent / "copy")
+
+
+def test_what_a_twin_did_is_read_again(measured, tmp_path):
+    rows = (Judged("fat", 0.02, 0.01, 0.9, 0.93, 1.2),)
+    bars = replace(measured.error_bars, twin=rows, of_twin="made wider by the twin of this pair: fat 1.2 times.")
+    replace(measured, error_bars=bars).write(tmp_path / "Load1")
+    again = dvc.Measurement.read(tmp_path / "Load1").error_bars
+    assert (again.twin, again.of_twin, again.told) == (rows, bars.of_twin, bars.told)
+
+
+def test_a_deformation_from_elsewhere_is_a_measurement_too(stretched, tmp_path):
+    np.testing.assert_allclose(np.nanmax(stretched.max_shear), (1.1**2 - 1) / 4, rtol=1e-5)
+    assert stretched.verdict.level == "caution"
+    assert stretched.intervals == ()
+    stretched.write(tmp_path / "stretched")
+    again = dvc.Measurement.read(tmp_path / "stretched", stretched.image)
+    np.testing.assert_array_equal(again.max_shear, stretched.max_shear)
+    assert again.image is stretched.image
+    assert not (tmp_path / "stretched" / files.PROVENANCE).exists()
+    assert dvc.Measurement.read(tmp_path / "stretched").image is None  # nothing lies there to show maps over
+    for one in (again, dvc.Measurement.read(tmp_path / "stretched")):
+        assert isinstance(one.plot(point_mm=GRID.points_at(np.array([7.0, 7.0, 9.0]))), Figure)
+    with pytest.raises(InputError, match="error of this measurement is not known"):
+        stretched.plot("sigma")
+
+
+def test_a_notebook_shows_the_verdict_a_picture_and_a_table_all_escaped(stretched):
+    page = stretched._repr_html_()
+    assert ATTACK not in page
+    assert "&lt;script&gt;" in page
+    assert stretched.verdict.words in page
+    assert "No images were compared" in page
+    (picture,) = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert base64.b64decode(picture).startswith(b"\x89PNG")
+    (row,) = re.findall(r"<tr>(?:<td[^>]*>[^<]*</td>)+</tr>", page)
+    assert "0.0525" in row  # (1.1 ^ 2 - 1) / 4
+
+
+@pytest.mark.parametrize(
+    ("quantity", "label"),
+    [
+        ("max_shear", "maximal shear"),
+        ("jacobian", "det F"),
+        ("displacement_mm", "mm"),
+        ("xy", "component xy"),
+        ("sigma", "standard deviation"),
+    ],
+)
+def test_any_quantity_is_drawn_on_the_planes_asked_for(measured, quantity, label):
+    drawn = measured.plot(quantity, ["coronal"])
+    assert isinstance(drawn, Figure)
+    panel, bar = drawn.axes
+    assert panel.get_title(loc="left").startswith("Coronal")
+    assert label in bar.get_xlabel()
+    assert len(measured.plot(quantity).axes) == 4
+    assert measured.plot(quantity, "axial").axes[0].get_title(loc="left").startswith("Axial")
+
+
+def test_colours_end_where_they_are_told_to_and_else_above_nearly_all(measured):
+    def ends(figure: Figure) -> tuple[float, float]:
+        return figure.axes[-1].get_xlim()
+
+    assert ends(measured.plot(largest=0.25)) == pytest.approx((0.0, 0.25))
+    low, high = ends(measured.plot())
+    assert low == 0.0
+    assert np.nanpercentile(measured.max_shear, 90) < high < 2 * np.nanmax(measured.max_shear)
+    low, high = ends(measured.plot("zz"))
+    assert low == -high
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"quantity": "von Mises"}, "No quantity 'von Mises'; there are max_shear"),
+        ({"planes": ["oblique"]}, "Planes are among sagittal"),
+        ({"planes": []}, "got none"),
+        ({"largest": -0.1}, "must be above zero"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(stretched, given, message):
+    with pytest.raises(InputError, match=message):
+        stretched.plot(**given)
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _without_verdict(path: Path) -> None:
+    told = json.loads(path.read_text())
+    del told["verdict"]
+    path.write_text(json.dumps(told))
+
+
+@pytest.mark.parametrize(
+    ("name", "harm"),
+    [
+        *((name, _cut) for name in (files.DISPLACEMENT, files.GREEN_LAGRANGE, files.MAX_SHEAR, files.VALID)),
+        *((name, _cut) for name in (files.QUALITY, files.SIGMA, files.ERROR_MODEL, files.SPLINE)),
+        *((name, Path.unlink) for name in (files.DISPLACEMENT, files.JACOBIAN, files.QUALITY, files.REGIONS)),
+        *((name, Path.unlink) for name in (files.SIGMA, files.INTERVALS)),
+        (files.QUALITY, _without_verdict),
+        (files.REGIONS, lambda path: path.write_text("region,quantity\nfat,max_shear\n")),
+        (files.INTERVALS, lambda path: path.write_text("region,figure\nfat,median\n")),
+    ],
+)
+def test_a_damaged_folder_is_refused_with_the_file_that_is_wrong(written, tmp_path, name, harm):
+    shutil.copytree(written, tmp_path / "Load1")
+    harm(tmp_path / "Load1" / name)
+    with pytest.raises((InputError, ImageFileError)) as refused:
+        dvc.Measurement.read(tmp_path / "Load1")
+    assert name in str(refused.value)
+
+
+def test_maps_of_two_grids_are_refused(written, stretched, tmp_path):
+    shutil.copytree(written, tmp_path / "Load1")
+    files.write_image(tmp_path / "Load1" / files.JACOBIAN, stretched.image)
+    with pytest.raises(ImageFileError, match=r"jacobian\.nii\.gz: on another grid than max_shear"):
+        dvc.Measurement.read(tmp_path / "Load1")
