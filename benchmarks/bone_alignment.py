@@ -19,12 +19,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dvc.deformation.protocol import RigidMotion
-from dvc.images.image import Image, Mask
+from dvc import Image, Mask, RigidMotion, read_parameter_file
 from dvc.images.shading import without_shading
 from dvc.io.transforms.read import rigid_from_elastix
 from dvc.registration.elastix import run as elastix
-from dvc.registration.elastix.presets import read_parameter_file
 from dvc.registration.rigid_fit import RigidFit
 from mrstrain.records.provenance import versions
 from phantoms import HeelPair, heel_pair

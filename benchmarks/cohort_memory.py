@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from dvc.io.images.write import write_image, write_labels
+from dvc import write_image, write_labels
 from mrstrain.records.provenance import versions
 from mrstrain.studies.file import read_study
 from mrstrain.studies.run import run_studies

@@ -21,14 +21,20 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import (
+    Deformation,
+    GaussNewton,
+    GaussNewtonWithInterfaces,
+    Mask,
+    Settings,
+    StrainField,
+    evaluate_on_grid,
+    register,
+)
 from dvc.arrays import BoolArray
-from dvc.deformation.protocol import Deformation, Motion, evaluate_on_grid
-from dvc.deformation.strain import StrainField
-from dvc.images.image import Mask
+from dvc.deformation.protocol import Motion
 from dvc.images.resample import shows
 from dvc.registration.elastix import run as elastix
-from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
-from dvc.registration.register import Settings, register
 from dvc.worker import Worker
 from mrstrain.records.provenance import versions
 from phantoms import Heel, HeelPair, distances_mm, heel_pair, motion_named, pressed

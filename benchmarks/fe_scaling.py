@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.fe_speed import ours
+from dvc import TetMesh
 from dvc.arrays import IntArray
-from dvc.mesh import TetMesh
 from fe import LoadStep, Plate, Problem, material_set, read_tet_mesh, solve, write_tet_mesh
 from mrstrain.records.provenance import versions
 

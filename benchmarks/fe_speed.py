@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from dvc import TetMesh
 from dvc.arrays import IntArray
-from dvc.mesh import TetMesh
 from fe import LoadState, LoadStep, PlateState, Tolerance, material_set, read_tet_mesh, write_calculix
 from fe.assembly import Assembler
 from fe.elements import edges_of, element

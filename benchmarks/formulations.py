@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from dvc.deformation.strain import StrainField
-from dvc.mesh import TetMesh
+from dvc import StrainField, TetMesh
 from fe import LoadState, LoadStep, NeoHooke, Ogden, Plate, Problem, Tolerance, material_set, read_tet_mesh, solve
 from fe.assembly import Assembler
 from fe.elements import element

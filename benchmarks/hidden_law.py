@@ -22,12 +22,18 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.nodal import Averaged
-from dvc.deformation.protocol import SampledDisplacement, evaluate_on_grid
-from dvc.images.image import Grid, LabelMap
-from dvc.io.images.labels import read_labels, read_mask
-from dvc.io.images.write import write_image, write_labels
+from dvc import (
+    Grid,
+    LabelMap,
+    SampledDisplacement,
+    TetMesh,
+    evaluate_on_grid,
+    read_labels,
+    read_mask,
+    write_image,
+    write_labels,
+)
 from dvc.io.result_folder import spline_in
-from dvc.mesh import TetMesh
 from dvc.trust.random_field import GaussianField
 from fe import read_tet_mesh, write_tet_mesh
 from mrstrain import mesh as make_mesh

@@ -15,11 +15,10 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from dvc.deformation.protocol import Composed, Motion
-from dvc.io.images.labels import read_labels, read_mask
-from dvc.io.images.write import write_image, write_labels
+from dvc import Composed, read_labels, read_mask, write_image, write_labels
+from dvc.deformation.protocol import Motion
 from dvc.io.result_folder import spline_in
-from mrstrain.measurement.register import register
+from mrstrain import register
 from mrstrain.records.provenance import versions
 from phantoms import (
     Heel,

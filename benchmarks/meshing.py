@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import read_labels
 from dvc.deformation.nodal import OnMesh
-from dvc.io.images.labels import read_labels
 from fe import mesh_labels
 from mrstrain.records.provenance import versions
 

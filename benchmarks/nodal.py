@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from dvc import TetMesh
 from dvc.arrays import FloatArray
 from dvc.deformation.nodal import Locator, OnMesh
-from dvc.mesh import TetMesh
 
 
 def at_corners(mesh: TetMesh, H: FloatArray) -> FloatArray:

@@ -21,18 +21,23 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dvc.deformation.protocol import RigidMotion
-from dvc.deformation.strain import StrainField
-from dvc.deformation.strain_maps import strain_maps
+from dvc import (
+    Grid,
+    Image,
+    Registration,
+    RigidMotion,
+    Settings,
+    StrainField,
+    local_correlation,
+    noise_floor,
+    read_image,
+    read_transform,
+    register,
+    strain_maps,
+    tissue_mask,
+)
 from dvc.errors import MrstrainError
-from dvc.images.image import Grid, Image
 from dvc.images.resample import carry
-from dvc.images.similarity import local_correlation
-from dvc.images.tissue import tissue_mask
-from dvc.io.images.read import read_image
-from dvc.io.transforms.read import read_transform
-from dvc.registration.register import Registration, Settings, register
-from dvc.trust.quality import noise_floor
 from dvc.worker import Worker, usable_cores
 from mrstrain.records.provenance import versions
 

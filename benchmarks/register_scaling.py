@@ -22,10 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.memory import peak_kib
-from dvc.images.image import Grid, Image
+from dvc import Grid, Image, fit_mask, write_image, write_labels, write_mask
 from dvc.images.resample import carry
-from dvc.io.images.labels import fit_mask
-from dvc.io.images.write import write_image, write_labels, write_mask
 from mrstrain.records.provenance import versions
 from phantoms import HeelPair, heel_pair
 

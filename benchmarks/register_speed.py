@@ -18,15 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.images.image import Mask
-from dvc.images.tissue import tissue_mask, widened
+from dvc import Mask, Settings, load_preset, read_parameter_file, register, tissue_mask
+from dvc.images.tissue import widened
 from dvc.io.transforms.elastix_text import format_parameters
 from dvc.registration.elastix import run as elastix
-from dvc.registration.elastix.presets import load_preset, read_parameter_file
-from dvc.registration.register import Settings, register
 from dvc.worker import Worker, usable_cores
+from mrstrain import phantom
 from mrstrain.records.provenance import versions
-from mrstrain.truth.phantom import phantom
 from phantoms import HeelPair, heel_pair
 
 RIGID = Path(__file__).with_name("bone_rigid.txt")

@@ -18,15 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.deformation.bspline import BSpline
-from dvc.deformation.protocol import Deformation, RigidMotion
-from dvc.images.image import Image, Mask
+from dvc import BSpline, Deformation, Image, Mask, Preset, RigidMotion, Settings, register
 from dvc.images.resample import shows
 from dvc.io.transforms.elastix_text import parse_parameters
 from dvc.io.transforms.read import bspline_from_elastix
 from dvc.registration.elastix import run as elastix
-from dvc.registration.elastix.presets import Preset
-from dvc.registration.register import Settings, register
 from dvc.worker import Worker, usable_cores
 from mrstrain.records.provenance import versions
 from phantoms import HeelPair, errors_by_tissue, heel_pair

@@ -57,9 +57,7 @@ def measure(threads: int) -> dict[str, object]:
     import itk
     import numpy as np
 
-    from dvc.deformation.bspline import BSpline
-    from dvc.deformation.strain import StrainField
-    from dvc.images.image import Grid
+    from dvc import BSpline, Grid, StrainField
     from dvc.io.transforms.write import write_elastix_transform
 
     grid = Grid(SHAPE, (SPACING_MM,) * 3, (0.0, 0.0, 0.0))

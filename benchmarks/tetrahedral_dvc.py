@@ -31,15 +31,9 @@ from scipy import sparse
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from benchmarks.nodal import at_corners, located
-from dvc.deformation.protocol import Deformation
-from dvc.deformation.strain import StrainField
-from dvc.io.images.labels import read_labels
-from dvc.io.images.read import read_image
-from dvc.mesh import TetMesh
-from dvc.registration.engine import AlignedPair
+from dvc import AlignedPair, Deformation, Settings, StrainField, TetMesh, read_image, read_labels, register
 from dvc.registration.gauss_newton.fit import scaled
 from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
-from dvc.registration.register import Settings, register
 from fe import NeoHooke, material_set, read_tet_mesh
 from mrstrain.records.provenance import versions
 from phantoms import distances_mm

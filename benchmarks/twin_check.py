@@ -18,9 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import read_image, read_labels
 from dvc.atomic_files import write_json
-from dvc.io.images.labels import read_labels
-from dvc.io.images.read import read_image
 from dvc.trust.error_model import read_error_model, to_surface_mm
 from mrstrain import phantom, register
 from mrstrain.records.provenance import versions

@@ -19,8 +19,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dvc import TetMesh
     from dvc.errors import InputError, MrstrainError, OutputError, WorkerError
-    from dvc.mesh import TetMesh
     from fe.convergence import Limit, cell_size_mm, extrapolate
     from fe.decks import write_calculix, write_febio
     from fe.fitting import LAWS, Fit, fit

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dvc import TetMesh
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
-from dvc.mesh import TetMesh
 
 _ORDERS = np.linspace(0.5, 2.0, 151)  # linear cells: displacement converges with the order 2, strain with 1
 _FEWEST = 3

@@ -13,10 +13,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from dvc import TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
-from dvc.mesh import TetMesh
 from fe.elements import Space, edges_of
 from fe.hyperelastic import OGDEN
 from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh

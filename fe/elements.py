@@ -22,9 +22,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
-from dvc.mesh import TetMesh
 
 DESCRIPTIONS = {
     "P1": "stabilised linear tetrahedra, displacement and pressure",

@@ -14,9 +14,9 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import whole_file
-from dvc.mesh import TetMesh
 from dvc.report.figures import REGION_COLOURS
 from dvc.report.planes import letters
 from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes

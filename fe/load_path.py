@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dvc import TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
-from dvc.mesh import TetMesh
 from fe.assembly import Assembler
 from fe.descent import descend
 from fe.elements import edges_of

@@ -9,11 +9,10 @@ from pathlib import Path
 import meshio
 import numpy as np
 
+from dvc import TetMesh, read_mesh
 from dvc.arrays import IntArray
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError
-from dvc.io.meshes.read import read_mesh
-from dvc.mesh import TetMesh
 from fe.surface_sets import known_name
 
 _FIRST_FACET = 101  # numbers of facets in the array "region"; those of tissues begin at 1

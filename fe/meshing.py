@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dvc import Grid, LabelMap, TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError, WorkerError
-from dvc.images.image import Grid, LabelMap
-from dvc.mesh import FACES, TetMesh, signed_volumes
+from dvc.mesh import FACES, signed_volumes
 from dvc.worker import Worker
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.surface_sets import BONE, CUT, SKIN

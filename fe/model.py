@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
-from dvc.mesh import TetMesh
 from fe.elements import Element, Space
 from fe.materials import Material
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from dvc import plate_axes
 from dvc.arrays import BoolArray, FloatArray, IntArray
-from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
 
 _BEYOND_MM = 0.5

@@ -9,9 +9,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from dvc import TetMesh
 from dvc.arrays import IntArray
 from dvc.errors import InputError
-from dvc.mesh import TetMesh
 from fe.elements import element as formulation
 from fe.load_step import LoadStep, paths_of
 from fe.materials import Material

@@ -11,9 +11,9 @@ from pathlib import Path
 import meshio
 import numpy as np
 
+from dvc import TetMesh
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
-from dvc.mesh import TetMesh
 from dvc.trust.regions import SHEAR_THRESHOLDS, volume_above
 from fe.load_path import PlateState
 from fe.materials import Material

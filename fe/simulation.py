@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dvc import TetMesh
 from dvc.arrays import FloatArray
 from dvc.atomic_files import write_whole
 from dvc.deformation.nodal import OnMesh
 from dvc.errors import InputError
-from dvc.mesh import TetMesh
 from fe.decks import write_calculix, write_febio
 from fe.elements import DESCRIPTIONS
 from fe.load_step import LoadStep

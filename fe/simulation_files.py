@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
-from dvc.mesh import TetMesh, outer_faces
+from dvc.mesh import outer_faces
 from fe.load_path import PlateState
 from fe.load_step import LoadStep
 from fe.materials import from_vector

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dvc import StrainField, TetMesh
 from dvc.arrays import FloatArray, IntArray
-from dvc.deformation.strain import StrainField
-from dvc.mesh import TetMesh
 from fe.elements import element
 from fe.load_path import LoadPath, PlateState
 from fe.load_step import LoadStep

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dvc.mesh import TetMesh
+from dvc import TetMesh
 
 BONE, SKIN, CUT = "bone", "skin", "cut"
 """The interface with bone, which is fixed; the outer surface, which the plate may touch; and where a label map ends."""

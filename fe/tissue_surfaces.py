@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dvc import LabelMap
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import MrstrainError
-from dvc.images.image import LabelMap
 
 _PASS_BAND = 0.03  # of a windowed sinc filter: 40 steps of plain relaxation take 7 % of a thin muscle, this takes 0.1 %
 _PASSES = 20

@@ -13,15 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import Image, LabelMap, Mask, Registration, RigidMotion, Settings, StrainField, evaluate_on_grid, register
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.atomic_files import whole_file
-from dvc.deformation.protocol import Motion, RigidMotion, evaluate_on_grid
-from dvc.deformation.strain import StrainField
+from dvc.deformation.protocol import Motion
 from dvc.errors import InputError
-from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.noise import signal_to_noise
 from dvc.images.resample import shows
-from dvc.registration.register import Registration, Settings, register
 from dvc.trust.error_model import to_surface_mm
 from dvc.worker import Worker
 from phantoms.anatomy import Heel

@@ -10,10 +10,10 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.spatial.transform import Rotation
 
+from dvc import Composed, Grid, Image, LabelMap, Mask, RigidMotion
 from dvc.arrays import BoolArray, FloatArray
-from dvc.deformation.protocol import Composed, Motion, RigidMotion
+from dvc.deformation.protocol import Motion
 from dvc.errors import InputError
-from dvc.images.image import Grid, Image, LabelMap, Mask
 from phantoms.anatomy import FAT_SIGNAL, TISSUES, Heel
 from phantoms.bodies import EllipsoidUnion
 from phantoms.flow import Border, Flow

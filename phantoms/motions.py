@@ -10,8 +10,8 @@ from typing import Self
 
 import numpy as np
 
+from dvc import Affine
 from dvc.arrays import FloatArray, frozen
-from dvc.deformation.protocol import Affine
 from dvc.errors import InputError
 
 _UNIT = 1e-6

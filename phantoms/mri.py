@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy import fft
 
+from dvc import Grid, Image
 from dvc.arrays import Float32Array, FloatArray
 from dvc.errors import InputError
-from dvc.images.image import Grid, Image
 
 _FULL = 0.6  # of the highest frequency, from which on k-space is tapered to zero
 _BIAS = 0.2

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dvc import Deformation, LabelMap, StrainField, evaluate_on_grid
 from dvc.arrays import BoolArray
-from dvc.deformation.protocol import Deformation, evaluate_on_grid
-from dvc.deformation.strain import StrainField
 from dvc.errors import GeometryError
-from dvc.images.image import LabelMap
 
 
 @dataclass(frozen=True, slots=True)

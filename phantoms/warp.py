@@ -14,10 +14,10 @@ from scipy.ndimage import binary_dilation, map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 from skimage.restoration import denoise_nl_means
 
+from dvc import Deformation, Grid, Image, Mask, RigidMotion, evaluate_on_grid
 from dvc.arrays import BoolArray, Float32Array, FloatArray
-from dvc.deformation.protocol import Deformation, Motion, RigidMotion, evaluate_on_grid
+from dvc.deformation.protocol import Motion
 from dvc.errors import InputError
-from dvc.images.image import Grid, Image, Mask
 from dvc.images.noise import noise_sd
 from dvc.images.resample import fill_missing
 from phantoms.mri import sensitivity

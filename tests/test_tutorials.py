@@ -134,7 +134,7 @@ def test_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_simulate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
-    follow("simulate.md", tmp_path, monkeypatch)
+    follow("tutorials/simulate.md", tmp_path, monkeypatch)
 
 
 @pytest.mark.full_size

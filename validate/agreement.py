@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dvc import Deformation
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.deformation.nodal import OnMesh
-from dvc.deformation.protocol import Deformation
 from dvc.mesh import outer_faces
 from validate.mapping import ALL, MappedFields
 

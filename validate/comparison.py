@@ -13,13 +13,12 @@ from typing import Literal
 import numpy as np
 from matplotlib.figure import Figure
 
+from dvc import LabelMap, TetMesh, Verdict
 from dvc.atomic_files import whole_folder, write_whole
 from dvc.errors import InputError
-from dvc.images.image import LabelMap
-from dvc.mesh import TetMesh
 from dvc.report.page import Section, record_lines, write_report
 from dvc.report.sheet import png_bytes
-from dvc.trust.verdict import Verdict, worst
+from dvc.trust.verdict import worst
 from validate import figures
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area

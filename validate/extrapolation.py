@@ -9,11 +9,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
+from dvc import Grid, SampledDisplacement, evaluate_on_grid
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.nodal import OnMesh
-from dvc.deformation.protocol import SampledDisplacement, evaluate_on_grid
 from dvc.errors import InputError
-from dvc.images.image import Grid
 
 LEVELLED = "-levelled"
 """Suffix of the name of a levelled model."""

@@ -14,13 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import Affine, Grid, MeshFile, TetMesh, read_mesh
 from dvc.arrays import FloatArray
 from dvc.deformation.nodal import OnMesh
-from dvc.deformation.protocol import Affine
 from dvc.errors import GeometryError, InputError
-from dvc.images.image import Grid
-from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS, MeshFile, read_mesh
-from dvc.mesh import TetMesh, box_told
+from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
+from dvc.mesh import box_told
 from validate.tetrahedra import linear_tetrahedra
 
 _NAMES = ("displacement_mm", "displacement", "displacements", "disp", "u")

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from dvc import Deformation
 from dvc.arrays import FloatArray
-from dvc.deformation.protocol import Deformation
 from dvc.report.figures import REGION_COLOURS
 from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dvc.trust.verdict import LEVELS, Verdict, worst
+from dvc import Verdict
+from dvc.trust.verdict import LEVELS, worst
 from validate.load_comparison import LoadComparison
 
 _COVERED = 0.9  # fraction of the mesh; a model that covers less is noted

@@ -9,15 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import Deformation, LabelMap, TetMesh, Verdict, plate_axes
 from dvc.arrays import BoolArray, FloatArray
-from dvc.deformation.protocol import Deformation
-from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
-from dvc.images.image import LabelMap
-from dvc.mesh import TetMesh
 from dvc.trust.error_model import ErrorTable
 from dvc.trust.truth_draws import TruthDraws
-from dvc.trust.verdict import Verdict
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
 from validate.extrapolation import LEVELLED

@@ -13,9 +13,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from dvc import TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
-from dvc.mesh import FACES, TetMesh
+from dvc.mesh import FACES
 
 LEAST_ML = 0.1
 """Volume of the smallest cluster that counts by default, mL."""

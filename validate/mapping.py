@@ -8,12 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dvc import Deformation, LabelMap, StrainField, TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
-from dvc.deformation.protocol import Deformation
-from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
-from dvc.images.image import LabelMap
-from dvc.mesh import TetMesh
 from dvc.trust.regions import volume_above
 
 ALL = "all soft tissue"

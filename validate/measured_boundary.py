@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dvc import Deformation, TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import write_whole
-from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, MrstrainError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
-from dvc.mesh import TetMesh, outer_faces
+from dvc.mesh import outer_faces
 from fe import BONE, LoadState, LoadStep, Material, Tolerance, check_materials
 from fe.assembly import Assembler
 from fe.elements import element

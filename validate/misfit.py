@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dvc import LabelMap, TetMesh
 from dvc.errors import GeometryError, InputError
-from dvc.images.image import LabelMap
-from dvc.mesh import TetMesh, box_told
+from dvc.mesh import box_told
 from validate.fe_result import FeResult, check_overlap
 from validate.load_comparison import LoadCase
 from validate.mapping import MappedFields, check_bones, tissues_of

@@ -7,14 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dvc import Deformation, LabelMap, Mask, StrainField, Verdict, evaluate_on_grid
 from dvc.arrays import FloatArray
-from dvc.deformation.protocol import Deformation, evaluate_on_grid
-from dvc.deformation.strain import StrainField
-from dvc.images.image import LabelMap, Mask
 from dvc.io.images.read import read_voxels
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, caption_of
 from dvc.report.viewer import Viewer, Volume
-from dvc.trust.verdict import Verdict
 from validate import figures
 from validate.curves import Area
 from validate.fe_result import FeResult

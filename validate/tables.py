@@ -14,13 +14,10 @@ from typing import Any, TypeVar
 import meshio
 import numpy as np
 
+from dvc import Image, StrainField, evaluate_on_grid, write_image, write_vectors
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
-from dvc.deformation.protocol import evaluate_on_grid
-from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
-from dvc.images.image import Image
-from dvc.io.images.write import write_image, write_vectors
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
 from validate.load_comparison import LoadComparison

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 import numpy as np
 from scipy import sparse
 
+from dvc import MeshFile, TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import GeometryError
-from dvc.io.meshes.read import CellBlock, MeshFile
-from dvc.mesh import TetMesh
+from dvc.io.meshes.read import CellBlock
 from validate.cell_shapes import SHAPES, Shape
 
 _log = logging.getLogger("validate.tetrahedra")

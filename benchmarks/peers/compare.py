@@ -30,10 +30,8 @@ import numpy as np
 from benchmarks.memory import peak_kib
 from benchmarks.peers.pairs import PAIRS, pair_named, write_pair
 from benchmarks.registration_accuracy import scored
-from dvc.deformation.protocol import Deformation
+from dvc import Deformation, read_displacement, read_transform
 from dvc.errors import MrstrainError
-from dvc.io.transforms.displacement_image import read_displacement
-from dvc.io.transforms.read import read_transform
 from mrstrain.records.provenance import versions
 from phantoms import HeelPair
 

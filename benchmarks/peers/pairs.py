@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.registration_accuracy import without_motion
-from dvc.images.image import Grid, Image, Mask
+from dvc import Grid, Image, Mask, write_image, write_labels, write_mask
 from dvc.images.resample import carry, fill_missing
 from dvc.images.shading import without_shading
-from dvc.io.images.write import write_image, write_labels, write_mask
 from phantoms import Heel, HeelPair, heel_pair, motion_named
 
 # Air left around the body: more than tissue moves, so that its true place is inside the aligned image as well.

@@ -11,8 +11,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.registration_accuracy import elastix_default
-from dvc.images.image import Mask
-from dvc.io.images.read import read_image
+from dvc import Mask, read_image
 from dvc.io.transforms.write import write_elastix_transform
 from dvc.worker import Worker
 

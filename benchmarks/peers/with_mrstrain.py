@@ -10,13 +10,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from dvc.deformation.bspline import BSpline
-from dvc.images.image import Mask
-from dvc.io.images.labels import read_labels
-from dvc.io.images.read import read_image
+from dvc import BSpline, Mask, Settings, read_image, read_labels, register
 from dvc.io.transforms.bordered_spline import write_bordered_spline
 from dvc.io.transforms.write import write_elastix_transform
-from dvc.registration.register import Settings, register
 
 
 def main() -> None:

@@ -19,6 +19,11 @@ ENGINES: dict[str, type[Engine]] = {
 """Engines that are known by one name. elastix is known by its presets and parameter files."""
 
 
+def families() -> list[str]:
+    """Names that engines are asked for by; an engine with and without tissue interfaces has one."""
+    return sorted({Elastix.family, *(kind().family for kind in ENGINES.values())})
+
+
 def engine_named(name: str) -> Engine:
     """An engine by the name that error models know it by: its own, that of a preset of elastix, or a .txt file.
 

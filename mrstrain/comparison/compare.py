@@ -8,13 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
-from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
-from dvc.images.image import Grid, LabelMap
-from dvc.io.images.labels import read_labels
 from dvc.io.result_folder import ResultFolder, result_folders
-from dvc.mesh import TetMesh
 from dvc.report.page import Section
 from fe import read_tet_mesh
 from mrstrain.comparison.methods import methods

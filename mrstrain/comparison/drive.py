@@ -6,11 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dvc import Deformation, TetMesh
 from dvc.atomic_files import write_json, write_whole
-from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import ResultFolder, result_folders
-from dvc.mesh import TetMesh
 from dvc.worker import usable_cores
 from fe import (
     Material,

@@ -11,13 +11,10 @@ from typing import Any
 import meshio
 import numpy as np
 
+from dvc import Image, Subject, tissue_mask, write_image
 from dvc.atomic_files import whole_file, write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
-from dvc.images.image import Image
-from dvc.images.tissue import tissue_mask
-from dvc.io.images.write import write_image
 from dvc.io.result_folder import result_folders
-from dvc.measurement.subject import Subject
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.register import register

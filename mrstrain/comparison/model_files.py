@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import Grid
 from dvc.arrays import FloatArray
 from dvc.errors import ExtentError, InputError
-from dvc.images.image import Grid
 from dvc.mesh import box_told
 from mrstrain.records.inputs import read_matrix
 from validate import FeResult, check_overlap, read_result

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvc.measurement.measurement import Measurement
+from dvc import Measurement, Verdict
 from dvc.report.page import Section
-from dvc.trust.verdict import Verdict
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
+from dvc import Elastix, Engine, GaussNewton, GaussNewtonWithInterfaces, load_preset, read_parameter_file
 from dvc.errors import InputError, ParameterError
-from dvc.registration.elastix.engine import Elastix
-from dvc.registration.elastix.presets import load_preset, read_parameter_file
-from dvc.registration.engine import Engine
 from dvc.registration.engines import DEFAULT, ENGINES
-from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.options.measurement import EngineOptions, RegistrationOptions
 

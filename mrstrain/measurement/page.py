@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from dvc import Verdict
 from dvc.report.page import Section, record_lines, write_report
-from dvc.trust.verdict import Verdict, worst
+from dvc.trust.verdict import worst
 
 _CLOSING = (
     Section(

@@ -6,14 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dvc.deformation.protocol import Deformation
-from dvc.images.image import Image
+from dvc import Deformation, Evidence, Image, Measurement, Registration, Settings, Subject
+from dvc import register as register_pair
 from dvc.measurement.error_bars import TwinCheck
-from dvc.measurement.measurement import Measurement
-from dvc.measurement.source import Evidence
-from dvc.measurement.subject import Subject
-from dvc.registration.register import Registration, Settings
-from dvc.registration.register import register as register_pair
 from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker
 from mrstrain.measurement.case import Case

@@ -9,18 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import Deformation, Evidence, Image, Settings, read_image, read_landmarks
 from dvc.atomic_files import write_json
-from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
-from dvc.images.image import Image
-from dvc.io.images.read import read_image
 from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
-from dvc.measurement.source import Evidence
 from dvc.registration.align import without_motion
 from dvc.registration.engines import DEFAULT
-from dvc.registration.register import Settings, refuse_one_image_twice
+from dvc.registration.register import refuse_one_image_twice
 from dvc.trust.error_model import error_model_of, read_error_model
-from dvc.trust.landmarks import read_landmarks
 from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.measurement.case import Case

@@ -6,10 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from dvc.io.images.read import read_image
+from dvc import Evidence, Settings, read_image
 from dvc.io.result_folder import QUALITY, REPEAT, spline_in
-from dvc.measurement.source import Evidence
-from dvc.registration.register import Settings
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.trust.quality import read_noise_floor
 from dvc.worker import Worker

@@ -6,14 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from dvc import Deformation, Measurement, Subject, read_displacement, read_transform
 from dvc.atomic_files import write_json
-from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError
 from dvc.io.result_folder import PROVENANCE, REPORT
-from dvc.io.transforms.displacement_image import read_displacement
-from dvc.io.transforms.read import read_transform
-from dvc.measurement.measurement import Measurement
-from dvc.measurement.subject import Subject
 from mrstrain.measurement.case import Case
 from mrstrain.measurement.page import write_series_report
 from mrstrain.options.door import door

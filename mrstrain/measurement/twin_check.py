@@ -6,14 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dvc.deformation.protocol import Deformation
+from dvc import Deformation, Registration, Subject, register, tissue_mask
 from dvc.errors import InputError, MrstrainError
 from dvc.images.noise import signal_to_noise
-from dvc.images.tissue import tissue_mask
 from dvc.measurement.error_bars import TwinCheck
 from dvc.measurement.judgement import maps_of
-from dvc.measurement.subject import Subject
-from dvc.registration.register import Registration, register
 from dvc.worker import Worker
 from phantoms import Acquisition, synthetic_warp
 

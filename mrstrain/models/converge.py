@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import read_labels
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
-from dvc.io.images.labels import read_labels
 from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
 from mrstrain.models.loads import LOADS
 from mrstrain.models.mesh import mesh as make_mesh

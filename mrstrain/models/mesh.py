@@ -6,10 +6,9 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from dvc import TetMesh, read_labels
 from dvc.errors import InputError, OutputError
-from dvc.io.images.labels import read_labels
 from dvc.measurement.subject import is_bones_name
-from dvc.mesh import TetMesh
 from fe import SKIN, MeshQuality, Plate, figures, mesh_labels, write_tet_mesh
 from mrstrain.options.door import door
 from mrstrain.options.modelling import Labelling, Meshing

@@ -25,7 +25,7 @@ class ModelReading(Options):
 
 
 def _rising(strains: tuple[float, float]) -> tuple[float, float]:
-    from validate.curves import check_range
+    from validate import check_range
 
     try:
         check_range(strains)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
+from pydantic import AfterValidator
+
 from mrstrain.options.model import Cli, Count, Flag, NotNegative, Options, Positive, Vector
 
 Frame = Literal["LPS", "RAS"]
@@ -45,12 +47,20 @@ class MeshAndAxes(Options):
     """Direction of the shear force on the tissue, LPS, such as --shear-direction 0 -1 0 (anterior)."""
 
 
+def _known_engine(name: str) -> str:
+    from dvc.registration.engines import families
+
+    if name not in families():
+        raise ValueError(f"there are {' and '.join(families())}")
+    return name
+
+
 class EngineOptions(Options):
     """What finds the non-rigid part of a registration."""
 
     panel: ClassVar[str] = "Registration"
 
-    engine: Literal["elastix", "gauss-newton"] | None = None
+    engine: Annotated[str, AfterValidator(_known_engine)] | None = None
     """What finds the non-rigid part. Default: gauss-newton; with --preset, elastix."""
     borders: Flag | None = None
     """gauss-newton: strain may jump where the tissues of --labels meet. Default: where there are labels; --no-borders

@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import Subject, fit_mask, read_image, read_labels, read_mask, read_mesh
 from dvc.arrays import FloatArray
 from dvc.errors import InputError, OutputError
-from dvc.io.images.labels import fit_mask, read_labels, read_mask
-from dvc.io.images.read import read_image
 from dvc.io.images.write import refuse_overwriting_inputs
-from dvc.io.meshes.read import read_mesh
 from dvc.io.result_folder import REPORT
-from dvc.measurement.subject import Subject, plate_directions
+from dvc.measurement.subject import plate_directions
 from mrstrain.options.measurement import MeshAndAxes, SubjectFiles
 
 IMAGE_ENDINGS = (".nii.gz", ".seg.nrrd", ".nii", ".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")

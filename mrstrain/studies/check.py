@@ -10,14 +10,10 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from dvc.deformation.strain import plate_axes
+from dvc import Image, LabelMap, TetMesh, fit_mask, plate_axes, read_image, read_labels, read_mask
 from dvc.errors import InputError, MrstrainError
-from dvc.images.image import Image, LabelMap
-from dvc.io.images.labels import fit_mask, read_labels, read_mask
-from dvc.io.images.read import read_image
 from dvc.io.result_folder import REPEAT
 from dvc.measurement.subject import is_bones_name
-from dvc.mesh import TetMesh
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.worker import usable_cores
 from fe import LoadStep, MaterialSet, Plate, Problem, check_loads, check_meshing, fixed_facets, material_set

@@ -8,10 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.images.image import LabelMap
-from dvc.io.images.labels import read_labels
-from dvc.io.images.read import read_image
-from dvc.mesh import TetMesh
+from dvc import LabelMap, TetMesh, read_image, read_labels
 from dvc.registration.engine import Cost
 from fe import LoadStep, paths_of, read_tet_mesh
 from mrstrain.measurement.engines import engine_of

@@ -6,10 +6,9 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from dvc import read_labels, read_mask, write_labels
 from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
-from dvc.io.images.labels import read_labels, read_mask
-from dvc.io.images.write import write_labels
 from dvc.io.result_folder import REPORT, spline_in
 from mrstrain.models.loads import LOADS
 from mrstrain.records.progress import OnProgress

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from dvc import Verdict
 from dvc.atomic_files import write_json
 from dvc.report.page import METHODS, Section, Table, record_lines, write_report
-from dvc.trust.verdict import Verdict, worst
+from dvc.trust.verdict import worst
 from mrstrain.comparison.methods import methods_of_registrations
 from mrstrain.records.provenance import provenance, without_folders
 from mrstrain.studies.file import Study

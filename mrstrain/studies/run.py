@@ -11,8 +11,8 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from dvc import Verdict
 from dvc.errors import InputError, OutputError, ParameterError
-from dvc.trust.verdict import Verdict
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from dvc import engine_named
 from dvc.atomic_files import write_json
 from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import REPORT
-from dvc.registration.engines import DEFAULT, engine_named
+from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk

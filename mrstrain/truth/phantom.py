@@ -10,12 +10,10 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 
+from dvc import Grid, Image, LabelMap, Mask, RigidMotion, StrainMaps, strain_maps, write_image, write_labels, write_mask
 from dvc.atomic_files import whole_folder, write_json
-from dvc.deformation.protocol import Motion, RigidMotion
-from dvc.deformation.strain_maps import StrainMaps, strain_maps
+from dvc.deformation.protocol import Motion
 from dvc.errors import InputError
-from dvc.images.image import Grid, Image, LabelMap, Mask
-from dvc.io.images.write import write_image, write_labels, write_mask
 from dvc.io.result_folder import PROVENANCE, REGIONS, write_maps
 from dvc.trust.regions import region_statistics, write_regions_csv
 from mrstrain.records.inputs import make_output, refuse_small_disk

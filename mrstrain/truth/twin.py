@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from dvc import write_image
 from dvc.atomic_files import write_json
-from dvc.io.images.write import write_image
 from dvc.io.result_folder import PROVENANCE
 from mrstrain.measurement.strain import read_deformation
 from mrstrain.options.door import door

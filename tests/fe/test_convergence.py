@@ -2,6 +2,7 @@
 
 import csv
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from dvc.images.image import LabelMap
 from dvc.io.images.write import write_labels
 from fe import extrapolate, write_tet_mesh
 from mrstrain.cli.app import app
+from mrstrain.options.modelling import Labelling, Meshing
 from mrstrain.records.provenance import provenance
 from tests.fe.test_meshing import half_onion
 from tests.fe.test_simulate import dome
@@ -58,12 +60,12 @@ def test_meshes_are_made_once_and_simulated_each(tmp_path: Path, monkeypatch: py
     """With blocks in the place of the mesher's tetrahedra."""
     counts, made = {6.0: (3, 4, 4), 4.0: (4, 6, 6), 2.5: (5, 8, 8)}, []
 
-    def block_of(labels: Path, *, out: Path, edge_mm: float, names: Path, bones: list[str], **_: object) -> None:
-        inputs = {"labels": Path(labels), "names": Path(names)}
-        write_tet_mesh(out, dome(counts[edge_mm]), provenance("mesh", inputs, {"bones": list(bones)}))
-        made.append(edge_mm)
+    def block_of(labels: Path, *, out: Path, labelling: Labelling, meshing: Meshing, **_: object) -> None:
+        inputs = {"labels": Path(labels), "names": Path(labelling.names)}
+        write_tet_mesh(out, dome(counts[meshing.edge_mm]), provenance("mesh", inputs, {"bones": list(labelling.bones)}))
+        made.append(meshing.edge_mm)
 
-    monkeypatch.setattr("mrstrain.models.converge.make_mesh", block_of)
+    monkeypatch.setattr("mrstrain.models.converge.make_mesh", SimpleNamespace(with_options=block_of))
     write_labels(tmp_path / "map.nii.gz", half_onion())
     given = [text for edge in counts for text in ("--edge-mm", str(edge))]
     given += ["--names", str(tmp_path / "map.csv"), "--load", "pressed=1", "--set", "luboz"]

@@ -164,7 +164,7 @@ def test_a_gradient_on_its_last_legs_gives_no_number_and_no_crash() -> None:
     [
         (lambda: NeoHooke.of(0.1, nu=0.5), "Poisson's ratio must lie between 0 and 0.49999, got 0.5"),
         (lambda: NeoHooke.of(0.1, nu=-0.1), "Poisson's ratio"),
-        (lambda: NeoHooke.of(-0.1), "shear modulus must be positive, and is -100 kPa"),
+        (lambda: NeoHooke.of(-0.1), "shear modulus must be positive; it is -100 kPa"),
         (lambda: Yeoh.of(0.0, 1.0), "shear modulus must be positive"),
         (lambda: NeoHooke.of(float("nan")), "finite"),
         (lambda: Ogden.of([0.1, 0.2], [3.0]), "2 moduli and 1 exponents"),

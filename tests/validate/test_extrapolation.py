@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import meshio
 import numpy as np
@@ -16,6 +17,7 @@ from dvc.io.images.write import write_image, write_mask
 from dvc.mesh import TetMesh
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME
 from mrstrain.comparison.level import level
+from mrstrain.options.measurement import RegistrationOptions
 from phantoms import heel_grid, labels_of, scan
 from tests.blocks import block
 from tests.quick import QUICK
@@ -110,13 +112,13 @@ def test_what_comes_back_is_the_model_as_the_measurement_shows_it(
         with pytest.raises(InputError, match=message):
             level(tmp_path / "Load0.nii.gz", wrong, out=tmp_path / "two", bone=tmp_path / "bone.nii.gz")
 
-    def fails(*_: object, **given: object) -> None:
+    def fails(*_: object, registration: RegistrationOptions, **__: object) -> None:
         # Beyond its mesh the model changes tissue's volume as no tissue does: that is not to be followed.
-        assert given["volume"] == USUAL_VOLUME
+        assert registration.volume == USUAL_VOLUME
         raise RegistrationError("No load could be registered. Load1: folded")
 
     with monkeypatch.context() as broken:
-        broken.setattr("mrstrain.comparison.level.register", fails)
+        broken.setattr("mrstrain.comparison.level.register", SimpleNamespace(with_options=fails))
         with pytest.raises(RegistrationError, match=r"Load1 was not registered: .* folded"):
             level(tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "two", bone=tmp_path / "bone.nii.gz")
     with pytest.raises(InputError, match="needs the bone"):

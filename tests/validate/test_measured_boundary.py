@@ -152,7 +152,7 @@ def test_the_command_writes_what_compare_takes(tmp_path: Path) -> None:
     argv = ["drive", tmp_path / "heel.vtu", tmp_path / "measured", "--set", "luboz", "--out", tmp_path / "out"]
     ran = CliRunner().invoke(app, [str(a) for a in argv])
     assert ran.exit_code == 0, ran.output
-    assert "luboz, Load1: maximal shear" in ran.output
+    assert "luboz, Load1: max. shear" in ran.output
     result = read_result("luboz", tmp_path / "out" / "luboz-driven" / "Load1.vtu")
     assert set(result.mesh.regions) == {"fat", "skin"}
     outer = np.unique(outer_faces(mesh.cells))

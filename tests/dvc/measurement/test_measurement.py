@@ -31,7 +31,7 @@ def measured(tiny_pair, worker) -> dvc.Measurement:
     settings = Settings.of("gauss-newton").of_repeat()
     flat = np.full((2, 1, 2), 0.02)
     table = ErrorTable(np.full(3, 2.5), 25.0, np.array([0.0, 0.5]), np.zeros(1), {POOLED: flat}, ({POOLED: flat},), 4.0)
-    digest = hashlib.sha256(settings.text.encode()).hexdigest()
+    digest = hashlib.sha256(settings.engine.text.encode()).hexdigest()
     return dvc.measure(
         tiny_pair.reference,
         tiny_pair.loaded,

@@ -43,7 +43,9 @@ def stored(grid: Grid, values: np.ndarray, axes: tuple[int, int, int], flips: tu
 def plain(tiny_pair, worker) -> dict[str, Registration]:
     pair = tiny_pair
     return {
-        s.engine: register(pair.reference, pair.loaded, bone=pair.bone, tissue=body(pair), settings=s, worker=worker)
+        s.engine.family: register(
+            pair.reference, pair.loaded, bone=pair.bone, tissue=body(pair), settings=s, worker=worker
+        )
         for s in (OURS, ELASTIX)
     }
 

@@ -18,6 +18,7 @@ from dvc.registration.elastix.presets import load_preset
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.gauss_newton.fit import USUAL_BENDING, USUAL_VOLUME
+from dvc.registration.gauss_newton.with_interfaces import USUAL_SKIN
 from dvc.registration.register import Settings
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.register import register as run
@@ -167,7 +168,8 @@ def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkey
             written / "Load0.nii.gz", tmp_path / "again.nii.gz", out=tmp_path / "repeat",
             labels=tmp_path / "labels.nii.gz", names=None, bone=written / "bone.nii.gz",
         )  # fmt: skip
-    assert used == {2.0: GaussNewton(bending=USUAL_BENDING, volume=USUAL_VOLUME)}
+    fixed = GaussNewton(bending=USUAL_BENDING, volume=USUAL_VOLUME)
+    assert used == {2.0: GaussNewtonWithInterfaces(fixed, USUAL_SKIN)}
     assert Settings.of("heel-mr").of_repeat() == Settings.of("heel-mr")
 
 

@@ -373,9 +373,9 @@ def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
     (study / "ansys" / "Load1.vtu").write_text("")
     init(study)
     told = read_study(study)
-    assert told.images.load0 == "Load0.nii.gz"
-    assert told.images.repeat == "Load0-again.nii.gz"
-    assert (told.images.labels, told.images.names) == ("tissues.nii.gz", "tissues.csv")
+    assert told.images.load0 == Path("Load0.nii.gz")
+    assert told.images.repeat == Path("Load0-again.nii.gz")
+    assert (told.images.labels, told.images.names) == (Path("tissues.nii.gz"), Path("tissues.csv"))
     assert list(told.loads) == ["Load1", "Load2"]
     assert told.loads["Load1"].normal_n is None  # forces are never guessed
     assert any("normal_n is missing" in one for one in check(study).wrong)
