@@ -200,7 +200,7 @@ def test_a_study_begins_a_load_where_the_one_before_ended(pad, out, monkeypatch)
         used.update(given)
         raise RegistrationError("enough")
 
-    monkeypatch.setattr("mrstrain.measurement.register_one.register_pair", never)
+    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", never)
     more = {"labels": pad.folder / "tissues.nrrd", "names": pad.folder / "tissues.csv", "bone_label": "bone"}
     with pytest.raises(RegistrationError, match="enough"):
         register_one(

@@ -160,7 +160,8 @@ def test_a_value_comes_from_the_command_line_as_it_was_typed(model: type[Options
     info = model.model_fields[field]
     assert info.description
     strains = field == "strains"
-    value = (0.25, 1.25) if strains else another(info.annotation, info.default)
+    engine = "elastix" if field == "engine" else None  # of those that there are
+    value = (0.25, 1.25) if strains else engine or another(info.annotation, info.default)
     given = {name: another(one.annotation) for name, one in model.model_fields.items() if one.is_required()}
     given[field] = value
     done = CliRunner().invoke(program, [word for name, one in given.items() for word in words(model, name, one)])
@@ -203,7 +204,8 @@ def test_a_value_comes_from_the_study_file_to_its_stage(model: type[Options], fi
     table, stage = TABLES[model]
     keys = {name: key for key, name in names_of(table).items()}
     info = model.model_fields[field]
-    value: Any = {"strains": (0.25, 1.25), "sets": ("name.toml",)}.get(field, another(info.annotation, info.default))
+    values = {"strains": (0.25, 1.25), "sets": ("name.toml",), "engine": "elastix"}
+    value: Any = values.get(field, another(info.annotation, info.default))
     more = {keys[field]: value / model.cli(field).times if model.cli(field).times != 1.0 else value}
     if table == "mesh":  # keys that say something beside others alone
         more |= {"file": "mesh.vtu"} if model is MeshCoordinates else {"labels": "own.nii.gz"}
