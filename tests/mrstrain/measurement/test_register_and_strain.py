@@ -198,6 +198,9 @@ def test_quality_landmarks_noise_floor_and_verdict_are_told_everywhere(results, 
     assert any(words in line for line in results.summary())
     verdict = results.cases[0].verdict
     assert told["verdict"] == {"level": verdict.level, "reasons": list(verdict.reasons)}
+    again = results.cases[0].measurement()
+    assert again.summary() == results.cases[0].summary()
+    assert again.quality.landmark_errors_mm.size == told["landmarks"]["count"]
     folder = study / "out" / "Load1"
     names = ("displacement", "green_lagrange", "green_lagrange_plate", "nodal_displacements")
     for name in names:
