@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dvc import LabelMap, TetMesh, Verdict
-from dvc.atomic_files import whole_folder, write_whole
+from dvc.atomic_files import whole_folder, write_json
 from dvc.errors import InputError
 from dvc.report.page import Section, record_lines, write_report
 from dvc.report.sheet import png_bytes
@@ -207,10 +207,10 @@ class Comparison:
                     (part / f"{stem}.png").write_bytes(picture.png)
                 if on_image:
                     write_on_image(part, one)
-                _write_json(part / "provenance.json", about | {"verdict": _plain(one.case.verdict)})
+                write_json(part / "provenance.json", about | {"verdict": _plain(one.case.verdict)})
             sections += load_sections(one, drawn)
         self._write_tables(target)
-        _write_json(target / RECORD, self._record() | about)
+        write_json(target / RECORD, self._record() | about)
         closing = closing_sections(self.loads[0].criteria.thresholds, methods)
         title, lines = "Models against the measurement", record_lines(about)
         write_report(target / "report.html", title, self.verdict, sections, closing, lines)
@@ -347,7 +347,3 @@ def _plain(verdict: Verdict | None) -> dict[str, object] | None:
 
 def _verdict(content: Mapping[str, object] | None) -> Verdict | None:
     return None if content is None else Verdict(content["level"], tuple(content["reasons"]))  # type: ignore[arg-type]
-
-
-def _write_json(path: Path, content: Mapping[str, object]) -> None:
-    write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
@@ -337,7 +337,8 @@ def uncertainty_of(
         _, sd = table.expected(name, max_shear[where].astype(np.float64), to_bone_mm[where])
         factor = wider.get(name, 1.0)
         sigma[where] = factor * sd
-        intervals += _intervals(name, where, max_shear, to_bone_mm, grid, table, thresholds, random, factor)
+        own = replace(table, widening=factor * table.factor)
+        intervals += _intervals(name, where, max_shear, to_bone_mm, grid, own, thresholds, random)
     return Uncertainty(sigma, tuple(intervals), table)
 
 
@@ -350,7 +351,6 @@ def _intervals(
     table: ErrorTable,
     thresholds: Sequence[float],
     random: np.random.Generator,
-    factor: float,
 ) -> list[Interval]:
     """Of one region, from draws on a lattice coarse enough to be quick."""
     box = tuple(slice(int(a.min()), int(a.max()) + 1) for a in np.nonzero(where))
@@ -367,7 +367,7 @@ def _intervals(
     for draw in range(_DRAWS):
         bias, sd = expected[random.integers(len(expected))]
         drawn[draw] = figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds)
-    low, middle, high = widened(drawn, factor * table.factor)
+    low, middle, high = widened(drawn, table.factor)
     high[3:] = np.minimum(high[3:], volume)
     measured = figures_of(max_shear[where].astype(np.float64), volume, thresholds)
     names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]

@@ -11,7 +11,7 @@ import numpy as np
 from dvc import Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
-from dvc.io.result_folder import ResultFolder, result_folders
+from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, result_folders
 from dvc.report.page import Section
 from fe import read_tet_mesh
 from mrstrain.comparison.methods import methods
@@ -45,7 +45,7 @@ class Compared:
 
     def summary(self) -> list[str]:
         """A few lines for a person."""
-        return [*self.comparison.summary(), f"Report: {self.out / 'report.html'}"]
+        return [*self.comparison.summary(), f"Report: {self.out / REPORT}"]
 
 
 @door
@@ -151,7 +151,7 @@ def _inputs(
         "labels": [labels],
         "names": [] if names is None else [Path(names)],
         "mesh": [] if mesh is None else [Path(mesh)],
-        "error_models": [f for m in measurements if (f := m.folder / "error_model.json").is_file()],
+        "error_models": [f for m in measurements if (f := m.folder / ERROR_MODEL).is_file()],
     }
 
 
@@ -190,7 +190,7 @@ def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
 
 
 def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> LoadCase:
-    image = measurement.folder / "registered.nii.gz"
+    image = measurement.folder / REGISTERED
     return LoadCase(
         measurement.load,
         lambda: (measurement.deformation(), [file.read(grid) for file in files]),

@@ -9,7 +9,7 @@ from pathlib import Path
 from dvc import Deformation, TetMesh
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
-from dvc.io.result_folder import ResultFolder, result_folders
+from dvc.io.result_folder import REGIONS, ResultFolder, result_folders
 from dvc.worker import usable_cores
 from fe import (
     Material,
@@ -164,7 +164,7 @@ def _drive_set(
         figures = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p90:.3f}" for r in own)
         part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the displacement was reached;"
         lines.append(f"{name}, {load}:{part} max. shear, median / 90th percentile: {figures}")
-    write_regions_csv(folder / "regions.csv", rows)
+    write_regions_csv(folder / REGIONS, rows)
     write_whole(folder / SETTINGS, IN_IMAGE)
     write_whole(folder / "log.txt", "\n".join(log) + "\n")
     return outcome, lines

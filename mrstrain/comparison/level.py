@@ -14,7 +14,7 @@ import numpy as np
 from dvc import Image, Subject, tissue_mask, write_image
 from dvc.atomic_files import whole_file, write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
-from dvc.io.result_folder import result_folders
+from dvc.io.result_folder import PROVENANCE, result_folders
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.register import register
@@ -177,7 +177,7 @@ def _prepare(target: Path, name: str, images: Mapping[str, Image], record: Mappi
         make_output(folder)
     for load in images:
         (target / name / f"{load}.vtu").unlink(missing_ok=True)
-    write_json(target / name / "provenance.json", record)
+    write_json(target / name / PROVENANCE, record)
     for load, image in images.items():
         write_image(work / "images" / f"{load}.nii.gz", image)
     write_whole(target / name / SETTINGS, IN_IMAGE)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dvc.io.images.read import format_of
-from dvc.io.result_folder import PROVENANCE
+from dvc.io.result_folder import PROVENANCE, QUALITY
 from dvc.registration.engines import methods_of
 from dvc.report.viewer import NIIVUE
 from fe import LoadStep
@@ -279,4 +279,4 @@ def _twins(measured: Mapping[str, Path]) -> str:
 
 def _errors(measured: Mapping[str, Path]) -> dict[str, Record]:
     """The record of each registration on the error of its maximum shear strain."""
-    return {load: _record(folder / "quality.json").get("error_of_max_shear", {}) for load, folder in measured.items()}
+    return {load: _record(folder / QUALITY).get("error_of_max_shear", {}) for load, folder in measured.items()}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import Deformation, Evidence, Image, Settings, read_image, read_landmarks
+from dvc import Deformation, Engine, Evidence, Image, Mask, Settings, read_image, read_landmarks
 from dvc.atomic_files import write_json
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
 from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
@@ -29,6 +29,7 @@ from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Runni
 from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_small_disk, refuse_touching_inputs
 
 Told = Callable[[str, str, float], None]
+_BESIDE = ("repeat", "landmarks", "start")  # files that are recorded beside the loads
 _BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plate's axes
 
 
@@ -95,26 +96,10 @@ def register(
         For any input that cannot be used, before anything is computed; or if every load failed.
     """
     target = Path(out)
-    paths = [Path(p) for p in loads]
-    cases = case_names(paths)
-    if scans.repeat is not None:
-        if REPEAT in cases:
-            raise InputError(
-                f"A loaded image is called '{REPEAT}', the folder name kept for the repeat scan: rename it."
-            )
-        cases, paths = [*cases, REPEAT], [*paths, scans.repeat]
-    if not paths:
-        raise InputError("Give at least one loaded image.")
-    for option, value in (("--landmarks", scans.landmarks), ("--start", scans.start)):
-        if value is not None and len(loads) != 1:
-            raise InputError(f"{option}: belongs to one loaded image; {len(loads)} are given. Register that one alone.")
+    places = _places([Path(p) for p in loads], scans)
+    cases, paths = list(places), list(places.values())
     chosen = engine_of(registration, labelled=subject_files.labels is not None)
-    if scans.start_frame is not None and scans.start is None:
-        raise ParameterError("--start-frame is the frame of --start, which is not given.")
-    if scans.start is not None and not chosen.starts_anywhere:
-        raise ParameterError(
-            f"--start is for --engine {DEFAULT}; {chosen.family} begins at results of its own (--chain)."
-        )
+    _check_start(scans, chosen)
     given = [p for of in (subject_files, registration, scans, onto) for p in of.paths]
     refuse_touching_inputs(target, cases, [Path(load0), *paths, *given])
     subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
@@ -123,54 +108,73 @@ def register(
         raise InputError(
             "Aligning on the bone needs it: give --bone, or --bone-label with --labels, or another --align."
         )
-    missing = scans.allow_missing
-    images = {name: read_image(path, allow_missing=missing) for name, path in zip(cases, paths, strict=True)}
+    images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
     # Read now: what is wrong with it must not be found after an hour.
     model = None if registration.error_model is None else read_error_model(registration.error_model)
     points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
     subject = replace(subject, tissue=subject.body())
-    held = {"bone": subject.bone, "image": subject.tissue, "none": None}[align]
-    begun_at = None if scans.start is None else without_motion(read_any(scans.start, scans.start_frame), held)[0]
+    begun_at = _first_guess(scans, {"bone": subject.bone, "image": subject.tissue, "none": None}[align])
     refuse_one_image_twice(
         [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
     )
-    each_voxel = _BYTES_PER_VOXEL + chosen.cost.bytes_per_voxel
-    needed = each_voxel * int(np.prod(subject.reference.grid.shape)) * len(cases)
+    needed = (_BYTES_PER_VOXEL + chosen.cost.bytes_per_voxel) * int(np.prod(subject.reference.grid.shape)) * len(cases)
     refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
     make_output(target)
-    cores = usable_cores()
-    at_once = 1 if chain else min(running.workers or cores, cores, len(cases))
-    each = running.threads or max(1, cores // at_once)
-    settings = Settings(chosen, align, running.seed, each)
+    at_once, threads = _shares(running, 1 if chain else len(cases))
+    settings = Settings(chosen, align, running.seed, threads)
     model = model or error_model_of(chosen.name)
     record = record_of(
         subject,
-        {
-            "loads": paths[: len(loads)],
-            **{role: scans.files.get(role, []) for role in ("repeat", "landmarks", "start")},
-        },
+        {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}},
         settings,
         registration,
-        {
-            "start_frame": scans.start_frame,
-            "bone_label": subject_files.bone_label,
-            "shear_direction_lps": onto.plain()["shear_direction"],
-            "mesh_unit": onto.mesh_unit,
-            "mesh_frame": onto.mesh_frame,
-            "allow_missing": scans.allow_missing,
-        },
+        {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
+        | {"shear_direction_lps": onto.plain()["shear_direction"]}
+        | {"mesh_unit": onto.mesh_unit, "mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing},
     )
     plan = Plan(subject, settings, Evidence(points, error_model=model), record, twin)
     run = _Run(target, plan, images, begun_at, progress or (lambda *_: None))
     run.all(at_once, chain)
-    finished = [run.cases[name] for name in cases if name in run.cases]
-    if not finished:
-        raise RegistrationError(
-            "No load could be registered. " + " ".join(f"{n}: {r}" for n, r in run.failures.items())
-        )
+    finished = run.finished()
     write_json(target / PROVENANCE, record)
     write_series_report(target / REPORT, [case.section for case in finished], run.failures, record)
-    return Series(target, tuple(finished), run.failures)
+    return Series(target, finished, run.failures)
+
+
+def _places(loads: list[Path], scans: Scans) -> dict[str, Path]:
+    """Every image to be registered, by the name of its results' folder; the repeat scan last."""
+    if not loads and scans.repeat is None:
+        raise InputError("Give at least one loaded image.")
+    for option, value in (("--landmarks", scans.landmarks), ("--start", scans.start)):
+        if value is not None and len(loads) != 1:
+            raise InputError(f"{option}: belongs to one loaded image; {len(loads)} are given. Register that one alone.")
+    places = dict(zip(case_names(loads), loads, strict=True))
+    if scans.repeat is None:
+        return places
+    if REPEAT in places:
+        raise InputError(f"A loaded image is called '{REPEAT}', the folder name kept for the repeat scan: rename it.")
+    return places | {REPEAT: scans.repeat}
+
+
+def _check_start(scans: Scans, engine: Engine) -> None:
+    if scans.start_frame is not None and scans.start is None:
+        raise ParameterError("--start-frame is the frame of --start, which is not given.")
+    if scans.start is not None and not engine.starts_anywhere:
+        raise ParameterError(
+            f"--start is for --engine {DEFAULT}; {engine.family} begins at results of its own (--chain)."
+        )
+
+
+def _first_guess(scans: Scans, held: Mask | None) -> Deformation | None:
+    """What the loads start from, without the motion of the mask that is aligned on."""
+    return None if scans.start is None else without_motion(read_any(scans.start, scans.start_frame), held)[0]
+
+
+def _shares(running: Running, loads: int) -> tuple[int, int]:
+    """Loads at once, and threads of each."""
+    cores = usable_cores()
+    at_once = min(running.workers or cores, cores, loads)
+    return at_once, running.threads or max(1, cores // at_once)
 
 
 class _Run:
@@ -210,6 +214,13 @@ class _Run:
 
         names = sorted(self.images, key=lambda name: name != REPEAT)  # its floor is waited for
         each_in_workers(names, one, at_once=at_once, threads=self.plan.settings.threads)
+
+    def finished(self) -> tuple[Case, ...]:
+        """The loads that were registered, in the order given; RegistrationError where none was."""
+        if not self.cases:
+            reasons = " ".join(f"{name}: {reason}" for name, reason in self.failures.items())
+            raise RegistrationError(f"No load could be registered. {reasons}")
+        return tuple(self.cases[name] for name in self.images if name in self.cases)
 
     def _write(self, name: str, done: Registered) -> None:
         stage = "strain and figures"

@@ -9,7 +9,7 @@ from pathlib import Path
 from dvc import read_labels, read_mask, write_labels
 from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
-from dvc.io.result_folder import REPORT, spline_in
+from dvc.io.result_folder import REPORT, VALID, spline_in
 from mrstrain.models.loads import LOADS
 from mrstrain.records.progress import OnProgress
 from mrstrain.studies.file import FILE
@@ -147,7 +147,7 @@ def _errors(
             continue
         if done.outcomes[f"register {load}"].record is None:
             continue
-        valid = read_mask(folder / "valid.nii.gz").inside
+        valid = read_mask(folder / VALID).inside
         errors[load] = errors_by_tissue(labels, under_load(heel, load), spline_in(folder), valid)
     return errors
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dvc import Verdict
 from dvc.atomic_files import write_json
+from dvc.io.result_folder import PROVENANCE
 from dvc.report.page import METHODS, Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.comparison.methods import methods_of_registrations
@@ -39,7 +40,7 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     records = {name: outcome.record for name, outcome in outcomes.items() if outcome.record is not None}
     record["inputs"] = {"inputs": _inputs(records)}
     stages = {name: {"made_utc": one.made_utc, **one.made_from} for name, one in records.items()}
-    write_json(path.with_name("provenance.json"), record | {"stages": stages})
+    write_json(path.with_name(PROVENANCE), record | {"stages": stages})
     write_report(
         path,
         study.study.name,

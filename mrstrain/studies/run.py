@@ -13,6 +13,7 @@ from filelock import FileLock, Timeout
 
 from dvc import Verdict
 from dvc.errors import InputError, OutputError, ParameterError
+from dvc.io.result_folder import REPORT
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
@@ -23,7 +24,7 @@ from mrstrain.studies.page import write_run_report
 from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, run_all
 from mrstrain.studies.plan import KINDS, Stage, plan
 
-LOG, REPORT = "study.log", "report.html"
+LOG = "study.log"
 _USUAL_VOXELS, _USUAL_CELLS = 2e6, 70e3
 _NOTHING = ("nothing",)  # may be run: every stage is taken as it is
 

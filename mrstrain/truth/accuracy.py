@@ -14,7 +14,7 @@ import numpy as np
 from dvc import engine_named
 from dvc.atomic_files import write_json
 from dvc.errors import InputError, MrstrainError
-from dvc.io.result_folder import REPORT
+from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers, usable_cores
@@ -288,10 +288,8 @@ def _write(target: Path, runs: Sequence[ErrorSamples], failures: dict[str, str])
             "seconds_of_registration": {r.case.name: round(r.seconds, 1) for r in runs},
         },
     )
-    write_json(target / "provenance.json", record)
-    write_accuracy_report(
-        target / "report.html", study.errors, study.floors, study.resolution, coverage, failures, record
-    )
+    write_json(target / PROVENANCE, record)
+    write_accuracy_report(target / REPORT, study.errors, study.floors, study.resolution, coverage, failures, record)
     return study
 
 

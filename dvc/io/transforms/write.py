@@ -56,9 +56,9 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
         If a file cannot be written; nothing is left under its name.
     """
     image = _image_parameters(reference)
-    stages = {"TransformParameters.0.txt": _bspline_parameters(bspline)}
+    stages = {ELASTIX_FILES[0]: _bspline_parameters(bspline)}
     if then is not None:
-        stages["TransformParameters.1.txt"] = {
+        stages[ELASTIX_FILES[1]] = {
             "Transform": ["EulerTransform"],
             "NumberOfParameters": [6],
             "TransformParameters": [*_euler_angles(then.rotation), *then.translation_mm.tolist()],
