@@ -6,6 +6,7 @@ import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -67,23 +68,32 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 
 
 @pytest.fixture(scope="session")
-def small_pair(made_once):
-    """A heel at 1.6 mm voxels, pressed, moved and scanned again; truth known."""
-    return _kept(made_once, "small-pair", shape=(64, 72, 68), spacing_mm=1.6)
+def computed_once(made_once) -> Callable[[str, Callable[[], Any]], Any]:
+    """Compute a value once for all tests, whichever worker asks first; each worker has a copy."""
+
+    def computed(name: str, compute: Callable[[], Any]) -> Any:
+        folder = made_once(name, lambda place: (place / "value").write_bytes(pickle.dumps(compute())))
+        return pickle.loads((folder / "value").read_bytes())
+
+    return computed
 
 
 @pytest.fixture(scope="session")
-def tiny_pair(made_once):
+def small_pair(computed_once):
+    """A heel at 1.6 mm voxels, pressed, moved and scanned again; truth known."""
+    return computed_once("small-pair", lambda: _heel(shape=(64, 72, 68), spacing_mm=1.6))
+
+
+@pytest.fixture(scope="session")
+def tiny_pair(computed_once):
     """The same at 2.3 mm, the largest voxels whose bias field is found on every other one: where seconds count."""
-    return _kept(made_once, "tiny-pair", shape=(44, 50, 46), spacing_mm=2.3)
+    return computed_once("tiny-pair", lambda: _heel(shape=(44, 50, 46), spacing_mm=2.3))
 
 
-def _kept(made_once, name: str, **size):
-    """A pair of images, made by one worker and read by the others."""
+def _heel(**size):
     from phantoms import heel_pair
 
-    folder = made_once(name, lambda place: (place / "pair").write_bytes(pickle.dumps(heel_pair(3, load=0.6, **size))))
-    return pickle.loads((folder / "pair").read_bytes())
+    return heel_pair(3, load=0.6, **size)
 
 
 @pytest.fixture(scope="session")

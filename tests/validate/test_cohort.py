@@ -67,7 +67,7 @@ def test_intervals_hold_as_often_as_they_claim():
     assert held / 2000 == pytest.approx(0.95, abs=0.015)
 
 
-def test_models_that_are_alike_are_differs_from_best_by_chance_as_rarely_as_claimed():
+def test_equal_models_differ_by_chance_as_rarely_as_claimed():
     rng = np.random.default_rng(3)
     apart = 0
     for _ in range(120):

@@ -40,14 +40,13 @@ def stored(grid: Grid, values: np.ndarray, axes: tuple[int, int, int], flips: tu
 
 
 @pytest.fixture(scope="module")
-def plain(tiny_pair, worker) -> dict[str, Registration]:
+def plain(tiny_pair, worker, computed_once) -> dict[str, Registration]:
     pair = tiny_pair
-    return {
-        s.engine.family: register(
-            pair.reference, pair.loaded, bone=pair.bone, tissue=body(pair), settings=s, worker=worker
-        )
-        for s in (OURS, ELASTIX)
-    }
+    given = {"bone": pair.bone, "tissue": body(pair), "worker": worker}
+    return computed_once(
+        "in-its-own-frame",
+        lambda: {s.engine.family: register(pair.reference, pair.loaded, settings=s, **given) for s in (OURS, ELASTIX)},
+    )
 
 
 def body(pair) -> Mask:

@@ -35,50 +35,43 @@ PATIENT = "Doe^Jane"
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory, small_pair) -> Path:
-    folder = tmp_path_factory.mktemp("study")
-    for name, image in (("Load0", small_pair.reference), ("Load1", small_pair.loaded), ("again", small_pair.repeat)):
+def study(made_once, tiny_pair) -> Path:
+    return made_once("by-command", lambda folder: _fill(folder, tiny_pair))
+
+
+def _fill(folder: Path, tiny_pair) -> None:
+    for name, image in (("Load0", tiny_pair.reference), ("Load1", tiny_pair.loaded), ("again", tiny_pair.repeat)):
         write_image(folder / f"{name}.nii.gz", image)
     written = nibabel.load(folder / "Load1.nii.gz")
     written.header["descrip"] = PATIENT.encode()  # a name in a header must not reach any output
     nibabel.save(written, folder / "Load1.nii.gz")
-    write_mask(folder / "bone.nii.gz", small_pair.bone)
-    write_labels(folder / "tissues.nrrd", small_pair.labels)
+    write_mask(folder / "bone.nii.gz", tiny_pair.bone)
+    write_labels(folder / "tissues.nrrd", tiny_pair.labels)
     (folder / "quick.txt").write_text(QUICK)
     rows = {"fat": [[0.01, 0.02]], POOLED: [[0.02, 0.03]]}
     cells = {tissue: np.array([row, row]) for tissue, row in rows.items()}
     table = ErrorTable(np.full(3, 1.6), 25.0, np.array([0.0, 0.2]), np.zeros(1), cells, (cells,), 8.0)
     digest = hashlib.sha256(QUICK.encode()).hexdigest()
     ErrorModel("quick.txt", digest, (table,), "made up").write(folder / "errors.json")
-    points = small_pair.labels.region("fat").points()[::4000]
-    x = small_pair.foot_motion.apply(points + small_pair.deformation.displacement(points))
+    points = tiny_pair.labels.region("fat").points()[::1500]
+    x = tiny_pair.foot_motion.apply(points + tiny_pair.deformation.displacement(points))
     with (folder / "points.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["x0", "y0", "z0", "x1", "y1", "z1"])
         rows.writerows(np.hstack([points, x]).tolist())
-    nodes = small_pair.bone.points().mean(axis=0) + np.array([[0, 0, -18], [5, 0, -18], [0, 5, -18], [0, 0, -14.0]])
+    nodes = tiny_pair.bone.points().mean(axis=0) + np.array([[0, 0, -18], [5, 0, -18], [0, 5, -18], [0, 0, -14.0]])
     meshio.write(folder / "mesh.vtu", meshio.Mesh(nodes, [("tetra", [[0, 2, 1, 3]])]))
-    return folder
 
 
 @pytest.fixture(scope="module")
-def results(study):
-    return register(
-        study / "Load0.nii.gz",
-        [study / "Load1.nii.gz"],
-        out=study / "out",
-        bone=study / "bone.nii.gz",
-        labels=study / "tissues.nrrd",
-        names=study / "tissues.csv",
-        parameters=[study / "quick.txt"],
-        repeat=study / "again.nii.gz",
-        landmarks=study / "points.csv",
-        mesh=study / "mesh.vtu",
-        error_model=study / "errors.json",
-        shear_direction=(0.0, -1.0, 0.0),
-        workers=1,
-        threads=1,
-    )
+def results(study, computed_once):
+    given = {
+        "out": study / "out", "bone": study / "bone.nii.gz", "labels": study / "tissues.nrrd",
+        "names": study / "tissues.csv", "parameters": [study / "quick.txt"], "repeat": study / "again.nii.gz",
+        "landmarks": study / "points.csv", "mesh": study / "mesh.vtu", "error_model": study / "errors.json",
+        "shear_direction": (0.0, -1.0, 0.0), "workers": 1, "threads": 1,
+    }  # fmt: skip
+    return computed_once("results", lambda: register(study / "Load0.nii.gz", [study / "Load1.nii.gz"], **given))
 
 
 PROMISED = [
@@ -98,14 +91,14 @@ def test_every_promised_file_is_there(results, study, name):
     assert (study / "out" / "Load1" / name).stat().st_size > 0
 
 
-def test_error_bars_are_those_of_the_model(results, study, small_pair):
+def test_error_bars_are_those_of_the_model(results, study, tiny_pair):
     folder = study / "out" / "Load1"
     shear = read_image(folder / "max_shear.nii.gz", allow_missing=True).values
     sigma = read_image(folder / "sigma_max_shear.nii.gz", allow_missing=True).values
     for tissue, low, high in (("fat", 0.01, 0.02), ("muscle", 0.02, 0.03)):
-        inside = small_pair.labels.region(tissue).inside & np.isfinite(shear)
+        inside = tiny_pair.labels.region(tissue).inside & np.isfinite(shear)
         np.testing.assert_allclose(sigma[inside], np.interp(shear[inside], [0.0, 0.2], [low, high]), atol=1e-6)
-    assert np.isnan(sigma[small_pair.bone.inside]).all()
+    assert np.isnan(sigma[tiny_pair.bone.inside]).all()
     with (folder / "intervals.csv").open() as file:
         rows = {(r["region"], r["figure"]): r for r in csv.DictReader(file)}
     fat = rows["fat", "median"]
@@ -133,21 +126,21 @@ def test_the_displacement_says_its_frame_and_its_twin_says_the_same(results, stu
     np.testing.assert_array_equal(np.asarray(nifti.dataobj)[:, :, :, 0], twin.transpose(2, 1, 0, 3))
 
 
-def test_the_written_transforms_are_the_whole_motion(results, study, small_pair):
+def test_the_written_transforms_are_the_whole_motion(results, study, tiny_pair):
     folder = study / "out" / "Load1"
-    X = small_pair.bone.points()[::200]
+    X = tiny_pair.bone.points()[::200]
     chain = X + read_transform(folder / "TransformParameters.1.txt").displacement(X)
     itk = sitk.ReadTransform(str(folder / "transform.h5"))
     np.testing.assert_allclose(chain, [itk.TransformPoint(p.tolist()) for p in X], atol=1e-5)
-    shift = np.median(np.linalg.norm(chain - small_pair.foot_motion.apply(X), axis=1))
+    shift = np.median(np.linalg.norm(chain - tiny_pair.foot_motion.apply(X), axis=1))
     assert shift < 0.5
 
 
-def test_the_measured_displacement_is_relative_to_the_bone(results, study, small_pair):
+def test_the_measured_displacement_is_relative_to_the_bone(results, study, tiny_pair):
     u = np.asarray(nibabel.load(study / "out" / "Load1" / "displacement.nii.gz").dataobj)[:, :, :, 0]
-    bone = u[small_pair.bone.inside]
+    bone = u[tiny_pair.bone.inside]
     assert np.nanmedian(np.linalg.norm(bone, axis=1)) < 0.5
-    moved = np.linalg.norm(small_pair.foot_motion.displacement(small_pair.bone.points()), axis=1)
+    moved = np.linalg.norm(tiny_pair.foot_motion.displacement(tiny_pair.bone.points()), axis=1)
     assert np.median(moved) > 1.5
 
 
@@ -175,15 +168,15 @@ def test_results_on_the_mesh_are_those_of_the_written_transform(results, study):
     np.testing.assert_allclose(rows, written.point_data["displacement_mm"], atol=1e-6)
 
 
-def test_the_aligned_image_is_nearer_to_the_unloaded_one_and_the_registered_nearer_still(results, study, small_pair):
+def test_the_aligned_image_is_nearer_to_the_unloaded_one_and_the_registered_nearer_still(results, study, tiny_pair):
     folder = study / "out" / "Load1"
-    as_scanned = carry(small_pair.loaded, small_pair.reference.grid)
+    as_scanned = carry(tiny_pair.loaded, tiny_pair.reference.grid)
     aligned, registered = (
         read_image(folder / f"{name}.nii.gz", allow_missing=True).values for name in ("aligned", "registered")
     )
-    fat = small_pair.labels.region("fat")
+    fat = tiny_pair.labels.region("fat")
     before, rigid, after = (
-        local_correlation(small_pair.reference, v, fat)[1] for v in (as_scanned, aligned, registered)
+        local_correlation(tiny_pair.reference, v, fat)[1] for v in (as_scanned, aligned, registered)
     )
     assert before + 0.1 < rigid
     assert rigid + 0.02 < after
@@ -253,7 +246,7 @@ def test_strain_from_the_written_transform_gives_the_same_maps(results, study):
     a = read_image(study / "out" / "Load1" / "max_shear.nii.gz", allow_missing=True).values
     b = read_image(study / "strain" / "transform" / "max_shear.nii.gz", allow_missing=True).values
     both = np.isfinite(a) & np.isfinite(b)
-    assert both.sum() > 50_000
+    assert both.sum() > 20_000
     np.testing.assert_allclose(b[both], a[both], atol=2e-5)
     assert again.case.verdict.level != "trust"  # no images were compared
     assert again.case.verdict.words in again.summary()[0]
@@ -272,11 +265,11 @@ def test_strain_from_a_displacement_image_too(results, study):
     assert np.median(np.abs(a[both] - b[both])) < 2e-3
 
 
-def test_a_failing_load_is_named_and_the_others_finish(study, small_pair):
+def test_a_failing_load_is_named_and_the_others_finish(study, tiny_pair):
     random = np.random.default_rng(3)
     write_image(
         study / "Broken.nii.gz",
-        Image(small_pair.loaded.grid, random.normal(size=small_pair.loaded.grid.shape).astype(np.float32)),
+        Image(tiny_pair.loaded.grid, random.normal(size=tiny_pair.loaded.grid.shape).astype(np.float32)),
     )
     both = register(
         study / "Load0.nii.gz",
@@ -295,10 +288,10 @@ def test_a_failing_load_is_named_and_the_others_finish(study, small_pair):
     assert not (study / "two" / "Broken").exists()
 
 
-def test_row_17_outputs_never_replace_inputs(study, small_pair, tmp_path):
+def test_row_17_outputs_never_replace_inputs(study, tiny_pair, tmp_path):
     inside = tmp_path / "out" / "Load1"
     inside.mkdir(parents=True)
-    write_image(inside / "Load1.nii.gz", small_pair.loaded)
+    write_image(inside / "Load1.nii.gz", tiny_pair.loaded)
     with pytest.raises(OutputError, match=r"Load1\.nii\.gz"):
         register(study / "Load0.nii.gz", [inside / "Load1.nii.gz"], out=tmp_path / "out", bone=study / "bone.nii.gz")
     assert (inside / "Load1.nii.gz").is_file()
@@ -322,7 +315,7 @@ def test_two_files_of_one_name_are_refused(study, tmp_path):
         )
 
 
-def test_row_23_html_in_a_name_is_escaped(study, small_pair, tmp_path):
+def test_row_23_html_in_a_name_is_escaped(study, tiny_pair, tmp_path):
     from dvc.report.page import Section, write_report
     from dvc.trust.verdict import Verdict
 

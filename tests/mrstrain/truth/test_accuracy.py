@@ -11,6 +11,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -253,8 +254,13 @@ def test_the_time_told_beforehand_is_that_of_the_engine() -> None:
     assert expected_minutes([CASE] * 10, 1) == pytest.approx(2.0 * elastix)
 
 
-def test_study_measures_writes_and_goes_on(tmp_path: Path) -> None:
-    """Two runs; then a third alone is made, and the page tells of all."""
+def test_study_measures_writes_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two runs, of which one is measured and one made up; then a third alone is made, and the page tells of all."""
+
+    def measured(case: AccuracyCase, *given: Any) -> ErrorSamples:
+        return measure_run(case, *given) if case.motion == "Load1" else samples(case)
+
+    monkeypatch.setattr("mrstrain.truth.accuracy.measure_run", measured)
     cases = [replace(CASE, preset="gauss-newton", motion=m) for m in ("still", "Load1", "wave-24")]
     plans: list[str] = []
     first = accuracy(tmp_path, cases=cases[:2], workers=1, tell_plan=plans.append)
@@ -274,7 +280,7 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path) -> None:
     assert repr(of_load[0]) == repr(of_load[1])
     fat = next(r for r in study.errors if r.motion == "Load1" and r.tissue == "fat" and r.by == "all")
     assert 0.01 < fat.shear_rmse < 0.15  # voxels of 2.3 mm
-    assert 0.3 < study.resolution[0].recovered < 1.1
+    assert study.resolution[0].recovered == pytest.approx(0.8)
     for name in ("errors.csv", "zero_strain.csv", "resolution.csv", "error_model_gauss-newton.json", "report.html"):
         assert (tmp_path / name).stat().st_size > 100
     page = (tmp_path / "report.html").read_text()
@@ -388,8 +394,8 @@ def test_two_parameter_files_of_one_name_are_never_taken_for_each_other(
 @pytest.mark.parametrize(
     "preset",
     [
-        "quick.txt",
         "gauss-newton",
+        pytest.param("quick.txt", marks=pytest.mark.full_size),
         pytest.param("heel-mr", marks=pytest.mark.full_size),
         pytest.param("gauss-newton-borders", marks=pytest.mark.full_size),
     ],
