@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.stats import f as fisher
-from scipy.stats import t as student
+from scipy.stats import f as fisher, t as student
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -19,7 +20,6 @@ PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 # empty: the first when a page's package has a front door, the second stays so.
 ALLOWED_IN_PAGES = {("docs/tutorials/preset.md", "mrstrain.truth.accuracy", "cases_of")}
 ALLOWED: set[tuple[str, str, str]] = set()
-WITHOUT_DOOR: set[str] = set()  # packages that offer no names yet
 
 
 def sources(folders: tuple[str, ...]) -> list[Path]:
@@ -98,11 +98,16 @@ def test_pages_import_nothing_from_inner_files(page: Path) -> None:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_a_front_door_lists_what_it_has_once(package: str) -> None:
-    names = names_at(package)
-    assert bool(names) == (package not in WITHOUT_DOOR)
-    assert len(names) == len(set(names))
-    assert all(hasattr(import_module(package), name) for name in names)
+def test_a_front_door_offers_what_type_checkers_and_the_reference_are_told(package: str) -> None:
+    door = import_module(package)
+    told = ast.parse((ROOT / package / "__init__.pyi").read_text()).body[-1]
+    assert isinstance(told, ast.Assign)
+    assert sorted(ast.literal_eval(told.value)) == sorted(door.__all__)
+    for name in door.__all__:
+        value = getattr(door, name)
+        assert inspect.getdoc(value) or not callable(value), name
+    with pytest.raises(AttributeError, match="Hoof"):
+        door.Hoof  # noqa: B018
 
 
 def test_every_way_past_the_door_is_seen() -> None:

@@ -112,6 +112,10 @@ def test_fe_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow("python/fe.md", tmp_path, monkeypatch)
 
 
+def test_phantoms_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    follow("python/phantoms.md", tmp_path, monkeypatch)
+
+
 def test_validate_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     heel = tmp_path / "heel"
     heel.mkdir()

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import studentized_range
-from scipy.stats import t as student
+from scipy.stats import studentized_range, t as student
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError

@@ -50,8 +50,7 @@ def run(
 ) -> None:
     """A study from its file to its report: register, mesh, simulate, compare. Goes on where it stopped."""
     from mrstrain.records.progress import live
-    from mrstrain.studies.run import forecast, report
-    from mrstrain.studies.run import run as start
+    from mrstrain.studies.run import forecast, report, run as start
 
     given = {"--only": only, "--force": force, "--scheduler": scheduler, "--workers": workers}
     if report_only:

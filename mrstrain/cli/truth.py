@@ -107,8 +107,7 @@ def accuracy(
     """
     from dvc.registration.engines import DEFAULT
     from mrstrain.records.progress import live
-    from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES, cases_of
-    from mrstrain.truth.accuracy import accuracy as run
+    from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES, accuracy as run, cases_of
 
     conditions = CONDITIONS
     if spacing or snr or slice_spacing:

@@ -29,9 +29,9 @@ from validate import (
     check_in_tissue,
     check_models,
     check_overlap,
+    compare as compare_loads,
     read_thresholds,
 )
-from validate import compare as compare_loads
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dvc import Deformation, Evidence, Image, Measurement, Registration, Settings, Subject
-from dvc import register as register_pair
+from dvc import Deformation, Evidence, Image, Measurement, Registration, Settings, Subject, register as register_pair
 from dvc.measurement.error_bars import TwinCheck
 from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker

@@ -7,8 +7,7 @@ import logging
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from dvc.errors import GeometryError, InputError
 from dvc.mesh import TetMesh

@@ -18,8 +18,7 @@ from dvc.deformation.protocol import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.images.itk_image import to_sitk
-from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE
-from dvc.io.transforms.bordered_spline import write_bordered_spline
+from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE, write_bordered_spline
 from dvc.io.transforms.elastix_text import Value, format_parameters
 
 StrPath = str | os.PathLike[str]

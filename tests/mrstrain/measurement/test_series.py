@@ -20,8 +20,7 @@ from dvc.registration.align import Alignment
 from dvc.registration.elastix.engine import Elastix
 from dvc.registration.elastix.presets import Preset
 from dvc.registration.gauss_newton.fit import control_grid, spline_through
-from dvc.registration.register import Registration, Settings
-from dvc.registration.register import register as register_pair
+from dvc.registration.register import Registration, Settings, register as register_pair
 from dvc.report.page import Section
 from dvc.trust.quality import NoiseFloor
 from dvc.trust.verdict import Verdict

@@ -1,0 +1,22 @@
+from .comparison.compare import compare
+from .comparison.drive import drive
+from .comparison.level import level
+from .measurement.register import register
+from .measurement.strain import strain
+from .models.converge import converge
+from .models.fit import fit
+from .models.mesh import mesh
+from .models.simulate import simulate
+from .studies.check import check
+from .studies.cohort import cohort
+from .studies.init import init
+from .studies.run import run
+from .truth.accuracy import accuracy
+from .truth.phantom import phantom
+from .truth.twin import twin
+
+__version__: str
+__all__ = [
+    "accuracy", "check", "cohort", "compare", "converge", "drive", "fit", "init", "level", "mesh", "phantom",
+    "register", "run", "simulate", "strain", "twin",
+]  # fmt: skip

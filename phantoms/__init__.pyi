@@ -1,0 +1,53 @@
+from . import figures
+from .accuracy_run import RIGID, AccuracyCase, ErrorSamples, distances_mm, measure_run, motion_named
+from .anatomy import FAT_SIGNAL, TISSUES, Heel
+from .bodies import EllipsoidUnion
+from .error_model import CoverageRow, coverage_rows, fit_error_model
+from .error_tables import (
+    SOFT,
+    ErrorRow,
+    FloorRow,
+    ResolutionRow,
+    RunRow,
+    error_rows,
+    floor_rows,
+    resolution_rows,
+    run_rows,
+    wavelength_recovered,
+)
+from .flow import Border, Flow
+from .from_dvc import GeometryError, InputError, MrstrainError
+from .heel import (
+    LOADS,
+    HeelPair,
+    centred_grid,
+    covering,
+    default_foot_motion,
+    heel_grid,
+    heel_pair,
+    labels_of,
+    labels_to_mesh,
+    misdrawn,
+    pressed,
+    random_foot_motion,
+    scan,
+    sliding,
+    swelling,
+    under_load,
+    under_plate,
+)
+from .motions import Bending, ShearWave, compressed, sheared, stretched
+from .mri import acquire, sensitivity
+from .tissue_error import TissueError, errors_by_tissue
+from .warp import Acquisition, SyntheticWarp, material_points, synthetic_warp
+
+__all__ = [
+    "FAT_SIGNAL", "LOADS", "RIGID", "SOFT", "TISSUES", "AccuracyCase", "Acquisition", "Bending", "Border",
+    "CoverageRow", "EllipsoidUnion", "ErrorRow", "ErrorSamples", "FloorRow", "Flow", "GeometryError", "Heel",
+    "HeelPair", "InputError", "MrstrainError", "ResolutionRow", "RunRow", "ShearWave", "SyntheticWarp",
+    "TissueError", "acquire", "centred_grid", "compressed", "coverage_rows", "covering", "default_foot_motion",
+    "distances_mm", "error_rows", "errors_by_tissue", "figures", "fit_error_model", "floor_rows", "heel_grid",
+    "heel_pair", "labels_of", "labels_to_mesh", "material_points", "measure_run", "misdrawn", "motion_named",
+    "pressed", "random_foot_motion", "resolution_rows", "run_rows", "scan", "sensitivity", "sheared", "sliding",
+    "stretched", "swelling", "synthetic_warp", "under_load", "under_plate", "wavelength_recovered",
+]  # fmt: skip
