@@ -11,12 +11,12 @@ from .studies.check import check
 from .studies.cohort import cohort
 from .studies.init import init
 from .studies.run import run
-from .truth.accuracy import accuracy
+from .truth.accuracy import accuracy, accuracy_cases
 from .truth.phantom import phantom
 from .truth.twin import twin
 
 __version__: str
 __all__ = [
-    "accuracy", "check", "cohort", "compare", "converge", "drive", "fit", "init", "level", "mesh", "phantom",
-    "register", "run", "simulate", "strain", "twin",
+    "accuracy", "accuracy_cases", "check", "cohort", "compare", "converge", "drive", "fit", "init", "level", "mesh",
+    "phantom", "register", "run", "simulate", "strain", "twin",
 ]  # fmt: skip

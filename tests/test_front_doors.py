@@ -16,11 +16,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("dvc", "fe", "phantoms", "validate", "mrstrain")
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 
-# What may still pass a front door: (file, module, name). Each entry that is no longer needed is refused, so both become
-# empty: the first when a page's package has a front door, the second stays so.
-ALLOWED_IN_PAGES = {("docs/tutorials/preset.md", "mrstrain.truth.accuracy", "cases_of")}
-ALLOWED: set[tuple[str, str, str]] = set()
-
 
 def sources(folders: tuple[str, ...]) -> list[Path]:
     return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
@@ -85,16 +80,13 @@ def test_packages_and_benchmarks_take_from_the_front_door_what_it_has() -> None:
         for path in sources((*PACKAGES, "benchmarks"))
         for module, name in past_the_door(path.read_text(), path.relative_to(ROOT).parts[0])
     }
-    assert not past - ALLOWED, "\n".join(f"{file}: {module}.{name}" for file, module, name in sorted(past - ALLOWED))
-    assert past >= ALLOWED, "no longer needed"
+    assert not past, "\n".join(f"{file}: {module}.{name}" for file, module, name in sorted(past))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_pages_import_nothing_from_inner_files(page: Path) -> None:
     blocks = [example.parsed for example in Sybil(parsers=[PythonCodeBlockParser()]).parse(page).examples()]
-    file = str(page.relative_to(ROOT))
-    inner = {(file, module, name) for block in blocks for module, name in inner_names(block)}
-    assert inner == {entry for entry in ALLOWED_IN_PAGES if entry[0] == file}
+    assert not [name for block in blocks for name in inner_names(block)]
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -107,12 +107,12 @@ def accuracy(
     """
     from dvc.registration.engines import DEFAULT
     from mrstrain.records.progress import live
-    from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES, accuracy as run, cases_of
+    from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES, accuracy as run, accuracy_cases
 
     conditions = CONDITIONS
     if spacing or snr or slice_spacing:
         conditions = tuple(((s, s, slice_spacing or s), r) for s in spacing or [0.8] for r in snr or [25.0])
-    cases = cases_of(preset or (DEFAULT,), conditions, motion or (*MOTIONS, *WAVES), seed or SEEDS)
+    cases = accuracy_cases(preset or (DEFAULT,), conditions, motion or (*MOTIONS, *WAVES), seed or SEEDS)
     with live() as progress:
         study = run(out, cases=cases, workers=workers, tell_plan=typer.echo, progress=progress)
     for line in study.summary():

@@ -94,7 +94,7 @@ class AccuracyStudy:
         return [*lines, f"Report: {self.out / REPORT}"]
 
 
-def cases_of(
+def accuracy_cases(
     presets: Sequence[str] = (DEFAULT,),
     conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
     motions: Sequence[str] = (*MOTIONS, *WAVES),
@@ -137,7 +137,7 @@ def accuracy(
         Samples of each run are kept in ``runs`` and used again as long as preset and software (`dvc.software`) are
         unchanged. Tables and report cover all runs found there, so a later call with other cases adds to them.
     cases : sequence of AccuracyCase
-        Default: ``cases_of()``.
+        Default: ``accuracy_cases()``.
     workers : int
         Registrations at once, on one thread each; by default one for each core.
     tell_plan : callable, optional
@@ -155,7 +155,7 @@ def accuracy(
     MrstrainError
         If every run failed.
     """
-    wanted = list(cases_of() if cases is None else cases)
+    wanted = list(accuracy_cases() if cases is None else cases)
     if not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
             "An accuracy study needs at least one case, and each only once (an engine that needs labels has "

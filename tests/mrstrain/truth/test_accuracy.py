@@ -22,7 +22,7 @@ from dvc.registration.elastix.presets import load_preset
 from dvc.trust.error_model import POOLED
 from dvc.worker import Worker
 from mrstrain import accuracy
-from mrstrain.truth.accuracy import MOTIONS, cases_of, expected_minutes
+from mrstrain.truth.accuracy import MOTIONS, accuracy_cases, expected_minutes
 from phantoms import (
     TISSUES,
     AccuracyCase,
@@ -219,7 +219,7 @@ def test_parameter_files_of_ones_own_can_be_judged(tmp_path: Path) -> None:
 
 
 def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
-    cases = cases_of()
+    cases = accuracy_cases()
     assert len({c.name for c in cases}) == len(cases) < 120
     assert not any(9000 <= c.seed <= 9999 for c in cases)  # set aside for published figures
     assert {"still", "sliding", "Load1", "wave-8"} <= {c.motion for c in cases}
@@ -227,7 +227,7 @@ def test_the_default_study_is_of_a_size_that_people_wait_for() -> None:
 
 def test_borders_are_studied_with_labels_that_are_right_too_large_and_too_small() -> None:
     """Waves move bone as they move tissue, which the engine holds still there."""
-    cases = cases_of(("gauss-newton", "gauss-newton-borders"), conditions=(((0.8, 0.8, 0.8), 25.0),))
+    cases = accuracy_cases(("gauss-newton", "gauss-newton-borders"), conditions=(((0.8, 0.8, 0.8), 25.0),))
     with_borders = [c for c in cases if c.preset == "gauss-newton-borders"]
     assert {c.motion for c in with_borders} == set(MOTIONS)
     for seed in (1, 2):
