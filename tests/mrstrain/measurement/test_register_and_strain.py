@@ -69,7 +69,7 @@ def results(study, computed_once):
         "out": study / "out", "bone": study / "bone.nii.gz", "labels": study / "tissues.nrrd",
         "names": study / "tissues.csv", "parameters": [study / "quick.txt"], "repeat": study / "again.nii.gz",
         "landmarks": study / "points.csv", "mesh": study / "mesh.vtu", "error_model": study / "errors.json",
-        "shear_direction": (0.0, -1.0, 0.0), "workers": 1, "threads": 1,
+        "shear_direction": (0.0, -1.0, 0.0), "workers": 1, "threads": 1, "seed": 5,
     }  # fmt: skip
     return computed_once("results", lambda: register(study / "Load0.nii.gz", [study / "Load1.nii.gz"], **given))
 
@@ -233,6 +233,7 @@ def test_provenance_holds_hashes_versions_parameters_and_no_path(results, study)
     assert told["machine"]["cores"] == usable_cores()
     assert told["machine"]["processor"]
     assert told["parameters"]["stages"][0]["text"] == QUICK
+    assert told["parameters"]["seed"] == 5
     assert str(study) not in text
 
 

@@ -34,13 +34,17 @@ from tests.quick import QUICK
 
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory, tiny_pair) -> Path:
-    """An unloaded heel and five others in its frame: two loads, one of turned contrast, and a repeat scan."""
+    """An unloaded heel and others in its frame: three loads, one of turned contrast, and a repeat scan."""
     folder = tmp_path_factory.mktemp("series")
     heel, foot = Heel(3), tiny_pair.foot_motion
     less = scan(heel, tiny_pair.loaded.grid, pressed(heel, 0.3), foot, snr=25.0, number=5)
+    values = less.values.copy()
+    values[0, 0, 0] += 1.0
+    other = replace(less, values=values)
     turned = replace(less, values=less.values.max() - less.values)
     back = foot.inverse()
-    for name, image in (("Load1", tiny_pair.loaded), ("Load2", less), ("Turned", turned), ("again", tiny_pair.repeat)):
+    loads = {"Load1": tiny_pair.loaded, "Load2": less, "Load3": other, "Turned": turned, "again": tiny_pair.repeat}
+    for name, image in loads.items():
         grid = image.grid.moved_by(back.rotation, back.translation_mm)
         write_image(folder / f"{name}.nii.gz", Image(grid, image.values))
     write_image(folder / "Load0.nii.gz", tiny_pair.reference)
@@ -89,18 +93,19 @@ def spy(monkeypatch, scans, tiny_pair) -> Spy:
 
 @pytest.mark.parametrize("chain", [True, False])
 def test_each_load_of_a_chain_starts_from_the_last_good_one(spy, scans, tmp_path, chain):
-    loads = [scans / f"{name}.nii.gz" for name in ("Load1", "Turned", "Load2")]
+    loads = [scans / f"{name}.nii.gz" for name in ("Load1", "Turned", "Load2", "Load3")]
     series = register(
         scans / "Load0.nii.gz", loads, out=tmp_path, bone=scans / "bone.nii.gz", repeat=scans / "again.nii.gz",
         chain=chain, workers=1,
     )  # fmt: skip
     assert series.failures == {"Turned": "turned"}
-    assert [name for name, _ in spy.asked] == ["again", "Load1", "Turned", "Load2"]
+    assert [name for name, _ in spy.asked] == ["again", "Load1", "Turned", "Load2", "Load3"]
     begun_at = dict(spy.asked)
     assert begun_at["again"] is None  # unloaded: it is far from every load
     assert begun_at["Load1"] is None
     assert begun_at["Turned"] is (spy.found["Load1"] if chain else None)
     assert begun_at["Load2"] is (spy.found["Load1"] if chain else None)
+    assert begun_at["Load3"] is (spy.found["Load2"] if chain else None)
 
 
 def test_the_bone_may_be_a_label_of_the_map(spy, scans, tmp_path, tiny_pair):

@@ -11,14 +11,16 @@ import time
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from dvc import Alignment, BSpline, Grid, Image, LabelMap, Registration, RigidMotion
 from dvc.errors import InputError, MrstrainError, OutputError
-from dvc.images.image import Grid, LabelMap
 from dvc.registration.elastix.presets import load_preset
+from dvc.registration.gauss_newton.fit import control_grid, spline_through
 from dvc.trust.error_model import POOLED
 from dvc.worker import Worker
 from mrstrain import accuracy
@@ -286,6 +288,25 @@ def test_study_measures_writes_and_goes_on(tmp_path: Path, monkeypatch: pytest.M
     page = (tmp_path / "report.html").read_text()
     assert "Spatial resolution" in page
     assert page.count("data:image/png") == 5
+
+
+def test_a_perfect_registration_has_no_error_and_resolves_the_wave(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = replace(CASE, preset="gauss-newton", motion="wave-24")
+    wave = motion_named(Heel(case.seed), case.motion)
+
+    def perfect(reference: Image, loaded: Image, **given: Any) -> Registration:
+        control = control_grid(reference.grid, np.full(3, 3.0))
+        spline = BSpline(control, spline_through(wave, control))
+        still = Alignment(RigidMotion.identity(), "none", 0.0, 1.0, 0.0, np.zeros(3))
+        return Registration(reference, loaded, given["tissue"], None, still, spline, given["settings"], 1.0)
+
+    monkeypatch.setattr("phantoms.accuracy_run.register", perfect)
+    run = measure_run(case, SimpleNamespace(threads=1), nullcontext(), lambda _: None)  # type: ignore[arg-type]
+    assert np.ptp(run.true_shear) > 0.05
+    assert np.ptp(run.true_slope) > 0.1
+    np.testing.assert_allclose(run.u_error_mm, 0.0, atol=0.02)
+    np.testing.assert_allclose(run.shear, run.true_shear, atol=0.01)
+    np.testing.assert_allclose(run.slope, run.true_slope, atol=0.02)
 
 
 def test_what_cannot_be_studied_is_refused_before_anything_runs(
