@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from functools import partial
 from importlib import import_module
 
+import numpy as np
 import pytest
 
+from dvc import StrainField, evaluate_on_grid, read_labels, read_mask
 from dvc.errors import OutputError
-from dvc.io.images.labels import read_labels
 from dvc.report.page import Section
 from dvc.trust.verdict import Verdict
 from mrstrain.models.loads import LOADS
@@ -23,7 +25,7 @@ from mrstrain.studies.run import StudyRun, run
 from mrstrain.studies.stages import StageResult
 from mrstrain.studies.true_error import read_errors, write_errors
 from mrstrain.truth.phantom import phantom
-from phantoms import TissueError
+from phantoms import Heel, TissueError, under_load
 
 demonstration = import_module("mrstrain.studies.demo")  # the package has a function of that name
 
@@ -132,6 +134,12 @@ def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_tru
     assert shown.lines[0].startswith("Verdicts on the registrations: Load2 ")
     error, true = (float(word) for word in re.search(r"Load2 ([\d.]+) of ([\d.]+)", shown.lines[1]).groups())
     assert 0.0 < error < 0.5 * true
+    labels = read_labels(tmp_path / "demo" / "tissues.nii.gz", tmp_path / "demo" / "tissues.csv")
+    valid = read_mask(tmp_path / "demo" / "results" / "registration" / "Load2" / "valid.nii.gz").inside
+    _, H = evaluate_on_grid(under_load(Heel(3), "Load2"), labels.grid, labels.region("fat").inside & valid)
+    with (tmp_path / "demo" / "error.csv").open(newline="") as file:
+        (fat,) = (row for row in csv.DictReader(file) if row["tissue"] == "fat")
+    assert float(fat["true_p95"]) == pytest.approx(np.percentile(StrainField.from_gradient(H).max_shear, 95), rel=1e-4)
     report = tmp_path / "demo" / "results" / "report.html"
     assert shown.lines[-1] == f"Report: {report}"
     assert "Error against the truth" in report.read_text()
