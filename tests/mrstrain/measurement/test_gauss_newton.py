@@ -13,6 +13,7 @@ from dvc.images.image import Image
 from dvc.io.images.labels import read_mask
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_mask
+from dvc.io.result_folder import spline_in
 from dvc.measurement.page import weights_table
 from dvc.registration.elastix.presets import load_preset
 from dvc.registration.gauss_newton.choice import Choice
@@ -174,6 +175,26 @@ def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkey
     fixed = GaussNewton(bending=USUAL_BENDING, volume=USUAL_VOLUME)
     assert used == {2.0: GaussNewtonWithInterfaces(fixed, USUAL_SKIN)}
     assert Settings.of("heel-mr").of_repeat() == Settings.of("heel-mr")
+
+
+def test_a_load_of_a_chain_starts_from_the_result_before_it(written, tmp_path, monkeypatch):
+    begun_at = []
+
+    def never(*_, start, **__):
+        begun_at.append(start)
+        raise RegistrationError("enough")
+
+    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", never)
+    before = written / "out" / "Load1"
+    for after in (before, None):
+        with pytest.raises(RegistrationError, match="enough"):
+            register_one(
+                written / "Load0.nii.gz", written / "Load1.nii.gz", out=tmp_path / "Load2",
+                bone=written / "bone.nii.gz", after=after,
+            )  # fmt: skip
+    started, anew = begun_at
+    np.testing.assert_array_equal(started.coefficients_mm, spline_in(before).coefficients_mm)
+    assert anew is None
 
 
 def test_our_own_engine_is_used_unless_something_of_elastix_is_asked_for(tmp_path):
