@@ -13,6 +13,7 @@ from dvc.images.image import LabelMap
 from dvc.io.images.write import write_labels
 from fe import extrapolate, write_tet_mesh
 from mrstrain.cli.app import app
+from mrstrain.models.converge import _is_of
 from mrstrain.options.modelling import Labelling, Meshing
 from mrstrain.records.provenance import provenance
 from tests.fe.test_meshing import half_onion
@@ -80,6 +81,9 @@ def test_meshes_are_made_once_and_simulated_each(tmp_path: Path, monkeypatch: py
     assert values == sorted(values)  # finer meshes are softer
     assert len(set(values)) == 3
     assert again.output.splitlines()[-6:] == done.output.splitlines()[-6:]
+    mesh, inputs = tmp_path / "study" / "mesh-6.vtu", {"labels": tmp_path / "map.nii.gz", "names": tmp_path / "map.csv"}
+    assert _is_of(mesh, inputs, ["bone"])
+    assert not _is_of(mesh, inputs, ["bone", "fat"])  # with another bone cut out it is another mesh
 
 
 @pytest.mark.full_size
