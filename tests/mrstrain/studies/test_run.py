@@ -24,6 +24,7 @@ from dvc.images.image import Grid, LabelMap
 from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_labels
 from mrstrain.studies.check import check
+from mrstrain.studies.cluster import cluster
 from mrstrain.studies.cohort import cohort
 from mrstrain.studies.file import read_study
 from mrstrain.studies.init import init
@@ -344,6 +345,19 @@ def test_a_cluster_whose_worker_is_killed_loses_nothing(done, tmp_path):
         assert areas(study) == pytest.approx(areas(folder), rel=1e-9)
         outcomes = (study / "results" / "study.log").read_text()
         assert "FAILED" not in outcomes
+
+
+def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(tmp_path):
+    mark = str(tmp_path / "tried")
+
+    def lost_once() -> str:
+        if not os.path.exists(mark):
+            open(mark, "w").close()
+            os._exit(1)
+        return "done"
+
+    with cluster(lambda *_: None, [tmp_path], workers=2) as runner:
+        assert runner._client.submit(lost_once).result(timeout=60) == "done"
 
 
 def test_a_scheduler_that_is_not_there(images, tmp_path):
