@@ -2,10 +2,6 @@
 
 A classic series is a folder with a file for each slice; enhanced (multi-frame) files hold many slices each. Both give
 frames (`dvc.io.images.dicom_frames`), and all that follows is the same for both.
-
-References
-----------
-.. [1] DICOM PS3.3, Image Plane Module (C.7.6.2): https://dicom.nema.org/medical/dicom/current/output/html/part03.html
 """
 
 from __future__ import annotations
@@ -50,41 +46,15 @@ def is_multiframe(path: Path) -> bool:
 
 
 def read_dicom(place: Path, *, series: str | None = None, max_bytes: int = MAX_BYTES) -> tuple[Grid, Float32Array]:
-    """Grid (LPS mm) and values (columns, rows, slices) of a DICOM image.
+    """Grid (LPS mm) and values (columns, rows, slices) of a DICOM folder (without subfolders) or of one enhanced file.
 
     Slices are ordered along the normal of their plane; rescale slope and intercept of each are applied. Private
-    scalings, such as Philips' scale slope, are not.
-
-    Parameters
-    ----------
-    place : folder whose files, not those of its subfolders, are the image; or one enhanced (multi-frame) file
-    series : str, optional
-        Which one of several: the end of the series' UID, and "/n" for the n-th stack of a series with several echoes,
-        image types, orientations, stacks or time points, as the refusal lists them.
-
-    Raises
-    ------
-    InputError
-        If there are several series, echoes or the like and ``series`` does not pick one.
-    ImageFileError
-        If there is no DICOM image, a file is damaged, a slice is missing or there twice, slices are sheared, frames do
-        not say where they lie, or voxels are not single grey values.
+    scalings, such as Philips' scale slope, are not. `series` is the end of a series' UID, and "/n" for the n-th stack
+    of a series with several echoes, image types, orientations, stacks or time points, as the refusal lists them.
     """
     grid, ordered = _found(place, series)
     refuse_if_too_large(place, grid.shape, max_bytes)
     return grid, read_values(ordered).transpose(2, 1, 0)
-
-
-def dicom_shape(place: Path) -> tuple[int, int, int]:
-    """Columns, rows and slices of a DICOM image, from its headers alone.
-
-    Raises
-    ------
-    InputError, ImageFileError
-        As `read_dicom`.
-    """
-    grid, _ = _found(place, None)
-    return grid.shape
 
 
 def _found(place: Path, series: str | None) -> tuple[Grid, list[Frame]]:
@@ -143,7 +113,11 @@ def _frames(path: Path, header: Any) -> list[Frame]:
 
 
 def _assembled(place: Path, stack: list[Frame]) -> tuple[Grid, list[Frame]]:
-    """Find the grid of a stack of parallel slices; return it and the slices in its order."""
+    """Grid of a stack of parallel slices [1]_, and the slices in its order.
+
+    .. [1] DICOM PS3.3, Image Plane Module (C.7.6.2):
+    https://dicom.nema.org/medical/dicom/current/output/html/part03.html
+    """
     x = stack[0].axes[0] / np.linalg.norm(stack[0].axes[0])
     normal = np.cross(x, stack[0].axes[1])
     normal /= np.linalg.norm(normal)
@@ -176,9 +150,8 @@ def _assembled(place: Path, stack: list[Frame]) -> tuple[Grid, list[Frame]]:
     column_spacing, row_spacing = stack[0].spacing_mm
     if uneven > _OFF_PLACE * spacing or aside > _OFF_PLACE * min(column_spacing, row_spacing):
         raise ImageFileError(
-            f"{place}: the slices are not evenly stacked: up to {uneven:.3g} mm off an even spacing of "
-            f"{spacing:.4g} mm, and up to {aside:.3g} mm sideways (tilted gantry). Resample the series to a "
-            "regular grid first."
+            f"{place}: the slices are not evenly stacked: up to {uneven:.3g} mm off an even spacing of {spacing:.4g} "
+            f"mm, and up to {aside:.3g} mm sideways (tilted gantry). Resample the series to a regular grid first."
         )
     direction = np.stack([x, np.cross(normal, x), normal], axis=1)
     sizes = np.array([column_spacing, row_spacing, spacing])

@@ -1,12 +1,10 @@
 """Frames of enhanced (multi-frame) DICOM files, from their functional groups: each frame's own, then the shared ones.
 
-What the standard puts into functional groups is read from there and from nowhere else: scanners repeat some of it, with
-other values, in private elements beside them.
+What the standard puts into functional groups is read only from there: scanners repeat some of it, with other values, in
+private elements beside them.
 
-References
-----------
-.. [1] DICOM PS3.3, Multi-frame Functional Groups Module (C.7.6.16) and Multi-frame Dimension Module (C.7.6.17):
-   https://dicom.nema.org/medical/dicom/current/output/html/part03.html
+References: DICOM PS3.3, Multi-frame Functional Groups Module (C.7.6.16) and Multi-frame Dimension Module (C.7.6.17),
+https://dicom.nema.org/medical/dicom/current/output/html/part03.html
 """
 
 from __future__ import annotations
@@ -49,13 +47,10 @@ def is_enhanced(header: Any) -> bool:
 
 
 def enhanced_frames(path: Path, header: Any) -> list[Frame]:
-    """Return the frames of an enhanced MR or CT image, in the order of the file.
+    """Frames of an enhanced MR or CT image, in the order of the file.
 
-    Raises
-    ------
-    ImageFileError
-        If the file is of another kind, does not describe every frame, or a frame lacks its position, orientation,
-        spacing or, where others have it, its scaling.
+    Refused if a frame is not described, or lacks its position, orientation, spacing or, where others have it, its
+    scaling.
     """
     if class_of(header) not in _READ:
         raise ImageFileError(
@@ -93,15 +88,8 @@ def _frame(path: Path, header: Any, number: int, groups: tuple[Any, Any], dimens
     if scaled:
         missing += [name for name, v in (("RescaleSlope", slope), ("RescaleIntercept", intercept)) if v is None]
     refuse_missing(path, missing, f" in the functional groups of frame {number}")
-    return build_frame(
-        path,
-        header,
-        number=number,
-        place=place,
-        scaling=(slope, intercept),
-        shows=_shown(header, groups),
-        labels=_labels(_group("FrameContentSequence", *groups), dimensions),
-    )
+    labels = _labels(_group("FrameContentSequence", *groups), dimensions)
+    return build_frame(path, header, number, place, (slope, intercept), _shown(header, groups), labels)
 
 
 def _shown(header: Any, groups: tuple[Any, Any]) -> tuple[Any, Any, str]:

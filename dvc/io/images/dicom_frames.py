@@ -1,11 +1,6 @@
 """One frame of a DICOM image: its place, what it shows and how its values are scaled, from a file of one or of many.
 
-Only what is needed of each header is looked at: no name, number or date of a patient is read, and no message quotes
-what a damaged header holds.
-
-References
-----------
-.. [1] DICOM PS3.3, Image Plane Module (C.7.6.2): https://dicom.nema.org/medical/dicom/current/output/html/part03.html
+Only what is needed of each header is read: no name, number or date of a patient; no message quotes a damaged header.
 """
 
 from __future__ import annotations
@@ -26,32 +21,14 @@ from dvc.errors import ImageFileError
 
 CONVERT = "Convert it to NIfTI, for example with dcm2niix, and give the .nii.gz file."
 _SAME_DIRECTION = 1e-3
-_TAGS = [
-    "SOPClassUID",
-    "SeriesInstanceUID",
-    "ImageType",
-    "ComplexImageComponent",
-    "EchoTime",
-    "EchoNumbers",
-    "Rows",
-    "Columns",
-    "PixelSpacing",
-    "ImagePositionPatient",
-    "ImageOrientationPatient",
-    "NumberOfFrames",
-    "SamplesPerPixel",
-    "PhotometricInterpretation",
-    "BitsAllocated",
-    "RescaleSlope",
-    "RescaleIntercept",
-    "ConcatenationUID",
-    "InConcatenationTotalNumber",
-    "DimensionIndexSequence",
-    "SharedFunctionalGroupsSequence",
-    "PerFrameFunctionalGroupsSequence",
-]
 _NEEDED = ("SeriesInstanceUID", "Rows", "Columns", "BitsAllocated")
 _PLACE = ("PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient")
+_TAGS = [
+    *_NEEDED, *_PLACE, "SOPClassUID", "ImageType", "ComplexImageComponent", "EchoTime", "EchoNumbers", "NumberOfFrames",
+    "SamplesPerPixel", "PhotometricInterpretation", "RescaleSlope", "RescaleIntercept", "ConcatenationUID",
+    "InConcatenationTotalNumber", "DimensionIndexSequence", "SharedFunctionalGroupsSequence",
+    "PerFrameFunctionalGroupsSequence",
+]  # fmt: skip
 
 
 class Kind(NamedTuple):
@@ -68,32 +45,20 @@ class Kind(NamedTuple):
 
 
 Labels = tuple[tuple[str, str | int], ...]
-"""What else a file of many frames tells of one: its stack, its time point, its index along other dimensions."""
+"""What else distinguishes frames at the same place: stack, time point, index along other dimensions."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One slice of a DICOM image.
-
-    Parameters
-    ----------
-    path : file
-    number : which frame of it, from 1; None in a file of one slice
-    position_mm : (3,) centre of the first voxel, LPS
-    axes : (2, 3) directions of increasing column and row, LPS
-    spacing_mm : between columns, between rows
-    kind : what it shares with other slices of the same image
-    slope, intercept : value = slope * stored + intercept
-    labels : what else may tell it from frames at the same place
-    """
+    """One slice of a DICOM image, in LPS."""
 
     path: Path
-    number: int | None
-    position_mm: FloatArray
-    axes: FloatArray
-    spacing_mm: tuple[float, float]
+    number: int | None  # from 1, in its file; None in a file of one slice
+    position_mm: FloatArray  # (3,) centre of the first voxel
+    axes: FloatArray  # (2, 3) directions of increasing column and row
+    spacing_mm: tuple[float, float]  # between columns, between rows
     kind: Kind
-    slope: float
+    slope: float  # value = slope * stored + intercept
     intercept: float
     labels: Labels = ()
 
@@ -104,42 +69,30 @@ class Frame:
 
 
 @contextmanager
-def _quiet(logger: logging.Logger) -> Iterator[None]:
+def damage_named(path: Path, problem: str = "not a readable DICOM file", remedy: str = "") -> Iterator[None]:
+    """Turn whatever fails on a damaged file into an error that names the file, and the cause by its kind only.
+
+    Elements of a header are decoded when they are first accessed, so any access may fail. The text of a failure may
+    quote the header, so only its kind is given.
+    """
+    logger = logging.getLogger("pydicom")
     before = logger.disabled
-    logger.disabled = True
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # warnings and the log may quote the values of a header
+            logger.disabled = True
+            yield
+    except ImageFileError:
+        raise
+    except Exception as error:
+        advice = remedy or "damaged or cut short. Export it again."
+        raise ImageFileError(f"{path}: {problem} ({type(error).__name__}): {advice}") from None
     finally:
         logger.disabled = before
 
 
-@contextmanager
-def damage_named(path: Path, problem: str = "not a readable DICOM file", remedy: str = "") -> Iterator[None]:
-    """Turn whatever fails on a damaged file into an error that names the file, and the cause by its kind only.
-
-    Elements of a header are decoded when they are first looked at, so any access may fail.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they may quote the values of a header
-            with _quiet(logging.getLogger("pydicom")):  # which says the same
-                yield
-    except ImageFileError:
-        raise
-    except Exception as error:
-        # The cause is named by its kind only: its text may quote the header.
-        advice = remedy or "damaged or cut short. Export it again."
-        raise ImageFileError(f"{path}: {problem} ({type(error).__name__}): {advice}") from None
-
-
 def read_image_header(path: Path) -> Any | None:
-    """What is needed of the header of a DICOM image with grey values; None for other DICOM objects, such as reports.
-
-    Raises
-    ------
-    ImageFileError
-        If the file is damaged or cut short, in colour, or lacks what any image has.
-    """
+    """The needed part of the header of a grey-value DICOM image; None for other DICOM objects, such as reports."""
     header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
     stored_as = class_of(header)
     if "Rows" not in header and _is_no_image(header, stored_as):
@@ -191,27 +144,16 @@ def several(value: Any) -> list[Any]:
 def build_frame(
     path: Path,
     header: Any,
-    *,
     number: int | None,
     place: dict[str, Any],
     scaling: tuple[Any, Any],
     shows: tuple[Any, Any, str],
     labels: Labels = (),
 ) -> Frame:
-    """Build a frame from elements of its header.
+    """Build a frame from elements of its header; refused if they are not finite, perpendicular or positive.
 
-    Parameters
-    ----------
-    path, number, labels : as in `Frame`
-    header : of the file
-    place : ImagePositionPatient, ImageOrientationPatient and PixelSpacing
-    scaling : slope, intercept; None where they are not told
-    shows : echo time (ms), numbers of echoes, image type
-
-    Raises
-    ------
-    ImageFileError
-        If numbers are not finite, or rows and columns are not perpendicular unit vectors a positive distance apart.
+    `place` holds ImagePositionPatient, ImageOrientationPatient and PixelSpacing; `scaling` slope and intercept, None
+    where missing; `shows` echo time (ms), numbers of echoes and image type.
     """
     axes = np.array([float(v) for v in place["ImageOrientationPatient"]]).reshape(2, 3)
     position = np.array([float(v) for v in place["ImagePositionPatient"]]).reshape(3)
@@ -232,30 +174,18 @@ def build_frame(
             f"{path}{which}: {columns} x {rows} voxels of {column_spacing:g} x {row_spacing:g} mm; all must be "
             "positive. The header is damaged."
         )
-    kind = Kind(
-        str(header.SeriesInstanceUID),
-        None if echo_time is None else round(float(echo_time), 2),
-        tuple(str(int(e)) for e in several(echoes)),
-        image_type,
-        columns,
-        rows,
-        round(column_spacing, 4),
-        round(row_spacing, 4),
-    )
+    echo_ms = None if echo_time is None else round(float(echo_time), 2)
+    echo = tuple(str(int(e)) for e in several(echoes))
+    spacing = round(column_spacing, 4), round(row_spacing, 4)
+    kind = Kind(str(header.SeriesInstanceUID), echo_ms, echo, image_type, columns, rows, *spacing)
     return Frame(path, number, position, axes, (column_spacing, row_spacing), kind, slope, intercept, labels)
 
 
 def classic_frame(path: Path, header: Any) -> Frame:
     """Return the frame of a file that holds one slice."""
+    place = {name: header.get(name) for name in _PLACE}
+    scaling = header.get("RescaleSlope"), header.get("RescaleIntercept")
+    image_type = "/".join(str(k) for k in several(header.get("ImageType"))[2:])
     return build_frame(
-        path,
-        header,
-        number=None,
-        place={name: header.get(name) for name in _PLACE},
-        scaling=(header.get("RescaleSlope"), header.get("RescaleIntercept")),
-        shows=(
-            header.get("EchoTime"),
-            header.get("EchoNumbers"),
-            "/".join(str(k) for k in several(header.get("ImageType"))[2:]),
-        ),
+        path, header, None, place, scaling, (header.get("EchoTime"), header.get("EchoNumbers"), image_type)
     )

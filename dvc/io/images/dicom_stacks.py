@@ -20,13 +20,7 @@ _SEVERAL = "several echoes, image types, orientations, stacks or time points"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stack:
-    """Frames of one image.
-
-    Parameters
-    ----------
-    frames : at least one, of one kind and orientation
-    labels : what else tells them from other frames of their kind and orientation
-    """
+    """Frames of one image; `labels` distinguish it from others of the same kind and orientation."""
 
     frames: list[Frame]
     labels: Labels = ()
@@ -58,35 +52,30 @@ class Stack:
 
 
 def stacks_of(frames: Sequence[Frame]) -> list[Stack]:
-    """Put frames of the same kind and orientation together, apart by what else tells volumes apart."""
-    alike: list[list[Frame]] = []
-    for one in frames:
-        for group in alike:
-            if group[0].kind == one.kind and np.abs(group[0].axes - one.axes).max() < _SAME_DIRECTION:
-                group.append(one)
-                break
-        else:
-            alike.append([one])
-    stacks = [Stack(group) for group in alike]
-    for name in _coarsest_first(frames):
-        stacks = [part for stack in stacks for part in _parted(stack, name)]
-    return stacks
-
-
-def _coarsest_first(frames: Sequence[Frame]) -> list[str]:
-    """Names of labels: stack and time point, then others by how many values they take, so that few parts result."""
+    """Group frames by kind and orientation, and then by whatever else distinguishes volumes."""
+    stacks: list[Stack] = []
     values: dict[str, set[str | int]] = {}
     for one in frames:
+        for stack in stacks:
+            first = stack.frames[0]
+            if first.kind == one.kind and np.abs(first.axes - one.axes).max() < _SAME_DIRECTION:
+                stack.frames.append(one)
+                break
+        else:
+            stacks.append(Stack([one]))
         for name, value in one.labels:
             values.setdefault(name, set()).add(value)
-    return sorted(values, key=lambda name: (name != STACK, name != TIME_POINT, len(values[name])))
+    # By stack and time point, then by the labels with the fewest values, so that few parts result.
+    for name in sorted(values, key=lambda name: (name != STACK, name != TIME_POINT, len(values[name]))):
+        stacks = [part for stack in stacks for part in _parted(stack, name)]
+    return stacks
 
 
 def _parted(stack: Stack, name: str) -> list[Stack]:
     """Part a stack by a label in which frames at one place differ; named stacks wherever they lie.
 
-    Scanners count along other dimensions than they say, or call each slice a stack; a label that goes with the
-    place alone tells no volumes apart.
+    Scanners count along other dimensions than they say, or call each slice a stack; a label that follows the position
+    alone does not distinguish volumes.
     """
     parts: dict[str | int | None, list[Frame]] = {}
     for one in stack.frames:
@@ -110,7 +99,7 @@ def _parted(stack: Stack, name: str) -> list[Stack]:
 
 
 def named_stacks(stacks: Sequence[Stack]) -> dict[str, Stack]:
-    """Name stacks by the shortest end of their series UID that tells them apart, numbered within a series."""
+    """Name stacks by the shortest distinct end of their series UID, numbered within a series."""
     uids = sorted({stack.series for stack in stacks})
     digits = 6
     while len({uid[-digits:] for uid in uids}) < len(uids):
@@ -124,13 +113,7 @@ def named_stacks(stacks: Sequence[Stack]) -> dict[str, Stack]:
 
 
 def pick_stack(place: Path, stacks: dict[str, Stack], series: str | None) -> Stack:
-    """Return the only stack, or the one whose name or series UID ends as ``series`` does.
-
-    Raises
-    ------
-    InputError
-        If several or none fit; they are listed.
-    """
+    """Return the only stack, or the one whose name or series UID ends as `series` does; otherwise list them all."""
     wanted, _, number = (series or "").strip().rpartition("/") if "/" in (series or "") else (series or "", "", "")
     matching = [
         stack

@@ -43,21 +43,11 @@ _TO_LPS = {
     "right-anterior-superior": (-1, -1, 1),
     "left-anterior-superior": (1, -1, 1),
 }
-_SPACES = {
-    "lps": "left-posterior-superior",
-    "ras": "right-anterior-superior",
-    "las": "left-anterior-superior",
-}
+_TO_LPS |= {"".join(word[0] for word in name.split("-")): signs for name, signs in _TO_LPS.items()}
 
 
 def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
-    """Fields and key/value pairs of an NRRD header, and where it ends (bytes).
-
-    Raises
-    ------
-    ImageFileError
-        If the file is not an NRRD file or its header does not end.
-    """
+    """Fields and key/value pairs of an NRRD header, and where it ends (bytes)."""
     start = header_start(path)
     if not re.match(rb"NRRD000\d\r?\n", start):
         raise ImageFileError(f"{path}: not an NRRD file (no NRRD magic at its start). Export it again.")
@@ -81,24 +71,10 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     return fields, pairs, end.end() if end else len(start)
 
 
-def nrrd_shape(path: Path) -> tuple[int, ...]:
-    """All sizes that the header claims, without any other check."""
-    return tuple(whole_numbers(path, nrrd_fields(path)[0], "sizes"))
-
-
 def read_nrrd_header(
     path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
 ) -> StoredVolume:
-    """Read what an NRRD file (.nrrd, .nhdr, .seg.nrrd) holds, and where its voxels lie in LPS mm.
-
-    With ``vectors``, a file of three components per voxel is needed in place of a scalar one.
-
-    Raises
-    ------
-    ImageFileError
-        If the header is damaged, claims more than ``max_bytes``, names no anatomical space, is sheared, is
-        not 3D, or uses an encoding other than raw and gzip.
-    """
+    """What an NRRD file (.nrrd, .nhdr, .seg.nrrd) holds: scalars, or with `vectors` three components per voxel."""
     fields, _, end = nrrd_fields(path)
     sizes = whole_numbers(path, fields, "sizes")
     if whole_numbers(path, fields, "dimension") != [len(sizes)]:
@@ -113,15 +89,9 @@ def read_nrrd_header(
     encoding = fields.get("encoding", "").lower()
     if encoding not in ("raw", "gzip", "gz"):
         raise ImageFileError(f"{path}: NRRD encoding '{encoding}' is not read; save it as raw or gzip.")
-    data, start = path, end
     detached = fields.get("data file", fields.get("datafile"))
-    if detached is not None:
-        data, start = detached_file(path, detached), 0
-    skips = {
-        fields.get("line skip", fields.get("lineskip", "0")),
-        fields.get("byte skip", fields.get("byteskip", "0")),
-    }
-    if skips != {"0"}:
+    data, start = (path, end) if detached is None else (detached_file(path, detached), 0)
+    if any(fields.get(name, "0") != "0" for name in ("line skip", "lineskip", "byte skip", "byteskip")):
         raise ImageFileError(f"{path}: NRRD files that skip lines or bytes are not read; save it again, attached.")
     kind = " ".join(fields.get("type", "").lower().split())
     if kind not in _NRRD_TYPES:
@@ -196,11 +166,10 @@ def _kind(fields: Mapping[str, str], sizes: list[int], axis: int) -> str:
 def _vectors(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
     written = fields.get("space directions")
     space = fields.get("space", "").lower()
-    if written is None or _SPACES.get(space, space) not in _TO_LPS:
+    if written is None or space not in _TO_LPS:
         raise ImageFileError(
-            f"{path}: the NRRD header does not say how the image lies in the body (space: "
-            f"'{space or 'none'}', space directions: {'given' if written else 'none'}); the spaces that are "
-            f"read are {sorted(_TO_LPS)}."
+            f"{path}: the NRRD header does not say how the image lies in the body (space: '{space or 'none'}', space "
+            f"directions: {'given' if written else 'none'}); the spaces that are read are {sorted(_TO_LPS)}."
         )
     if not re.fullmatch(r"((none|\([^()]*\))\s*)+", written):
         raise ImageFileError(f"{path}: the header's 'space directions' are no vectors: '{written[:60]}'; damaged.")
@@ -220,8 +189,7 @@ def _vector(path: Path, written: str, field: str) -> FloatArray:
 
 
 def _nrrd_grid(path: Path, fields: Mapping[str, str], sizes: list[int], axes: list[int]) -> Grid:
-    space = fields["space"].lower()
-    signs = np.array(_TO_LPS[_SPACES.get(space, space)], dtype=np.float64)
+    signs = np.array(_TO_LPS[fields["space"].lower()], dtype=np.float64)
     columns = np.stack([v for v in _vectors(path, fields) if v is not None], axis=1)
     origin = _vector(path, fields.get("space origin", ""), "space origin")
     scale = MM_PER_UNIT[_nrrd_unit(path, fields)]

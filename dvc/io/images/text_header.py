@@ -1,8 +1,8 @@
-"""What the text headers of NRRD and MetaImage have in common: numbers, units, axes, and voxels in a file beside."""
+"""What the text headers of NRRD and MetaImage share: numbers, units, axes, and voxels in a file beside."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -65,13 +65,19 @@ def unit_of_length(path: Path, units: set[str]) -> str:
     return known.pop()
 
 
-def grid_of_axes(path: Path, shape: list[int], columns: FloatArray, origin: FloatArray) -> Grid:
+def grid_of_axes(
+    path: Path,
+    shape: Sequence[int],
+    columns: FloatArray,
+    origin: FloatArray,
+    straightened: Callable[[FloatArray], FloatArray] = np.asarray,
+) -> Grid:
     """The grid with these steps along its axes, (3, 3) by columns, and origin, LPS mm."""
     with np.errstate(over="ignore"):
         spacing = np.linalg.norm(columns, axis=0)
     if not np.isfinite(spacing).all() or np.any(spacing <= 0):
         raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
     try:
-        return Grid((shape[0], shape[1], shape[2]), spacing, origin, columns / spacing)
+        return Grid((shape[0], shape[1], shape[2]), spacing, origin, straightened(columns / spacing))
     except GeometryError as error:
         raise ImageFileError(f"{path}: {error}") from error

@@ -46,15 +46,7 @@ class _Lines:
 
 
 def read_ansys(path: Path) -> RawMesh:
-    """Read the mesh of a blocked archive, in the global Cartesian frame.
-
-    Its regions are the element components and each material ("material 1").
-
-    Raises
-    ------
-    ImageFileError
-        If the file is damaged or cut short, or has no block of nodes or of elements.
-    """
+    """Read a blocked archive in the global Cartesian frame; its regions: element components and "material 1" ..."""
     mesh = NumberedMesh(path)
     types: dict[str, str] = {}
     materials: dict[int, list[int]] = {}

@@ -1,8 +1,6 @@
 """Gmsh files (.msh), by meshio and what it passes over: node numbers, groups of one name, the order of some nodes.
 
-References
-----------
-.. [1] Gmsh reference manual, sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
+See the Gmsh reference manual, sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
 """
 
 from __future__ import annotations
@@ -30,13 +28,7 @@ _TO_VTK = {
 
 
 def read_gmsh(path: Path) -> RawMesh:
-    """Read a .msh file (version 2.2 or 4.1, text or binary): its regions are the physical groups.
-
-    Raises
-    ------
-    ImageFileError
-        If it is damaged or of another version.
-    """
+    """Read a .msh file (version 2.2 or 4.1, text or binary): its regions are the physical groups."""
     names = _group_names(path)
     with _names_apart(path, names) as (place, real):
         mesh = read_through_meshio(path, lambda _: meshio.gmsh.read(str(place)))
@@ -70,20 +62,8 @@ def _in_vtk_order(kind: str, nodes: IntArray) -> IntArray:
 def node_numbers(path: Path, count: int) -> IntArray:
     """Node tags of a .msh file (version 2.2 or 4.1, text or binary), (count,), in the file's order.
 
-    Gmsh numbers nodes freely: from any number, with gaps, in any order. Boundary conditions are given by
-    these numbers, so they are read and never assumed.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    count : int
-        The number of nodes that it is known to hold.
-
-    Raises
-    ------
-    ImageFileError
-        If the file has another version, or its nodes are not ``count`` different ones.
+    Gmsh numbers nodes freely: from any number, with gaps, in any order. Boundary conditions refer to these numbers, so
+    they are read and never assumed.
     """
     data = path.read_bytes()
     with damage_named(f"{path}: its $Nodes section"):
@@ -119,10 +99,7 @@ def _group_names(path: Path) -> dict[tuple[int, int], str]:
 
 @contextmanager
 def _names_apart(path: Path, names: dict[tuple[int, int], str]) -> Iterator[tuple[Path, dict[str, str]]]:
-    """A file in which every group has a name of its own, as meshio needs it, and the real name of each of these.
-
-    It is ``path`` itself where no two groups share a name.
-    """
+    """A file in which every group has a name of its own, as meshio needs it, and the real name of each of these."""
     if len(set(names.values())) == len(names):
         yield path, {name: name for name in names.values()}
         return

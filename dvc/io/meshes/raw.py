@@ -24,23 +24,7 @@ _DAMAGE = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawMesh:
-    """Nodes, cells, sets and nodal fields in the file's own unit, frame and order.
-
-    Attributes
-    ----------
-    path : Path
-    points : (n, 3)
-    node_ids : (n,) int
-        The file's number of each node; the index from 0 in a format without numbers.
-    blocks : list of (kind in meshio's names, node indices (m, k))
-        Cells are counted through all blocks.
-    regions : mapping of str to (k,) int
-        Cells of each named set.
-    node_sets : mapping of str to (k,) int
-        Node indices of each named set.
-    at_nodes : mapping of str to (n, ...)
-        Fields; NaN at nodes for which the file gives no value.
-    """
+    """Nodes, cells, sets and nodal fields in the file's own unit, frame and order."""
 
     path: Path
     points: Any
@@ -84,12 +68,7 @@ class NumberedMesh:
     ) -> RawMesh:
         """The mesh by indices: nodes in the file's order, cells grouped by kind.
 
-        Sets may name elements and nodes that were left out; a field may not.
-
-        Raises
-        ------
-        ImageFileError
-            If there are no nodes, or an element or a field names a node that the file does not define.
+        Sets may name elements and nodes that were left out; an element or a field may not.
         """
         if not self.nodes:
             raise ImageFileError(f"{self.path} has no nodes: there is no mesh in it.")

@@ -57,14 +57,12 @@ class MeshFile:
 
     Attributes
     ----------
-    path : Path
-        The file.
     unit, frame : str
         The file's own: "mm" or "m", "LPS" or "RAS".
     points_mm : (n, 3)
         All nodes, mid-side nodes too, LPS mm.
     node_ids : (n,) int
-        The file's numbers of its nodes (Gmsh, Abaqus); the index from 0 in VTK files, which give none.
+        The file's numbers of its nodes; the index from 0 in VTK files, which give none.
     blocks : tuple of CellBlock
         All cells, surfaces and lines too; cells are counted through all blocks.
     regions : mapping of str to (k,) int
@@ -108,7 +106,7 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     Parameters
     ----------
     path : path
-        The file; its ending tells the format.
+        The file; its ending gives the format.
     unit : {"mm", "m"}
         Unit of length of the file's coordinates.
     frame : {"LPS", "RAS"}
@@ -128,7 +126,7 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     ImageFileError
         If the file is missing, damaged, or has no volume cells.
     GeometryError
-        If the mesh is not usable; see `dvc.mesh.TetMesh`.
+        If the mesh is not usable; see `dvc.TetMesh`.
     """
     path = Path(path)
     if unit not in MM_PER_UNIT:

@@ -21,13 +21,7 @@ topological_dimension.update({"wedge15": 3, "pyramid13": 3})
 
 
 def read_through_meshio(path: Path, read: Callable[[str], Any]) -> Any:
-    """Read a file by one of meshio's readers.
-
-    Raises
-    ------
-    ImageFileError
-        If it cannot, for whatever reason.
-    """
+    """Read a file by one of meshio's readers; refused if that fails, for whatever reason."""
     with silenced() as said, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

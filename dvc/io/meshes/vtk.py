@@ -17,13 +17,7 @@ _MOST_REGIONS = 256
 
 
 def read_vtk(path: Path) -> RawMesh:
-    """Read a .vtu or .vtk file; its nodes have no numbers and are counted from 0.
-
-    Raises
-    ------
-    ImageFileError
-        If it is damaged or of a variant that is not read.
-    """
+    """Read a .vtu or .vtk file; its nodes have no numbers and are counted from 0."""
     mesh = read_through_meshio(path, meshio.vtu.read if path.suffix.lower() == ".vtu" else meshio.vtk.read)
     regions: dict[str, IntArray] = {}
     arrays = {name.casefold(): name for name in mesh.cell_data}

@@ -1,7 +1,7 @@
 """Results on the user's own mesh: VTU to look at, CSV of nodal displacements for the user's solver.
 
-Values come in LPS mm; what is written is in the mesh file's own frame and unit, so that a displacement can be
-taken over as a boundary condition as it stands.
+Values come in LPS mm and are written in the mesh file's own frame and unit, so that a displacement can be used as a
+boundary condition as it stands.
 """
 
 from __future__ import annotations
@@ -35,32 +35,10 @@ def write_on_mesh(
 ) -> dict[str, int]:
     """Write results on the user's own mesh as a VTU file (binary), in the mesh file's own frame and unit.
 
-    Parameters
-    ----------
-    path : path
-        The file to write, ending in .vtu. It appears under this name only when it is whole.
-    mesh : MeshFile
-        The user's mesh; written with all its nodes and cells, whatever their kind.
-    point_data, cell_data : mapping of str to array
-        One row for each node of ``mesh``, or for each cell through all its blocks; in LPS. (n,) is a scalar,
-        (n, 3) a vector and (n, 3, 3) a tensor in space, both turned into the mesh's frame (principal values
-        are three scalars, not a vector). A name that ends in ``_mm`` is a length: it is converted to the
-        mesh's unit, and so is the ending of its name. NaN stays NaN. The nodes' own numbers are added as
-        ``node``.
-    verdict : Verdict, optional
-        Whether the results may be trusted: field data of the name `VERDICT_FIELD`.
-
-    Returns
-    -------
-    dict of str to int
-        For each array, as it is named in the file, the number of rows that hold a NaN.
-
-    Raises
-    ------
-    InputError
-        If an array has not one row for each node or cell, or the file would replace the mesh itself.
-    OutputError
-        If the file cannot be written.
+    The data, in LPS, have one row for each node of `mesh`, or for each cell through all its blocks. (n,) is a scalar,
+    (n, 3) a vector and (n, 3, 3) a tensor, both turned into the mesh's frame (principal values are three scalars, not a
+    vector). A name that ends in ``_mm`` is a length: it and the ending of its name are converted to the mesh's unit.
+    NaN stays NaN. The nodes' own numbers are added as ``node``, the verdict as field data (`VERDICT_FIELD`).
     """
     path = Path(path)
     _check_name(path, ".vtu", mesh)
@@ -93,34 +71,11 @@ def write_on_mesh(
 def write_nodal_displacements(
     path: str | os.PathLike[str], mesh: MeshFile, u_mm: FloatArray, verdict: Verdict | None = None
 ) -> int:
-    """Write the displacement of every node of the user's mesh as CSV, ready as boundary conditions.
+    """Write the displacement `u_mm` (n, 3; LPS mm) of every node of the user's mesh as CSV, for boundary conditions.
 
-    The columns are ``node,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm``, or ``x_m`` and so on for a mesh in metres: the
-    mesh file's own node numbers, frame and unit. A JSON file beside it (same name, ending .json) declares
-    them.
-
-    Parameters
-    ----------
-    path : path
-        The file to write, ending in .csv. It appears under this name only when it is whole.
-    mesh : MeshFile
-        The user's mesh.
-    u_mm : (n, 3)
-        Displacement at ``mesh.points_mm``, LPS mm; NaN where the measurement is not defined.
-    verdict : Verdict, optional
-        Whether they may be trusted; told in the JSON file.
-
-    Returns
-    -------
-    int
-        Number of nodes without a displacement. Their last three columns are empty; they are not zero.
-
-    Raises
-    ------
-    InputError
-        If ``u_mm`` has not one row for each node.
-    OutputError
-        If the file cannot be written.
+    The columns are ``node,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm``, or ``x_m`` and so on for a mesh in metres: the mesh
+    file's own node numbers, frame and unit. A JSON file beside it (same name, ending .json) declares them. Where `u_mm`
+    is NaN, the last three columns are empty, not zero; the number of such nodes is returned.
     """
     path = Path(path)
     _check_name(path, ".csv", mesh)

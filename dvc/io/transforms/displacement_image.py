@@ -23,9 +23,9 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
     Parameters
     ----------
     frame : {"LPS", "RAS"}, optional
-        Frame of the components. It overrides nothing: where the file, or the JSON file of the same stem
-        beside it (key "frame"), tells the frame too, both must agree. MetaImage is LPS, NRRD is LPS where
-        its space is; NIfTI files differ by the program that wrote them, so that it must be told.
+        Frame of the components. Where the file, or the JSON file of the same stem beside it (key "frame"), gives the
+        frame too, both must agree. MetaImage is LPS, NRRD is LPS where its space is; NIfTI files differ by the
+        program that wrote them, so that it must be given.
 
     Returns
     -------
@@ -38,7 +38,7 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
         If there is no such file.
     ImageFileError
         If the file is damaged, not a 3D image of three components, in another unit than mm, or holds infinite
-        values, or if its place or frame is not known without contradiction.
+        values, or if its geometry or frame is missing or contradictory.
     """
     place = Path(path)
     if not place.is_file():

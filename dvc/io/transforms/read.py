@@ -1,8 +1,4 @@
-"""Transform files of elastix and ITK, read to a Deformation.
-
-All of them map points of the fixed (reference) image to points of the moving one, in LPS mm; so does a
-Deformation.
-"""
+"""Transform files of elastix and ITK, read to a Deformation: fixed (reference) points to moving points, LPS mm."""
 
 from __future__ import annotations
 
@@ -51,15 +47,15 @@ class Added:
 def read_transform(path: StrPath) -> Deformation:
     """Read a transform file: elastix' TransformParameters (.txt), ITK's (.h5, .tfm, .mat, .txt), or ours (.npz).
 
-    elastix' chain of initial transforms is followed, combined as each file says: "Compose" (T(x) =
-    T1(T0(x))) or "Add". An initial transform's name is looked for beside the file that names it.
+    elastix' chain of initial transforms is followed, combined as each file says: "Compose" (T(x) = T1(T0(x))) or
+    "Add". An initial transform's name is looked for beside the file that names it.
 
     Returns
     -------
     Deformation
-        Of fixed points to moving points, LPS mm. A `BSpline` is NaN outside its valid region, where elastix
-        and ITK answer with the identity. A displacement field inside an ITK file is interpolated by cubic
-        splines (ITK: linearly).
+        Of fixed points to moving points, LPS mm. A `BSpline` is NaN outside its valid region, where elastix and ITK
+        answer with the identity. A displacement field inside an ITK file is interpolated by cubic splines (ITK:
+        linearly).
 
     Raises
     ------
@@ -98,15 +94,7 @@ def rigid_from_elastix(parameters: Parameters) -> RigidMotion:
 
 
 def bspline_from_elastix(parameters: Parameters) -> BSpline:
-    """Read an elastix B-spline from its parameter map alone (an initial transform is left out).
-
-    Coefficients may be NaN.
-
-    Raises
-    ------
-    ParameterError
-        If it is another kind of transform, not cubic, cyclic, or numbers are missing.
-    """
+    """Read an elastix B-spline from its parameter map alone (an initial transform is left out); NaN is let pass."""
     _require(parameters, ("BSplineTransform", "RecursiveBSplineTransform"))
     if _word(parameters, "BSplineTransformSplineOrder", "3") != "3":
         raise ParameterError("BSplineTransformSplineOrder is not 3; only cubic B-splines are read.")
