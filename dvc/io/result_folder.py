@@ -10,6 +10,7 @@ import io
 import json
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,7 @@ from dvc.io.images.write import write_image, write_mask, write_vectors
 from dvc.io.meshes.read import MeshFile
 from dvc.io.meshes.write import write_nodal_displacements, write_on_mesh
 from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE
-from dvc.io.transforms.displacement_image import read_displacement
-from dvc.io.transforms.read import read_transform
+from dvc.io.transforms.read import read_displacement, read_transform
 from dvc.io.transforms.write import ELASTIX_FILES
 from dvc.trust.error_model import ErrorModel, ErrorTable, Interval, Uncertainty, read_error_model
 from dvc.trust.verdict import Verdict
@@ -155,27 +155,15 @@ def write_maps(
     With `plate_axes` (3, 3), columns n, s, t (`dvc.plate_axes`), the strain in these axes is written too.
     """
     write_displacement(folder, maps.grid, maps.displacement_mm, verdict)
-    write_vectors(
-        folder / GREEN_LAGRANGE,
-        maps.grid,
-        maps.green_lagrange,
-        TENSOR_COMPONENTS,
-        _GREEN_LAGRANGE,
-        unit="1",
-        verdict=verdict,
-    )
+    write = partial(write_vectors, unit="1", verdict=verdict)
+    write(folder / GREEN_LAGRANGE, maps.grid, maps.green_lagrange, TENSOR_COMPONENTS, _GREEN_LAGRANGE)
     if plate_axes is not None:
-        write_vectors(
-            folder / GREEN_LAGRANGE_PLATE,
-            maps.grid,
-            in_axes(maps.green_lagrange, plate_axes),
-            ("nn", "ns", "nt", "ss", "st", "tt"),
+        in_plate, components = in_axes(maps.green_lagrange, plate_axes), ("nn", "ns", "nt", "ss", "st", "tt")
+        meaning = (
             f"{_GREEN_LAGRANGE} in the plate's axes: n outward normal, s shear direction, t = n x s; "
-            f"columns of {np.round(plate_axes, 6).tolist()} in LPS",
-            "invariant",
-            unit="1",
-            verdict=verdict,
+            f"columns of {np.round(plate_axes, 6).tolist()} in LPS"
         )
+        write(folder / GREEN_LAGRANGE_PLATE, maps.grid, in_plate, components, meaning, "invariant")
     write_image(folder / MAX_SHEAR, Image(maps.grid, maps.max_shear))
     write_image(folder / JACOBIAN, Image(maps.grid, maps.jacobian))
     write_mask(folder / VALID, Mask(maps.grid, maps.valid))
@@ -218,10 +206,9 @@ def _same_grid(path: Path, found: Grid, wanted: Grid) -> None:
 
 def write_displacement(folder: Path, grid: Grid, displacement_mm: Float32Array, verdict: Verdict | None = None) -> None:
     """Write the displacement as NIfTI and as NRRD, LPS mm."""
+    write = partial(write_vectors, unit="mm", verdict=verdict)
     for name in (DISPLACEMENT_NRRD, DISPLACEMENT):  # the JSON beside them names the last
-        write_vectors(
-            folder / name, grid, displacement_mm, ("x", "y", "z"), _DISPLACEMENT, "LPS", unit="mm", verdict=verdict
-        )
+        write(folder / name, grid, displacement_mm, ("x", "y", "z"), _DISPLACEMENT)
 
 
 def in_axes(tensor: Float32Array, axes: FloatArray) -> Float32Array:
@@ -244,12 +231,9 @@ def write_uncertainty(
         model.write(folder / ERROR_MODEL)
     write_image(folder / SIGMA, Image(grid, uncertainty.sigma))
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*(f.name for f in fields(Interval)), "verdict"])
-    writer.writerows(
-        [*(f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)), verdict.words]
-        for row in uncertainty.intervals
-    )
+    rows = [[f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)] for row in uncertainty.intervals]
+    head = [f.name for f in fields(Interval)]
+    csv.writer(text, lineterminator="\n").writerows([[*head, "verdict"], *([*row, verdict.words] for row in rows)])
     write_whole(folder / INTERVALS, text.getvalue())
 
 
@@ -272,30 +256,18 @@ def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel]
 def write_mesh_results(
     folder: Path, mesh: MeshFile, deformation: Deformation, verdict: Verdict | None = None
 ) -> dict[str, int]:
-    """Displacement and strain at the nodes and in the cells of a user's mesh; returns how many there are, and
-    undefined.
-    """
-    u, strain = _evaluated(deformation, mesh.points_mm)
-    u_cells, in_cells = _evaluated(deformation, mesh.centroids_mm)
-    write_on_mesh(folder / ON_MESH, mesh, _fields(u, strain), _fields(u_cells, in_cells), verdict)
-    missing = write_nodal_displacements(folder / AT_NODES, mesh, u, verdict)
-    return {
-        "nodes": len(u),
-        "nodes_without_value": missing,
-        "cells": mesh.cell_count,
-        "cells_without_value": int(np.count_nonzero(~in_cells.valid)),
-    }
+    """Displacement and strain at the nodes and in the cells of a user's mesh; returns their numbers."""
+    at_nodes, _ = _fields(deformation, mesh.points_mm)
+    in_cells, without_value = _fields(deformation, mesh.centroids_mm)
+    write_on_mesh(folder / ON_MESH, mesh, at_nodes, in_cells, verdict)
+    missing = write_nodal_displacements(folder / AT_NODES, mesh, at_nodes["displacement_mm"], verdict)
+    nodes = {"nodes": len(mesh.points_mm), "nodes_without_value": missing}
+    return nodes | {"cells": mesh.cell_count, "cells_without_value": without_value}
 
 
-def _evaluated(deformation: Deformation, points_mm: FloatArray) -> tuple[FloatArray, StrainField]:
+def _fields(deformation: Deformation, points_mm: FloatArray) -> tuple[dict[str, FloatArray], int]:
+    """Displacement and strain at points (n, 3) LPS mm, and at how many of them they are not defined."""
     u, H = deformation.evaluate(points_mm)
-    return u, StrainField.from_gradient(H)
-
-
-def _fields(u: FloatArray, strain: StrainField) -> dict[str, FloatArray]:
-    return {
-        "displacement_mm": u,
-        "green_lagrange": strain.green_lagrange,
-        "max_shear": strain.max_shear,
-        "jacobian": strain.jacobian,
-    }
+    strain = StrainField.from_gradient(H)
+    named = {name: getattr(strain, name) for name in ("green_lagrange", "max_shear", "jacobian")}
+    return {"displacement_mm": u, **named}, int(np.count_nonzero(~strain.valid))

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from dvc.arrays import IntArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, LabelMap, Mask
+from dvc.io import StrPath
 from dvc.io.images.nrrd import nrrd_fields
 from dvc.io.images.read import read_voxels
 
@@ -30,7 +31,6 @@ _POINTS_AT_ONCE = 1 << 20
 _LABEL_COLUMNS = ("label", "value", "index", "id")
 _NAME_COLUMNS = ("name", "structure", "label")  # "label" may head the names beside another column of numbers
 
-StrPath = str | PathLike[str]
 _OnGrid = TypeVar("_OnGrid", Mask, LabelMap)
 
 
@@ -91,10 +91,9 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
         raise InputError(f"{place}: the label map is empty: all of its {labels.size} voxels are 0.")
     if min(present) < 0:
         raise InputError(f"{place}: labels must not be negative; found {_shortened([v for v in present if v < 0])}.")
-    if names is None:
-        known: Mapping[int, str] = _segment_names(place) or {v: f"label-{v}" for v in present}
-    else:
-        known = names if isinstance(names, Mapping) else read_names(names)
+    known = read_names(names) if isinstance(names, str | PathLike) else names
+    if known is None:
+        known = _segment_names(place) or {v: f"label-{v}" for v in present}
     nameless = [v for v in present if v not in known]
     if nameless:
         source = f" in {names}" if isinstance(names, str | PathLike) else ""
@@ -184,15 +183,10 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     left = np.count_nonzero(fitted) * grid.voxel_volume_mm3
     if left == 0:
         raise GeometryError(f"{what}: nothing of it is left on the image's grid. {boxes}")
-    _log.warning(
-        "%s: on another grid than the image; resampled to it by nearest neighbour (%.4g mL became %.4g mL, "
-        "%.0f %% of it lies in the image). %s",
-        what,
-        total * own.voxel_volume_mm3 / 1000,
-        left / 1000,
-        100 * share,
-        boxes,
-    )
+    before = total * own.voxel_volume_mm3
+    change = f"{before / 1000:.4g} mL became {left / 1000:.4g} mL, {100 * share:.0f} % of it lies in the image"
+    told = "%s: on another grid than the image; resampled to it by nearest neighbour (%s). %s"
+    _log.warning(told, what, change, boxes)
     if isinstance(mask_or_labels, LabelMap):
         lost = sorted(set(_counts(values)) - set(_counts(fitted)))
         if lost:
@@ -236,8 +230,7 @@ def _nearest(own: Grid, values: npt.NDArray[Any], grid: Grid) -> npt.NDArray[Any
     j, k = np.ogrid[: grid.shape[1], : grid.shape[2]]
     fitted = np.zeros(grid.shape, dtype=values.dtype)
     for i in range(grid.shape[0]):  # a slice at a time: a whole grid of indices would be large
-        index = []
-        within = np.ones(grid.shape[1:], dtype=bool)
+        index, within = [], np.ones(grid.shape[1:], dtype=bool)
         for axis in range(3):
             place = start[axis] + step[axis, 0] * i + step[axis, 1] * j + step[axis, 2] * k
             # The small shift settles ties, which rounding errors would otherwise scatter.

@@ -15,7 +15,6 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.errors import ImageFileError
-from dvc.images.image import Grid
 from dvc.io.images.stored import MAX_BYTES, StoredVolume, expanded, pick_volume, refuse_if_too_large
 from dvc.io.images.text_header import grid_of_axes
 
@@ -25,8 +24,7 @@ LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Turns an affine to RAS into one to LPS, and back."""
 
 _AGREEMENT_VOXELS = 0.05
-_UNITS = {0: "mm", 1: "metres", 2: "mm", 3: "microns"}
-_MM_PER_UNIT = {"metres": 1000.0, "mm": 1.0, "microns": 0.001}
+_UNITS = {0: ("mm", 1.0), 1: ("metres", 1000.0), 2: ("mm", 1.0), 3: ("microns", 0.001)}
 _ORTHONORMAL = 1e-4
 _HALF_TURN = 1e-7
 _ROUNDING = 4e-7  # of b^2 + c^2 + d^2 in single precision, with a margin
@@ -43,21 +41,23 @@ def read_nifti_header(
     refuse_if_too_large(path, layout, max_bytes)
     chosen = pick_volume(path, count, volume)
     dtype = _number_type(path, header)
-    unit = _unit(path, header)
-    grid = _grid(path, header, shape, _MM_PER_UNIT[unit])
+    unit, mm_per_unit = _unit(path, header)
+    lps = LPS_FROM_RAS @ _ras_affine(path, header, shape)
+    columns = lps[:3, :3] * mm_per_unit
     bytes_each = int(np.prod(layout)) * dtype.itemsize
-    slope, intercept = _scaling(header)
+    slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
+    scaled = slope != 0.0 and np.isfinite(slope)
     return StoredVolume(
         path=path,
-        grid=grid,
+        grid=grid_of_axes(path, shape, columns, lps[:3, 3] * mm_per_unit, _straightened),
         dtype=dtype,
         layout=layout,
         unit=unit,
         compressed=_is_compressed(path),
         stream_start=max(int(header["vox_offset"]), int(header["sizeof_hdr"]) + 4) + chosen * bytes_each,
         stream_rest=(count - 1 - chosen) * bytes_each,
-        slope=slope,
-        intercept=intercept,
+        slope=slope if scaled else 1.0,
+        intercept=intercept if scaled and np.isfinite(intercept) else 0.0,
         components=3 if vectors else None,
     )
 
@@ -139,27 +139,14 @@ def _number_type(path: Path, header: Any) -> np.dtype[Any]:
     return dtype
 
 
-def _scaling(header: Any) -> tuple[float, float]:
-    slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
-    if slope == 0.0 or not np.isfinite(slope):  # both mean: not scaled
-        return 1.0, 0.0
-    return slope, intercept if np.isfinite(intercept) else 0.0
-
-
-def _unit(path: Path, header: Any) -> str:
-    """The header's unit of length; mm where it gives none."""
+def _unit(path: Path, header: Any) -> tuple[str, float]:
+    """The header's unit of length and its size in mm; mm where it gives none."""
     code = int(header["xyzt_units"]) & 7
     if code not in _UNITS:
         raise ImageFileError(f"{path}: unknown unit of length (xyzt_units code {code}); set it to mm (2).")
     if code == 0:
         _log.warning("%s: the header gives no unit of length; taken as mm", path)
     return _UNITS[code]
-
-
-def _grid(path: Path, header: Any, shape: tuple[int, int, int], mm_per_unit: float) -> Grid:
-    lps = LPS_FROM_RAS @ _ras_affine(path, header, shape)
-    columns = lps[:3, :3] * mm_per_unit
-    return grid_of_axes(path, shape, columns, lps[:3, 3] * mm_per_unit, _straightened)
 
 
 def _straightened(direction: FloatArray) -> FloatArray:

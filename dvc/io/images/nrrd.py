@@ -80,11 +80,8 @@ def read_nrrd_header(
     if whole_numbers(path, fields, "dimension") != [len(sizes)]:
         raise ImageFileError(f"{path}: {len(sizes)} sizes in {fields['dimension']} dimensions; the header is damaged.")
     axes, other = _nrrd_axes(path, fields, sizes)
-    select = components = None
-    if vectors:
-        components = _component_axis(path, fields, sizes, other)
-    else:
-        select = _nrrd_volume(path, fields, sizes, other, volume)
+    select = None if vectors else _nrrd_volume(path, fields, sizes, other, volume)
+    components = _component_axis(path, fields, sizes, other) if vectors else None
     refuse_if_too_large(path, tuple(sizes), max_bytes)
     encoding = fields.get("encoding", "").lower()
     if encoding not in ("raw", "gzip", "gz"):
@@ -149,10 +146,10 @@ def _nrrd_volume(
 
 def _component_axis(path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None) -> int:
     """Find the axis of a vector's three components."""
-    kind = "" if other is None else _kind(fields, sizes, other)
     if other is None or sizes[other] != 3:
         count = 1 if other is None else sizes[other]
         raise ImageFileError(f"{path}: {count} components per voxel; vectors of three are needed.")
+    kind = _kind(fields, sizes, other)
     if kind not in ("", "none", "???", "list") and not kind.endswith("vector"):
         raise ImageFileError(f"{path}: the three values of a voxel are of kind {kind}; a vector is needed.")
     return other
@@ -179,13 +176,10 @@ def _vectors(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
 
 def _vector(path: Path, written: str, field: str) -> FloatArray:
     """The three numbers of ``(x,y,z)``."""
-    inside = re.fullmatch(r"\(([^()]*)\)", written)
-    numbers: list[float] = []
-    with suppress(ValueError):
-        numbers = [float(part) for part in inside[1].split(",")] if inside else []
-    if len(numbers) != 3:
-        raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
-    return np.array(numbers)
+    if match := re.fullmatch(r"\(([^(),]*),([^(),]*),([^(),]*)\)", written):
+        with suppress(ValueError):
+            return np.array([float(part) for part in match.groups()])
+    raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
 
 
 def _nrrd_grid(path: Path, fields: Mapping[str, str], sizes: list[int], axes: list[int]) -> Grid:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from dvc.arrays import Float32Array
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image
+from dvc.io import StrPath
 from dvc.io.images.dicom import is_dicom, read_dicom
 from dvc.io.images.metaimage import read_meta_header
 from dvc.io.images.nifti import read_nifti_header
@@ -37,7 +37,7 @@ _FORMATS: dict[str, tuple[str, Callable[[Path, int | None, int, bool], StoredVol
 
 
 def read_image(
-    path: str | PathLike[str],
+    path: StrPath,
     *,
     allow_missing: bool = False,
     series: str | None = None,
@@ -78,7 +78,7 @@ def read_image(
 
 
 def read_voxels(
-    path: str | PathLike[str], *, series: str | None = None, volume: int | None = None, max_bytes: int = MAX_BYTES
+    path: StrPath, *, series: str | None = None, volume: int | None = None, max_bytes: int = MAX_BYTES
 ) -> tuple[Grid, Voxels]:
     """Grid (LPS mm) and voxels (ni, nj, nk) of a file or DICOM folder, in the file's own number type.
 
@@ -113,13 +113,7 @@ def read_header(
 
 
 def format_of(name: str) -> str:
-    """Format of an image that was read, by its name alone; a folder's, and a file's of no other format, is DICOM.
-
-    Examples
-    --------
-    >>> format_of("Load0.nii.gz"), format_of("Load0.mha"), format_of("Load0")
-    ('NIfTI', 'MetaImage', 'DICOM')
-    """
+    """Format of an image that was read, by its name alone; a folder's, and a file's of no other format, is DICOM."""
     suffix = _known_suffix(name)
     return "DICOM" if suffix is None else _FORMATS[suffix][0]
 

@@ -13,7 +13,6 @@ import io
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +23,9 @@ import numpy.typing as npt
 from dvc.atomic_files import whole_file, write_json, write_whole
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
+from dvc.io import StrPath
 from dvc.io.images.nifti import LPS_FROM_RAS
 from dvc.trust.verdict import Verdict
-
-StrPath = str | PathLike[str]
 
 _SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
 _LEVEL = 1  # floats hardly shrink at higher levels, which take several times as long
@@ -135,14 +133,8 @@ def write_vectors(
         raise InputError(f"{place}: frame '{frame}'; components are written in LPS, or are invariant.")
     vector = frame == "LPS" and len(components) == 3
     _write(place, grid, array.astype(np.float32, copy=False), vector=vector)
-    declared: dict[str, object] = {
-        "file": place.name,
-        "meaning": meaning,
-        "components": components,
-        "frame": frame,
-        "unit": unit,
-    }
-    declared |= {"configuration": "reference", "missing": "NaN"}
+    declared: dict[str, object] = {"file": place.name, "meaning": meaning, "components": components, "frame": frame}
+    declared |= {"unit": unit, "configuration": "reference", "missing": "NaN"}
     write_json(_beside(place, ".json"), declared | ({} if verdict is None else {"verdict": verdict.as_dict()}))
 
 

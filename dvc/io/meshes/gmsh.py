@@ -14,11 +14,11 @@ from pathlib import Path
 import meshio
 import numpy as np
 from meshio._mesh import topological_dimension
+from meshio.gmsh import _gmsh22, _gmsh41
 
 from dvc.arrays import IntArray
 from dvc.errors import ImageFileError
-from dvc.io.meshes.raw import RawMesh, damage_named
-from dvc.io.meshes.through_meshio import read_through_meshio
+from dvc.io.meshes.raw import RawMesh, damage_named, read_through_meshio
 
 # Quadratic cells of Gmsh in VTK's order, of those that meshio leaves as they are.
 _TO_VTK = {
@@ -32,7 +32,7 @@ def read_gmsh(path: Path) -> RawMesh:
     names = _group_names(path)
     with _names_apart(path, names) as (place, real):
         mesh = read_through_meshio(path, lambda _: meshio.gmsh.read(str(place)))
-    blocks = [(block.type, _in_vtk_order(block.type, block.data)) for block in mesh.cells]
+    blocks = [(c.type, c.data[:, _TO_VTK[c.type]] if c.type in _TO_VTK else c.data) for c in mesh.cells]
     sizes = [len(data) for _, data in blocks]
     groups: list[tuple[str, IntArray]] = []
     if "gmsh:physical" in mesh.cell_data:
@@ -49,14 +49,9 @@ def read_gmsh(path: Path) -> RawMesh:
             cells = np.concatenate([np.asarray(part, dtype=np.int64) + start for part, start in pairs])
             groups.append((real[name], cells))
     regions: dict[str, IntArray] = {}
-    for name, cells in groups:  # a volume and its surface may share a name: their cells are told apart by their shape
+    for name, cells in groups:  # a volume and its surface may share a name: the shape distinguishes their cells
         regions[name] = np.union1d(regions.get(name, np.empty(0, dtype=np.int64)), cells)
     return RawMesh(path, mesh.points, node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
-
-
-def _in_vtk_order(kind: str, nodes: IntArray) -> IntArray:
-    """Nodes (m, k) of cells that meshio read from a Gmsh file, in VTK's order for quadratic wedges and pyramids too."""
-    return nodes[:, _TO_VTK[kind]] if kind in _TO_VTK else nodes
 
 
 def node_numbers(path: Path, count: int) -> IntArray:
@@ -66,18 +61,22 @@ def node_numbers(path: Path, count: int) -> IntArray:
     they are read and never assumed.
     """
     data = path.read_bytes()
-    with damage_named(f"{path}: its $Nodes section"):
-        version, binary, size = _section(data, b"MeshFormat").split()[:3]
-        body = _section(data, b"Nodes", whole=binary == b"1")
-        if version == b"2.2":
-            tags = _binary_2(body) if binary == b"1" else _text_2(body)
-        elif version == b"4.1":
-            tags = _binary_4(body, int(size)) if binary == b"1" else _text_4(body)
-        else:
-            raise ImageFileError(
-                f"{path} is a Gmsh file of version {version.decode(errors='replace')}; 2.2 and 4.1 are read. "
-                "Save it again with Gmsh (Mesh.MshFileVersion = 4.1)."
-            )
+    with damage_named(f"{path}: its $MeshFormat section"):
+        version, mode, size = _section(data, b"MeshFormat").split()[:3]
+    if version not in (b"2.2", b"4.1"):
+        raise ImageFileError(
+            f"{path} is a Gmsh file of version {version.decode(errors='replace')}; 2.2 and 4.1 are read. "
+            "Save it again with Gmsh (Mesh.MshFileVersion = 4.1)."
+        )
+
+    def read_tags(_: str) -> IntArray:
+        with path.open("rb") as file:  # meshio reads these numbers, and keeps them to itself
+            file.seek(_start(data, b"Nodes"))
+            if version == b"2.2":
+                return np.array(_gmsh22._read_nodes(file, mode == b"0")[1], dtype=np.int64)
+            return np.array(_gmsh41._read_nodes(file, mode == b"0", int(size))[1] + 1, dtype=np.int64)
+
+    tags: IntArray = read_through_meshio(path, read_tags)
     if len(tags) != count or len(np.unique(tags)) != count:
         raise ImageFileError(
             f"{path}: {len(np.unique(tags))} different node numbers were found for {count} nodes; the file is damaged."
@@ -111,41 +110,10 @@ def _names_apart(path: Path, names: dict[tuple[int, int], str]) -> Iterator[tupl
         yield copy, {f"{dimension} {tag}": name for (dimension, tag), name in names.items()}
 
 
-def _section(data: bytes, name: bytes, *, whole: bool = False) -> bytes:
-    start = data.index(b"$" + name) + len(name) + 1
-    start = data.index(b"\n", start) + 1
-    # Binary data may hold the closing word by chance, and is measured by its own counts instead.
-    return data[start:] if whole else data[start : data.index(b"$End" + name, start)]
+def _section(data: bytes, name: bytes) -> bytes:
+    start = _start(data, name)
+    return data[start : data.index(b"$End" + name, start)]
 
 
-def _text_2(body: bytes) -> IntArray:
-    lines = body.split(b"\n")
-    return np.array([int(line.split()[0]) for line in lines[1 : int(lines[0]) + 1]], dtype=np.int64)
-
-
-def _binary_2(body: bytes) -> IntArray:
-    end = body.index(b"\n")
-    record = np.dtype([("tag", "<i4"), ("x", "<f8", 3)])
-    return np.frombuffer(body, record, int(body[:end]), end + 1)["tag"].astype(np.int64)
-
-
-def _text_4(body: bytes) -> IntArray:
-    lines = [line for line in body.split(b"\n") if line.strip()]
-    at, tags = 1, []
-    for _ in range(int(lines[0].split()[0])):
-        nodes = int(lines[at].split()[3])
-        tags += [int(line) for line in lines[at + 1 : at + 1 + nodes]]
-        at += 1 + 2 * nodes
-    return np.array(tags, dtype=np.int64)
-
-
-def _binary_4(body: bytes, size: int) -> IntArray:
-    number = np.dtype(f"<u{size}")
-    blocks = int(np.frombuffer(body, number, 4)[0])
-    at, tags = 4 * size, []
-    for _ in range(blocks):
-        nodes = int(np.frombuffer(body, number, 1, at + 12)[0])
-        at += 12 + size
-        tags.append(np.frombuffer(body, number, nodes, at).astype(np.int64))
-        at += nodes * (size + 24)
-    return np.concatenate(tags) if tags else np.empty(0, dtype=np.int64)
+def _start(data: bytes, name: bytes) -> int:
+    return data.index(b"\n", data.index(b"$" + name)) + 1

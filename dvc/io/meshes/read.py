@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from meshio._common import num_nodes_per_cell
 
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
+from dvc.io import StrPath
 from dvc.io.meshes.abaqus import read_abaqus
 from dvc.io.meshes.ansys import read_ansys
 from dvc.io.meshes.calculix import read_frd
@@ -100,7 +100,7 @@ class MeshFile:
         return np.stack([self.points_mm.min(axis=0), self.points_mm.max(axis=0)])
 
 
-def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
+def read_mesh(path: StrPath, *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
     """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2, 4.1), Abaqus (.inp), ANSYS (.cdb), CalculiX (.frd), FEBio (.xplt).
 
     Parameters

@@ -8,8 +8,7 @@ import meshio
 import numpy as np
 
 from dvc.arrays import IntArray
-from dvc.io.meshes.raw import RawMesh
-from dvc.io.meshes.through_meshio import read_through_meshio
+from dvc.io.meshes.raw import RawMesh, read_through_meshio
 
 # Cell arrays that hold a region's number, in the order in which they are looked for.
 _REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part", "part_id")

@@ -7,8 +7,6 @@ boundary condition as it stands.
 from __future__ import annotations
 
 import csv
-import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,10 +14,11 @@ import meshio
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
+from dvc.io import StrPath
+from dvc.io.meshes.raw import silenced
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS, MeshFile
-from dvc.io.meshes.through_meshio import silenced
 from dvc.trust.verdict import LEVELS, Verdict
 
 VERDICT_FIELD = "verdict_0_trust_1_use_with_care_2_do_not_trust"
@@ -27,12 +26,12 @@ VERDICT_FIELD = "verdict_0_trust_1_use_with_care_2_do_not_trust"
 
 
 def write_on_mesh(
-    path: str | os.PathLike[str],
+    path: StrPath,
     mesh: MeshFile,
     point_data: Mapping[str, FloatArray],
     cell_data: Mapping[str, FloatArray],
     verdict: Verdict | None = None,
-) -> dict[str, int]:
+) -> None:
     """Write results on the user's own mesh as a VTU file (binary), in the mesh file's own frame and unit.
 
     The data, in LPS, have one row for each node of `mesh`, or for each cell through all its blocks. (n,) is a scalar,
@@ -42,18 +41,8 @@ def write_on_mesh(
     """
     path = Path(path)
     _check_name(path, ".vtu", mesh)
-    undefined: dict[str, int] = {}
-
-    def own(data: Mapping[str, FloatArray], rows: int, what: str) -> dict[str, FloatArray]:
-        converted = {}
-        for own_name, values in data.items():
-            name, array = _in_own_frame(mesh, own_name, np.asarray(values, dtype=np.float64), rows, what)
-            undefined[name] = int(np.count_nonzero(np.isnan(array.reshape(rows, -1)).any(axis=1)))
-            converted[name] = array
-        return converted
-
-    at_nodes = own(point_data, len(mesh.points_mm), "node")
-    in_cells = own(cell_data, mesh.cell_count, "cell")
+    at_nodes = dict(_in_own_frame(mesh, *item, len(mesh.points_mm), "node") for item in point_data.items())
+    in_cells = dict(_in_own_frame(mesh, *item, mesh.cell_count, "cell") for item in cell_data.items())
     ends = np.cumsum([len(block.nodes) for block in mesh.blocks])[:-1]
     results = meshio.Mesh(
         _own_points(mesh),
@@ -65,12 +54,9 @@ def write_on_mesh(
         meshio.vtu.write(part, results, binary=True)
         if verdict is not None:
             _add_verdict(part, verdict)
-    return undefined
 
 
-def write_nodal_displacements(
-    path: str | os.PathLike[str], mesh: MeshFile, u_mm: FloatArray, verdict: Verdict | None = None
-) -> int:
+def write_nodal_displacements(path: StrPath, mesh: MeshFile, u_mm: FloatArray, verdict: Verdict | None = None) -> int:
     """Write the displacement `u_mm` (n, 3; LPS mm) of every node of the user's mesh as CSV, for boundary conditions.
 
     The columns are ``node,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm``, or ``x_m`` and so on for a mesh in metres: the mesh
@@ -79,10 +65,9 @@ def write_nodal_displacements(
     """
     path = Path(path)
     _check_name(path, ".csv", mesh)
-    u = np.asarray(u_mm, dtype=np.float64)
-    if u.shape != mesh.points_mm.shape:
-        raise InputError(f"u_mm must have shape {mesh.points_mm.shape}, a row for each node; got {u.shape}.")
-    _, own_u = _in_own_frame(mesh, "u_mm", u, len(u), "node")
+    if np.shape(u_mm) != mesh.points_mm.shape:
+        raise InputError(f"u_mm must have shape {mesh.points_mm.shape}, a row for each node; got {np.shape(u_mm)}.")
+    _, own_u = _in_own_frame(mesh, "u_mm", u_mm, len(u_mm), "node")
     undefined = np.asarray(np.isnan(own_u).any(axis=1))
     columns = ["node", *(f"{axis}_{mesh.unit}" for axis in ("x", "y", "z", "ux", "uy", "uz"))]
     has_numbers = mesh.path.suffix.lower() not in {".vtu", ".vtk"}
@@ -92,18 +77,16 @@ def write_nodal_displacements(
         "unit": mesh.unit,
         "columns": columns,
         "node": "number in the mesh file" if has_numbers else "index in the mesh file, counted from 0",
-        "nodes": len(u),
+        "nodes": len(own_u),
         "nodes_without_displacement": int(np.count_nonzero(undefined)),
     }
-    if verdict is not None:
-        declared["verdict"] = verdict.as_dict()
     with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(columns)
         for node, X, u_X, missing in zip(mesh.node_ids, _own_points(mesh), own_u, undefined, strict=True):
             numbers = [f"{x:.10g}" for x in (X if missing else (*X, *u_X))]
             rows.writerow([int(node), *numbers, *([""] * 3 if missing else [])])
-    write_whole(path.with_suffix(".json"), json.dumps(declared, indent=2) + "\n")
+    write_json(path.with_suffix(".json"), declared | ({} if verdict is None else {"verdict": verdict.as_dict()}))
     return int(np.count_nonzero(undefined))
 
 
@@ -121,6 +104,7 @@ def _own_points(mesh: MeshFile) -> FloatArray:
 
 def _in_own_frame(mesh: MeshFile, name: str, values: FloatArray, rows: int, what: str) -> tuple[str, FloatArray]:
     """Turn an LPS mm array into the mesh file's frame and unit; its name tells whether it is a length."""
+    values = np.asarray(values, dtype=np.float64)
     if values.ndim == 0 or len(values) != rows or values.shape[1:] not in {(), (3,), (3, 3)}:
         raise InputError(
             f"{name!r} must have a row for each of the {rows} {what}s, of a scalar, a vector (3,) or a "

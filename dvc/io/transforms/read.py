@@ -1,7 +1,8 @@
-"""Transform files of elastix and ITK, read to a Deformation: fixed (reference) points to moving points, LPS mm."""
+"""Transforms of elastix and ITK, and displacement images, read to a Deformation: fixed to moving points, LPS mm."""
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,13 +15,15 @@ import SimpleITK as sitk
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
-from dvc.errors import InputError, ParameterError
+from dvc.errors import ImageFileError, InputError, ParameterError
 from dvc.images.image import Grid
 from dvc.images.itk_image import from_sitk as image_from_sitk
+from dvc.io import StrPath
+from dvc.io.images.nrrd import nrrd_fields
+from dvc.io.images.read import read_header
+from dvc.io.images.stored import Voxels
 from dvc.io.transforms.bordered_spline import read_bordered_spline
 from dvc.io.transforms.elastix_text import Parameters, parse_parameters
-
-StrPath = str | os.PathLike[str]
 
 _ITK_SUFFIXES = (".h5", ".hdf5", ".tfm", ".mat")
 _ITK_TEXT = b"#Insight Transform File"
@@ -74,15 +77,59 @@ def read_transform(path: StrPath) -> Deformation:
     return _read_elastix(place, ())
 
 
+def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplacement:
+    """Read a displacement image, in mm: three components per voxel (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd).
+
+    Parameters
+    ----------
+    frame : {"LPS", "RAS"}, optional
+        Frame of the components. Where the file, or the JSON file of the same stem beside it (key "frame"), gives the
+        frame too, both must agree. MetaImage is LPS, NRRD is LPS where its space is; NIfTI files differ by the
+        program that wrote them, so that it must be given.
+
+    Returns
+    -------
+    SampledDisplacement
+        On the grid of the image; voxels that are NaN are undefined.
+
+    Raises
+    ------
+    InputError
+        If there is no such file.
+    ImageFileError
+        If the file is damaged, not a 3D image of three components, in another unit than mm, or holds infinite
+        values, or if its geometry or frame is missing or contradictory.
+    """
+    place = Path(path)
+    if not place.is_file():
+        raise InputError(f"{place}: no such displacement image. Check the path.")
+    declared = {frame, _frame_beside(place)}
+    try:
+        stored = read_header(place, vectors=True)
+        if stored.unit != "mm":
+            raise ImageFileError(f"{place}: lengths in {stored.unit}; a displacement in mm is needed.")
+        declared |= {_frame_of_header(place)}
+        values = stored.load()
+    except OSError as failure:
+        raise ImageFileError(f"{place}: not readable as a displacement image ({failure}).") from failure
+    frames = sorted(f for f in declared if f is not None)
+    if len(frames) != 1 or frames[0] not in ("LPS", "RAS"):
+        raise ImageFileError(
+            f"{place}: the components' frame must be LPS or RAS, and told alike wherever it is told; "
+            f"found {frames or 'none'}. Pass frame=, or set 'frame' in the JSON file beside it."
+        )
+    _refuse_infinite(place, values)
+    signs = np.array([1.0, 1.0, 1.0] if frames[0] == "LPS" else [-1.0, -1.0, 1.0])
+    try:
+        return SampledDisplacement(stored.grid, values * signs)
+    except InputError as wrong:
+        raise ImageFileError(f"{place}: {wrong}") from wrong
+
+
 def rigid_from_elastix(parameters: Parameters) -> RigidMotion:
     """Read an elastix EulerTransform from its parameter map alone (an initial transform is left out).
 
     ``x = R (X - c) + c + t``, with ``R = Rz Rx Ry``, or ``Rz Ry Rx`` where ComputeZYX is "true".
-
-    Raises
-    ------
-    ParameterError
-        If it is another kind of transform, or parameters are missing.
     """
     _require(parameters, ("EulerTransform",))
     a, b, c, *shift = _numbers(parameters, "TransformParameters", 6)
@@ -148,12 +195,9 @@ def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
         raise ParameterError(f"{path}: its initial transforms lead back to itself.")
     try:
         parameters = parse_parameters(path.read_text())
+        last = _last_of_chain(path, parameters)
     except (OSError, UnicodeDecodeError) as failure:
         raise InputError(f"{path}: not readable as an elastix transform file ({failure}).") from failure
-    except ParameterError as wrong:
-        raise ParameterError(f"{path}: {wrong}") from wrong
-    try:
-        last = _last_of_chain(path, parameters)
     except ParameterError as wrong:
         raise ParameterError(f"{path}: {wrong}") from wrong
     name = _word(parameters, "InitialTransformParameterFileName", "") or _word(
@@ -173,13 +217,10 @@ def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
         return Composed([*_flat(first), last])
     if how != "Add":
         raise ParameterError(f"{path}: HowToCombineTransforms is '{how}'; it is Compose or Add.")
-    if isinstance(first, BSpline) and isinstance(last, BSpline) and _same(first.control, last.control):
-        return last.plus(first)
+    splines = [part for part in (first, last) if isinstance(part, BSpline)]
+    if len(splines) == 2 and splines[0].control.same_as(splines[1].control, tolerance_voxels=_SAME_CONTROL):
+        return splines[1].plus(splines[0])
     return Added((first, last))
-
-
-def _same(control: Grid, other: Grid) -> bool:
-    return control.same_as(other, tolerance_voxels=_SAME_CONTROL)
 
 
 def _last_of_chain(path: Path, parameters: Parameters) -> Deformation:
@@ -271,3 +312,40 @@ def _from_sitk(transform: Any) -> Deformation:
     if isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform):
         return RigidMotion.about(np.array(transform.GetCenter()), matrix, np.array(shift))
     return _about(np.array(transform.GetCenter()), matrix, np.array(shift))
+
+
+def _frame_beside(path: Path) -> str | None:
+    stem = path.name.removesuffix(".gz").rsplit(".", maxsplit=1)[0]
+    beside = path.with_name(stem + ".json")
+    if not beside.is_file():
+        return None
+    try:
+        header = json.loads(beside.read_text(encoding="utf-8"))
+        frame, unit = header.get("frame"), header.get("unit", "mm")
+    except (OSError, ValueError, AttributeError) as failure:
+        raise ImageFileError(f"{beside}: not readable as a JSON object ({failure}).") from failure
+    if unit != "mm" or header.get("configuration", "reference") != "reference":
+        raise ImageFileError(f"{beside}: a displacement in mm on the reference configuration is needed; got {header}.")
+    return None if frame is None else str(frame)
+
+
+def _frame_of_header(place: Path) -> str | None:
+    """Frame of the components, where the format fixes it."""
+    name = place.name.lower()
+    if name.endswith((".mha", ".mhd")):
+        return "LPS"
+    if not name.endswith((".nrrd", ".nhdr")):
+        return None
+    fields = nrrd_fields(place)[0]
+    in_lps = fields.get("space", "").lower() in ("left-posterior-superior", "lps")
+    return "LPS" if in_lps and "measurement frame" not in fields else None
+
+
+def _refuse_infinite(place: Path, values: Voxels) -> None:
+    infinite = np.isinf(values).any(axis=-1)
+    if infinite.any():
+        first = tuple(int(n) for n in np.argwhere(infinite)[0])
+        raise ImageFileError(
+            f"{place}: the displacement of {int(infinite.sum())} of {infinite.size} voxels is infinite, the first at "
+            f"index {first}. Where it is not known, it is NaN: repair the file, or make it again."
+        )

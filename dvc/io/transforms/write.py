@@ -18,10 +18,9 @@ from dvc.deformation.protocol import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.images.itk_image import to_sitk
+from dvc.io import StrPath
 from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE, write_bordered_spline
 from dvc.io.transforms.elastix_text import Value, format_parameters
-
-StrPath = str | os.PathLike[str]
 
 ELASTIX_FILES = ("TransformParameters.0.txt", "TransformParameters.1.txt")
 """Names of the files of a chain: a B-spline, and the rigid motion that follows."""
@@ -71,25 +70,15 @@ def _bspline_parameters(bspline: BSpline) -> dict[str, Sequence[Value]]:
 
 def _image_parameters(grid: Grid) -> dict[str, Sequence[Value]]:
     return {
-        "HowToCombineTransforms": ["Compose"],
-        "FixedImageDimension": [3],
-        "MovingImageDimension": [3],
-        "FixedInternalImagePixelType": ["float"],
-        "MovingInternalImagePixelType": ["float"],
-        "Size": list(grid.shape),
-        "Index": [0, 0, 0],
-        "Spacing": grid.spacing_mm.tolist(),
-        "Origin": grid.origin_mm.tolist(),
-        "Direction": grid.direction.T.ravel().tolist(),
-        "UseDirectionCosines": [True],
-        "ResampleInterpolator": ["FinalBSplineInterpolator"],
-        "FinalBSplineInterpolationOrder": [3],
-        "Resampler": ["DefaultResampler"],
-        "DefaultPixelValue": [0],
-        "ResultImageFormat": ["nii.gz"],
-        "ResultImagePixelType": ["float"],
-        "CompressResultImage": [True],
-    }
+        "HowToCombineTransforms": ["Compose"], "FixedImageDimension": [3], "MovingImageDimension": [3],
+        "FixedInternalImagePixelType": ["float"], "MovingInternalImagePixelType": ["float"],
+        "Size": list(grid.shape), "Index": [0, 0, 0],
+        "Spacing": grid.spacing_mm.tolist(), "Origin": grid.origin_mm.tolist(),
+        "Direction": grid.direction.T.ravel().tolist(), "UseDirectionCosines": [True],
+        "ResampleInterpolator": ["FinalBSplineInterpolator"], "FinalBSplineInterpolationOrder": [3],
+        "Resampler": ["DefaultResampler"], "DefaultPixelValue": [0],
+        "ResultImageFormat": ["nii.gz"], "ResultImagePixelType": ["float"], "CompressResultImage": [True],
+    }  # fmt: skip
 
 
 def _euler_angles(rotation: FloatArray) -> list[float]:
