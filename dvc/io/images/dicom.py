@@ -18,18 +18,7 @@ import numpy as np
 from dvc.arrays import Float32Array
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid
-from dvc.io.images.dicom_frames import (
-    CONVERT,
-    STACK,
-    TIME_POINT,
-    Frame,
-    Labels,
-    classic_frame,
-    damage_named,
-    enhanced_frames,
-    is_enhanced,
-    read_image_header,
-)
+from dvc.io.images.dicom_frames import CONVERT, STACK, TIME_POINT, Frame, Labels, read_frames
 from dvc.io.images.dicom_pixels import read_values
 from dvc.io.images.stored import MAX_BYTES, refuse_if_too_large
 
@@ -52,7 +41,7 @@ def is_dicom(path: Path) -> bool:
 def is_multiframe(path: Path) -> bool:
     """Whether a file is a DICOM image of several frames."""
     with suppress(ImageFileError):  # none that could be used
-        frames, _ = _read(path) if is_dicom(path) else ([], None)
+        frames, _ = read_frames(path) if is_dicom(path) else ([], None)
         return len(frames) > 1
     return False
 
@@ -75,7 +64,7 @@ def read_dicom(place: Path, *, series: str | None = None, max_bytes: int = MAX_B
 
 def _frames_in(folder: Path) -> list[Frame]:
     paths = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
-    contents = [_read(path) for path in paths if is_dicom(path)]
+    contents = [read_frames(path) for path in paths if is_dicom(path)]
     for (_, total), held in Counter(part for _, part in contents if part).items():
         if held != total:
             raise ImageFileError(
@@ -90,7 +79,7 @@ def _frames_in(folder: Path) -> list[Frame]:
 
 
 def _frames_of_one(path: Path) -> list[Frame]:
-    frames, part = _read(path)
+    frames, part = read_frames(path)
     if not frames:
         raise ImageFileError(f"{path}: a DICOM file without an image, such as a report. Give the image.")
     if len(frames) == 1 or (part and part[1] > 1):
@@ -98,23 +87,8 @@ def _frames_of_one(path: Path) -> list[Frame]:
     return frames
 
 
-def _read(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
-    """Frames of a file, none if it holds no image; UID and number of files of the image that it is a part of."""
-    with damage_named(path):
-        header = read_image_header(path)
-        if header is None:
-            return [], None
-        frames = enhanced_frames(path, header) if is_enhanced(header) else [classic_frame(path, header)]
-        uid, total = header.get("ConcatenationUID"), header.get("InConcatenationTotalNumber")
-        return frames, (str(uid), int(total)) if uid and total else None
-
-
 def _assembled(place: Path, stack: list[Frame]) -> tuple[Grid, list[Frame]]:
-    """Grid of a stack of parallel slices [1]_, and the slices in its order.
-
-    .. [1] DICOM PS3.3, Image Plane Module (C.7.6.2):
-    https://dicom.nema.org/medical/dicom/current/output/html/part03.html
-    """
+    """Grid of a stack of parallel slices (DICOM PS3.3, C.7.6.2), and the slices in its order."""
     x = stack[0].axes[0] / np.linalg.norm(stack[0].axes[0])
     normal = np.cross(x, stack[0].axes[1])
     normal /= np.linalg.norm(normal)
@@ -251,25 +225,21 @@ def _named_stacks(stacks: Sequence[_Stack]) -> dict[str, _Stack]:
 
 def _pick_stack(place: Path, stacks: dict[str, _Stack], series: str | None) -> _Stack:
     """Return the only stack, or the one whose name or series UID ends as `series` does; otherwise list them all."""
-    wanted, _, number = (series or "").strip().rpartition("/") if "/" in (series or "") else (series or "", "", "")
-    matching = [
-        stack
-        for name, stack in stacks.items()
-        if stack.series.endswith(wanted) and (not number or name.endswith(f"/{number}"))
-    ]
+    wanted, _, number = (series or "").strip().partition("/")
+    ending = f"/{number}" if number else ""
+    matching = [s for name, s in stacks.items() if s.series.endswith(wanted) and name.endswith(ending)]
     if len(matching) == 1:
         return matching[0]
     lines = [f"  {name}: {stack.describe()}" for name, stack in stacks.items()]
     if len(lines) > _LISTED:
         lines[_LISTED:] = [f"  and {len(lines) - _LISTED} more, named in the same way"]
-    what = "folder" if place.is_dir() else "file"
+    what, move = "file", "Write one"
+    if place.is_dir():
+        what, move = "folder", "Move the files of one into a folder of its own, or write it"
+    problem = f"series='{series}' fits {len(matching)} of the DICOM series in this {what}"
     if series is None:
-        uids = {stack.series for stack in stacks.values()}
-        held = f"{len(uids)} DICOM series" if len(uids) > 1 else _SEVERAL
-        problem = f"the {what} holds {held}; one is needed"
-    else:
-        problem = f"series='{series}' fits {len(matching)} of the DICOM series in this {what}"
-    move = "Move the files of one into a folder of its own, or write it" if place.is_dir() else "Write one"
+        count = len({stack.series for stack in stacks.values()})
+        problem = f"the {what} holds {f'{count} DICOM series' if count > 1 else _SEVERAL}; one is needed"
     raise InputError(
         f"{place}: {problem}. {move} to a file: in Python, "
         f'dvc.write_image("one.nii.gz", dvc.read_image("{place}", series=NAME)) with a NAME out of this list:\n'

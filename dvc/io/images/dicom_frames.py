@@ -110,37 +110,43 @@ def damage_named(path: Path, problem: str = "not a readable DICOM file", remedy:
         logger.disabled = before
 
 
-def read_image_header(path: Path) -> Any | None:
-    """The needed part of the header of a grey-value DICOM image; None for other DICOM objects, such as reports."""
-    header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
-    stored_as = class_of(header)
-    if "Rows" not in header:
-        # Every object of a series names it; a file that does not, was cut before.
-        whole = bool(stored_as) and "SeriesInstanceUID" in header
-        if stored_as == pydicom.uid.MediaStorageDirectoryStorage or (whole and "Image Storage" not in stored_as.name):
-            return None
-    if "PerFrameFunctionalGroupsSequence" not in header and "Enhanced" not in stored_as.name:
-        kinds = [str(k) for k in several(header.get("ImageType"))]
-        if "MOSAIC" in kinds or int(header.get("NumberOfFrames") or 1) > 1:
+def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
+    """Frames of a file, none if it is no image but a report or the like; and the image that it is a part of, if any.
+
+    That image is given by its UID and the number of its files.
+    """
+    with damage_named(path):
+        header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
+        stored = pydicom.uid.UID(
+            str(header.get("SOPClassUID") or header.file_meta.get("MediaStorageSOPClassUID") or "")
+        )
+        if "Rows" not in header:
+            # Every object of a series names it; a file that does not, was cut before.
+            whole = bool(stored) and "SeriesInstanceUID" in header
+            if stored == pydicom.uid.MediaStorageDirectoryStorage or (whole and "Image Storage" not in stored.name):
+                return [], None
+        enhanced = "PerFrameFunctionalGroupsSequence" in header or "Enhanced" in stored.name
+        kinds = [str(k) for k in _several(header.get("ImageType"))]
+        if not enhanced and ("MOSAIC" in kinds or int(header.get("NumberOfFrames") or 1) > 1):
             raise ImageFileError(
                 f"{path}: a mosaic, or a multi-frame DICOM file that does not say where its frames lie; it is not "
                 f"read. {CONVERT}"
             )
-        refuse_missing(path, [name for name in (*_NEEDED, *_PLACE) if header.get(name) is None])
-    refuse_missing(path, [name for name in _NEEDED if header.get(name) is None])
-    colour = str(header.get("PhotometricInterpretation", ""))
-    if not colour.startswith("MONOCHROME") or int(header.get("SamplesPerPixel", 1)) != 1:
-        raise ImageFileError(f"{path}: a DICOM image in colour; grey values (MONOCHROME) are needed.")
-    return header
+        needed = _NEEDED if enhanced else (*_NEEDED, *_PLACE)
+        _refuse_missing(path, [name for name in needed if header.get(name) is None])
+        colour = str(header.get("PhotometricInterpretation", ""))
+        if not colour.startswith("MONOCHROME") or int(header.get("SamplesPerPixel", 1)) != 1:
+            raise ImageFileError(f"{path}: a DICOM image in colour; grey values (MONOCHROME) are needed.")
+        if enhanced and stored.keyword not in _ENHANCED:
+            raise ImageFileError(
+                f"{path}: a multi-frame DICOM file of a kind that is not read; enhanced MR and CT images are. {CONVERT}"
+            )
+        uid, total = header.get("ConcatenationUID"), header.get("InConcatenationTotalNumber")
+        frames = _enhanced_frames(path, header) if enhanced else [_classic_frame(path, header)]
+        return frames, (str(uid), int(total)) if uid and total else None
 
 
-def class_of(header: Any) -> pydicom.uid.UID:
-    """The kind of DICOM object that a header belongs to."""
-    return pydicom.uid.UID(str(header.get("SOPClassUID") or header.file_meta.get("MediaStorageSOPClassUID") or ""))
-
-
-def refuse_missing(path: Path, missing: Sequence[str], where: str = "") -> None:
-    """Raise an error that names what an image lacks, if it lacks anything."""
+def _refuse_missing(path: Path, missing: Sequence[str], where: str = "") -> None:
     if missing:
         raise ImageFileError(
             f"{path}: a DICOM image without {', '.join(missing)}{where}: damaged, or not a slice with a place in "
@@ -148,14 +154,14 @@ def refuse_missing(path: Path, missing: Sequence[str], where: str = "") -> None:
         )
 
 
-def several(value: Any) -> list[Any]:
-    """Return the values of an element that may hold none, one or several."""
+def _several(value: Any) -> list[Any]:
+    """The values of an element that may hold none, one or several."""
     if value is None:
         return []
     return [value] if isinstance(value, str | int | float) else list(value)
 
 
-def build_frame(
+def _build_frame(
     path: Path,
     header: Any,
     number: int | None,
@@ -189,37 +195,26 @@ def build_frame(
             "positive. The header is damaged."
         )
     echo_ms = None if echo_time is None else round(float(echo_time), 2)
-    echo = tuple(str(int(e)) for e in several(echoes))
+    echo = tuple(str(int(e)) for e in _several(echoes))
     spacing = round(column_spacing, 4), round(row_spacing, 4)
     kind = Kind(str(header.SeriesInstanceUID), echo_ms, echo, image_type, columns, rows, *spacing)
     return Frame(path, number, position, axes, (column_spacing, row_spacing), kind, slope, intercept, labels)
 
 
-def classic_frame(path: Path, header: Any) -> Frame:
-    """Return the frame of a file that holds one slice."""
+def _classic_frame(path: Path, header: Any) -> Frame:
     place = {name: header.get(name) for name in _PLACE}
     scaling = header.get("RescaleSlope"), header.get("RescaleIntercept")
-    image_type = "/".join(str(k) for k in several(header.get("ImageType"))[2:])
-    return build_frame(
-        path, header, None, place, scaling, (header.get("EchoTime"), header.get("EchoNumbers"), image_type)
-    )
+    image_type = "/".join(str(k) for k in _several(header.get("ImageType"))[2:])
+    shows = header.get("EchoTime"), header.get("EchoNumbers"), image_type
+    return _build_frame(path, header, None, place, scaling, shows)
 
 
-def is_enhanced(header: Any) -> bool:
-    """Whether a header describes its frames in functional groups, or should."""
-    return "PerFrameFunctionalGroupsSequence" in header or "Enhanced" in class_of(header).name
-
-
-def enhanced_frames(path: Path, header: Any) -> list[Frame]:
+def _enhanced_frames(path: Path, header: Any) -> list[Frame]:
     """Frames of an enhanced MR or CT image, in the order of the file.
 
     Refused if a frame is not described, or lacks its position, orientation, spacing or, where others have it, its
     scaling.
     """
-    if class_of(header).keyword not in _ENHANCED:
-        raise ImageFileError(
-            f"{path}: a multi-frame DICOM file of a kind that is not read; enhanced MR and CT images are. {CONVERT}"
-        )
     own = list(header.get("PerFrameFunctionalGroupsSequence") or [])
     count = int(header.get("NumberOfFrames") or 0)
     if count < 1 or len(own) != count:
@@ -228,20 +223,15 @@ def enhanced_frames(path: Path, header: Any) -> list[Frame]:
             "short, or stripped by an anonymizer. Export it again."
         )
     shared = (list(header.get("SharedFunctionalGroupsSequence") or []) or [{}])[0]
-    dimensions = [
-        keyword_for_tag(d.get("DimensionIndexPointer") or 0) for d in header.get("DimensionIndexSequence") or []
-    ]
+    indices = header.get("DimensionIndexSequence") or []
+    dimensions = [keyword_for_tag(index.get("DimensionIndexPointer") or 0) for index in indices]
     scaled = any(_group(_SCALING, groups, shared) is not None for groups in own)
     return [_frame(path, header, number, (groups, shared), dimensions, scaled) for number, groups in enumerate(own, 1)]
 
 
 def _group(name: str, *groups: Any) -> Any | None:
     """Return the first item of a functional group: the frame's own, else the shared one."""
-    for holder in groups:
-        items = holder.get(name)
-        if items:
-            return items[0]
-    return None
+    return next((items[0] for holder in groups if (items := holder.get(name))), None)
 
 
 def _frame(path: Path, header: Any, number: int, groups: tuple[Any, Any], dimensions: list[str], scaled: bool) -> Frame:
@@ -251,22 +241,21 @@ def _frame(path: Path, header: Any, number: int, groups: tuple[Any, Any], dimens
     missing = [name for name, value in place.items() if value is None]
     if scaled:
         missing += [name for name, v in (("RescaleSlope", slope), ("RescaleIntercept", intercept)) if v is None]
-    refuse_missing(path, missing, f" in the functional groups of frame {number}")
+    _refuse_missing(path, missing, f" in the functional groups of frame {number}")
     labels = _labels(_group("FrameContentSequence", *groups), dimensions)
-    return build_frame(path, header, number, place, (slope, intercept), _shown(header, groups), labels)
+    return _build_frame(path, header, number, place, (slope, intercept), _shown(header, groups), labels)
 
 
 def _shown(header: Any, groups: tuple[Any, Any]) -> tuple[Any, Any, str]:
     """Echo time (ms), numbers of echoes and image type of a frame."""
     converted = [_group(name, *groups) or {} for name in _CONVERTED]
-    echo_time = (_group("MREchoSequence", *groups) or {}).get("EffectiveEchoTime")
-    if echo_time is None:
-        echo_time = next((c.get("EchoTime") for c in converted if c.get("EchoTime") is not None), None)
-    echoes = next((c.get("EchoNumbers") for c in converted if c.get("EchoNumbers") is not None), None)
+    echo_times = [(_group("MREchoSequence", *groups) or {}).get("EffectiveEchoTime")]
+    echo_time = next((t for t in echo_times + [c.get("EchoTime") for c in converted] if t is not None), None)
+    echoes = next((e for e in [c.get("EchoNumbers") for c in converted] if e is not None), None)
     frame_type: Any = next((t for name in _FRAME_TYPES if (t := _group(name, *groups)) is not None), {})
-    image_type = several(frame_type.get("FrameType")) or several(header.get("ImageType"))
+    image_type = _several(frame_type.get("FrameType")) or _several(header.get("ImageType"))
     component = frame_type.get("ComplexImageComponent") or header.get("ComplexImageComponent")
-    return echo_time, echoes, "/".join(str(k) for k in (*image_type[2:], *several(component)))
+    return echo_time, echoes, "/".join(str(k) for k in (*image_type[2:], *_several(component)))
 
 
 def _labels(content: Any | None, dimensions: list[str]) -> Labels:
@@ -277,7 +266,7 @@ def _labels(content: Any | None, dimensions: list[str]) -> Labels:
         labels.append((STACK, str(content.StackID)))
     if content.get("TemporalPositionIndex"):
         labels.append((TIME_POINT, int(content.TemporalPositionIndex)))
-    for k, index in enumerate(several(content.get("DimensionIndexValues"))):
+    for k, index in enumerate(_several(content.get("DimensionIndexValues"))):
         # Some scanners list the dimensions in another order than the indices: the name is a hint, no more.
         name = dimensions[k] if k < len(dimensions) else ""
         labels.append((f"dimension {k + 1}" + (f" ({name})" if name else ""), int(index)))

@@ -86,16 +86,10 @@ def read_meta_header(
     unit = unit_of_length(path, {fields.get("distanceunits", "mm").lower()})
     scale = MM_PER_UNIT[unit]
     columns = matrix.reshape(3, 3).T * spacing  # a row of the matrix is the direction of one image axis
-    return StoredVolume(
-        path=data,
-        grid=grid_of_axes(path, sizes, columns * scale, origin * scale),
-        dtype=np.dtype((">" if big else "<") + _TYPES[kind]),
-        layout=layout,
-        unit=unit,
-        file_start=start,
-        components=0 if vectors else None,
-        compressed=_truth(path, fields, "compresseddata", False),
-    )
+    grid = grid_of_axes(path, sizes, columns * scale, origin * scale)
+    dtype = np.dtype((">" if big else "<") + _TYPES[kind])
+    packed = _truth(path, fields, "compresseddata", False)
+    return StoredVolume(data, grid, dtype, layout, unit, start, packed, components=0 if vectors else None)
 
 
 def _needed(path: Path, fields: Mapping[str, str], names: tuple[str, ...], count: int) -> FloatArray:

@@ -98,17 +98,10 @@ def read_nrrd_header(
         raise ImageFileError(f"{path}: the NRRD header does not give the byte order (endian); save it again.")
     if order not in ("little", "big"):
         raise ImageFileError(f"{path}: the byte order (endian) is '{order}', neither little nor big: damaged.")
-    return StoredVolume(
-        path=data,
-        grid=_nrrd_grid(path, fields, sizes, axes),
-        dtype=np.dtype((">" if order == "big" else "<") + _NRRD_TYPES[kind]),
-        layout=tuple(sizes),
-        unit=_nrrd_unit(path, fields),
-        file_start=start,
-        compressed=encoding != "raw",
-        select=select,
-        components=components,
-    )
+    grid, unit = _nrrd_grid(path, fields, sizes, axes), _nrrd_unit(path, fields)
+    dtype = np.dtype((">" if order == "big" else "<") + _NRRD_TYPES[kind])
+    packed = encoding != "raw"
+    return StoredVolume(data, grid, dtype, tuple(sizes), unit, start, packed, select=select, components=components)
 
 
 def _nrrd_axes(path: Path, fields: Mapping[str, str], sizes: list[int]) -> tuple[list[int], int | None]:
