@@ -117,9 +117,8 @@ def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
     """
     with damage_named(path):
         header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
-        stored = pydicom.uid.UID(
-            str(header.get("SOPClassUID") or header.file_meta.get("MediaStorageSOPClassUID") or "")
-        )
+        kind = header.get("SOPClassUID") or header.file_meta.get("MediaStorageSOPClassUID") or ""
+        stored = pydicom.uid.UID(str(kind))
         if "Rows" not in header:
             # Every object of a series names it; a file that does not, was cut before.
             whole = bool(stored) and "SeriesInstanceUID" in header

@@ -160,7 +160,8 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     >>> int(fitted.inside.sum()), coarse.volume_mm3
     (64, 64.0)
     """
-    own, values = mask_or_labels.grid, _values(mask_or_labels)
+    own = mask_or_labels.grid
+    values: npt.NDArray[Any] = mask_or_labels.inside if isinstance(mask_or_labels, Mask) else mask_or_labels.labels
     if own.same_as(grid):
         return _with_values(mask_or_labels, grid, values)
     inside, total = _count_inside(own, values, grid)
@@ -192,10 +193,6 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
         if lost:
             _log.warning("%s: regions lost by it: %s", what, [mask_or_labels.names[v] for v in lost])
     return _with_values(mask_or_labels, grid, fitted)
-
-
-def _values(source: Mask | LabelMap) -> npt.NDArray[Any]:
-    return source.inside if isinstance(source, Mask) else source.labels
 
 
 def _with_values(source: _OnGrid, grid: Grid, values: npt.NDArray[Any]) -> _OnGrid:

@@ -15,7 +15,7 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.errors import ImageFileError
-from dvc.io.images.stored import MAX_BYTES, StoredVolume, pick_volume, refuse_if_too_large
+from dvc.io.images.stored import StoredVolume, pick_volume, refuse_if_too_large
 from dvc.io.images.text_header import (
     MM_PER_UNIT,
     detached_file,
@@ -52,9 +52,7 @@ def meta_fields(path: Path) -> tuple[dict[str, str], int]:
     return {name.strip().lower(): value.strip() for name, value in pairs}, last.end()
 
 
-def read_meta_header(
-    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
-) -> StoredVolume:
+def read_meta_header(path: Path, volume: int | None, max_bytes: int, vectors: bool) -> StoredVolume:
     """What a MetaImage file (.mha, .mhd) holds: scalars, or with `vectors` three components per voxel."""
     fields, end = meta_fields(path)
     sizes = whole_numbers(path, fields, "dimsize")

@@ -16,8 +16,7 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.errors import ImageFileError
-from dvc.images.image import Grid
-from dvc.io.images.stored import MAX_BYTES, StoredVolume, pick_volume, refuse_if_too_large
+from dvc.io.images.stored import StoredVolume, pick_volume, refuse_if_too_large
 from dvc.io.images.text_header import (
     HEADER_LIMIT,
     MM_PER_UNIT,
@@ -71,9 +70,7 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     return fields, pairs, end.end() if end else len(start)
 
 
-def read_nrrd_header(
-    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
-) -> StoredVolume:
+def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bool) -> StoredVolume:
     """What an NRRD file (.nrrd, .nhdr, .seg.nrrd) holds: scalars, or with `vectors` three components per voxel."""
     fields, _, end = nrrd_fields(path)
     sizes = whole_numbers(path, fields, "sizes")
@@ -98,7 +95,11 @@ def read_nrrd_header(
         raise ImageFileError(f"{path}: the NRRD header does not give the byte order (endian); save it again.")
     if order not in ("little", "big"):
         raise ImageFileError(f"{path}: the byte order (endian) is '{order}', neither little nor big: damaged.")
-    grid, unit = _nrrd_grid(path, fields, sizes, axes), _nrrd_unit(path, fields)
+    unit = _nrrd_unit(path, fields)
+    to_lps_mm = np.array(_TO_LPS[fields["space"].lower()]) * MM_PER_UNIT[unit]
+    columns = np.stack([v for v in _vectors(path, fields) if v is not None], axis=1) * to_lps_mm[:, None]
+    origin = _vector(path, fields.get("space origin", ""), "space origin") * to_lps_mm
+    grid = grid_of_axes(path, [sizes[a] for a in axes], columns, origin)
     dtype = np.dtype((">" if order == "big" else "<") + _NRRD_TYPES[kind])
     packed = encoding != "raw"
     return StoredVolume(data, grid, dtype, tuple(sizes), unit, start, packed, select=select, components=components)
@@ -173,14 +174,6 @@ def _vector(path: Path, written: str, field: str) -> FloatArray:
         with suppress(ValueError):
             return np.array([float(part) for part in match.groups()])
     raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
-
-
-def _nrrd_grid(path: Path, fields: Mapping[str, str], sizes: list[int], axes: list[int]) -> Grid:
-    signs = np.array(_TO_LPS[fields["space"].lower()], dtype=np.float64)
-    columns = np.stack([v for v in _vectors(path, fields) if v is not None], axis=1)
-    origin = _vector(path, fields.get("space origin", ""), "space origin")
-    scale = MM_PER_UNIT[_nrrd_unit(path, fields)]
-    return grid_of_axes(path, [sizes[a] for a in axes], columns * signs[:, None] * scale, origin * signs * scale)
 
 
 def _nrrd_unit(path: Path, fields: Mapping[str, str]) -> str:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import Float32Array
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image
 from dvc.io import StrPath
@@ -74,7 +73,21 @@ def read_image(
         )
     with np.errstate(over="ignore"):  # beyond single precision: infinite, and refused below
         values = np.ascontiguousarray(voxels, dtype=np.float32)
-    return Image(grid, _checked_values(Path(path), values, allow_missing))
+    finite = np.isfinite(values)
+    missing = values.size - int(np.count_nonzero(finite))
+    if missing == values.size:
+        raise ImageFileError(f"{path}: no voxel has a finite value.")
+    if missing:
+        first = tuple(map(int, np.unravel_index(int(np.argmin(finite)), values.shape)))
+        problem = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
+        if not allow_missing:
+            raise InputError(f"{path}: {problem}. Repair the image, or have those voxels left out (allow_missing).")
+        _log.warning("%s: %s; taken as missing", path, problem)
+        values = np.where(finite, values, np.float32(np.nan))
+    low = np.nanmin(values)
+    if low == np.nanmax(values):
+        raise ImageFileError(f"{path}: a constant image (every voxel is {float(low):g}); there is nothing to follow.")
+    return Image(grid, values)
 
 
 def read_voxels(
@@ -120,21 +133,3 @@ def format_of(name: str) -> str:
 
 def _known_suffix(name: str) -> str | None:
     return next((s for s in sorted(_FORMATS, key=len, reverse=True) if name.lower().endswith(s)), None)
-
-
-def _checked_values(path: Path, values: Float32Array, allow_missing: bool) -> Float32Array:
-    finite = np.isfinite(values)
-    missing = values.size - int(np.count_nonzero(finite))
-    if missing == values.size:
-        raise ImageFileError(f"{path}: no voxel has a finite value.")
-    if missing:
-        first = tuple(map(int, np.unravel_index(int(np.argmin(finite)), values.shape)))
-        problem = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
-        if not allow_missing:
-            raise InputError(f"{path}: {problem}. Repair the image, or have those voxels left out (allow_missing).")
-        _log.warning("%s: %s; taken as missing", path, problem)
-        values = np.where(finite, values, np.float32(np.nan))
-    low = np.nanmin(values)
-    if low == np.nanmax(values):
-        raise ImageFileError(f"{path}: a constant image (every voxel is {float(low):g}); there is nothing to follow.")
-    return values

@@ -153,13 +153,13 @@ def refuse_if_too_large(path: Path, shape: tuple[int, ...], max_bytes: int) -> N
         )
 
 
-def pick_volume(path: Path, count: int, volume: int | None, what: str = "volumes") -> int:
+def pick_volume(path: Path, count: int, volume: int | None) -> int:
     """Which of `count` volumes to read: the one asked for, or the only one."""
     if volume is None:
         if count == 1:
             return 0
         raise ImageFileError(
-            f"{path}: the file holds {count} {what}; one is needed. Take it out into a file of its own: in Python, "
+            f"{path}: the file holds {count} volumes; one is needed. Take it out into a file of its own: in Python, "
             f'dvc.write_image("one.nii.gz", dvc.read_image("{path}", volume=N)) with N from 0 to {count - 1}.'
         )
     if not 0 <= volume < count:

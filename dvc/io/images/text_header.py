@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -28,14 +29,10 @@ def detached_file(path: Path, name: str) -> Path:
     """Find the file beside a header that holds its voxels."""
     if name.startswith("LIST") or "%" in name:
         raise ImageFileError(f"{path}: voxels spread over several files are not read; save it as one file.")
-    data = path.parent / name
-    try:
-        there = data.is_file()
-    except OSError:  # no name that a file can have
-        there = False
-    if not there:
-        raise ImageFileError(f"{path}: the file of its voxels, '{name}', is not there; keep the two together.")
-    return data
+    with suppress(OSError):  # no name that a file can have
+        if (path.parent / name).is_file():
+            return path.parent / name
+    raise ImageFileError(f"{path}: the file of its voxels, '{name}', is not there; keep the two together.")
 
 
 def numbers_in(path: Path, text: str, field: str, count: int | None = None) -> list[float]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import SimpleITK as sitk
+from scipy.spatial.transform import Rotation
 
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
@@ -21,7 +22,6 @@ from dvc.images.itk_image import from_sitk as image_from_sitk
 from dvc.io import StrPath
 from dvc.io.images.nrrd import nrrd_fields
 from dvc.io.images.read import read_header
-from dvc.io.images.stored import Voxels
 from dvc.io.transforms.bordered_spline import read_bordered_spline
 from dvc.io.transforms.elastix_text import Parameters, parse_parameters
 
@@ -118,7 +118,13 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
             f"{place}: the components' frame must be LPS or RAS, and told alike wherever it is told; "
             f"found {frames or 'none'}. Pass frame=, or set 'frame' in the JSON file beside it."
         )
-    _refuse_infinite(place, values)
+    infinite = np.isinf(values).any(axis=-1)
+    if infinite.any():
+        first = tuple(int(n) for n in np.argwhere(infinite)[0])
+        raise ImageFileError(
+            f"{place}: the displacement of {int(infinite.sum())} of {infinite.size} voxels is infinite, the first at "
+            f"index {first}. Where it is not known, it is NaN: repair the file, or make it again."
+        )
     signs = np.array([1.0, 1.0, 1.0] if frames[0] == "LPS" else [-1.0, -1.0, 1.0])
     try:
         return SampledDisplacement(stored.grid, values * signs)
@@ -133,11 +139,9 @@ def rigid_from_elastix(parameters: Parameters) -> RigidMotion:
     """
     _require(parameters, ("EulerTransform",))
     a, b, c, *shift = _numbers(parameters, "TransformParameters", 6)
-    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
-    rotation = z @ y @ x if _word(parameters, "ComputeZYX", "false") == "true" else z @ x @ y
-    return RigidMotion.about(_numbers(parameters, "CenterOfRotationPoint", 3), rotation, np.array(shift))
+    zyx = _word(parameters, "ComputeZYX", "false") == "true"
+    rotation = Rotation.from_euler("ZYX", [c, b, a]) if zyx else Rotation.from_euler("ZXY", [c, a, b])
+    return RigidMotion.about(_numbers(parameters, "CenterOfRotationPoint", 3), rotation.as_matrix(), np.array(shift))
 
 
 def bspline_from_elastix(parameters: Parameters) -> BSpline:
@@ -200,9 +204,8 @@ def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
         raise InputError(f"{path}: not readable as an elastix transform file ({failure}).") from failure
     except ParameterError as wrong:
         raise ParameterError(f"{path}: {wrong}") from wrong
-    name = _word(parameters, "InitialTransformParameterFileName", "") or _word(
-        parameters, "InitialTransformParametersFileName", _NO_INITIAL
-    )
+    older = _word(parameters, "InitialTransformParametersFileName", _NO_INITIAL)
+    name = _word(parameters, "InitialTransformParameterFileName", "") or older
     if name == _NO_INITIAL:
         return last
     initial = path.parent / name  # an absolute name stays what it is
@@ -339,13 +342,3 @@ def _frame_of_header(place: Path) -> str | None:
     fields = nrrd_fields(place)[0]
     in_lps = fields.get("space", "").lower() in ("left-posterior-superior", "lps")
     return "LPS" if in_lps and "measurement frame" not in fields else None
-
-
-def _refuse_infinite(place: Path, values: Voxels) -> None:
-    infinite = np.isinf(values).any(axis=-1)
-    if infinite.any():
-        first = tuple(int(n) for n in np.argwhere(infinite)[0])
-        raise ImageFileError(
-            f"{place}: the displacement of {int(infinite.sum())} of {infinite.size} voxels is infinite, the first at "
-            f"index {first}. Where it is not known, it is NaN: repair the file, or make it again."
-        )

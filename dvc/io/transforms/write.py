@@ -58,14 +58,11 @@ def _bspline_parameters(bspline: BSpline) -> dict[str, Sequence[Value]]:
         "NumberOfParameters": [bspline.coefficients_mm.size],
         "TransformParameters": np.concatenate([c.ravel(order="F") for c in bspline.coefficients_mm]).tolist(),
         "InitialTransformParameterFileName": [_NO_INITIAL],
-        "GridSize": list(control.shape),
-        "GridIndex": [0, 0, 0],
-        "GridSpacing": control.spacing_mm.tolist(),
-        "GridOrigin": control.origin_mm.tolist(),
+        "GridSize": list(control.shape), "GridIndex": [0, 0, 0],
+        "GridSpacing": control.spacing_mm.tolist(), "GridOrigin": control.origin_mm.tolist(),
         "GridDirection": control.direction.T.ravel().tolist(),
-        "BSplineTransformSplineOrder": [3],
-        "UseCyclicTransform": [False],
-    }
+        "BSplineTransformSplineOrder": [3], "UseCyclicTransform": [False],
+    }  # fmt: skip
 
 
 def _image_parameters(grid: Grid) -> dict[str, Sequence[Value]]:
