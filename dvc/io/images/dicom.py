@@ -138,7 +138,6 @@ class _Stack:
 
     @property
     def series(self) -> str:
-        """UID of the series."""
         return self.frames[0].kind.series
 
     def describe(self) -> str:
@@ -204,9 +203,7 @@ def _parted(stack: _Stack, name: str) -> list[_Stack]:
         apart = pairs.shape[1] > int(place_of[-1]) + 1
     if not apart:
         return [stack]
-    return [
-        _Stack(part, stack.labels if value is None else (*stack.labels, (name, value))) for value, part in parts.items()
-    ]
+    return [_Stack(part, stack.labels if v is None else (*stack.labels, (name, v))) for v, part in parts.items()]
 
 
 def _named_stacks(stacks: Sequence[_Stack]) -> dict[str, _Stack]:

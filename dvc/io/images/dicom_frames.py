@@ -111,10 +111,7 @@ def damage_named(path: Path, problem: str = "not a readable DICOM file", remedy:
 
 
 def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
-    """Frames of a file, none if it is no image but a report or the like; and the image that it is a part of, if any.
-
-    That image is given by its UID and the number of its files.
-    """
+    """Frames of a file, none if it is no image (a report); UID and number of files of the image that it belongs to."""
     with damage_named(path):
         header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
         kind = header.get("SOPClassUID") or header.file_meta.get("MediaStorageSOPClassUID") or ""
@@ -209,11 +206,7 @@ def _classic_frame(path: Path, header: Any) -> Frame:
 
 
 def _enhanced_frames(path: Path, header: Any) -> list[Frame]:
-    """Frames of an enhanced MR or CT image, in the order of the file.
-
-    Refused if a frame is not described, or lacks its position, orientation, spacing or, where others have it, its
-    scaling.
-    """
+    """Frames of an enhanced MR or CT image, in the order of the file; refused if one is not described."""
     own = list(header.get("PerFrameFunctionalGroupsSequence") or [])
     count = int(header.get("NumberOfFrames") or 0)
     if count < 1 or len(own) != count:
@@ -260,9 +253,7 @@ def _shown(header: Any, groups: tuple[Any, Any]) -> tuple[Any, Any, str]:
 def _labels(content: Any | None, dimensions: list[str]) -> Labels:
     if content is None:
         return ()
-    labels: list[tuple[str, str | int]] = []
-    if content.get("StackID"):
-        labels.append((STACK, str(content.StackID)))
+    labels: list[tuple[str, str | int]] = [(STACK, str(content.StackID))] if content.get("StackID") else []
     if content.get("TemporalPositionIndex"):
         labels.append((TIME_POINT, int(content.TemporalPositionIndex)))
     for k, index in enumerate(_several(content.get("DimensionIndexValues"))):

@@ -74,13 +74,10 @@ def read_meta_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     named = fields["elementdatafile"]
     data, start = (path, end) if named == "LOCAL" else (detached_file(path, named), 0)
     if np.dtype(_TYPES[kind]).itemsize > 1 and not set(_BYTE_ORDER) & set(fields):
-        raise ImageFileError(
-            f"{path}: the MetaImage header does not give the byte order ({_BYTE_ORDER[0]}); save it again."
-        )
+        raise ImageFileError(f"{path}: the header does not give the byte order ({_BYTE_ORDER[0]}); save it again.")
     big = any(_truth(path, fields, name, False) for name in _BYTE_ORDER)
-    matrix, origin, spacing = (
-        _needed(path, fields, names, count) for names, count in ((_MATRIX, 9), (_ORIGIN, 3), (_SPACING, 3))
-    )
+    matrix, spacing = _needed(path, fields, _MATRIX, 9), _needed(path, fields, _SPACING, 3)
+    origin = _needed(path, fields, _ORIGIN, 3)
     unit = unit_of_length(path, {fields.get("distanceunits", "mm").lower()})
     scale = MM_PER_UNIT[unit]
     columns = matrix.reshape(3, 3).T * spacing  # a row of the matrix is the direction of one image axis

@@ -25,7 +25,6 @@ LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 _AGREEMENT_VOXELS = 0.05
 _UNITS = {0: ("mm", 1.0), 1: ("metres", 1000.0), 2: ("mm", 1.0), 3: ("microns", 0.001)}
-_ORTHONORMAL = 1e-4
 _HALF_TURN = 1e-7
 _ROUNDING = 4e-7  # of b^2 + c^2 + d^2 in single precision, with a margin
 
@@ -49,7 +48,7 @@ def read_nifti_header(
     scaled = slope != 0.0 and np.isfinite(slope)
     return StoredVolume(
         path=path,
-        grid=grid_of_axes(path, shape, columns, lps[:3, 3] * mm_per_unit, _straightened),
+        grid=grid_of_axes(path, shape, columns, lps[:3, 3] * mm_per_unit, single_precision=True),
         dtype=dtype,
         layout=layout,
         unit=unit,
@@ -147,12 +146,6 @@ def _unit(path: Path, header: Any) -> tuple[str, float]:
     if code == 0:
         _log.warning("%s: the header gives no unit of length; taken as mm", path)
     return _UNITS[code]
-
-
-def _straightened(direction: FloatArray) -> FloatArray:
-    """The nearest orthonormal matrix, where the two differ by single precision only; else the matrix as given."""
-    left, stretch, right = np.linalg.svd(direction)
-    return np.asarray(left @ right) if np.abs(stretch - 1.0).max() < _ORTHONORMAL / 2 else direction
 
 
 def _ras_affine(path: Path, header: Any, shape: tuple[int, int, int]) -> FloatArray:

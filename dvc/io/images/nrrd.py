@@ -77,8 +77,7 @@ def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
     if whole_numbers(path, fields, "dimension") != [len(sizes)]:
         raise ImageFileError(f"{path}: {len(sizes)} sizes in {fields['dimension']} dimensions; the header is damaged.")
     axes, other = _nrrd_axes(path, fields, sizes)
-    select = None if vectors else _nrrd_volume(path, fields, sizes, other, volume)
-    components = _component_axis(path, fields, sizes, other) if vectors else None
+    select, components = _fourth_axis(path, fields, sizes, other, volume, vectors)
     refuse_if_too_large(path, tuple(sizes), max_bytes)
     encoding = fields.get("encoding", "").lower()
     if encoding not in ("raw", "gzip", "gz"):
@@ -119,39 +118,28 @@ def _nrrd_axes(path: Path, fields: Mapping[str, str], sizes: list[int]) -> tuple
     return axes, others[0] if others else None
 
 
-def _nrrd_volume(
-    path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None, volume: int | None
-) -> tuple[int, int] | None:
-    """Which index of a fourth axis to keep, if there is one."""
-    if other is None:
-        pick_volume(path, 1, volume)
-        return None
-    count = sizes[other]
+def _fourth_axis(
+    path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None, volume: int | None, vectors: bool
+) -> tuple[tuple[int, int] | None, int | None]:
+    """What is kept of a fourth axis: a volume (axis, index), or a vector's three components (axis)."""
+    kinds = fields.get("kinds", "").split()
+    kind = kinds[other].lower() if other is not None and len(kinds) == len(sizes) else ""
+    count = 1 if other is None else sizes[other]
+    if vectors:
+        if count != 3:
+            raise ImageFileError(f"{path}: {count} components per voxel; vectors of three are needed.")
+        if kind not in ("", "none", "???", "list") and not kind.endswith("vector"):
+            raise ImageFileError(f"{path}: the three values of a voxel are of kind {kind}; a vector is needed.")
+        return None, other
     if path.name.lower().endswith(".seg.nrrd") and count > 1:
         raise ImageFileError(
             f"{path}: a segmentation of {count} layers, in which segments overlap; a label map has one "
             "label per voxel. In Slicer, export the segments to a label map, or remove the overlap."
         )
-    kind = _kind(fields, sizes, other)
     if count > 1 and not any(word in kind for word in ("list", "domain", "time", "?", "none")) and kind:
         raise ImageFileError(f"{path}: each voxel holds {count} values (kind {kind}); a scalar image is needed.")
-    return other, pick_volume(path, count, volume)
-
-
-def _component_axis(path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None) -> int:
-    """Find the axis of a vector's three components."""
-    if other is None or sizes[other] != 3:
-        count = 1 if other is None else sizes[other]
-        raise ImageFileError(f"{path}: {count} components per voxel; vectors of three are needed.")
-    kind = _kind(fields, sizes, other)
-    if kind not in ("", "none", "???", "list") and not kind.endswith("vector"):
-        raise ImageFileError(f"{path}: the three values of a voxel are of kind {kind}; a vector is needed.")
-    return other
-
-
-def _kind(fields: Mapping[str, str], sizes: list[int], axis: int) -> str:
-    kinds = fields.get("kinds", "").split()
-    return kinds[axis].lower() if len(kinds) == len(sizes) else ""
+    index = pick_volume(path, count, volume)
+    return None if other is None else (other, index), None
 
 
 def _vectors(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:

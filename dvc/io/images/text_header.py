@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -17,6 +17,7 @@ HEADER_LIMIT = 1 << 20
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "µm": 0.001, "micron": 0.001}
 _LARGEST_SIZE = 2.0**63
+_ORTHONORMAL = 1e-4
 
 
 def header_start(path: Path) -> bytes:
@@ -63,18 +64,18 @@ def unit_of_length(path: Path, units: set[str]) -> str:
 
 
 def grid_of_axes(
-    path: Path,
-    shape: Sequence[int],
-    columns: FloatArray,
-    origin: FloatArray,
-    straightened: Callable[[FloatArray], FloatArray] = np.asarray,
+    path: Path, shape: Sequence[int], columns: FloatArray, origin: FloatArray, *, single_precision: bool = False
 ) -> Grid:
     """The grid with these steps along its axes, (3, 3) by columns, and origin, LPS mm."""
     with np.errstate(over="ignore"):
         spacing = np.linalg.norm(columns, axis=0)
     if not np.isfinite(spacing).all() or np.any(spacing <= 0):
         raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
+    direction = columns / spacing
+    if single_precision:
+        left, stretch, right = np.linalg.svd(direction)
+        direction = left @ right if np.abs(stretch - 1.0).max() < _ORTHONORMAL / 2 else direction
     try:
-        return Grid((shape[0], shape[1], shape[2]), spacing, origin, straightened(columns / spacing))
+        return Grid((shape[0], shape[1], shape[2]), spacing, origin, direction)
     except GeometryError as error:
         raise ImageFileError(f"{path}: {error}") from error

@@ -30,7 +30,6 @@ _SHAPES = {
 }  # fmt: skip
 _VARIANTS = set("HRIMTSPEW5")
 _READ = {"NODE", "ELEMENT", "ELSET", "NSET"}
-_SET_OF = {"ELSET": "element set", "NSET": "node set"}
 _ELSEWHERE = {"INCLUDE", "SYSTEM", "NGEN", "NCOPY", "NFILL", "ELGEN", "ELCOPY", "NMAP"}
 
 
@@ -193,9 +192,8 @@ class _Sets:
     def _members(self, name: str, seen: tuple[str, ...] = ()) -> list[int]:
         key = name.strip('"').casefold()
         if key in seen or key not in self._entries:
-            raise ImageFileError(
-                f"{self._path}: the {_SET_OF[self._kind]} {name!r} is not defined, or contains itself."
-            )
+            kind = {"ELSET": "element set", "NSET": "node set"}[self._kind]
+            raise ImageFileError(f"{self._path}: the {kind} {name!r} is not defined, or contains itself.")
         members: list[int] = []
         for entry in self._entries[key]:
             members += [int(entry)] if entry.isdigit() else self._members(entry, (*seen, key))

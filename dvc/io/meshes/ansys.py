@@ -64,9 +64,7 @@ def read_ansys(path: Path) -> RawMesh:
                 of_kind = components.setdefault(fields[2][:4].upper(), {})
                 of_kind[fields[1].upper()] = _members(lines, int(fields[3]))
     if not {"NBLOCK", "EBLOCK"} <= words:
-        raise ImageFileError(
-            f"{path} has no nodes or no elements in blocks. Write it in ANSYS with CDWRITE, DB, name, cdb."
-        )
+        raise ImageFileError(f"{path} has no nodes or no elements in blocks. Write it with CDWRITE, DB, name, cdb.")
     regions = {f"material {number}": materials[number] for number in sorted(materials)}
     return mesh.by_index(regions | components["ELEM"], components["NODE"])
 

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import io
-import logging
 import struct
-import warnings
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from meshio._common import num_nodes_per_cell
-from meshio._mesh import topological_dimension
 
 from dvc.arrays import IntArray
 from dvc.errors import ImageFileError
-
-_log = logging.getLogger("dvc.io.meshes.read")
-
-# meshio 5.3.5 reads and writes these cells, but has left them out of its own table of dimensions, and fails on them.
-topological_dimension.update({"wedge15": 3, "pyramid13": 3})
 
 _DAMAGE = (
     ValueError, IndexError, KeyError, TypeError, AttributeError, ArithmeticError, OSError, StopIteration,
@@ -126,28 +117,3 @@ def damage_named(place: str) -> Iterator[None]:
         raise
     except _DAMAGE as error:
         raise ImageFileError(f"{place} could not be read ({error}); the file is damaged.") from error
-
-
-def read_through_meshio(path: Path, read: Callable[[str], Any]) -> Any:
-    """Read a file by one of meshio's readers; refused if that fails, for whatever reason."""
-    with silenced() as said, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return read(str(path))
-        except Exception as error:
-            # meshio meets damaged files with whatever Python raises: KeyError, ValueError, IndexError ...
-            reason = " ".join(f"{type(error).__name__}: {error} {said.getvalue()}".split())
-            raise ImageFileError(
-                f"{path} cannot be read as a mesh ({reason}). It is damaged, or of a variant that is not "
-                "read; write it again as VTU."
-            ) from error
-
-
-@contextmanager
-def silenced() -> Iterator[io.StringIO]:
-    """Keep what meshio prints off the terminal, and log it."""
-    said = io.StringIO()
-    with redirect_stdout(said), redirect_stderr(said):
-        yield said
-    if said.getvalue().strip():
-        _log.info("meshio: %s", " ".join(said.getvalue().split()))

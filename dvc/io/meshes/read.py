@@ -17,9 +17,8 @@ from dvc.io.meshes.abaqus import read_abaqus
 from dvc.io.meshes.ansys import read_ansys
 from dvc.io.meshes.calculix import read_frd
 from dvc.io.meshes.febio import read_xplt
-from dvc.io.meshes.gmsh import read_gmsh
 from dvc.io.meshes.raw import RawMesh
-from dvc.io.meshes.vtk import read_vtk
+from dvc.io.meshes.through_meshio import read_gmsh, read_vtk
 from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points, outer_faces
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0}
@@ -164,9 +163,7 @@ def _checked(raw: RawMesh, unit: str, frame: str) -> MeshFile:
         )
     check_extent(points[np.unique(np.concatenate([block.nodes.ravel() for block in volumes]))])
     regions = {name: frozen(index, np.int64) for name, index in raw.regions.items() if len(index)}
-    tets = None
-    if all(block.shape == "tetra" for block in volumes):
-        tets = _tetrahedra(points, raw.node_ids, blocks, regions, raw.node_sets)
+    tets = _tetrahedra(raw, points, blocks, regions) if all(block.shape == "tetra" for block in volumes) else None
     return MeshFile(
         path=path,
         unit=unit,
@@ -180,13 +177,7 @@ def _checked(raw: RawMesh, unit: str, frame: str) -> MeshFile:
     )
 
 
-def _tetrahedra(
-    points: FloatArray,
-    node_ids: IntArray,
-    blocks: list[CellBlock],
-    regions: Mapping[str, IntArray],
-    node_sets: Mapping[str, IntArray],
-) -> TetMesh:
+def _tetrahedra(raw: RawMesh, points: FloatArray, blocks: list[CellBlock], regions: Mapping[str, IntArray]) -> TetMesh:
     shape = np.repeat([block.shape for block in blocks], [len(block.nodes) for block in blocks])
 
     def gathered(wanted: str) -> tuple[IntArray, IntArray]:
@@ -203,11 +194,11 @@ def _tetrahedra(
             tissues[name] = tet_row[solid]
         if len(flat):
             surfaces[name] = triangles[triangle_row[flat]]
-    outside = outer_faces(cells) if node_sets else np.empty((0, 3), dtype=np.int64)
-    for name, nodes in node_sets.items():
+    outside = outer_faces(cells) if raw.node_sets else np.empty((0, 3), dtype=np.int64)
+    for name, nodes in raw.node_sets.items():
         inside = np.zeros(len(points), dtype=bool)
         inside[nodes] = True
         faces = outside[inside[outside].all(axis=1)]
         if len(faces):
             surfaces.setdefault(name, faces)
-    return TetMesh(points, cells, tissues, surfaces, node_ids)
+    return TetMesh(points, cells, tissues, surfaces, raw.node_ids)

@@ -17,8 +17,8 @@ from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
 from dvc.io import StrPath
-from dvc.io.meshes.raw import silenced
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS, MeshFile
+from dvc.io.meshes.through_meshio import silenced
 from dvc.trust.verdict import LEVELS, Verdict
 
 VERDICT_FIELD = "verdict_0_trust_1_use_with_care_2_do_not_trust"
@@ -71,23 +71,18 @@ def write_nodal_displacements(path: StrPath, mesh: MeshFile, u_mm: FloatArray, v
     undefined = np.asarray(np.isnan(own_u).any(axis=1))
     columns = ["node", *(f"{axis}_{mesh.unit}" for axis in ("x", "y", "z", "ux", "uy", "uz"))]
     has_numbers = mesh.path.suffix.lower() not in {".vtu", ".vtk"}
-    declared: dict[str, object] = {
-        "mesh": mesh.path.name,
-        "frame": mesh.frame,
-        "unit": mesh.unit,
-        "columns": columns,
-        "node": "number in the mesh file" if has_numbers else "index in the mesh file, counted from 0",
-        "nodes": len(own_u),
-        "nodes_without_displacement": int(np.count_nonzero(undefined)),
-    }
+    node = "number in the mesh file" if has_numbers else "index in the mesh file, counted from 0"
+    missing_nodes = int(np.count_nonzero(undefined))
+    declared: dict[str, object] = {"mesh": mesh.path.name, "frame": mesh.frame, "unit": mesh.unit, "columns": columns}
+    declared |= {"node": node, "nodes": len(own_u), "nodes_without_displacement": missing_nodes}
     with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(columns)
-        for node, X, u_X, missing in zip(mesh.node_ids, _own_points(mesh), own_u, undefined, strict=True):
-            numbers = [f"{x:.10g}" for x in (X if missing else (*X, *u_X))]
-            rows.writerow([int(node), *numbers, *([""] * 3 if missing else [])])
+        for number, X, u_X, missing in zip(mesh.node_ids, _own_points(mesh), own_u, undefined, strict=True):
+            values = [f"{x:.10g}" for x in (X if missing else (*X, *u_X))]
+            rows.writerow([int(number), *values, *([""] * 3 if missing else [])])
     write_json(path.with_suffix(".json"), declared | ({} if verdict is None else {"verdict": verdict.as_dict()}))
-    return int(np.count_nonzero(undefined))
+    return missing_nodes
 
 
 def _add_verdict(vtu: Path, verdict: Verdict) -> None:

@@ -68,16 +68,12 @@ _latest: list[Interfaces] = []
 
 def _between(grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Interfaces:
     """The latest interfaces, if these are the same; otherwise computed anew."""
-    known = _latest[-1] if _latest else None
-    if (
-        known is None
-        or (known.rest, known.reach_mm) != (rest, reach_mm)
-        or not np.array_equal(_rows_of(known.grid), _rows_of(grid))
-        or not np.array_equal(known.own, own)
-    ):
-        known = Interfaces.between(grid, own, rest, reach_mm)
-        _latest[:] = [known]
-    return known
+    for known in _latest:
+        same_grid = np.array_equal(_rows_of(known.grid), _rows_of(grid))
+        if same_grid and (known.rest, known.reach_mm) == (rest, reach_mm) and np.array_equal(known.own, own):
+            return known
+    _latest[:] = [Interfaces.between(grid, own, rest, reach_mm)]
+    return _latest[0]
 
 
 def _rows_of(grid: Grid) -> FloatArray:

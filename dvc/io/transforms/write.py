@@ -139,9 +139,7 @@ def _(displacement: BorderedSpline, grid: Grid | None) -> sitk.Transform:
 
 
 @singledispatch
-def write_displacement_as_found(
-    displacement: Deformation, folder: Path, then: RigidMotion | None, reference: Grid
-) -> None:
+def write_displacement_as_found(found: Deformation, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
     """Write a displacement with its own gradient, and the motion `then` (R, t), to the files that hold its kind.
 
     A `BSpline` as elastix' text files (grid of transformix: `reference`); a `BorderedSpline` as a file of its own. Any
@@ -150,10 +148,10 @@ def write_displacement_as_found(
 
 
 @write_displacement_as_found.register
-def _(displacement: BSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
-    write_elastix_transform(folder, displacement, then, reference)
+def _(found: BSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
+    write_elastix_transform(folder, found, then, reference)
 
 
 @write_displacement_as_found.register
-def _(displacement: BorderedSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
-    write_bordered_spline(folder / BORDERED_SPLINE, displacement)
+def _(found: BorderedSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
+    write_bordered_spline(folder / BORDERED_SPLINE, found)

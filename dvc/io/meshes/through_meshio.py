@@ -1,15 +1,20 @@
-"""Gmsh files (.msh), by meshio and what it passes over: node numbers, groups of one name, the order of some nodes.
+"""Gmsh (.msh) and VTK files (.vtu, .vtk), by meshio, with its many kinds of failure and its printing in one place.
 
-See the Gmsh reference manual, sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
+Of Gmsh it passes over node numbers, groups of one name and the order of some nodes: see the Gmsh reference manual,
+sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
 """
 
 from __future__ import annotations
 
+import io
+import logging
 import re
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -18,8 +23,16 @@ from meshio.gmsh import _gmsh22, _gmsh41
 
 from dvc.arrays import IntArray
 from dvc.errors import ImageFileError
-from dvc.io.meshes.raw import RawMesh, damage_named, read_through_meshio
+from dvc.io.meshes.raw import RawMesh, damage_named
 
+_log = logging.getLogger("dvc.io.meshes.read")
+
+# meshio 5.3.5 reads and writes these cells, but has left them out of its own table of dimensions, and fails on them.
+topological_dimension.update({"wedge15": 3, "pyramid13": 3})
+
+# Cell arrays that hold a region's number, in the order in which they are looked for.
+_REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part", "part_id")
+_MOST_REGIONS = 256
 # Quadratic cells of Gmsh in VTK's order, of those that meshio leaves as they are.
 _TO_VTK = {
     "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
@@ -31,7 +44,7 @@ def read_gmsh(path: Path) -> RawMesh:
     """Read a .msh file (version 2.2 or 4.1, text or binary): its regions are the physical groups."""
     names = _group_names(path)
     with _names_apart(path, names) as (place, real):
-        mesh = read_through_meshio(path, lambda _: meshio.gmsh.read(str(place)))
+        mesh = _read(path, lambda _: meshio.gmsh.read(str(place)))
     blocks = [(c.type, c.data[:, _TO_VTK[c.type]] if c.type in _TO_VTK else c.data) for c in mesh.cells]
     sizes = [len(data) for _, data in blocks]
     groups: list[tuple[str, IntArray]] = []
@@ -51,10 +64,10 @@ def read_gmsh(path: Path) -> RawMesh:
     regions: dict[str, IntArray] = {}
     for name, cells in groups:  # a volume and its surface may share a name: the shape distinguishes their cells
         regions[name] = np.union1d(regions.get(name, np.empty(0, dtype=np.int64)), cells)
-    return RawMesh(path, mesh.points, node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
+    return RawMesh(path, mesh.points, _node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
 
 
-def node_numbers(path: Path, count: int) -> IntArray:
+def _node_numbers(path: Path, count: int) -> IntArray:
     """Node tags of a .msh file (version 2.2 or 4.1, text or binary), (count,), in the file's order.
 
     Gmsh numbers nodes freely: from any number, with gaps, in any order. Boundary conditions refer to these numbers, so
@@ -76,7 +89,7 @@ def node_numbers(path: Path, count: int) -> IntArray:
                 return np.array(_gmsh22._read_nodes(file, mode == b"0")[1], dtype=np.int64)
             return np.array(_gmsh41._read_nodes(file, mode == b"0", int(size))[1] + 1, dtype=np.int64)
 
-    tags: IntArray = read_through_meshio(path, read_tags)
+    tags: IntArray = _read(path, read_tags)
     if len(tags) != count or len(np.unique(tags)) != count:
         raise ImageFileError(
             f"{path}: {len(np.unique(tags))} different node numbers were found for {count} nodes; the file is damaged."
@@ -117,3 +130,45 @@ def _section(data: bytes, name: bytes) -> bytes:
 
 def _start(data: bytes, name: bytes) -> int:
     return data.index(b"\n", data.index(b"$" + name)) + 1
+
+
+def read_vtk(path: Path) -> RawMesh:
+    """Read a .vtu or .vtk file; its nodes have no numbers and are counted from 0."""
+    mesh = _read(path, meshio.vtu.read if path.suffix.lower() == ".vtu" else meshio.vtk.read)
+    regions: dict[str, IntArray] = {}
+    arrays = {name.casefold(): name for name in mesh.cell_data}
+    for wanted in _REGION_ARRAYS:
+        if wanted in arrays:
+            values = np.concatenate(mesh.cell_data[arrays[wanted]])
+            values = values[:, 0] if values.shape[1:] == (1,) else values  # as legacy VTK has scalars
+            numbers = np.unique(values)
+            if values.ndim == 1 and len(numbers) <= _MOST_REGIONS and np.all(numbers == np.round(numbers)):
+                regions = {f"{arrays[wanted]} {int(n)}": np.flatnonzero(values == n) for n in numbers}
+                break
+    blocks = [(block.type, block.data) for block in mesh.cells]
+    return RawMesh(path, mesh.points, np.arange(len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
+
+
+def _read(path: Path, read: Callable[[str], Any]) -> Any:
+    """Read a file by one of meshio's readers; refused if that fails, for whatever reason."""
+    with silenced() as said, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return read(str(path))
+        except Exception as error:
+            # meshio meets damaged files with whatever Python raises: KeyError, ValueError, IndexError ...
+            reason = " ".join(f"{type(error).__name__}: {error} {said.getvalue()}".split())
+            raise ImageFileError(
+                f"{path} cannot be read as a mesh ({reason}). It is damaged, or of a variant that is not "
+                "read; write it again as VTU."
+            ) from error
+
+
+@contextmanager
+def silenced() -> Iterator[io.StringIO]:
+    """Keep what meshio prints off the terminal, and log it."""
+    said = io.StringIO()
+    with redirect_stdout(said), redirect_stderr(said):
+        yield said
+    if said.getvalue().strip():
+        _log.info("meshio: %s", " ".join(said.getvalue().split()))
