@@ -19,8 +19,7 @@ from .io.images.labels import fit_mask, read_labels, read_mask
 from .io.images.read import read_image
 from .io.images.write import write_image, write_labels, write_mask, write_vectors
 from .io.meshes.read import MeshFile, read_mesh
-from .io.transforms.displacement_image import read_displacement
-from .io.transforms.read import read_transform
+from .io.transforms.read import read_displacement, read_transform
 from .measurement.measure import measure
 from .measurement.measurement import Measurement
 from .measurement.source import Evidence

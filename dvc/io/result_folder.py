@@ -1,6 +1,6 @@
-"""The folder of results of one loaded image: the names of its files, what writes them and what reads them.
+"""The results folder of one loaded image: the names of its files, their writers and readers.
 
-No other file names one of them by a literal.
+No other module names one of them by a literal.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import io
 import json
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,7 @@ from dvc.io.images.write import write_image, write_mask, write_vectors
 from dvc.io.meshes.read import MeshFile
 from dvc.io.meshes.write import write_nodal_displacements, write_on_mesh
 from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE
-from dvc.io.transforms.displacement_image import read_displacement
-from dvc.io.transforms.read import read_transform
+from dvc.io.transforms.read import read_displacement, read_transform
 from dvc.io.transforms.write import ELASTIX_FILES
 from dvc.trust.error_model import ErrorModel, ErrorTable, Interval, Uncertainty, read_error_model
 from dvc.trust.verdict import Verdict
@@ -56,18 +56,7 @@ _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResultFolder:
-    """The folder of one load as `register` or `strain` wrote it; its arrays are read when they are asked for.
-
-    Attributes
-    ----------
-    folder : Path
-    table : ErrorTable or None
-        Error of the maximal shear, where it is known.
-    verdict : Verdict or None
-        On the registration.
-    aligned_on : str
-        "bone", "image" or "none"; empty where it is not told.
-    """
+    """The folder of one load as `register` or `strain` wrote it; its arrays are read on demand."""
 
     folder: Path
     table: ErrorTable | None = None
@@ -76,13 +65,7 @@ class ResultFolder:
 
     @classmethod
     def at(cls, folder: Path) -> ResultFolder:
-        """Open a folder.
-
-        Raises
-        ------
-        InputError
-            If its quality or its error model cannot be read.
-        """
+        """Open a folder; refused if its quality or its error model cannot be read."""
         model, verdict, aligned_on = folder / ERROR_MODEL, None, ""
         if (folder / QUALITY).is_file():
             told = read_quality(folder)
@@ -101,25 +84,19 @@ class ResultFolder:
 
     @property
     def files(self) -> list[Path]:
-        """What is read of the displacement."""
+        """The files that the displacement is read from."""
         borders = self.folder / SPLINE_WITH_BORDERS
         return [borders, self.folder / VALID] if borders.is_file() else [self.field]
 
     def deformation(self) -> Deformation:
-        """Displacement of tissue relative to its bone: with its jumps of strain at borders, where it has any."""
+        """Displacement of tissue relative to its bone, with its strain discontinuities at tissue interfaces."""
         if (self.folder / SPLINE_WITH_BORDERS).is_file():
             return Within(spline_in(self.folder), read_mask(self.folder / VALID), margin_voxels=0)
         return read_displacement(self.field)
 
 
 def result_folders(place: Path, loads: Sequence[str] = ()) -> list[ResultFolder]:
-    """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is; or some of them by name.
-
-    Raises
-    ------
-    InputError
-        If there is none, or one that is asked for is missing.
-    """
+    """The loads in a folder that `register` or `strain` wrote, or the one whose folder it is; all, or those named."""
     folders = [place] if (place / DISPLACEMENT).is_file() else sorted(p.parent for p in place.glob(f"*/{DISPLACEMENT}"))
     folders = [f for f in folders if f == place or f.name != REPEAT]
     if not folders:
@@ -133,7 +110,7 @@ def result_folders(place: Path, loads: Sequence[str] = ()) -> list[ResultFolder]
 
 
 def spline_in(folder: Path) -> Deformation:
-    """The displacement of tissue relative to its bone that `register` found for one load.
+    """Displacement of tissue relative to its bone that `register` measured for one load.
 
     With its own gradient, where the engine has a file that holds it; otherwise its displacement image.
     """
@@ -146,13 +123,7 @@ def spline_in(folder: Path) -> Deformation:
 
 
 def read_quality(folder: Path) -> dict[str, Any]:
-    """What ``quality.json`` tells.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it is no JSON object.
-    """
+    """The content of ``quality.json``."""
     path = folder / QUALITY
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
@@ -172,7 +143,7 @@ def verdict_in(told: dict[str, Any], folder: Path) -> Verdict:
 
 
 def motion_in(alignment: dict[str, Any]) -> RigidMotion:
-    """The bone's rigid motion, as ``quality.json`` tells it."""
+    """The bone's rigid motion in ``quality.json``."""
     return RigidMotion(np.array(alignment["rotation"]), np.array(alignment["translation_lps_mm"]))
 
 
@@ -181,49 +152,25 @@ def write_maps(
 ) -> None:
     """Write displacement and strain maps as NIfTI on the reference grid, with their meaning in JSON beside.
 
-    Parameters
-    ----------
-    plate_axes : (3, 3), optional
-        Columns n (plate normal), s (shear), t (`dvc.deformation.strain.plate_axes`); the strain in these axes is
-        written too.
-    verdict : Verdict, optional
-        Of a measurement; told in the JSON files.
+    With `plate_axes` (3, 3), columns n, s, t (`dvc.plate_axes`), the strain in these axes is written too.
     """
     write_displacement(folder, maps.grid, maps.displacement_mm, verdict)
-    write_vectors(
-        folder / GREEN_LAGRANGE,
-        maps.grid,
-        maps.green_lagrange,
-        TENSOR_COMPONENTS,
-        _GREEN_LAGRANGE,
-        unit="1",
-        verdict=verdict,
-    )
+    write = partial(write_vectors, unit="1", verdict=verdict)
+    write(folder / GREEN_LAGRANGE, maps.grid, maps.green_lagrange, TENSOR_COMPONENTS, _GREEN_LAGRANGE)
     if plate_axes is not None:
-        write_vectors(
-            folder / GREEN_LAGRANGE_PLATE,
-            maps.grid,
-            in_axes(maps.green_lagrange, plate_axes),
-            ("nn", "ns", "nt", "ss", "st", "tt"),
+        in_plate, components = in_axes(maps.green_lagrange, plate_axes), ("nn", "ns", "nt", "ss", "st", "tt")
+        meaning = (
             f"{_GREEN_LAGRANGE} in the plate's axes: n outward normal, s shear direction, t = n x s; "
-            f"columns of {np.round(plate_axes, 6).tolist()} in LPS",
-            "invariant",
-            unit="1",
-            verdict=verdict,
+            f"columns of {np.round(plate_axes, 6).tolist()} in LPS"
         )
+        write(folder / GREEN_LAGRANGE_PLATE, maps.grid, in_plate, components, meaning, "invariant")
     write_image(folder / MAX_SHEAR, Image(maps.grid, maps.max_shear))
     write_image(folder / JACOBIAN, Image(maps.grid, maps.jacobian))
     write_mask(folder / VALID, Mask(maps.grid, maps.valid))
 
 
 def read_maps(folder: Path) -> StrainMaps:
-    """Read what `write_maps` wrote.
-
-    Raises
-    ------
-    InputError, ImageFileError
-        If a file is missing, damaged, or on another grid than the others.
-    """
+    """Read what `write_maps` wrote; a file that is missing, damaged or on another grid is refused."""
     shear = read_scalar(folder / MAX_SHEAR)
     grid = shear.grid
     jacobian, valid = read_scalar(folder / JACOBIAN, grid), read_mask(_there(folder / VALID))
@@ -259,17 +206,13 @@ def _same_grid(path: Path, found: Grid, wanted: Grid) -> None:
 
 def write_displacement(folder: Path, grid: Grid, displacement_mm: Float32Array, verdict: Verdict | None = None) -> None:
     """Write the displacement as NIfTI and as NRRD, LPS mm."""
+    write = partial(write_vectors, unit="mm", verdict=verdict)
     for name in (DISPLACEMENT_NRRD, DISPLACEMENT):  # the JSON beside them names the last
-        write_vectors(
-            folder / name, grid, displacement_mm, ("x", "y", "z"), _DISPLACEMENT, "LPS", unit="mm", verdict=verdict
-        )
+        write(folder / name, grid, displacement_mm, ("x", "y", "z"), _DISPLACEMENT)
 
 
 def in_axes(tensor: Float32Array, axes: FloatArray) -> Float32Array:
-    """Symmetric tensors (..., 6) in other axes: E' = A^T E A, columns of A the new axes.
-
-    Order of components: 11, 12, 13, 22, 23, 33.
-    """
+    """Symmetric tensors (..., 6; 11, 12, 13, 22, 23, 33) in other axes: E' = A^T E A, columns of A the new axes."""
     full = np.empty((*tensor.shape[:-1], 3, 3), dtype=np.float32)
     for c, (i, j) in enumerate(_UPPER):
         full[..., i, j] = full[..., j, i] = tensor[..., c]
@@ -282,29 +225,20 @@ def write_uncertainty(
 ) -> None:
     """Write the map of the standard deviation, the intervals, and the error model that was used.
 
-    The registration's verdict stands beside every interval: of one that failed they tell nothing.
+    The registration's verdict stands beside every interval: after a failed one they are meaningless.
     """
     if model is not None:
         model.write(folder / ERROR_MODEL)
     write_image(folder / SIGMA, Image(grid, uncertainty.sigma))
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*(f.name for f in fields(Interval)), "verdict"])
-    writer.writerows(
-        [*(f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)), verdict.words]
-        for row in uncertainty.intervals
-    )
+    rows = [[f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)] for row in uncertainty.intervals]
+    head = [f.name for f in fields(Interval)]
+    csv.writer(text, lineterminator="\n").writerows([[*head, "verdict"], *([*row, verdict.words] for row in rows)])
     write_whole(folder / INTERVALS, text.getvalue())
 
 
 def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel] | None:
-    """Read what `write_uncertainty` wrote; None where the error was not known.
-
-    Raises
-    ------
-    InputError, ImageFileError
-        If a file is missing or damaged.
-    """
+    """Read what `write_uncertainty` wrote; None where the error was not known."""
     if not (folder / ERROR_MODEL).is_file():
         return None
     model, sigma = read_error_model(folder / ERROR_MODEL), read_scalar(folder / SIGMA, grid)
@@ -322,34 +256,18 @@ def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel]
 def write_mesh_results(
     folder: Path, mesh: MeshFile, deformation: Deformation, verdict: Verdict | None = None
 ) -> dict[str, int]:
-    """Displacement and strain at the nodes and in the cells of a user's mesh.
-
-    Returns
-    -------
-    dict
-        ``nodes`` and ``cells``, and how many of each have no value.
-    """
-    u, strain = _evaluated(deformation, mesh.points_mm)
-    u_cells, in_cells = _evaluated(deformation, mesh.centroids_mm)
-    write_on_mesh(folder / ON_MESH, mesh, _fields(u, strain), _fields(u_cells, in_cells), verdict)
-    missing = write_nodal_displacements(folder / AT_NODES, mesh, u, verdict)
-    return {
-        "nodes": len(u),
-        "nodes_without_value": missing,
-        "cells": mesh.cell_count,
-        "cells_without_value": int(np.count_nonzero(~in_cells.valid)),
-    }
+    """Displacement and strain at the nodes and in the cells of a user's mesh; returns their numbers."""
+    at_nodes, _ = _fields(deformation, mesh.points_mm)
+    in_cells, without_value = _fields(deformation, mesh.centroids_mm)
+    write_on_mesh(folder / ON_MESH, mesh, at_nodes, in_cells, verdict)
+    missing = write_nodal_displacements(folder / AT_NODES, mesh, at_nodes["displacement_mm"], verdict)
+    nodes = {"nodes": len(mesh.points_mm), "nodes_without_value": missing}
+    return nodes | {"cells": mesh.cell_count, "cells_without_value": without_value}
 
 
-def _evaluated(deformation: Deformation, points_mm: FloatArray) -> tuple[FloatArray, StrainField]:
+def _fields(deformation: Deformation, points_mm: FloatArray) -> tuple[dict[str, FloatArray], int]:
+    """Displacement and strain at points (n, 3) LPS mm, and at how many of them they are not defined."""
     u, H = deformation.evaluate(points_mm)
-    return u, StrainField.from_gradient(H)
-
-
-def _fields(u: FloatArray, strain: StrainField) -> dict[str, FloatArray]:
-    return {
-        "displacement_mm": u,
-        "green_lagrange": strain.green_lagrange,
-        "max_shear": strain.max_shear,
-        "jacobian": strain.jacobian,
-    }
+    strain = StrainField.from_gradient(H)
+    named = {name: getattr(strain, name) for name in ("green_lagrange", "max_shear", "jacobian")}
+    return {"displacement_mm": u, **named}, int(np.count_nonzero(~strain.valid))

@@ -2,34 +2,34 @@
 
 A classic series is a folder with a file for each slice; enhanced (multi-frame) files hold many slices each. Both give
 frames (`dvc.io.images.dicom_frames`), and all that follows is the same for both.
-
-References
-----------
-.. [1] DICOM PS3.3, Image Plane Module (C.7.6.2): https://dicom.nema.org/medical/dicom/current/output/html/part03.html
 """
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dvc.arrays import Float32Array
-from dvc.errors import ImageFileError
+from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid
-from dvc.io.images.dicom_enhanced import enhanced_frames, is_enhanced
-from dvc.io.images.dicom_frames import CONVERT, Frame, classic_frame, damage_named, read_image_header
+from dvc.io.images.dicom_frames import CONVERT, STACK, TIME_POINT, Frame, Labels, read_frames
 from dvc.io.images.dicom_pixels import read_values
-from dvc.io.images.dicom_stacks import SAME_PLACE_MM, named_stacks, pick_stack, stacks_of
 from dvc.io.images.stored import MAX_BYTES, refuse_if_too_large
 
 _log = logging.getLogger("dvc.images")
 
 _SUFFIXES = (".dcm", ".ima")
 _OFF_PLACE = 0.1  # of a voxel
+_SAME_PLACE_MM = 0.01
+_SAME_DIRECTION = 1e-3
+_LISTED = 40
+_SEVERAL = "several echoes, image types, orientations, stacks or time points"
 
 
 def is_dicom(path: Path) -> bool:
@@ -40,110 +40,55 @@ def is_dicom(path: Path) -> bool:
 
 def is_multiframe(path: Path) -> bool:
     """Whether a file is a DICOM image of several frames."""
-    if not is_dicom(path):
-        return False
-    try:
-        header = _header(path)
-        return header is not None and len(_frames(path, header)) > 1
-    except ImageFileError:  # none that could be used
-        return False
+    with suppress(ImageFileError):  # none that could be used
+        frames, _ = read_frames(path) if is_dicom(path) else ([], None)
+        return len(frames) > 1
+    return False
 
 
 def read_dicom(place: Path, *, series: str | None = None, max_bytes: int = MAX_BYTES) -> tuple[Grid, Float32Array]:
-    """Grid (LPS mm) and values (columns, rows, slices) of a DICOM image.
+    """Grid (LPS mm) and values (columns, rows, slices) of a DICOM folder (without subfolders) or of one enhanced file.
 
     Slices are ordered along the normal of their plane; rescale slope and intercept of each are applied. Private
-    scalings, such as Philips' scale slope, are not.
-
-    Parameters
-    ----------
-    place : folder whose files, not those of its subfolders, are the image; or one enhanced (multi-frame) file
-    series : str, optional
-        Which one of several: the end of the series' UID, and "/n" for the n-th stack of a series with several echoes,
-        image types, orientations, stacks or time points, as the refusal lists them.
-
-    Raises
-    ------
-    InputError
-        If there are several series, echoes or the like and ``series`` does not pick one.
-    ImageFileError
-        If there is no DICOM image, a file is damaged, a slice is missing or there twice, slices are sheared, frames do
-        not say where they lie, or voxels are not single grey values.
+    scalings, such as Philips' scale slope, are not. `series` is the end of a series' UID, and "/n" for the n-th stack
+    of a series with several echoes, image types, orientations, stacks or time points, as the refusal lists them.
     """
-    grid, ordered = _found(place, series)
+    frames = _frames_in(place) if place.is_dir() else _frames_of_one(place)
+    stacks = _named_stacks(_stacks_of(frames))
+    if not stacks:
+        raise ImageFileError(f"{place}: no DICOM image in this folder (subfolders are not searched).")
+    grid, ordered = _assembled(place, _pick_stack(place, stacks, series).frames)
     refuse_if_too_large(place, grid.shape, max_bytes)
     return grid, read_values(ordered).transpose(2, 1, 0)
 
 
-def dicom_shape(place: Path) -> tuple[int, int, int]:
-    """Columns, rows and slices of a DICOM image, from its headers alone.
-
-    Raises
-    ------
-    InputError, ImageFileError
-        As `read_dicom`.
-    """
-    grid, _ = _found(place, None)
-    return grid.shape
-
-
-def _found(place: Path, series: str | None) -> tuple[Grid, list[Frame]]:
-    """Find the grid of the one image that is there or picked, and its frames in order."""
-    stacks = named_stacks(stacks_of(_frames_in(place) if place.is_dir() else _frames_of_one(place)))
-    if not stacks:
-        raise ImageFileError(f"{place}: no DICOM image in this folder (subfolders are not searched).")
-    return _assembled(place, pick_stack(place, stacks, series).frames)
-
-
 def _frames_in(folder: Path) -> list[Frame]:
-    frames, parts, skipped = [], [], 0
-    for path in sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")):
-        header = _header(path) if is_dicom(path) else None
-        if header is None:
-            skipped += 1
-            continue
-        frames += _frames(path, header)
-        parts += _concatenation(path, header)
-    for (_, total), held in Counter(parts).items():
+    paths = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    contents = [read_frames(path) for path in paths if is_dicom(path)]
+    for (_, total), held in Counter(part for _, part in contents if part).items():
         if held != total:
             raise ImageFileError(
-                f"{folder}: an image that was stored in {total} files, of which {held} are here. Export the "
-                "whole series."
+                f"{folder}: an image that was stored in {total} files, of which {held} are here. Export the whole "
+                "series."
             )
+    frames = [frame for own, _ in contents for frame in own]
+    skipped = len(paths) - sum(bool(own) for own, _ in contents)
     if skipped and frames:
         _log.info("%s: %d files that are no DICOM images left out", folder, skipped)
     return frames
 
 
 def _frames_of_one(path: Path) -> list[Frame]:
-    header = _header(path)
-    if header is None:
+    frames, part = read_frames(path)
+    if not frames:
         raise ImageFileError(f"{path}: a DICOM file without an image, such as a report. Give the image.")
-    frames = _frames(path, header)
-    if len(frames) == 1 or any(total > 1 for _, total in _concatenation(path, header)):
+    if len(frames) == 1 or (part and part[1] > 1):
         raise ImageFileError(f"{path}: one file of a DICOM series. Give its folder instead: {path.parent}")
     return frames
 
 
-def _concatenation(path: Path, header: Any) -> list[tuple[str, int]]:
-    """UID and number of files of the image that a file is a part of; nothing where it is the whole."""
-    with damage_named(path):
-        uid, total = header.get("ConcatenationUID"), header.get("InConcatenationTotalNumber")
-        return [(str(uid), int(total))] if uid and total else []
-
-
-def _header(path: Path) -> Any | None:
-    with damage_named(path):
-        return read_image_header(path)
-
-
-def _frames(path: Path, header: Any) -> list[Frame]:
-    with damage_named(path):
-        return enhanced_frames(path, header) if is_enhanced(header) else [classic_frame(path, header)]
-
-
 def _assembled(place: Path, stack: list[Frame]) -> tuple[Grid, list[Frame]]:
-    """Find the grid of a stack of parallel slices; return it and the slices in its order."""
+    """Grid of a stack of parallel slices (DICOM PS3.3, C.7.6.2), and the slices in its order."""
     x = stack[0].axes[0] / np.linalg.norm(stack[0].axes[0])
     normal = np.cross(x, stack[0].axes[1])
     normal /= np.linalg.norm(normal)
@@ -153,7 +98,7 @@ def _assembled(place: Path, stack: list[Frame]) -> tuple[Grid, list[Frame]]:
     if len(ordered) < 2:
         raise ImageFileError(f"{place}: a single slice ({ordered[0].name}); a volume is needed.")
     steps = np.diff(along)
-    twice = np.flatnonzero(steps < SAME_PLACE_MM)
+    twice = np.flatnonzero(steps < _SAME_PLACE_MM)
     if len(twice):
         pairs = "; ".join(f"{ordered[t].name} and {ordered[t + 1].name}" for t in twice[:3])
         if any(ordered[t].number is not None and ordered[t].path == ordered[t + 1].path for t in twice):
@@ -176,10 +121,124 @@ def _assembled(place: Path, stack: list[Frame]) -> tuple[Grid, list[Frame]]:
     column_spacing, row_spacing = stack[0].spacing_mm
     if uneven > _OFF_PLACE * spacing or aside > _OFF_PLACE * min(column_spacing, row_spacing):
         raise ImageFileError(
-            f"{place}: the slices are not evenly stacked: up to {uneven:.3g} mm off an even spacing of "
-            f"{spacing:.4g} mm, and up to {aside:.3g} mm sideways (tilted gantry). Resample the series to a "
-            "regular grid first."
+            f"{place}: the slices are not evenly stacked: up to {uneven:.3g} mm off an even spacing of {spacing:.4g} "
+            f"mm, and up to {aside:.3g} mm sideways (tilted gantry). Resample the series to a regular grid first."
         )
     direction = np.stack([x, np.cross(normal, x), normal], axis=1)
     sizes = np.array([column_spacing, row_spacing, spacing])
     return Grid((stack[0].kind.columns, stack[0].kind.rows, len(ordered)), sizes, positions[0], direction), ordered
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stack:
+    """Frames of one image; `labels` distinguish it from others of the same kind and orientation."""
+
+    frames: list[Frame]
+    labels: Labels = ()
+
+    @property
+    def series(self) -> str:
+        return self.frames[0].kind.series
+
+    def describe(self) -> str:
+        """Size, echo, image type, labels and direction, for a person to choose by."""
+        kind = self.frames[0].kind
+        normal = np.cross(*self.frames[0].axes)
+        parts = [f"{len(self.frames)} slices of {kind.columns} x {kind.rows}"]
+        parts += [f"echo time {kind.echo_time_ms:g} ms"] if kind.echo_time_ms is not None else []
+        parts += [f"echo {'/'.join(kind.echo)}"] if kind.echo else []
+        parts += [f"image type {kind.image_type}"] if kind.image_type else []
+        # The name of a stack is free text, which nobody vouches for.
+        parts += [f"{name} {value if str(value).isdigit() else 'with a name'}" for name, value in self.labels]
+        parts += [f"voxels of {kind.column_spacing_mm:g} x {kind.row_spacing_mm:g} mm"]
+        parts += ["stacked along ({})".format(", ".join(f"{v:.2f}" for v in normal + 0.0))]
+        return ", ".join(parts)
+
+    def order(self) -> tuple[str, list[list[float]], list[tuple[int, str]]]:
+        """By echo, image type, direction and labels, so that numbers do not depend on the files' names."""
+        first = self.frames[0]
+        labels = [(int(v) if str(v).isdigit() else -1, str(v)) for _, v in self.labels]
+        return str(first.kind[1:]), first.axes.round(2).tolist(), labels
+
+
+def _stacks_of(frames: Sequence[Frame]) -> list[_Stack]:
+    """Group frames by kind and orientation, and then by whatever else distinguishes volumes."""
+    stacks: list[_Stack] = []
+    values: dict[str, set[str | int]] = {}
+    for one in frames:
+        for stack in stacks:
+            first = stack.frames[0]
+            if first.kind == one.kind and np.abs(first.axes - one.axes).max() < _SAME_DIRECTION:
+                stack.frames.append(one)
+                break
+        else:
+            stacks.append(_Stack([one]))
+        for name, value in one.labels:
+            values.setdefault(name, set()).add(value)
+    # By stack and time point, then by the labels with the fewest values, so that few parts result.
+    for name in sorted(values, key=lambda name: (name != STACK, name != TIME_POINT, len(values[name]))):
+        stacks = [part for stack in stacks for part in _parted(stack, name)]
+    return stacks
+
+
+def _parted(stack: _Stack, name: str) -> list[_Stack]:
+    """Part a stack by a label in which frames at one place differ; named stacks wherever they lie.
+
+    Scanners count along other dimensions than they say, or call each slice a stack; a label that follows the position
+    alone does not distinguish volumes.
+    """
+    parts: dict[str | int | None, list[Frame]] = {}
+    for one in stack.frames:
+        parts.setdefault(dict(one.labels).get(name), []).append(one)
+    if len(parts) == 1:
+        return [stack]
+    apart = name == STACK and max(len(p) for p in parts.values()) > 1
+    if not apart:
+        normal = np.cross(*stack.frames[0].axes)
+        along = np.array([one.position_mm @ normal for part in parts.values() for one in part])
+        part_of = np.repeat(np.arange(len(parts)), [len(p) for p in parts.values()])
+        order = np.argsort(along)
+        place_of = np.cumsum(np.diff(along[order], prepend=along[order[0]]) > _SAME_PLACE_MM)
+        pairs = np.unique(np.stack([place_of, part_of[order]]), axis=1)
+        apart = pairs.shape[1] > int(place_of[-1]) + 1
+    if not apart:
+        return [stack]
+    return [_Stack(part, stack.labels if v is None else (*stack.labels, (name, v))) for v, part in parts.items()]
+
+
+def _named_stacks(stacks: Sequence[_Stack]) -> dict[str, _Stack]:
+    """Name stacks by the shortest distinct end of their series UID, numbered within a series."""
+    uids = sorted({stack.series for stack in stacks})
+    digits = 6
+    while len({uid[-digits:] for uid in uids}) < len(uids):
+        digits += 1
+    named = {}
+    for uid in uids:
+        own = sorted((s for s in stacks if s.series == uid), key=_Stack.order)
+        for number, stack in enumerate(own, start=1):
+            named[uid[-digits:] + (f"/{number}" if len(own) > 1 else "")] = stack
+    return named
+
+
+def _pick_stack(place: Path, stacks: dict[str, _Stack], series: str | None) -> _Stack:
+    """Return the only stack, or the one whose name or series UID ends as `series` does; otherwise list them all."""
+    wanted, _, number = (series or "").strip().partition("/")
+    ending = f"/{number}" if number else ""
+    matching = [s for name, s in stacks.items() if s.series.endswith(wanted) and name.endswith(ending)]
+    if len(matching) == 1:
+        return matching[0]
+    lines = [f"  {name}: {stack.describe()}" for name, stack in stacks.items()]
+    if len(lines) > _LISTED:
+        lines[_LISTED:] = [f"  and {len(lines) - _LISTED} more, named in the same way"]
+    what, move = "file", "Write one"
+    if place.is_dir():
+        what, move = "folder", "Move the files of one into a folder of its own, or write it"
+    problem = f"series='{series}' fits {len(matching)} of the DICOM series in this {what}"
+    if series is None:
+        count = len({stack.series for stack in stacks.values()})
+        problem = f"the {what} holds {f'{count} DICOM series' if count > 1 else _SEVERAL}; one is needed"
+    raise InputError(
+        f"{place}: {problem}. {move} to a file: in Python, "
+        f'dvc.write_image("one.nii.gz", dvc.read_image("{place}", series=NAME)) with a NAME out of this list:\n'
+        + "\n".join(lines)
+    )

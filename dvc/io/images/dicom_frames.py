@@ -1,11 +1,13 @@
 """One frame of a DICOM image: its place, what it shows and how its values are scaled, from a file of one or of many.
 
-Only what is needed of each header is looked at: no name, number or date of a patient is read, and no message quotes
-what a damaged header holds.
+Only what is needed of each header is read: no name, number or date of a patient; no message quotes a damaged header.
+What the standard puts into the functional groups of enhanced (multi-frame) files is read only from there, each frame's
+own first, then the shared ones: scanners repeat some of it, with other values, in private elements beside them.
 
 References
 ----------
-.. [1] DICOM PS3.3, Image Plane Module (C.7.6.2): https://dicom.nema.org/medical/dicom/current/output/html/part03.html
+.. [1] DICOM PS3.3, Image Plane Module (C.7.6.2), Multi-frame Functional Groups Module (C.7.6.16) and Multi-frame
+   Dimension Module (C.7.6.17): https://dicom.nema.org/medical/dicom/current/output/html/part03.html
 """
 
 from __future__ import annotations
@@ -20,38 +22,32 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pydicom
+from pydicom.datadict import keyword_for_tag
 
 from dvc.arrays import FloatArray
 from dvc.errors import ImageFileError
 
 CONVERT = "Convert it to NIfTI, for example with dcm2niix, and give the .nii.gz file."
 _SAME_DIRECTION = 1e-3
-_TAGS = [
-    "SOPClassUID",
-    "SeriesInstanceUID",
-    "ImageType",
-    "ComplexImageComponent",
-    "EchoTime",
-    "EchoNumbers",
-    "Rows",
-    "Columns",
-    "PixelSpacing",
-    "ImagePositionPatient",
-    "ImageOrientationPatient",
-    "NumberOfFrames",
-    "SamplesPerPixel",
-    "PhotometricInterpretation",
-    "BitsAllocated",
-    "RescaleSlope",
-    "RescaleIntercept",
-    "ConcatenationUID",
-    "InConcatenationTotalNumber",
-    "DimensionIndexSequence",
-    "SharedFunctionalGroupsSequence",
-    "PerFrameFunctionalGroupsSequence",
-]
 _NEEDED = ("SeriesInstanceUID", "Rows", "Columns", "BitsAllocated")
 _PLACE = ("PixelSpacing", "ImagePositionPatient", "ImageOrientationPatient")
+_TAGS = [
+    *_NEEDED, *_PLACE, "SOPClassUID", "ImageType", "ComplexImageComponent", "EchoTime", "EchoNumbers", "NumberOfFrames",
+    "SamplesPerPixel", "PhotometricInterpretation", "RescaleSlope", "RescaleIntercept", "ConcatenationUID",
+    "InConcatenationTotalNumber", "DimensionIndexSequence", "SharedFunctionalGroupsSequence",
+    "PerFrameFunctionalGroupsSequence",
+]  # fmt: skip
+STACK, TIME_POINT = "stack", "time point"
+
+_ENHANCED = [f"{origin}Enhanced{of}ImageStorage" for origin in ("", "LegacyConverted") for of in ("MR", "CT")]
+_MACROS = (
+    ("PlanePositionSequence", "ImagePositionPatient"),
+    ("PlaneOrientationSequence", "ImageOrientationPatient"),
+    ("PixelMeasuresSequence", "PixelSpacing"),
+)
+_SCALING = "PixelValueTransformationSequence"
+_FRAME_TYPES = ("MRImageFrameTypeSequence", "CTImageFrameTypeSequence")
+_CONVERTED = ("UnassignedPerFrameConvertedAttributesSequence", "UnassignedSharedConvertedAttributesSequence")
 
 
 class Kind(NamedTuple):
@@ -68,32 +64,20 @@ class Kind(NamedTuple):
 
 
 Labels = tuple[tuple[str, str | int], ...]
-"""What else a file of many frames tells of one: its stack, its time point, its index along other dimensions."""
+"""What else distinguishes frames at the same place: stack, time point, index along other dimensions."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One slice of a DICOM image.
-
-    Parameters
-    ----------
-    path : file
-    number : which frame of it, from 1; None in a file of one slice
-    position_mm : (3,) centre of the first voxel, LPS
-    axes : (2, 3) directions of increasing column and row, LPS
-    spacing_mm : between columns, between rows
-    kind : what it shares with other slices of the same image
-    slope, intercept : value = slope * stored + intercept
-    labels : what else may tell it from frames at the same place
-    """
+    """One slice of a DICOM image, in LPS."""
 
     path: Path
-    number: int | None
-    position_mm: FloatArray
-    axes: FloatArray
-    spacing_mm: tuple[float, float]
+    number: int | None  # from 1, in its file; None in a file of one slice
+    position_mm: FloatArray  # (3,) centre of the first voxel
+    axes: FloatArray  # (2, 3) directions of increasing column and row
+    spacing_mm: tuple[float, float]  # between columns, between rows
     kind: Kind
-    slope: float
+    slope: float  # value = slope * stored + intercept
     intercept: float
     labels: Labels = ()
 
@@ -104,76 +88,61 @@ class Frame:
 
 
 @contextmanager
-def _quiet(logger: logging.Logger) -> Iterator[None]:
+def damage_named(path: Path, problem: str = "not a readable DICOM file", remedy: str = "") -> Iterator[None]:
+    """Turn whatever fails on a damaged file into an error that names the file, and the cause by its kind only.
+
+    Elements of a header are decoded when they are first accessed, so any access may fail. The text of a failure may
+    quote the header, so only its kind is given.
+    """
+    logger = logging.getLogger("pydicom")
     before = logger.disabled
-    logger.disabled = True
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # warnings and the log may quote the values of a header
+            logger.disabled = True
+            yield
+    except ImageFileError:
+        raise
+    except Exception as error:
+        advice = remedy or "damaged or cut short. Export it again."
+        raise ImageFileError(f"{path}: {problem} ({type(error).__name__}): {advice}") from None
     finally:
         logger.disabled = before
 
 
-@contextmanager
-def damage_named(path: Path, problem: str = "not a readable DICOM file", remedy: str = "") -> Iterator[None]:
-    """Turn whatever fails on a damaged file into an error that names the file, and the cause by its kind only.
-
-    Elements of a header are decoded when they are first looked at, so any access may fail.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they may quote the values of a header
-            with _quiet(logging.getLogger("pydicom")):  # which says the same
-                yield
-    except ImageFileError:
-        raise
-    except Exception as error:
-        # The cause is named by its kind only: its text may quote the header.
-        advice = remedy or "damaged or cut short. Export it again."
-        raise ImageFileError(f"{path}: {problem} ({type(error).__name__}): {advice}") from None
-
-
-def read_image_header(path: Path) -> Any | None:
-    """What is needed of the header of a DICOM image with grey values; None for other DICOM objects, such as reports.
-
-    Raises
-    ------
-    ImageFileError
-        If the file is damaged or cut short, in colour, or lacks what any image has.
-    """
-    header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
-    stored_as = class_of(header)
-    if "Rows" not in header and _is_no_image(header, stored_as):
-        return None
-    if "PerFrameFunctionalGroupsSequence" not in header and "Enhanced" not in stored_as.name:
-        kinds = [str(k) for k in several(header.get("ImageType"))]
-        if "MOSAIC" in kinds or int(header.get("NumberOfFrames") or 1) > 1:
+def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
+    """Frames of a file, none if it is no image (a report); UID and number of files of the image that it belongs to."""
+    with damage_named(path):
+        header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
+        kind = header.get("SOPClassUID") or header.file_meta.get("MediaStorageSOPClassUID") or ""
+        stored = pydicom.uid.UID(str(kind))
+        if "Rows" not in header:
+            # Every object of a series names it; a file that does not, was cut before.
+            whole = bool(stored) and "SeriesInstanceUID" in header
+            if stored == pydicom.uid.MediaStorageDirectoryStorage or (whole and "Image Storage" not in stored.name):
+                return [], None
+        enhanced = "PerFrameFunctionalGroupsSequence" in header or "Enhanced" in stored.name
+        kinds = [str(k) for k in _several(header.get("ImageType"))]
+        if not enhanced and ("MOSAIC" in kinds or int(header.get("NumberOfFrames") or 1) > 1):
             raise ImageFileError(
                 f"{path}: a mosaic, or a multi-frame DICOM file that does not say where its frames lie; it is not "
                 f"read. {CONVERT}"
             )
-        refuse_missing(path, [name for name in (*_NEEDED, *_PLACE) if header.get(name) is None])
-    refuse_missing(path, [name for name in _NEEDED if header.get(name) is None])
-    colour = str(header.get("PhotometricInterpretation", ""))
-    if not colour.startswith("MONOCHROME") or int(header.get("SamplesPerPixel", 1)) != 1:
-        raise ImageFileError(f"{path}: a DICOM image in colour; grey values (MONOCHROME) are needed.")
-    return header
+        needed = _NEEDED if enhanced else (*_NEEDED, *_PLACE)
+        _refuse_missing(path, [name for name in needed if header.get(name) is None])
+        colour = str(header.get("PhotometricInterpretation", ""))
+        if not colour.startswith("MONOCHROME") or int(header.get("SamplesPerPixel", 1)) != 1:
+            raise ImageFileError(f"{path}: a DICOM image in colour; grey values (MONOCHROME) are needed.")
+        if enhanced and stored.keyword not in _ENHANCED:
+            raise ImageFileError(
+                f"{path}: a multi-frame DICOM file of a kind that is not read; enhanced MR and CT images are. {CONVERT}"
+            )
+        uid, total = header.get("ConcatenationUID"), header.get("InConcatenationTotalNumber")
+        frames = _enhanced_frames(path, header) if enhanced else [_classic_frame(path, header)]
+        return frames, (str(uid), int(total)) if uid and total else None
 
 
-def class_of(header: Any) -> pydicom.uid.UID:
-    """The kind of DICOM object that a header belongs to."""
-    return pydicom.uid.UID(str(header.get("SOPClassUID") or header.file_meta.get("MediaStorageSOPClassUID") or ""))
-
-
-def _is_no_image(header: Any, stored_as: pydicom.uid.UID) -> bool:
-    """Whether an object without rows is whole and no image: a report, a presentation state, the folder's index."""
-    if stored_as == pydicom.uid.MediaStorageDirectoryStorage:
-        return True
-    # Every object of a series names it; a file that does not, was cut before.
-    return bool(stored_as) and "SeriesInstanceUID" in header and "Image Storage" not in stored_as.name
-
-
-def refuse_missing(path: Path, missing: Sequence[str], where: str = "") -> None:
-    """Raise an error that names what an image lacks, if it lacks anything."""
+def _refuse_missing(path: Path, missing: Sequence[str], where: str = "") -> None:
     if missing:
         raise ImageFileError(
             f"{path}: a DICOM image without {', '.join(missing)}{where}: damaged, or not a slice with a place in "
@@ -181,37 +150,26 @@ def refuse_missing(path: Path, missing: Sequence[str], where: str = "") -> None:
         )
 
 
-def several(value: Any) -> list[Any]:
-    """Return the values of an element that may hold none, one or several."""
+def _several(value: Any) -> list[Any]:
+    """The values of an element that may hold none, one or several."""
     if value is None:
         return []
     return [value] if isinstance(value, str | int | float) else list(value)
 
 
-def build_frame(
+def _build_frame(
     path: Path,
     header: Any,
-    *,
     number: int | None,
     place: dict[str, Any],
     scaling: tuple[Any, Any],
     shows: tuple[Any, Any, str],
     labels: Labels = (),
 ) -> Frame:
-    """Build a frame from elements of its header.
+    """Build a frame from elements of its header; refused if they are not finite, perpendicular or positive.
 
-    Parameters
-    ----------
-    path, number, labels : as in `Frame`
-    header : of the file
-    place : ImagePositionPatient, ImageOrientationPatient and PixelSpacing
-    scaling : slope, intercept; None where they are not told
-    shows : echo time (ms), numbers of echoes, image type
-
-    Raises
-    ------
-    ImageFileError
-        If numbers are not finite, or rows and columns are not perpendicular unit vectors a positive distance apart.
+    `place` holds ImagePositionPatient, ImageOrientationPatient and PixelSpacing; `scaling` slope and intercept, None
+    where missing; `shows` echo time (ms), numbers of echoes and image type.
     """
     axes = np.array([float(v) for v in place["ImageOrientationPatient"]]).reshape(2, 3)
     position = np.array([float(v) for v in place["ImagePositionPatient"]]).reshape(3)
@@ -232,30 +190,74 @@ def build_frame(
             f"{path}{which}: {columns} x {rows} voxels of {column_spacing:g} x {row_spacing:g} mm; all must be "
             "positive. The header is damaged."
         )
-    kind = Kind(
-        str(header.SeriesInstanceUID),
-        None if echo_time is None else round(float(echo_time), 2),
-        tuple(str(int(e)) for e in several(echoes)),
-        image_type,
-        columns,
-        rows,
-        round(column_spacing, 4),
-        round(row_spacing, 4),
-    )
+    echo_ms = None if echo_time is None else round(float(echo_time), 2)
+    echo = tuple(str(int(e)) for e in _several(echoes))
+    spacing = round(column_spacing, 4), round(row_spacing, 4)
+    kind = Kind(str(header.SeriesInstanceUID), echo_ms, echo, image_type, columns, rows, *spacing)
     return Frame(path, number, position, axes, (column_spacing, row_spacing), kind, slope, intercept, labels)
 
 
-def classic_frame(path: Path, header: Any) -> Frame:
-    """Return the frame of a file that holds one slice."""
-    return build_frame(
-        path,
-        header,
-        number=None,
-        place={name: header.get(name) for name in _PLACE},
-        scaling=(header.get("RescaleSlope"), header.get("RescaleIntercept")),
-        shows=(
-            header.get("EchoTime"),
-            header.get("EchoNumbers"),
-            "/".join(str(k) for k in several(header.get("ImageType"))[2:]),
-        ),
-    )
+def _classic_frame(path: Path, header: Any) -> Frame:
+    place = {name: header.get(name) for name in _PLACE}
+    scaling = header.get("RescaleSlope"), header.get("RescaleIntercept")
+    image_type = "/".join(str(k) for k in _several(header.get("ImageType"))[2:])
+    shows = header.get("EchoTime"), header.get("EchoNumbers"), image_type
+    return _build_frame(path, header, None, place, scaling, shows)
+
+
+def _enhanced_frames(path: Path, header: Any) -> list[Frame]:
+    """Frames of an enhanced MR or CT image, in the order of the file; refused if one is not described."""
+    own = list(header.get("PerFrameFunctionalGroupsSequence") or [])
+    count = int(header.get("NumberOfFrames") or 0)
+    if count < 1 or len(own) != count:
+        raise ImageFileError(
+            f"{path}: the header claims {count} frames and describes {len(own)} (functional groups): damaged, cut "
+            "short, or stripped by an anonymizer. Export it again."
+        )
+    shared = (list(header.get("SharedFunctionalGroupsSequence") or []) or [{}])[0]
+    indices = header.get("DimensionIndexSequence") or []
+    dimensions = [keyword_for_tag(index.get("DimensionIndexPointer") or 0) for index in indices]
+    scaled = any(_group(_SCALING, groups, shared) is not None for groups in own)
+    return [_frame(path, header, number, (groups, shared), dimensions, scaled) for number, groups in enumerate(own, 1)]
+
+
+def _group(name: str, *groups: Any) -> Any | None:
+    """Return the first item of a functional group: the frame's own, else the shared one."""
+    return next((items[0] for holder in groups if (items := holder.get(name))), None)
+
+
+def _frame(path: Path, header: Any, number: int, groups: tuple[Any, Any], dimensions: list[str], scaled: bool) -> Frame:
+    place = {name: (_group(macro, *groups) or {}).get(name) for macro, name in _MACROS}
+    scaling = _group(_SCALING, *groups) or {}
+    slope, intercept = scaling.get("RescaleSlope"), scaling.get("RescaleIntercept")
+    missing = [name for name, value in place.items() if value is None]
+    if scaled:
+        missing += [name for name, v in (("RescaleSlope", slope), ("RescaleIntercept", intercept)) if v is None]
+    _refuse_missing(path, missing, f" in the functional groups of frame {number}")
+    labels = _labels(_group("FrameContentSequence", *groups), dimensions)
+    return _build_frame(path, header, number, place, (slope, intercept), _shown(header, groups), labels)
+
+
+def _shown(header: Any, groups: tuple[Any, Any]) -> tuple[Any, Any, str]:
+    """Echo time (ms), numbers of echoes and image type of a frame."""
+    converted = [_group(name, *groups) or {} for name in _CONVERTED]
+    echo_times = [(_group("MREchoSequence", *groups) or {}).get("EffectiveEchoTime")]
+    echo_time = next((t for t in echo_times + [c.get("EchoTime") for c in converted] if t is not None), None)
+    echoes = next((e for e in [c.get("EchoNumbers") for c in converted] if e is not None), None)
+    frame_type: Any = next((t for name in _FRAME_TYPES if (t := _group(name, *groups)) is not None), {})
+    image_type = _several(frame_type.get("FrameType")) or _several(header.get("ImageType"))
+    component = frame_type.get("ComplexImageComponent") or header.get("ComplexImageComponent")
+    return echo_time, echoes, "/".join(str(k) for k in (*image_type[2:], *_several(component)))
+
+
+def _labels(content: Any | None, dimensions: list[str]) -> Labels:
+    if content is None:
+        return ()
+    labels: list[tuple[str, str | int]] = [(STACK, str(content.StackID))] if content.get("StackID") else []
+    if content.get("TemporalPositionIndex"):
+        labels.append((TIME_POINT, int(content.TemporalPositionIndex)))
+    for k, index in enumerate(_several(content.get("DimensionIndexValues"))):
+        # Some scanners list the dimensions in another order than the indices: the name is a hint, no more.
+        name = dimensions[k] if k < len(dimensions) else ""
+        labels.append((f"dimension {k + 1}" + (f" ({name})" if name else ""), int(index)))
+    return tuple(labels)

@@ -18,32 +18,15 @@ from dvc.errors import ImageFileError
 from dvc.io.images.dicom_frames import CONVERT, Frame, damage_named
 from dvc.io.images.stored import Voxels
 
-_TAGS = [
-    "Rows",
-    "Columns",
-    "NumberOfFrames",
-    "SamplesPerPixel",
-    "PhotometricInterpretation",
-    "BitsAllocated",
-    "BitsStored",
-    "HighBit",
+_OF_A_FRAME = [  # what describes the pixels of one
+    "Rows", "Columns", "SamplesPerPixel", "PhotometricInterpretation", "BitsAllocated", "BitsStored", "HighBit",
     "PixelRepresentation",
-    "PlanarConfiguration",
-    "ExtendedOffsetTable",
-    "ExtendedOffsetTableLengths",
-    "PixelData",
-]
-_OF_A_FRAME = _TAGS[:2] + _TAGS[3:9]  # what describes the pixels of one
+]  # fmt: skip
+_OF_ALL = ["NumberOfFrames", "PlanarConfiguration", "ExtendedOffsetTable", "ExtendedOffsetTableLengths", "PixelData"]
 
 
 def read_values(frames: Sequence[Frame]) -> Float32Array:
-    """Values (frames, rows, columns) of frames of one size, rescaled, in the order given.
-
-    Raises
-    ------
-    ImageFileError
-        If a file holds fewer pixels than its header says, or they cannot be decoded.
-    """
+    """Rescaled values (frames, rows, columns) of frames of one size, in the order given."""
     kind = frames[0].kind
     values = np.empty((len(frames), kind.rows, kind.columns), dtype=np.float32)
     places: dict[Path, list[int]] = {}
@@ -61,7 +44,7 @@ def read_values(frames: Sequence[Frame]) -> Float32Array:
 def _stored(path: Path, numbers: list[int], shape: tuple[int, int]) -> Iterator[Voxels]:
     """Stored values (rows, columns) of some frames of a file, numbered from 0, in the order given."""
     with damage_named(path):
-        header = pydicom.dcmread(path, specific_tags=list(_TAGS))
+        header = pydicom.dcmread(path, specific_tags=[*_OF_A_FRAME, *_OF_ALL])
         data = header.get("PixelData")
     if data is None:
         raise ImageFileError(f"{path}: a DICOM file without pixels: damaged or cut short. Export it again.")

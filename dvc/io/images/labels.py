@@ -6,6 +6,7 @@ import csv
 import logging
 import re
 from collections.abc import Mapping
+from itertools import product
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from dvc.arrays import IntArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, LabelMap, Mask
+from dvc.io import StrPath
 from dvc.io.images.nrrd import nrrd_fields
 from dvc.io.images.read import read_voxels
 
@@ -27,9 +29,8 @@ _LARGEST_LABEL = 2**31
 _NEEDED_OVERLAP = 0.5
 _POINTS_AT_ONCE = 1 << 20
 _LABEL_COLUMNS = ("label", "value", "index", "id")
-_NAME_COLUMNS = ("name", "label", "structure")
+_NAME_COLUMNS = ("name", "structure", "label")  # "label" may head the names beside another column of numbers
 
-StrPath = str | PathLike[str]
 _OnGrid = TypeVar("_OnGrid", Mask, LabelMap)
 
 
@@ -45,7 +46,7 @@ def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
     Raises
     ------
     ImageFileError
-        If the file cannot be read, as `dvc.io.images.read.read_image`.
+        If the file cannot be read, as in `read_image`.
     InputError
         If the mask is empty, or holds several values other than zero; the message lists them.
     GeometryError
@@ -60,9 +61,8 @@ def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
         names = _segment_names(place)
         listed = [f"{v}" + (f" ({names[v]})" if v in names else "") + f": {n} voxels" for v, n in counts.items()]
         raise InputError(
-            f"{place}: a mask holds zeros and one other value; this file holds {len(counts)}: "
-            f"{_shortened(listed)}. It is a label map: name the region that you mean (--bone-label), or "
-            "save that region as a mask."
+            f"{place}: a mask holds zeros and one other value; this file holds {len(counts)}: {_shortened(listed)}. "
+            "It is a label map: name the region that you mean (--bone-label), or save that region as a mask."
         )
     mask = Mask(own, labels != 0)
     return mask if grid is None else fit_mask(mask, grid, f"{place}")
@@ -74,13 +74,13 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
     Parameters
     ----------
     path : .nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, or Slicer's .seg.nrrd, which has its own names
-    names : names file (`read_names`) or mapping, optional
-        Without names label N is called "label-N". Names of labels that the map does not hold are let go.
+    names : mapping, or file of names (CSV, ITK-SNAP label descriptions, Slicer colour table), optional
+        Without names label N is called "label-N". Names of labels that the map does not hold are ignored.
 
     Raises
     ------
     ImageFileError
-        If a file cannot be read, as `dvc.io.images.read.read_image`.
+        If a file cannot be read, as in `read_image`.
     InputError
         If the map is empty, a value is negative or not a whole number, or a label has no name.
     """
@@ -91,10 +91,9 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
         raise InputError(f"{place}: the label map is empty: all of its {labels.size} voxels are 0.")
     if min(present) < 0:
         raise InputError(f"{place}: labels must not be negative; found {_shortened([v for v in present if v < 0])}.")
-    if names is None:
-        known: Mapping[int, str] = _segment_names(place) or {v: f"label-{v}" for v in present}
-    else:
-        known = names if isinstance(names, Mapping) else read_names(names)
+    known = read_names(names) if isinstance(names, str | PathLike) else names
+    if known is None:
+        known = _segment_names(place) or {v: f"label-{v}" for v in present}
     nameless = [v for v in present if v not in known]
     if nameless:
         source = f" in {names}" if isinstance(names, str | PathLike) else ""
@@ -108,34 +107,26 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
 def read_names(path: StrPath) -> dict[int, str]:
     """Names of labels from a table: CSV, ITK-SNAP's label descriptions, or a Slicer colour table.
 
-    CSV needs a header line with a column of labels (label, value, index or id) and one of names (name, label
-    or structure). ITK-SNAP: ``index r g b a visible mesh "name"``. Slicer: ``index name r g b a``. Label 0 is
-    the background and has no name.
-
-    Raises
-    ------
-    InputError
-        If the file is of no such kind, or gives a label twice.
+    CSV needs a header line with a column of labels (label, value, index or id) and one of names (name, label or
+    structure). ITK-SNAP: ``index r g b a visible mesh "name"``. Slicer: ``index name r g b a``. Label 0 is the
+    background and has no name.
     """
     place = Path(path)
     try:
         text = place.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{place}: the names of labels cannot be read ({type(error).__name__}).") from error
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    content = [line for line in lines if not line.startswith("#")]
-    rows = _csv_names(lines) if place.suffix.lower() == ".csv" else [_table_name(line) for line in content]
+    lines = [line.strip() for line in text.splitlines() if line.strip() and not line.strip().startswith("#")]
+    is_csv = place.suffix.lower() == ".csv"
+    rows = _csv_names(lines) if is_csv else [_table_name(line) for line in lines]
     if not rows or None in rows:
-        wrong = content[rows.index(None)] if None in rows and place.suffix.lower() != ".csv" else None
+        wrong = "" if is_csv or not rows else f" (line: {lines[rows.index(None)][:60]!r})"
         raise InputError(
-            f"{place}: not a table of labels and names{f' (line: {wrong[:60]!r})' if wrong else ''}. What "
-            "is read: CSV with a header line 'label,name', ITK-SNAP label descriptions, Slicer colour "
-            "tables."
+            f"{place}: not a table of labels and names{wrong}. What is read: CSV with a header line 'label,name', "
+            "ITK-SNAP label descriptions, Slicer colour tables."
         )
     names: dict[int, str] = {}
-    for row in rows:
-        assert row is not None
-        value, name = row
+    for value, name in filter(None, rows):
         if value in names:
             raise InputError(f"{place}: label {value} is named twice: '{names[value]}' and '{name}'.")
         if value != 0:
@@ -146,16 +137,15 @@ def read_names(path: StrPath) -> dict[int, str]:
 def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid:
     """Bring a mask or label map onto an image's grid.
 
-    On the same grid, up to the last digits of a header, it takes the image's geometry. On another grid of the
-    same frame (cropped, coarser, finer, turned) every voxel of the image takes the nearest value, and a
-    warning tells so.
+    On the same grid, up to the last digits of a header, it takes the image's geometry. On another grid of the same
+    frame (cropped, coarser, finer, oblique) every voxel of the image takes the nearest value, and a warning is logged.
 
     Parameters
     ----------
     mask_or_labels : Mask or LabelMap
     grid : Grid
         The image's grid.
-    what : how messages call it, such as its path
+    what : its name in messages, such as its path
 
     Raises
     ------
@@ -171,7 +161,7 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     (64, 64.0)
     """
     own = mask_or_labels.grid
-    values: npt.NDArray[Any] = _values(mask_or_labels)
+    values: npt.NDArray[Any] = mask_or_labels.inside if isinstance(mask_or_labels, Mask) else mask_or_labels.labels
     if own.same_as(grid):
         return _with_values(mask_or_labels, grid, values)
     inside, total = _count_inside(own, values, grid)
@@ -194,24 +184,15 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     left = np.count_nonzero(fitted) * grid.voxel_volume_mm3
     if left == 0:
         raise GeometryError(f"{what}: nothing of it is left on the image's grid. {boxes}")
-    _log.warning(
-        "%s: on another grid than the image; resampled to it by nearest neighbour (%.4g mL became %.4g mL, "
-        "%.0f %% of it lies in the image). %s",
-        what,
-        total * own.voxel_volume_mm3 / 1000,
-        left / 1000,
-        100 * share,
-        boxes,
-    )
+    before = total * own.voxel_volume_mm3
+    change = f"{before / 1000:.4g} mL became {left / 1000:.4g} mL, {100 * share:.0f} % of it lies in the image"
+    told = "%s: on another grid than the image; resampled to it by nearest neighbour (%s). %s"
+    _log.warning(told, what, change, boxes)
     if isinstance(mask_or_labels, LabelMap):
         lost = sorted(set(_counts(values)) - set(_counts(fitted)))
         if lost:
             _log.warning("%s: regions lost by it: %s", what, [mask_or_labels.names[v] for v in lost])
     return _with_values(mask_or_labels, grid, fitted)
-
-
-def _values(source: Mask | LabelMap) -> npt.NDArray[Any]:
-    return source.inside if isinstance(source, Mask) else source.labels
 
 
 def _with_values(source: _OnGrid, grid: Grid, values: npt.NDArray[Any]) -> _OnGrid:
@@ -231,10 +212,8 @@ def _count_inside(own: Grid, values: npt.NDArray[Any], grid: Grid) -> tuple[int,
 def _mirrored_axes(own: Grid, grid: Grid) -> str:
     """Name the world axes whose sign turns one grid into the other, or nothing."""
     wanted = grid.toward_lps()
-    if own.toward_lps().same_as(wanted):
-        return ""
-    for signs in ((-1, -1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, 1, -1), (1, -1, -1), (-1, -1, -1)):
-        flip = np.array(signs, dtype=np.float64)
+    for signs in product((1.0, -1.0), repeat=3):
+        flip = np.array(signs)
         mirror = Grid(own.shape, own.spacing_mm, own.origin_mm * flip, own.direction * flip[:, None])
         if mirror.toward_lps().same_as(wanted):
             return " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
@@ -248,8 +227,7 @@ def _nearest(own: Grid, values: npt.NDArray[Any], grid: Grid) -> npt.NDArray[Any
     j, k = np.ogrid[: grid.shape[1], : grid.shape[2]]
     fitted = np.zeros(grid.shape, dtype=values.dtype)
     for i in range(grid.shape[0]):  # a slice at a time: a whole grid of indices would be large
-        index = []
-        within = np.ones(grid.shape[1:], dtype=bool)
+        index, within = [], np.ones(grid.shape[1:], dtype=bool)
         for axis in range(3):
             place = start[axis] + step[axis, 0] * i + step[axis, 1] * j + step[axis, 2] * k
             # The small shift settles ties, which rounding errors would otherwise scatter.
@@ -304,37 +282,26 @@ def _segment_names(path: Path) -> dict[int, str]:
     if not path.name.lower().endswith((".nrrd", ".nhdr")):
         return {}
     _, pairs, _ = nrrd_fields(path)
-    names = {}
-    for key, value in pairs.items():
-        segment = re.fullmatch(r"Segment(\d+)_LabelValue", key)
-        if segment and value.strip().isdigit():
-            names[int(value)] = pairs.get(f"Segment{segment[1]}_Name", f"label-{value.strip()}").strip()
-    return names
+    return {
+        int(value): pairs.get(f"Segment{segment[1]}_Name", f"label-{value.strip()}").strip()
+        for key, value in pairs.items()
+        if (segment := re.fullmatch(r"Segment(\d+)_LabelValue", key)) and value.strip().isdigit()
+    }
 
 
 def _csv_names(lines: list[str]) -> list[tuple[int, str] | None]:
-    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
-    if not rows:
+    """Labels and names of a table; none if a column is missing, None for a row without a label."""
+    rows = list(csv.reader(lines))
+    columns = [cell.strip().lower() for cell in rows[0]] if rows else []
+    name = next((columns.index(c) for c in _NAME_COLUMNS if c in columns), None)
+    label = next((columns.index(c) for c in _LABEL_COLUMNS if c in columns and columns.index(c) != name), None)
+    if name is None or label is None:
         return []
-    head = [cell.strip().lower() for cell in rows[0]]
-    # "label" may head either column: the numbers, or the names beside another column of numbers.
-    name_at = next((head.index(n) for n in _NAME_COLUMNS if n in head and n != "label"), None)
-    label_at = next(
-        (head.index(n) for n in _LABEL_COLUMNS if n in head and (n != "label" or name_at is not None)), None
-    )
-    if name_at is None and "label" in head:
-        name_at = head.index("label")
-    if label_at is None or name_at is None or label_at == name_at:
-        return [None]
-    entries: list[tuple[int, str] | None] = []
-    for row in rows[1:]:
-        value = row[label_at].strip() if len(row) > max(label_at, name_at) else ""
-        entries.append((int(value), row[name_at].strip()) if value.isdigit() else None)
-    return entries
+    whole = [len(row) > max(name, label) and row[label].strip().isdigit() for row in rows[1:]]
+    return [(int(row[label]), row[name].strip()) if ok else None for row, ok in zip(rows[1:], whole, strict=True)]
 
 
 def _table_name(line: str) -> tuple[int, str] | None:
-    snap = re.fullmatch(r'(\d+)(?:\s+[\d.]+){6}\s+"(.*)"', line)
-    slicer = re.fullmatch(r"(\d+)\s+(\S.*?)(?:\s+[\d.]+){4}", line)
-    match = snap or slicer
+    match = re.fullmatch(r'(\d+)(?:\s+[\d.]+){6}\s+"(.*)"', line)  # ITK-SNAP
+    match = match or re.fullmatch(r"(\d+)\s+(\S.*?)(?:\s+[\d.]+){4}", line)  # Slicer
     return (int(match[1]), match[2].strip()) if match else None

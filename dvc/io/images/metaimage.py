@@ -15,7 +15,7 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.errors import ImageFileError
-from dvc.io.images.stored import MAX_BYTES, StoredVolume, pick_volume, refuse_if_too_large
+from dvc.io.images.stored import StoredVolume, pick_volume, refuse_if_too_large
 from dvc.io.images.text_header import (
     MM_PER_UNIT,
     detached_file,
@@ -27,19 +27,10 @@ from dvc.io.images.text_header import (
 )
 
 _TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    "MET_INT": "i4",
-    "MET_UINT": "u4",
-    "MET_LONG": "i4",
-    "MET_ULONG": "u4",
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
+    "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
+    "MET_LONG": "i4", "MET_ULONG": "u4", "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4",
     "MET_DOUBLE": "f8",
-}
+}  # fmt: skip
 # Names that the format has for the same thing, the usual one first.
 _MATRIX = ("TransformMatrix", "Rotation", "Orientation")
 _ORIGIN = ("Offset", "Position", "Origin")
@@ -48,13 +39,7 @@ _BYTE_ORDER = ("binarydatabyteordermsb", "elementbyteordermsb")
 
 
 def meta_fields(path: Path) -> tuple[dict[str, str], int]:
-    """Fields of a MetaImage header, and where it ends (bytes).
-
-    Raises
-    ------
-    ImageFileError
-        If the file is not a MetaImage file or its header does not end.
-    """
+    """Fields of a MetaImage header (names in lower case), and where it ends (bytes)."""
     start = header_start(path)
     last = re.search(rb"^[ \t]*ElementDataFile[ \t]*=[^\r\n]*\r?\n?", start, re.MULTILINE)
     if last is None:
@@ -67,24 +52,8 @@ def meta_fields(path: Path) -> tuple[dict[str, str], int]:
     return {name.strip().lower(): value.strip() for name, value in pairs}, last.end()
 
 
-def meta_shape(path: Path) -> tuple[int, ...]:
-    """All sizes that the header claims, without any other check."""
-    return tuple(whole_numbers(path, meta_fields(path)[0], "dimsize"))
-
-
-def read_meta_header(
-    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
-) -> StoredVolume:
-    """Read what a MetaImage file (.mha, .mhd) holds, and where its voxels lie in LPS mm.
-
-    With ``vectors``, a file of three components per voxel is needed in place of a scalar one.
-
-    Raises
-    ------
-    ImageFileError
-        If the header is damaged, claims more than ``max_bytes``, does not say where the image lies, is sheared, is not
-        a 3D image of what is needed, or its voxels are written as text.
-    """
+def read_meta_header(path: Path, volume: int | None, max_bytes: int, vectors: bool) -> StoredVolume:
+    """What a MetaImage file (.mha, .mhd) holds: scalars, or with `vectors` three components per voxel."""
     fields, end = meta_fields(path)
     sizes = whole_numbers(path, fields, "dimsize")
     if len(sizes) != 3 or fields.get("ndims") != "3":
@@ -102,34 +71,24 @@ def read_meta_header(
         raise ImageFileError(f"{path}: voxels of type '{kind}', or written as text, are not read; save it as binary.")
     if numbers_in(path, fields.get("headersize", "0"), "HeaderSize", 1) != [0.0]:
         raise ImageFileError(f"{path}: MetaImage files with a HeaderSize are not read; save it again as .mha.")
-    data, start = path, end
-    if fields["elementdatafile"] != "LOCAL":
-        data, start = detached_file(path, fields["elementdatafile"]), 0
+    named = fields["elementdatafile"]
+    data, start = (path, end) if named == "LOCAL" else (detached_file(path, named), 0)
     if np.dtype(_TYPES[kind]).itemsize > 1 and not set(_BYTE_ORDER) & set(fields):
-        raise ImageFileError(
-            f"{path}: the MetaImage header does not give the byte order ({_BYTE_ORDER[0]}); save it again."
-        )
+        raise ImageFileError(f"{path}: the header does not give the byte order ({_BYTE_ORDER[0]}); save it again.")
     big = any(_truth(path, fields, name, False) for name in _BYTE_ORDER)
-    matrix, origin, spacing = (
-        _needed(path, fields, names, count) for names, count in ((_MATRIX, 9), (_ORIGIN, 3), (_SPACING, 3))
-    )
+    matrix, spacing = _needed(path, fields, _MATRIX, 9), _needed(path, fields, _SPACING, 3)
+    origin = _needed(path, fields, _ORIGIN, 3)
     unit = unit_of_length(path, {fields.get("distanceunits", "mm").lower()})
     scale = MM_PER_UNIT[unit]
     columns = matrix.reshape(3, 3).T * spacing  # a row of the matrix is the direction of one image axis
-    return StoredVolume(
-        path=data,
-        grid=grid_of_axes(path, sizes, columns * scale, origin * scale),
-        dtype=np.dtype((">" if big else "<") + _TYPES[kind]),
-        layout=layout,
-        unit=unit,
-        file_start=start,
-        components=0 if vectors else None,
-        compressed=_truth(path, fields, "compresseddata", False),
-    )
+    grid = grid_of_axes(path, sizes, columns * scale, origin * scale)
+    dtype = np.dtype((">" if big else "<") + _TYPES[kind])
+    packed = _truth(path, fields, "compresseddata", False)
+    return StoredVolume(data, grid, dtype, layout, unit, start, packed, components=0 if vectors else None)
 
 
 def _needed(path: Path, fields: Mapping[str, str], names: tuple[str, ...], count: int) -> FloatArray:
-    """Numbers of a field that the format gives a default, which a damaged line would be read as."""
+    """Numbers of a field for which the format has a default, as which a damaged line would be read."""
     written = next((fields[name.lower()] for name in names if name.lower() in fields), None)
     if written is None:
         raise ImageFileError(

@@ -1,12 +1,7 @@
 """NIfTI files, read with the checks that the usual readers leave out.
 
-A NIfTI file may say twice where it lies in space (qform and sform), in one of several units, in a frame RAS.
-Readers pick one of the two and differ in which; here they must agree. Everything is returned in LPS mm.
-
-References
-----------
-.. [1] Cox RW et al. A (sort of) new image data format standard: NIfTI-1. Human Brain Mapping 2004.
-   https://nifti.nimh.nih.gov/nifti-1
+A NIfTI file may give its geometry twice (qform and sform), in one of several units, in the frame RAS. Readers pick one
+of the two and differ in which; here they must agree. Everything is returned in LPS mm.
 """
 
 from __future__ import annotations
@@ -19,9 +14,9 @@ import nibabel
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.errors import GeometryError, ImageFileError
-from dvc.images.image import Grid
+from dvc.errors import ImageFileError
 from dvc.io.images.stored import MAX_BYTES, StoredVolume, expanded, pick_volume, refuse_if_too_large
+from dvc.io.images.text_header import grid_of_axes
 
 _log = logging.getLogger("dvc.images")
 
@@ -29,9 +24,7 @@ LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Turns an affine to RAS into one to LPS, and back."""
 
 _AGREEMENT_VOXELS = 0.05
-_UNITS = {0: "mm", 1: "metres", 2: "mm", 3: "microns"}
-_MM_PER_UNIT = {"metres": 1000.0, "mm": 1.0, "microns": 0.001}
-_ORTHONORMAL = 1e-4
+_UNITS = {0: ("mm", 1.0), 1: ("metres", 1000.0), 2: ("mm", 1.0), 3: ("microns", 0.001)}
 _HALF_TURN = 1e-7
 _ROUNDING = 4e-7  # of b^2 + c^2 + d^2 in single precision, with a margin
 
@@ -39,21 +32,7 @@ _ROUNDING = 4e-7  # of b^2 + c^2 + d^2 in single precision, with a margin
 def read_nifti_header(
     path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False, components: int = 3
 ) -> StoredVolume:
-    """Read what a NIfTI-1 or NIfTI-2 file holds, and where its voxels lie in LPS mm.
-
-    Parameters
-    ----------
-    path : .nii or .nii.gz
-    volume : which volume of a 4D file, from 0
-    vectors : whether a file of several components per voxel, (ni, nj, nk, 1, c), is needed in place of a scalar one
-    components : how many, c
-
-    Raises
-    ------
-    ImageFileError
-        If the header is damaged, claims more than ``max_bytes``, has no orientation, has a qform and an
-        sform that disagree, is sheared, is not 3D, or its voxels are not real numbers.
-    """
+    """What a NIfTI-1 or -2 file holds: scalars, or with `vectors` c `components` per voxel, (ni, nj, nk, 1, c)."""
     header = _header(path)
     shape, count = (_vector_sizes(path, header, components), 1) if vectors else _sizes(path, header)
     layout = (*shape, components) if vectors else shape
@@ -61,30 +40,25 @@ def read_nifti_header(
     refuse_if_too_large(path, layout, max_bytes)
     chosen = pick_volume(path, count, volume)
     dtype = _number_type(path, header)
-    unit = _unit(path, header)
-    grid = _grid(path, header, shape, _MM_PER_UNIT[unit])
-    bytes_each = int(np.prod([int(n) for n in layout])) * dtype.itemsize
-    slope, intercept = _scaling(header)
-    start = int(header["vox_offset"])
-    smallest = int(header["sizeof_hdr"]) + 4
+    unit, mm_per_unit = _unit(path, header)
+    lps = LPS_FROM_RAS @ _ras_affine(path, header, shape)
+    columns = lps[:3, :3] * mm_per_unit
+    bytes_each = int(np.prod(layout)) * dtype.itemsize
+    slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
+    scaled = slope != 0.0 and np.isfinite(slope)
     return StoredVolume(
         path=path,
-        grid=grid,
+        grid=grid_of_axes(path, shape, columns, lps[:3, 3] * mm_per_unit, single_precision=True),
         dtype=dtype,
         layout=layout,
         unit=unit,
         compressed=_is_compressed(path),
-        stream_start=max(start, smallest) + chosen * bytes_each,
+        stream_start=max(int(header["vox_offset"]), int(header["sizeof_hdr"]) + 4) + chosen * bytes_each,
         stream_rest=(count - 1 - chosen) * bytes_each,
-        slope=slope,
-        intercept=intercept,
+        slope=slope if scaled else 1.0,
+        intercept=intercept if scaled and np.isfinite(intercept) else 0.0,
         components=3 if vectors else None,
     )
-
-
-def nifti_shape(path: Path) -> tuple[int, ...]:
-    """All sizes that the header claims, without any other check."""
-    return tuple(_dimensions(_header(path)))
 
 
 def _dimensions(header: Any) -> list[int]:
@@ -106,10 +80,7 @@ def _header(path: Path) -> Any:
     else:
         with path.open("rb") as file:
             start = file.read(544)
-    for kind, size, magic in (
-        (nibabel.Nifti1Header, 348, slice(344, 348)),
-        (nibabel.Nifti2Header, 540, slice(4, 8)),
-    ):
+    for kind, size, magic in ((nibabel.Nifti1Header, 348, slice(344, 348)), (nibabel.Nifti2Header, 540, slice(4, 8))):
         if len(start) < size:
             continue
         written = start[magic]
@@ -167,15 +138,8 @@ def _number_type(path: Path, header: Any) -> np.dtype[Any]:
     return dtype
 
 
-def _scaling(header: Any) -> tuple[float, float]:
-    slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
-    if slope == 0.0 or not np.isfinite(slope):  # both mean: not scaled
-        return 1.0, 0.0
-    return slope, intercept if np.isfinite(intercept) else 0.0
-
-
-def _unit(path: Path, header: Any) -> str:
-    """The header's unit of length; mm where it gives none."""
+def _unit(path: Path, header: Any) -> tuple[str, float]:
+    """The header's unit of length and its size in mm; mm where it gives none."""
     code = int(header["xyzt_units"]) & 7
     if code not in _UNITS:
         raise ImageFileError(f"{path}: unknown unit of length (xyzt_units code {code}); set it to mm (2).")
@@ -184,51 +148,33 @@ def _unit(path: Path, header: Any) -> str:
     return _UNITS[code]
 
 
-def _grid(path: Path, header: Any, shape: tuple[int, int, int], mm_per_unit: float) -> Grid:
-    lps = LPS_FROM_RAS @ _ras_affine(path, header, shape)
-    columns = lps[:3, :3] * mm_per_unit
-    spacing = np.linalg.norm(columns, axis=0)
-    if not np.all(np.isfinite(spacing)) or np.any(spacing <= 0):
-        raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
-    try:
-        return Grid(shape, spacing, lps[:3, 3] * mm_per_unit, _straightened(columns / spacing))
-    except GeometryError as error:
-        raise ImageFileError(f"{path}: {error}") from error
-
-
-def _straightened(direction: FloatArray) -> FloatArray:
-    """Return the nearest orthonormal matrix, where only single precision parts the two; else as given."""
-    left, stretch, right = np.linalg.svd(direction)
-    return np.asarray(left @ right) if np.abs(stretch - 1.0).max() < _ORTHONORMAL / 2 else direction
-
-
 def _ras_affine(path: Path, header: Any, shape: tuple[int, int, int]) -> FloatArray:
     qforms = _qforms(path, header) if int(header["qform_code"]) > 0 else []
-    sform = None
+    sforms = []
     if int(header["sform_code"]) > 0:
-        sform = np.eye(4)
-        sform[:3] = [np.float64(header[f"srow_{axis}"]) for axis in "xyz"]
-    if not qforms and sform is None:
+        sforms = [np.vstack([*(np.float64(header[f"srow_{axis}"]) for axis in "xyz"), [0.0, 0.0, 0.0, 1.0]])]
+    if not qforms and not sforms:
         raise ImageFileError(
             f"{path}: the header does not say how the image lies in space (qform_code and sform_code are "
             "0), and programs guess differently. Export it again with its orientation, or copy the header "
             "of the image it was made from."
         )
-    for name, affines in (("qform", qforms), ("sform", [] if sform is None else [sform])):
+    for name, affines in (("qform", qforms), ("sform", sforms)):
         if not np.isfinite(affines).all():
             raise ImageFileError(f"{path}: the {name} holds values that are not finite; the header is damaged.")
-    if sform is None:
-        return qforms[0]
-    if qforms:
-        _refuse_disagreement(path, qforms, sform, shape)
-    return sform  # a full matrix, which holds its digits better than a quaternion
+    if qforms and sforms:
+        _refuse_disagreement(path, qforms, sforms[0], shape)
+    return (sforms or qforms)[0]  # a full matrix holds its digits better than a quaternion
 
 
 def _qforms(path: Path, header: Any) -> list[FloatArray]:
-    """Compute the affine of the quaternion [1]_, and others that single precision cannot tell from it.
+    """Affine of the quaternion [1]_, and others that single precision cannot distinguish from it.
 
-    The header holds b, c, d; a is what is left of a unit quaternion. Near a half turn, which is where axial
-    images lie, rounding of b, c, d leaves a uncertain by up to 5e-4: a voxel at the end of a large image.
+    The header holds b, c, d; a is what is left of a unit quaternion. Near a half turn, which is where axial images lie,
+    rounding of b, c, d leaves a uncertain by up to 5e-4: a voxel at the end of a large image.
+
+    .. [1] Cox RW et al. A (sort of) new image data format standard: NIfTI-1. Human Brain Mapping 2004.
+    https://nifti.nimh.nih.gov/nifti-1
     """
     b, c, d = (float(header[f"quatern_{name}"]) for name in "bcd")
     rest = 1.0 - (b * b + c * c + d * d)
@@ -260,8 +206,7 @@ def _qform(header: Any, a: float, b: float, c: float, d: float) -> FloatArray:
 def _refuse_disagreement(path: Path, qforms: list[FloatArray], sform: FloatArray, shape: tuple[int, int, int]) -> None:
     bits = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.float64)
     corners = bits * [*(np.array(shape) - 1), 1]
-    moved = [np.linalg.norm((corners @ (sform - qform).T)[:, :3], axis=1).max() for qform in qforms]
-    apart = float(min(moved))
+    apart = min(float(np.linalg.norm((corners @ (sform - q).T)[:, :3], axis=1).max()) for q in qforms)
     voxel = float(np.linalg.norm(sform[:3, :3], axis=0).min())
     if not apart <= _AGREEMENT_VOXELS * voxel:
         raise ImageFileError(

@@ -16,8 +16,7 @@ import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.errors import ImageFileError
-from dvc.images.image import Grid
-from dvc.io.images.stored import MAX_BYTES, StoredVolume, pick_volume, refuse_if_too_large
+from dvc.io.images.stored import StoredVolume, pick_volume, refuse_if_too_large
 from dvc.io.images.text_header import (
     HEADER_LIMIT,
     MM_PER_UNIT,
@@ -43,21 +42,11 @@ _TO_LPS = {
     "right-anterior-superior": (-1, -1, 1),
     "left-anterior-superior": (1, -1, 1),
 }
-_SPACES = {
-    "lps": "left-posterior-superior",
-    "ras": "right-anterior-superior",
-    "las": "left-anterior-superior",
-}
+_TO_LPS |= {"".join(word[0] for word in name.split("-")): signs for name, signs in _TO_LPS.items()}
 
 
 def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
-    """Fields and key/value pairs of an NRRD header, and where it ends (bytes).
-
-    Raises
-    ------
-    ImageFileError
-        If the file is not an NRRD file or its header does not end.
-    """
+    """Fields and key/value pairs of an NRRD header, and where it ends (bytes)."""
     start = header_start(path)
     if not re.match(rb"NRRD000\d\r?\n", start):
         raise ImageFileError(f"{path}: not an NRRD file (no NRRD magic at its start). Export it again.")
@@ -81,47 +70,21 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     return fields, pairs, end.end() if end else len(start)
 
 
-def nrrd_shape(path: Path) -> tuple[int, ...]:
-    """All sizes that the header claims, without any other check."""
-    return tuple(whole_numbers(path, nrrd_fields(path)[0], "sizes"))
-
-
-def read_nrrd_header(
-    path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
-) -> StoredVolume:
-    """Read what an NRRD file (.nrrd, .nhdr, .seg.nrrd) holds, and where its voxels lie in LPS mm.
-
-    With ``vectors``, a file of three components per voxel is needed in place of a scalar one.
-
-    Raises
-    ------
-    ImageFileError
-        If the header is damaged, claims more than ``max_bytes``, names no anatomical space, is sheared, is
-        not 3D, or uses an encoding other than raw and gzip.
-    """
+def read_nrrd_header(path: Path, volume: int | None, max_bytes: int, vectors: bool) -> StoredVolume:
+    """What an NRRD file (.nrrd, .nhdr, .seg.nrrd) holds: scalars, or with `vectors` three components per voxel."""
     fields, _, end = nrrd_fields(path)
     sizes = whole_numbers(path, fields, "sizes")
     if whole_numbers(path, fields, "dimension") != [len(sizes)]:
         raise ImageFileError(f"{path}: {len(sizes)} sizes in {fields['dimension']} dimensions; the header is damaged.")
     axes, other = _nrrd_axes(path, fields, sizes)
-    select = components = None
-    if vectors:
-        components = _component_axis(path, fields, sizes, other)
-    else:
-        select = _nrrd_volume(path, fields, sizes, other, volume)
+    select, components = _fourth_axis(path, fields, sizes, other, volume, vectors)
     refuse_if_too_large(path, tuple(sizes), max_bytes)
     encoding = fields.get("encoding", "").lower()
     if encoding not in ("raw", "gzip", "gz"):
         raise ImageFileError(f"{path}: NRRD encoding '{encoding}' is not read; save it as raw or gzip.")
-    data, start = path, end
     detached = fields.get("data file", fields.get("datafile"))
-    if detached is not None:
-        data, start = detached_file(path, detached), 0
-    skips = {
-        fields.get("line skip", fields.get("lineskip", "0")),
-        fields.get("byte skip", fields.get("byteskip", "0")),
-    }
-    if skips != {"0"}:
+    data, start = (path, end) if detached is None else (detached_file(path, detached), 0)
+    if any(fields.get(name, "0") != "0" for name in ("line skip", "lineskip", "byte skip", "byteskip")):
         raise ImageFileError(f"{path}: NRRD files that skip lines or bytes are not read; save it again, attached.")
     kind = " ".join(fields.get("type", "").lower().split())
     if kind not in _NRRD_TYPES:
@@ -131,17 +94,14 @@ def read_nrrd_header(
         raise ImageFileError(f"{path}: the NRRD header does not give the byte order (endian); save it again.")
     if order not in ("little", "big"):
         raise ImageFileError(f"{path}: the byte order (endian) is '{order}', neither little nor big: damaged.")
-    return StoredVolume(
-        path=data,
-        grid=_nrrd_grid(path, fields, sizes, axes),
-        dtype=np.dtype((">" if order == "big" else "<") + _NRRD_TYPES[kind]),
-        layout=tuple(sizes),
-        unit=_nrrd_unit(path, fields),
-        file_start=start,
-        compressed=encoding != "raw",
-        select=select,
-        components=components,
-    )
+    unit = _nrrd_unit(path, fields)
+    to_lps_mm = np.array(_TO_LPS[fields["space"].lower()]) * MM_PER_UNIT[unit]
+    columns = np.stack([v for v in _vectors(path, fields) if v is not None], axis=1) * to_lps_mm[:, None]
+    origin = _vector(path, fields.get("space origin", ""), "space origin") * to_lps_mm
+    grid = grid_of_axes(path, [sizes[a] for a in axes], columns, origin)
+    dtype = np.dtype((">" if order == "big" else "<") + _NRRD_TYPES[kind])
+    packed = encoding != "raw"
+    return StoredVolume(data, grid, dtype, tuple(sizes), unit, start, packed, select=select, components=components)
 
 
 def _nrrd_axes(path: Path, fields: Mapping[str, str], sizes: list[int]) -> tuple[list[int], int | None]:
@@ -158,49 +118,37 @@ def _nrrd_axes(path: Path, fields: Mapping[str, str], sizes: list[int]) -> tuple
     return axes, others[0] if others else None
 
 
-def _nrrd_volume(
-    path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None, volume: int | None
-) -> tuple[int, int] | None:
-    """Which index of a fourth axis to keep, if there is one."""
-    if other is None:
-        pick_volume(path, 1, volume)
-        return None
-    count = sizes[other]
+def _fourth_axis(
+    path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None, volume: int | None, vectors: bool
+) -> tuple[tuple[int, int] | None, int | None]:
+    """What is kept of a fourth axis: a volume (axis, index), or a vector's three components (axis)."""
+    kinds = fields.get("kinds", "").split()
+    kind = kinds[other].lower() if other is not None and len(kinds) == len(sizes) else ""
+    count = 1 if other is None else sizes[other]
+    if vectors:
+        if count != 3:
+            raise ImageFileError(f"{path}: {count} components per voxel; vectors of three are needed.")
+        if kind not in ("", "none", "???", "list") and not kind.endswith("vector"):
+            raise ImageFileError(f"{path}: the three values of a voxel are of kind {kind}; a vector is needed.")
+        return None, other
     if path.name.lower().endswith(".seg.nrrd") and count > 1:
         raise ImageFileError(
             f"{path}: a segmentation of {count} layers, in which segments overlap; a label map has one "
             "label per voxel. In Slicer, export the segments to a label map, or remove the overlap."
         )
-    kind = _kind(fields, sizes, other)
     if count > 1 and not any(word in kind for word in ("list", "domain", "time", "?", "none")) and kind:
         raise ImageFileError(f"{path}: each voxel holds {count} values (kind {kind}); a scalar image is needed.")
-    return other, pick_volume(path, count, volume)
-
-
-def _component_axis(path: Path, fields: Mapping[str, str], sizes: list[int], other: int | None) -> int:
-    """Find the axis of a vector's three components."""
-    kind = "" if other is None else _kind(fields, sizes, other)
-    if other is None or sizes[other] != 3:
-        count = 1 if other is None else sizes[other]
-        raise ImageFileError(f"{path}: {count} components per voxel; vectors of three are needed.")
-    if kind not in ("", "none", "???", "list") and not kind.endswith("vector"):
-        raise ImageFileError(f"{path}: the three values of a voxel are of kind {kind}; a vector is needed.")
-    return other
-
-
-def _kind(fields: Mapping[str, str], sizes: list[int], axis: int) -> str:
-    kinds = fields.get("kinds", "").split()
-    return kinds[axis].lower() if len(kinds) == len(sizes) else ""
+    index = pick_volume(path, count, volume)
+    return None if other is None else (other, index), None
 
 
 def _vectors(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
     written = fields.get("space directions")
     space = fields.get("space", "").lower()
-    if written is None or _SPACES.get(space, space) not in _TO_LPS:
+    if written is None or space not in _TO_LPS:
         raise ImageFileError(
-            f"{path}: the NRRD header does not say how the image lies in the body (space: "
-            f"'{space or 'none'}', space directions: {'given' if written else 'none'}); the spaces that are "
-            f"read are {sorted(_TO_LPS)}."
+            f"{path}: the NRRD header does not say how the image lies in the body (space: '{space or 'none'}', space "
+            f"directions: {'given' if written else 'none'}); the spaces that are read are {sorted(_TO_LPS)}."
         )
     if not re.fullmatch(r"((none|\([^()]*\))\s*)+", written):
         raise ImageFileError(f"{path}: the header's 'space directions' are no vectors: '{written[:60]}'; damaged.")
@@ -210,22 +158,10 @@ def _vectors(path: Path, fields: Mapping[str, str]) -> list[FloatArray | None]:
 
 def _vector(path: Path, written: str, field: str) -> FloatArray:
     """The three numbers of ``(x,y,z)``."""
-    inside = re.fullmatch(r"\(([^()]*)\)", written)
-    numbers: list[float] = []
-    with suppress(ValueError):
-        numbers = [float(part) for part in inside[1].split(",")] if inside else []
-    if len(numbers) != 3:
-        raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
-    return np.array(numbers)
-
-
-def _nrrd_grid(path: Path, fields: Mapping[str, str], sizes: list[int], axes: list[int]) -> Grid:
-    space = fields["space"].lower()
-    signs = np.array(_TO_LPS[_SPACES.get(space, space)], dtype=np.float64)
-    columns = np.stack([v for v in _vectors(path, fields) if v is not None], axis=1)
-    origin = _vector(path, fields.get("space origin", ""), "space origin")
-    scale = MM_PER_UNIT[_nrrd_unit(path, fields)]
-    return grid_of_axes(path, [sizes[a] for a in axes], columns * signs[:, None] * scale, origin * signs * scale)
+    if match := re.fullmatch(r"\(([^(),]*),([^(),]*),([^(),]*)\)", written):
+        with suppress(ValueError):
+            return np.array([float(part) for part in match.groups()])
+    raise ImageFileError(f"{path}: the header's '{field}' is missing or not a vector (x,y,z): '{written[:60]}'.")
 
 
 def _nrrd_unit(path: Path, fields: Mapping[str, str]) -> str:

@@ -1,53 +1,49 @@
 """Reading images: NIfTI, NRRD, MetaImage and DICOM, to an Image in LPS mm.
 
-A file that is damaged, or whose place in space can be read in two ways, is refused with the reason. What
-was read differently from how it was written (units, a lone volume of a 4D file) is told by the logger
-``dvc.images``.
+A damaged file, or one with an ambiguous geometry, is refused with the reason. Conversions on the way (units, the only
+volume of a 4D file) are logged by ``dvc.images``.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import Float32Array
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image
-from dvc.io.images.dicom import dicom_shape, is_dicom, read_dicom
-from dvc.io.images.metaimage import meta_shape, read_meta_header
-from dvc.io.images.nifti import nifti_shape, read_nifti_header
-from dvc.io.images.nrrd import nrrd_shape, read_nrrd_header
+from dvc.io import StrPath
+from dvc.io.images.dicom import is_dicom, read_dicom
+from dvc.io.images.metaimage import read_meta_header
+from dvc.io.images.nifti import read_nifti_header
+from dvc.io.images.nrrd import read_nrrd_header
 from dvc.io.images.stored import MAX_BYTES, StoredVolume, Voxels
 
 _log = logging.getLogger("dvc.images")
 
 _MIN_SLICES = 4
 
-_Header = Callable[[Path, int | None, int, bool], StoredVolume]
-_Shape = Callable[[Path], tuple[int, ...]]
-_FORMATS: dict[str, tuple[str, _Header, _Shape]] = {
-    ".nii": ("NIfTI", read_nifti_header, nifti_shape),
-    ".nii.gz": ("NIfTI", read_nifti_header, nifti_shape),
-    ".nrrd": ("NRRD", read_nrrd_header, nrrd_shape),
-    ".nhdr": ("NRRD", read_nrrd_header, nrrd_shape),
-    ".mha": ("MetaImage", read_meta_header, meta_shape),
-    ".mhd": ("MetaImage", read_meta_header, meta_shape),
+_FORMATS: dict[str, tuple[str, Callable[[Path, int | None, int, bool], StoredVolume]]] = {
+    ".nii": ("NIfTI", read_nifti_header),
+    ".nii.gz": ("NIfTI", read_nifti_header),
+    ".nrrd": ("NRRD", read_nrrd_header),
+    ".nhdr": ("NRRD", read_nrrd_header),
+    ".mha": ("MetaImage", read_meta_header),
+    ".mhd": ("MetaImage", read_meta_header),
 }
 
 
 def read_image(
-    path: str | PathLike[str],
+    path: StrPath,
     *,
     allow_missing: bool = False,
     series: str | None = None,
     volume: int | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> Image:
-    """Read a 3D image, whatever its format, into LPS mm.
+    """Read a 3D image, whatever its format, into LPS mm: voxels in the order of the file, slope and intercept applied.
 
     Parameters
     ----------
@@ -61,16 +57,11 @@ def read_image(
     max_bytes : int
         Largest image that is read, counted in single precision.
 
-    Returns
-    -------
-    Image
-        Voxels in the order of the file; scaling (slope and intercept) applied.
-
     Raises
     ------
     ImageFileError
-        If the file is damaged, of an unknown kind, not a scalar 3D image of four slices or more, constant, or
-        does not say without contradiction where it lies.
+        If the file is damaged, of an unknown kind, not a scalar 3D image of four slices or more, constant, or its
+        geometry is missing or contradictory.
     InputError
         If voxels are NaN or infinite and ``allow_missing`` is not set, or ``series`` is missing or unknown.
     """
@@ -80,29 +71,36 @@ def read_image(
             f"{path}: an image of {' x '.join(map(str, grid.shape))} voxels; a volume needs at least "
             f"{_MIN_SLICES} slices along each axis, since strain is a matter of three dimensions."
         )
-    with np.errstate(over="ignore"):  # beyond single precision: infinite, and found below
+    with np.errstate(over="ignore"):  # beyond single precision: infinite, and refused below
         values = np.ascontiguousarray(voxels, dtype=np.float32)
-    return Image(grid, _checked_values(Path(path), values, allow_missing))
+    finite = np.isfinite(values)
+    missing = values.size - int(np.count_nonzero(finite))
+    if missing == values.size:
+        raise ImageFileError(f"{path}: no voxel has a finite value.")
+    if missing:
+        first = tuple(map(int, np.unravel_index(int(np.argmin(finite)), values.shape)))
+        problem = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
+        if not allow_missing:
+            raise InputError(f"{path}: {problem}. Repair the image, or have those voxels left out (allow_missing).")
+        _log.warning("%s: %s; taken as missing", path, problem)
+        values = np.where(finite, values, np.float32(np.nan))
+    low = np.nanmin(values)
+    if low == np.nanmax(values):
+        raise ImageFileError(f"{path}: a constant image (every voxel is {float(low):g}); there is nothing to follow.")
+    return Image(grid, values)
 
 
 def read_voxels(
-    path: str | PathLike[str],
-    *,
-    series: str | None = None,
-    volume: int | None = None,
-    max_bytes: int = MAX_BYTES,
+    path: StrPath, *, series: str | None = None, volume: int | None = None, max_bytes: int = MAX_BYTES
 ) -> tuple[Grid, Voxels]:
     """Grid (LPS mm) and voxels (ni, nj, nk) of a file or DICOM folder, in the file's own number type.
 
-    Raises
-    ------
-    ImageFileError, InputError
-        As `read_image`, but for the checks of the values.
+    Parameters and errors as in `read_image`, whose checks of the values are left out.
     """
     place = Path(path)
     if not place.exists():
         raise InputError(f"{place}: no such file or folder. Check the path.")
-    if place.is_dir() or _is_dicom_file(place):
+    if place.is_dir() or (_known_suffix(place.name) is None and is_dicom(place)):
         if volume is not None:
             raise InputError(f"{place}: volume={volume} is for 4D files; DICOM is chosen from by series.")
         return read_dicom(place, series=series, max_bytes=max_bytes)
@@ -117,85 +115,21 @@ def read_voxels(
 def read_header(
     path: Path, *, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False
 ) -> StoredVolume:
-    """Read what a file holds, its voxels not yet read.
-
-    Parameters
-    ----------
-    path : file (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd)
-    volume, max_bytes
-        As in `read_image`.
-    vectors : bool
-        A file of three components per voxel is needed, and no other is read; without, a scalar one.
-
-    Raises
-    ------
-    ImageFileError
-        As `read_image`, but for the checks of the voxels.
-    """
-    _, header, _ = _FORMATS[_suffix(path)]
-    return header(path, volume, max_bytes, vectors)
-
-
-def estimate_size(path: str | PathLike[str]) -> int:
-    """Bytes that the image of a file would take in single precision, from its header alone.
-
-    Raises
-    ------
-    ImageFileError
-        If the file is of an unknown kind or its header is damaged.
-    """
-    place = Path(path)
-    if not place.is_file():
-        raise InputError(f"{place}: no such file. Check the path.")
-    shape = dicom_shape if _is_dicom_file(place) else _FORMATS[_suffix(place)][2]
-    return 4 * int(np.prod([max(n, 0) for n in shape(place)], dtype=object))
+    """Read what a file holds, its voxels not yet read: scalars, or with `vectors` three components per voxel."""
+    suffix = _known_suffix(path.name)
+    if suffix is None:
+        raise ImageFileError(
+            f"{path}: images of this kind are not read. What is read: {', '.join(_FORMATS)}, enhanced DICOM files and "
+            "folders of DICOM files."
+        )
+    return _FORMATS[suffix][1](path, volume, max_bytes, vectors)
 
 
 def format_of(name: str) -> str:
-    """Format of an image that was read, by its name alone; a folder's, and a file's of no other format, is DICOM.
-
-    Examples
-    --------
-    >>> format_of("Load0.nii.gz"), format_of("Load0.mha"), format_of("Load0")
-    ('NIfTI', 'MetaImage', 'DICOM')
-    """
+    """Format of an image that was read, by its name alone; a folder's, and a file's of no other format, is DICOM."""
     suffix = _known_suffix(name)
     return "DICOM" if suffix is None else _FORMATS[suffix][0]
 
 
 def _known_suffix(name: str) -> str | None:
     return next((s for s in sorted(_FORMATS, key=len, reverse=True) if name.lower().endswith(s)), None)
-
-
-def _is_dicom_file(path: Path) -> bool:
-    return _known_suffix(path.name) is None and is_dicom(path)
-
-
-def _suffix(path: Path) -> str:
-    suffix = _known_suffix(path.name)
-    if suffix is not None:
-        return suffix
-    raise ImageFileError(
-        f"{path}: images of this kind are not read. What is read: {', '.join(_FORMATS)}, enhanced DICOM files and "
-        "folders of DICOM files."
-    )
-
-
-def _checked_values(path: Path, values: Float32Array, allow_missing: bool) -> Float32Array:
-    finite = np.isfinite(values)
-    missing = values.size - int(np.count_nonzero(finite))
-    if missing == values.size:
-        raise ImageFileError(f"{path}: no voxel has a finite value.")
-    if missing:
-        first = tuple(int(n) for n in np.unravel_index(int(np.argmin(finite)), values.shape))
-        problem = f"{missing} of {values.size} voxels are NaN or infinite, the first at index {first}"
-        if not allow_missing:
-            raise InputError(f"{path}: {problem}. Repair the image, or have those voxels left out (allow_missing).")
-        _log.warning("%s: %s; taken as missing", path, problem)
-        values = np.where(finite, values, np.float32(np.nan))
-        low, high = np.nanmin(values), np.nanmax(values)
-    else:
-        low, high = values.min(), values.max()
-    if low == high:
-        raise ImageFileError(f"{path}: a constant image (every voxel is {float(low):g}); there is nothing to follow.")
-    return values

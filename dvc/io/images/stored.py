@@ -1,8 +1,7 @@
 """Voxels as they lie in a file: where they start, how they are coded, and reading them with every check.
 
-Libraries that read images often hand back whatever they found in a file that was cut short or damaged. Here
-the number of bytes is compared with the header, and compressed streams are read to their end, so that
-their checksum counts.
+Libraries that read images often return whatever a truncated or damaged file holds. Here the number of bytes is compared
+with the header, and compressed streams are read to their end, so that their checksum counts.
 """
 
 from __future__ import annotations
@@ -31,38 +30,21 @@ Voxels = npt.NDArray[Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredVolume:
-    """One volume of a file, described by its header and not yet read.
+    """One volume of a file, described by its header and not yet read."""
 
-    Parameters
-    ----------
-    path : file that holds the voxels
-    grid : Grid
-        LPS mm.
-    dtype : as stored, with byte order
-    layout : sizes, fastest first; three, or four where each voxel holds several values
-    unit : of length, as the header names it; the grid is in mm whatever it is
-    file_start : bytes of the file before the stream of voxels
-    compressed : whether the stream is gzip or zlib
-    stream_start : bytes of the (expanded) stream before this volume
-    stream_rest : bytes of the (expanded) stream after this volume, which must be there too
-    slope, intercept : value = slope * stored + intercept
-    select : (axis, index) of ``layout`` to keep, where it has four
-    components : axis of ``layout`` along which the components of a vector lie, where they are kept
-    """
-
-    path: Path
-    grid: Grid
-    dtype: np.dtype[Any]
-    layout: tuple[int, ...]
-    unit: str = "mm"
-    file_start: int = 0
-    compressed: bool = False
-    stream_start: int = 0
-    stream_rest: int = 0
-    slope: float = 1.0
+    path: Path  # of the file that holds the voxels
+    grid: Grid  # LPS mm, whatever the unit of the file
+    dtype: np.dtype[Any]  # as stored, with byte order
+    layout: tuple[int, ...]  # sizes, fastest first; three, or four where each voxel holds several values
+    unit: str = "mm"  # of length, as the header names it
+    file_start: int = 0  # bytes of the file before the stream of voxels
+    compressed: bool = False  # gzip or zlib
+    stream_start: int = 0  # bytes of the (expanded) stream before this volume
+    stream_rest: int = 0  # bytes of the (expanded) stream after this volume, which must be there too
+    slope: float = 1.0  # value = slope * stored + intercept
     intercept: float = 0.0
-    select: tuple[int, int] | None = None
-    components: int | None = None
+    select: tuple[int, int] | None = None  # (axis, index) of ``layout`` to keep, where it has four
+    components: int | None = None  # axis of ``layout`` along which a vector's components lie, where they are kept
 
     @property
     def size_bytes(self) -> int:
@@ -72,13 +54,9 @@ class StoredVolume:
     def load(self) -> Voxels:
         """Read the voxels: (ni, nj, nk), vectors (ni, nj, nk, 3), in the stored number type where no scaling applies.
 
-        Raises
-        ------
-        ImageFileError
-            If the file is shorter or longer than its header says, or its compressed stream is damaged.
+        A file that is shorter or longer than its header says, or a damaged compressed stream, is refused.
         """
-        raw = self._bytes()
-        values = raw.view(self.dtype).reshape(self.layout, order="F")
+        values = self._bytes().view(self.dtype).reshape(self.layout, order="F")
         if self.select is not None:
             values = values.take(self.select[1], axis=self.select[0])
         if self.components is not None:
@@ -97,7 +75,7 @@ class StoredVolume:
         on_disk = self.path.stat().st_size - self.file_start
         most = on_disk * _DEFLATE_LIMIT if self.compressed else on_disk
         if most < expected:
-            raise ImageFileError(_cut_short(self.path, expected, on_disk, self.compressed))
+            raise self._cut_short(expected, on_disk, " compressed" if self.compressed else "")
         raw = np.empty(self.size_bytes, dtype=np.uint8)
         if not self.compressed:
             with self.path.open("rb") as file:
@@ -114,7 +92,7 @@ class StoredVolume:
                     raw[at : at + high - low] = np.frombuffer(block, np.uint8)[low:high]
                 available += len(block)
         if available < expected:
-            raise ImageFileError(_cut_short(self.path, expected, available, False))
+            raise self._cut_short(expected, available)
         if available > expected + _TRAILING:
             raise ImageFileError(
                 f"{self.path}: the header describes {expected} bytes of voxels, the file holds {available}: "
@@ -122,23 +100,15 @@ class StoredVolume:
             )
         return raw
 
-
-def _cut_short(path: Path, expected: int, available: int, compressed: bool) -> str:
-    coded = " compressed" if compressed else ""
-    return (
-        f"{path}: the file is cut short: the header needs {expected} bytes of voxels, the file holds "
-        f"{available}{coded} bytes. Copy or export it again."
-    )
+    def _cut_short(self, expected: int, available: int, coded: str = "") -> ImageFileError:
+        return ImageFileError(
+            f"{self.path}: the file is cut short: the header needs {expected} bytes of voxels, the file holds "
+            f"{available}{coded} bytes. Copy or export it again."
+        )
 
 
 def expanded(path: Path, start: int = 0) -> Iterator[bytes]:
-    """Blocks of a gzip or zlib stream that starts at byte ``start`` of a file, to its end and checksum.
-
-    Raises
-    ------
-    ImageFileError
-        If the stream is damaged, its checksum is wrong, or the file ends before it does.
-    """
+    """Blocks of the gzip or zlib stream at byte `start` of a file, to its end and checksum; refused if damaged."""
     with path.open("rb") as file:
         file.seek(start)
         decoder = zlib.decompressobj(wbits=47)  # 47: gzip or zlib, told apart by their first bytes
@@ -169,14 +139,8 @@ def expanded(path: Path, start: int = 0) -> Iterator[bytes]:
                 )
 
 
-def refuse_if_too_large(path: Path, shape: tuple[int, ...], max_bytes: int) -> int:
-    """Bytes of an image of this shape in single precision.
-
-    Raises
-    ------
-    ImageFileError
-        If that is more than ``max_bytes``, or a size is not positive.
-    """
+def refuse_if_too_large(path: Path, shape: tuple[int, ...], max_bytes: int) -> None:
+    """Refuse an image that takes more than `max_bytes` in single precision, or has a size that is not positive."""
     sizes = [int(n) for n in shape]
     if min(sizes) < 1:
         raise ImageFileError(f"{path}: the header gives the image sizes {sizes}; all must be positive.")
@@ -187,22 +151,15 @@ def refuse_if_too_large(path: Path, shape: tuple[int, ...], max_bytes: int) -> i
             f"GiB in single precision; the limit is {max_bytes / 2**30:,.1f} GiB. Either the header is "
             "damaged, or the image must be cropped or resampled first."
         )
-    return estimate
 
 
-def pick_volume(path: Path, count: int, volume: int | None, what: str = "volumes") -> int:
-    """Which of ``count`` volumes to read.
-
-    Raises
-    ------
-    ImageFileError
-        If there are several and none was asked for, or the one asked for is not there.
-    """
+def pick_volume(path: Path, count: int, volume: int | None) -> int:
+    """Which of `count` volumes to read: the one asked for, or the only one."""
     if volume is None:
         if count == 1:
             return 0
         raise ImageFileError(
-            f"{path}: the file holds {count} {what}; one is needed. Take it out into a file of its own: in Python, "
+            f"{path}: the file holds {count} volumes; one is needed. Take it out into a file of its own: in Python, "
             f'dvc.write_image("one.nii.gz", dvc.read_image("{path}", volume=N)) with N from 0 to {count - 1}.'
         )
     if not 0 <= volume < count:

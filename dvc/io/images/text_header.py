@@ -1,8 +1,9 @@
-"""What the text headers of NRRD and MetaImage have in common: numbers, units, axes, and voxels in a file beside."""
+"""What the text headers of NRRD and MetaImage share: numbers, units, axes, and voxels in a file beside."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ HEADER_LIMIT = 1 << 20
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "µm": 0.001, "micron": 0.001}
 _LARGEST_SIZE = 2.0**63
+_ORTHONORMAL = 1e-4
 
 
 def header_start(path: Path) -> bytes:
@@ -28,14 +30,10 @@ def detached_file(path: Path, name: str) -> Path:
     """Find the file beside a header that holds its voxels."""
     if name.startswith("LIST") or "%" in name:
         raise ImageFileError(f"{path}: voxels spread over several files are not read; save it as one file.")
-    data = path.parent / name
-    try:
-        there = data.is_file()
-    except OSError:  # no name that a file can have
-        there = False
-    if not there:
-        raise ImageFileError(f"{path}: the file of its voxels, '{name}', is not there; keep the two together.")
-    return data
+    with suppress(OSError):  # no name that a file can have
+        if (path.parent / name).is_file():
+            return path.parent / name
+    raise ImageFileError(f"{path}: the file of its voxels, '{name}', is not there; keep the two together.")
 
 
 def numbers_in(path: Path, text: str, field: str, count: int | None = None) -> list[float]:
@@ -65,13 +63,19 @@ def unit_of_length(path: Path, units: set[str]) -> str:
     return known.pop()
 
 
-def grid_of_axes(path: Path, shape: list[int], columns: FloatArray, origin: FloatArray) -> Grid:
+def grid_of_axes(
+    path: Path, shape: Sequence[int], columns: FloatArray, origin: FloatArray, *, single_precision: bool = False
+) -> Grid:
     """The grid with these steps along its axes, (3, 3) by columns, and origin, LPS mm."""
     with np.errstate(over="ignore"):
         spacing = np.linalg.norm(columns, axis=0)
     if not np.isfinite(spacing).all() or np.any(spacing <= 0):
         raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
+    direction = columns / spacing
+    if single_precision:
+        left, stretch, right = np.linalg.svd(direction)
+        direction = left @ right if np.abs(stretch - 1.0).max() < _ORTHONORMAL / 2 else direction
     try:
-        return Grid((shape[0], shape[1], shape[2]), spacing, origin, columns / spacing)
+        return Grid((shape[0], shape[1], shape[2]), spacing, origin, direction)
     except GeometryError as error:
         raise ImageFileError(f"{path}: {error}") from error

@@ -1,43 +1,35 @@
 """Writing images, masks, label maps and vector fields: NIfTI, NRRD and MetaImage.
 
-Headers are made anew and hold geometry only, so nothing of a patient can pass from an input to an output. A
-file appears under its name when it is whole: it is written beside it and then renamed.
+Headers are written from the geometry alone, so that nothing of a patient passes from an input to an output.
 
-Missing values are NaN. Programs built on ITK (Slicer, ITK-SNAP, SimpleITK) show a NaN of a NIfTI file as
-zero, but not one of an NRRD file or a MetaImage: give them one of those, or the mask of what is defined.
-
-References
-----------
-.. [1] NIfTI-1 intent codes: https://nifti.nimh.nih.gov/nifti-1/documentation/nifti1fields
+Missing values are NaN. Programs built on ITK (Slicer, ITK-SNAP, SimpleITK) show a NaN of a NIfTI file as zero, but not
+that of an NRRD file or a MetaImage: give them one of those, or the mask of valid voxels.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from os import PathLike
+from itertools import chain
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import nibabel
 import numpy as np
 import numpy.typing as npt
 
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_json, write_whole
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
+from dvc.io import StrPath
 from dvc.io.images.nifti import LPS_FROM_RAS
 from dvc.trust.verdict import Verdict
-
-StrPath = str | PathLike[str]
 
 _SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
 _LEVEL = 1  # floats hardly shrink at higher levels, which take several times as long
 _BLOCK = 1 << 22
-_NIFTI_VECTOR = 1007
 _NRRD_TYPES = {"f4": "float", "u1": "uint8", "u2": "uint16", "i4": "int32"}
 _META_TYPES = {"f4": "MET_FLOAT", "u1": "MET_UCHAR", "u2": "MET_USHORT", "i4": "MET_INT"}
 
@@ -86,9 +78,7 @@ def write_labels(path: StrPath, labels: LabelMap) -> None:
         raise OutputError(f"{place}: label {largest} is too large for the file format; number the labels anew.")
     _write(place, labels.grid, labels.labels.astype(dtype))
     table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["label", "name"])
-    writer.writerows(sorted(labels.names.items()))
+    csv.writer(table, lineterminator="\n").writerows([("label", "name"), *sorted(labels.names.items())])
     write_whole(_beside(place, ".csv"), table.getvalue())
 
 
@@ -103,12 +93,11 @@ def write_vectors(
     unit: str,
     verdict: Verdict | None = None,
 ) -> None:
-    """Write several values per voxel of the reference image, and what they mean in a JSON file beside it.
+    """Write several values per voxel of the reference image, and a JSON file beside them that says what they are.
 
-    NIfTI: 5D, (ni, nj, nk, 1, c). Three components in the frame LPS get the intent "vector" (1007) [1]_; the
-    affine is RAS as always, so that a reader must take the components' frame from the JSON file. Everything
-    else, such as symmetric tensors in the order xx, xy, xz, yy, yz, zz, has no intent: NIfTI's own order of
-    these is another.
+    NIfTI: 5D, (ni, nj, nk, 1, c). Three components in the frame LPS get the intent "vector" (1007) [1]_; the affine is
+    RAS as always, so that a reader must take the components' frame from the JSON file. Everything else, such as
+    symmetric tensors in the order xx, xy, xz, yy, yz, zz, has no intent: NIfTI's own order of these is another.
 
     Parameters
     ----------
@@ -118,10 +107,10 @@ def write_vectors(
         NaN where not defined.
     components : names of the c components
     meaning : what is written, in a line
-    frame : "LPS", or "invariant" for components that no frame changes
+    frame : "LPS", or "invariant" for components that do not depend on the frame
     unit : "mm", "1", ...
     verdict : Verdict, optional
-        Whether the values may be trusted; told in the JSON file.
+        Whether the values may be trusted; goes into the JSON file.
 
     Raises
     ------
@@ -129,6 +118,10 @@ def write_vectors(
         If shapes, names and frame do not fit together.
     OutputError
         If a file cannot be written; nothing is left under its name.
+
+    References
+    ----------
+    .. [1] NIfTI-1 intent codes: https://nifti.nimh.nih.gov/nifti-1/documentation/nifti1fields
     """
     place, array = Path(path), np.asarray(values)
     if array.shape != (*grid.shape, len(components)):
@@ -140,30 +133,13 @@ def write_vectors(
         raise InputError(f"{place}: frame '{frame}'; components are written in LPS, or are invariant.")
     vector = frame == "LPS" and len(components) == 3
     _write(place, grid, array.astype(np.float32, copy=False), vector=vector)
-    declared: dict[str, object] = {
-        "file": place.name,
-        "meaning": meaning,
-        "components": list(components),
-        "frame": frame,
-        "unit": unit,
-        "configuration": "reference",
-        "missing": "NaN",
-    }
-    if verdict is not None:
-        declared["verdict"] = verdict.as_dict()
-    write_whole(_beside(place, ".json"), json.dumps(declared, indent=2) + "\n")
+    declared: dict[str, object] = {"file": place.name, "meaning": meaning, "components": components, "frame": frame}
+    declared |= {"unit": unit, "configuration": "reference", "missing": "NaN"}
+    write_json(_beside(place, ".json"), declared | ({} if verdict is None else {"verdict": verdict.as_dict()}))
 
 
 def refuse_overwriting_inputs(outputs: Iterable[StrPath], inputs: Iterable[StrPath]) -> None:
-    """Refuse outputs that are one of the inputs, or lie in a folder that is one (a DICOM series).
-
-    Links are followed, so another name of the same file counts too.
-
-    Raises
-    ------
-    OutputError
-        Naming the output and the input.
-    """
+    """Refuse outputs that are one of the inputs (links followed), or lie in a folder that is one (a DICOM series)."""
     sources = [Path(p) for p in inputs]
     for output in map(Path, outputs):
         there = output.resolve()
@@ -192,23 +168,14 @@ def _write(path: Path, grid: Grid, values: npt.NDArray[Any], vector: bool = Fals
     values = values.astype(values.dtype.newbyteorder("<"), copy=False)
     makers: dict[str, Callable[[Grid, npt.NDArray[Any], bool], bytes]] = {".nrrd": _nrrd, ".mha": _meta}
     # NRRD and MetaImage keep the components of a voxel together, NIfTI one volume after the other.
-    together = suffix in makers
+    blocks = _blocks(values, together=suffix in makers)
     with whole_file(path) as part, part.open("wb") as file:
         header = makers.get(suffix, _nifti)(grid, values, vector)
-        parts = _blocks(values, together)
         if suffix == ".nrrd":
             file.write(header)
-            _deflate(file, parts)
-        elif suffix == ".nii.gz":
-            _deflate(file, _chained(header, parts))
+            file.writelines(_deflated(blocks))
         else:
-            for block in _chained(header, parts):
-                file.write(block)
-
-
-def _chained(header: bytes, parts: Iterator[bytes]) -> Iterator[bytes]:
-    yield header
-    yield from parts
+            file.writelines(_deflated([header], blocks) if suffix == ".nii.gz" else chain([header], blocks))
 
 
 def _blocks(values: npt.NDArray[Any], together: bool) -> Iterator[bytes]:
@@ -217,19 +184,17 @@ def _blocks(values: npt.NDArray[Any], together: bool) -> Iterator[bytes]:
         for c in range(values.shape[3]):
             yield from _blocks(values[..., c], together)
         return
-    per_slice = max(values[:, :, 0].nbytes, 1)
-    step = max(_BLOCK // per_slice, 1)
+    step = max(_BLOCK // max(values[:, :, 0].nbytes, 1), 1)
     for k in range(0, values.shape[2], step):
         part = values[:, :, k : k + step]
         yield np.ascontiguousarray(part.transpose(2, 1, 0, *range(3, values.ndim))).tobytes()
 
 
-def _deflate(file: IO[bytes], parts: Iterable[bytes]) -> None:
-    """Write a gzip stream without name and time, so that equal images give equal files."""
+def _deflated(*parts: Iterable[bytes]) -> Iterator[bytes]:
+    """Yield a gzip stream without name and time, so that equal images give equal files."""
     coder = zlib.compressobj(_LEVEL, wbits=31)
-    for part in parts:
-        file.write(coder.compress(part))
-    file.write(coder.flush())
+    yield from map(coder.compress, chain(*parts))
+    yield coder.flush()
 
 
 def _nifti(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:
@@ -244,52 +209,50 @@ def _nifti(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:
     header.set_sform(affine, code=1)
     header.set_xyzt_units("mm")
     header["scl_slope"], header["scl_inter"] = 1.0, 0.0
-    header["intent_code"] = _NIFTI_VECTOR if vector else 0
-    header["vox_offset"] = 352
-    header["magic"] = b"n+1"
+    header["intent_code"] = 1007 if vector else 0  # "vector"
+    header["vox_offset"], header["magic"] = 352, b"n+1"
     return bytes(header.binaryblock) + bytes(4)
 
 
 def _nrrd(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:
-    several = values.ndim == 4
-    directions = [f"({','.join(repr(float(v)) for v in column)})" for column in grid.affine[:3, :3].T]
-    sizes = ([values.shape[3]] if several else []) + list(grid.shape)
-    first = (["vector"] if vector else ["list"]) if several else []
+    count, kind = [*values.shape[3:]], "vector" if vector else "list"
+    directions = ["none" for _ in count] + [f"({_numbers(step, ',')})" for step in grid.affine[:3, :3].T]
+    sizes = [*count, *grid.shape]
     lines = [
         "NRRD0005",
         f"type: {_NRRD_TYPES[values.dtype.str[1:]]}",
         f"dimension: {len(sizes)}",
         "space: left-posterior-superior",
         f"sizes: {' '.join(map(str, sizes))}",
-        f"space directions: {' '.join((['none'] if several else []) + directions)}",
-        f"kinds: {' '.join([*first, 'domain', 'domain', 'domain'])}",
+        f"space directions: {' '.join(directions)}",
+        f"kinds: {' '.join([*(kind for _ in count), 'domain', 'domain', 'domain'])}",
         "endian: little",
         "encoding: gzip",
         'space units: "mm" "mm" "mm"',
-        f"space origin: ({','.join(repr(float(v)) for v in grid.origin_mm)})",
+        f"space origin: ({_numbers(grid.origin_mm, ',')})",
     ]
     return ("\n".join(lines) + "\n\n").encode()
 
 
 def _meta(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:
     del vector  # MetaImage has no word for it
-
-    def numbers(array: npt.NDArray[Any]) -> str:
-        return " ".join(repr(float(v)) for v in array.ravel())
-
     lines = [
         "ObjectType = Image",
         "NDims = 3",
         "BinaryData = True",
         "BinaryDataByteOrderMSB = False",
         "CompressedData = False",
-        f"TransformMatrix = {numbers(grid.direction.T)}",
-        f"Offset = {numbers(grid.origin_mm)}",
+        f"TransformMatrix = {_numbers(grid.direction.T)}",
+        f"Offset = {_numbers(grid.origin_mm)}",
         "CenterOfRotation = 0 0 0",
-        f"ElementSpacing = {numbers(grid.spacing_mm)}",
+        f"ElementSpacing = {_numbers(grid.spacing_mm)}",
         f"DimSize = {' '.join(map(str, grid.shape))}",
         *([f"ElementNumberOfChannels = {values.shape[3]}"] if values.ndim == 4 else []),
         f"ElementType = {_META_TYPES[values.dtype.str[1:]]}",
         "ElementDataFile = LOCAL",
     ]
     return ("\n".join(lines) + "\n").encode()
+
+
+def _numbers(array: npt.NDArray[Any], mark: str = " ") -> str:
+    return mark.join(repr(float(v)) for v in array.ravel())

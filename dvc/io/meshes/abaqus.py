@@ -1,7 +1,7 @@
 """Nodes, elements and element sets of an Abaqus input file (.inp), with the file's own numbers.
 
-The dialect of Abaqus that CalculiX shares. One part in global coordinates is read; what would move, join or
-make geometry elsewhere in the file is refused: a mesh in the wrong place gives wrong strains in silence.
+The dialect of Abaqus that CalculiX shares. One part in global coordinates is read; what would move, join or create
+geometry elsewhere in the file is refused: a misplaced mesh gives wrong strains without a warning.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ _SHAPES = {
 }  # fmt: skip
 _VARIANTS = set("HRIMTSPEW5")
 _READ = {"NODE", "ELEMENT", "ELSET", "NSET"}
-_SET_OF = {"ELSET": "element set", "NSET": "node set"}
 _ELSEWHERE = {"INCLUDE", "SYSTEM", "NGEN", "NCOPY", "NFILL", "ELGEN", "ELCOPY", "NMAP"}
 
 
@@ -45,15 +44,9 @@ class _Keyword:
 def read_abaqus(path: Path) -> RawMesh:
     """Read the mesh of an Abaqus or CalculiX input file.
 
-    Reads ``*NODE`` (any number of blocks), ``*ELEMENT`` (solids incl. hybrid and reduced ones, shells,
-    membranes, surface elements), ``*ELSET`` and ``*NSET`` (lists, GENERATE, sets of sets). Springs, trusses, connectors
-    and the reference points of an assembly are not tissue: they are left out, and logged.
-
-    Raises
-    ------
-    ImageFileError
-        If the file is damaged, holds a solid element of another kind, more than one part, an instance that is
-        moved, or nodes and elements that come from elsewhere (``*INCLUDE``, ``*NGEN`` and their like).
+    Reads ``*NODE`` (any number of blocks), ``*ELEMENT`` (solids incl. hybrid and reduced ones, shells, membranes,
+    surface elements), ``*ELSET`` and ``*NSET`` (lists, GENERATE, sets of sets). Springs, trusses, connectors and the
+    reference points of an assembly are not tissue: they are left out, and logged.
     """
     mesh = NumberedMesh(path)
     element_sets, node_sets = _Sets(path, "ELSET"), _Sets(path, "NSET")
@@ -199,9 +192,8 @@ class _Sets:
     def _members(self, name: str, seen: tuple[str, ...] = ()) -> list[int]:
         key = name.strip('"').casefold()
         if key in seen or key not in self._entries:
-            raise ImageFileError(
-                f"{self._path}: the {_SET_OF[self._kind]} {name!r} is not defined, or contains itself."
-            )
+            kind = {"ELSET": "element set", "NSET": "node set"}[self._kind]
+            raise ImageFileError(f"{self._path}: the {kind} {name!r} is not defined, or contains itself.")
         members: list[int] = []
         for entry in self._entries[key]:
             members += [int(entry)] if entry.isdigit() else self._members(entry, (*seen, key))

@@ -31,36 +31,20 @@ _DEGENERATE = {
 _FORMAT = re.compile(r"\((\d+)i(\d+)(?:,(\d+)e(\d+))?", re.IGNORECASE)
 
 
-class _Lines:
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
-
-    def __iter__(self) -> Iterator[str]:
-        return self._lines
-
-    def next(self, within: str) -> str:
-        for line in self._lines:
-            return line
-        raise ImageFileError(f"{self._path} ends within {within}: it is cut short.")
+def _next(lines: Iterator[str], within: str) -> str:
+    for line in lines:
+        return line
+    raise ValueError(f"it ends within {within}: cut short")
 
 
 def read_ansys(path: Path) -> RawMesh:
-    """Read the mesh of a blocked archive, in the global Cartesian frame.
-
-    Its regions are the element components and each material ("material 1").
-
-    Raises
-    ------
-    ImageFileError
-        If the file is damaged or cut short, or has no block of nodes or of elements.
-    """
+    """Read a blocked archive in the global Cartesian frame; its regions: element components and "material 1" ..."""
     mesh = NumberedMesh(path)
     types: dict[str, str] = {}
     materials: dict[int, list[int]] = {}
     components: dict[str, dict[str, list[int]]] = {"ELEM": {}, "NODE": {}}
     words: set[str] = set()
-    lines = _Lines(path)
+    lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
     for line in lines:
         fields = [f.strip() for f in line.split("!")[0].split(",")]
         word = fields[0].upper()
@@ -80,9 +64,7 @@ def read_ansys(path: Path) -> RawMesh:
                 of_kind = components.setdefault(fields[2][:4].upper(), {})
                 of_kind[fields[1].upper()] = _members(lines, int(fields[3]))
     if not {"NBLOCK", "EBLOCK"} <= words:
-        raise ImageFileError(
-            f"{path} has no nodes or no elements in blocks. Write it in ANSYS with CDWRITE, DB, name, cdb."
-        )
+        raise ImageFileError(f"{path} has no nodes or no elements in blocks. Write it with CDWRITE, DB, name, cdb.")
     regions = {f"material {number}": materials[number] for number in sorted(materials)}
     return mesh.by_index(regions | components["ELEM"], components["NODE"])
 
@@ -101,18 +83,18 @@ def _columns(line: str, width: int, count: int | None = None) -> list[int]:
     return [int(line[i * width : (i + 1) * width]) for i in range(columns)]
 
 
-def _add_types(lines: _Lines, types: dict[str, str]) -> None:
-    _, width, *_ = _format(lines.next("ETBLOCK"))
-    while (line := lines.next("ETBLOCK")).strip() != "-1":
+def _add_types(lines: Iterator[str], types: dict[str, str]) -> None:
+    _, width, *_ = _format(_next(lines, "ETBLOCK"))
+    while (line := _next(lines, "ETBLOCK")).strip() != "-1":
         number, kind = _columns(line, width, 2)
         types[str(number)] = str(kind)
 
 
-def _add_nodes(lines: _Lines, mesh: NumberedMesh) -> None:
-    count, width, _, wide = _format(lines.next("NBLOCK"))
+def _add_nodes(lines: Iterator[str], mesh: NumberedMesh) -> None:
+    count, width, _, wide = _format(_next(lines, "NBLOCK"))
     start = count * width
     # The end is written in one way in old archives and in another in new ones.
-    while not (line := lines.next("NBLOCK")).lstrip().startswith(("N,", "-1")):
+    while not (line := _next(lines, "NBLOCK")).lstrip().startswith(("N,", "-1")):
         # Trailing zeros are left out, so a row may hold fewer than three coordinates.
         at = [line[start + i * wide : start + (i + 1) * wide].strip() for i in range(3)]
         cut = [text for text in at if text and len(text) < wide // 2]
@@ -121,15 +103,17 @@ def _add_nodes(lines: _Lines, mesh: NumberedMesh) -> None:
         mesh.add_node(int(line[:width]), [float(text or 0.0) for text in at])
 
 
-def _add_elements(lines: _Lines, types: dict[str, str], mesh: NumberedMesh, materials: dict[int, list[int]]) -> None:
-    _, width, *_ = _format(lines.next("EBLOCK"))
+def _add_elements(
+    lines: Iterator[str], types: dict[str, str], mesh: NumberedMesh, materials: dict[int, list[int]]
+) -> None:
+    _, width, *_ = _format(_next(lines, "EBLOCK"))
     left_out: Counter[str] = Counter()
-    while (line := lines.next("EBLOCK")).strip() != "-1":
+    while (line := _next(lines, "EBLOCK")).strip() != "-1":
         numbers = _columns(line, width)
         material, kind, number, count = numbers[0], str(numbers[1]), numbers[10], numbers[8]
         nodes = numbers[_HEAD:]
         while len(nodes) < count:
-            nodes += _columns(lines.next("EBLOCK"), width)
+            nodes += _columns(_next(lines, "EBLOCK"), width)
         if kind not in types:
             raise ValueError(f"element {number} has type {kind}, which no ET defines")
         cell = _shape(types[kind], nodes[:count])
@@ -142,11 +126,11 @@ def _add_elements(lines: _Lines, types: dict[str, str], mesh: NumberedMesh, mate
         _log.warning("%s: %d elements of type %s are left out: no solid or shell that is read.", mesh.path, count, kind)
 
 
-def _members(lines: _Lines, count: int) -> list[int]:
-    _, width, *_ = _format(lines.next("CMBLOCK"))
+def _members(lines: Iterator[str], count: int) -> list[int]:
+    _, width, *_ = _format(_next(lines, "CMBLOCK"))
     numbers: list[int] = []
     while len(numbers) < count:
-        numbers += _columns(lines.next("CMBLOCK"), width)
+        numbers += _columns(_next(lines, "CMBLOCK"), width)
     members: list[int] = []
     for number in numbers:  # a negative one ends a run
         members += range(members[-1] + 1, -number + 1) if number < 0 else [number]

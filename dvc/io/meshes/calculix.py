@@ -23,13 +23,7 @@ _NODE, _VALUE = 10, 12  # columns of a number of a node, and of a value
 
 
 def read_frd(path: Path) -> RawMesh:
-    """Read a result file: its regions are the materials ("material 1"), its field the last step's displacement.
-
-    Raises
-    ------
-    ImageFileError
-        If it is binary, damaged, cut short, or has no nodes and elements.
-    """
+    """Read a result file: its regions are the materials ("material 1"), its field the last step's displacement."""
     try:
         text = path.read_text(encoding="ascii")
     except (UnicodeDecodeError, OSError) as error:

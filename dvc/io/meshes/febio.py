@@ -1,8 +1,8 @@
 """FEBio's plot files (.xplt): nodes, elements, parts and the last state's displacements.
 
 A file is a tree of chunks: a tag and a length in bytes (two little-endian integers of 32 bits), then data or further
-chunks. The layout is that of FEBio's specification of its binary database and of the program that writes it (versions
-2.0 to 3.5 of the format, FEBio 3 and 4); states may be compressed, each by itself.
+chunks, as FEBio's specification of its binary database and the program itself have it (versions 2.0 to 3.5 of the
+format, FEBio 3 and 4); states may be compressed, each by itself.
 """
 
 from __future__ import annotations
@@ -49,11 +49,6 @@ def read_xplt(path: Path) -> RawMesh:
     """Read a plot file: its regions are FEBio's parts, its field the last state's displacement.
 
     Nodes have FEBio's numbers, where the file has them; else they are counted from 0.
-
-    Raises
-    ------
-    ImageFileError
-        If it is none, damaged, cut short, changes its mesh between states, or holds elements that are not read.
     """
     with damage_named(f"{path}: its sections"):
         data = path.read_bytes()
@@ -73,7 +68,7 @@ def read_xplt(path: Path) -> RawMesh:
 
 
 def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Top chunks; one that is compressed is known by its tag, which is none."""
+    """Top chunks; a compressed one is recognised by its first bytes, which are no tag."""
     at = 4
     while at < len(data):
         if len(data) >= at + 8 and struct.unpack_from("<I", data, at)[0] in (_ROOT, _MESH, _STATE):

@@ -24,31 +24,15 @@ _DAMAGE = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawMesh:
-    """Nodes, cells, sets and nodal fields in the file's own unit, frame and order.
-
-    Attributes
-    ----------
-    path : Path
-    points : (n, 3)
-    node_ids : (n,) int
-        The file's number of each node; the index from 0 in a format without numbers.
-    blocks : list of (kind in meshio's names, node indices (m, k))
-        Cells are counted through all blocks.
-    regions : mapping of str to (k,) int
-        Cells of each named set.
-    node_sets : mapping of str to (k,) int
-        Node indices of each named set.
-    at_nodes : mapping of str to (n, ...)
-        Fields; NaN at nodes for which the file gives no value.
-    """
+    """Nodes, cells, sets and nodal fields in the file's own unit, frame and order."""
 
     path: Path
-    points: Any
-    node_ids: IntArray
-    blocks: list[tuple[str, Any]]
-    regions: Mapping[str, IntArray]
-    node_sets: Mapping[str, IntArray] = field(default_factory=dict)
-    at_nodes: Mapping[str, Any] = field(default_factory=dict)
+    points: Any  # (n, 3)
+    node_ids: IntArray  # (n,) the file's number of each node; the index from 0 in a format without numbers
+    blocks: list[tuple[str, Any]]  # kind in meshio's names, node indices (m, k); cells count through all blocks
+    regions: Mapping[str, IntArray]  # cells of each named set
+    node_sets: Mapping[str, IntArray] = field(default_factory=dict)  # node indices of each named set
+    at_nodes: Mapping[str, Any] = field(default_factory=dict)  # fields (n, ...); NaN where the file gives no value
 
 
 @dataclass(slots=True)
@@ -84,12 +68,7 @@ class NumberedMesh:
     ) -> RawMesh:
         """The mesh by indices: nodes in the file's order, cells grouped by kind.
 
-        Sets may name elements and nodes that were left out; a field may not.
-
-        Raises
-        ------
-        ImageFileError
-            If there are no nodes, or an element or a field names a node that the file does not define.
+        Sets may name elements and nodes that were left out; an element or a field may not.
         """
         if not self.nodes:
             raise ImageFileError(f"{self.path} has no nodes: there is no mesh in it.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +12,13 @@ from meshio._common import num_nodes_per_cell
 
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
+from dvc.io import StrPath
 from dvc.io.meshes.abaqus import read_abaqus
 from dvc.io.meshes.ansys import read_ansys
 from dvc.io.meshes.calculix import read_frd
 from dvc.io.meshes.febio import read_xplt
-from dvc.io.meshes.gmsh import read_gmsh
 from dvc.io.meshes.raw import RawMesh
-from dvc.io.meshes.vtk import read_vtk
+from dvc.io.meshes.through_meshio import read_gmsh, read_vtk
 from dvc.mesh import TetMesh, check_extent, checked_indices, checked_points, outer_faces
 
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0}
@@ -57,14 +56,12 @@ class MeshFile:
 
     Attributes
     ----------
-    path : Path
-        The file.
     unit, frame : str
         The file's own: "mm" or "m", "LPS" or "RAS".
     points_mm : (n, 3)
         All nodes, mid-side nodes too, LPS mm.
     node_ids : (n,) int
-        The file's numbers of its nodes (Gmsh, Abaqus); the index from 0 in VTK files, which give none.
+        The file's numbers of its nodes; the index from 0 in VTK files, which give none.
     blocks : tuple of CellBlock
         All cells, surfaces and lines too; cells are counted through all blocks.
     regions : mapping of str to (k,) int
@@ -102,13 +99,13 @@ class MeshFile:
         return np.stack([self.points_mm.min(axis=0), self.points_mm.max(axis=0)])
 
 
-def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
+def read_mesh(path: StrPath, *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
     """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2, 4.1), Abaqus (.inp), ANSYS (.cdb), CalculiX (.frd), FEBio (.xplt).
 
     Parameters
     ----------
     path : path
-        The file; its ending tells the format.
+        The file; its ending gives the format.
     unit : {"mm", "m"}
         Unit of length of the file's coordinates.
     frame : {"LPS", "RAS"}
@@ -128,7 +125,7 @@ def read_mesh(path: str | os.PathLike[str], *, unit: str = "mm", frame: str = "L
     ImageFileError
         If the file is missing, damaged, or has no volume cells.
     GeometryError
-        If the mesh is not usable; see `dvc.mesh.TetMesh`.
+        If the mesh is not usable; see `dvc.TetMesh`.
     """
     path = Path(path)
     if unit not in MM_PER_UNIT:
@@ -166,9 +163,7 @@ def _checked(raw: RawMesh, unit: str, frame: str) -> MeshFile:
         )
     check_extent(points[np.unique(np.concatenate([block.nodes.ravel() for block in volumes]))])
     regions = {name: frozen(index, np.int64) for name, index in raw.regions.items() if len(index)}
-    tets = None
-    if all(block.shape == "tetra" for block in volumes):
-        tets = _tetrahedra(points, raw.node_ids, blocks, regions, raw.node_sets)
+    tets = _tetrahedra(raw, points, blocks, regions) if all(block.shape == "tetra" for block in volumes) else None
     return MeshFile(
         path=path,
         unit=unit,
@@ -182,13 +177,7 @@ def _checked(raw: RawMesh, unit: str, frame: str) -> MeshFile:
     )
 
 
-def _tetrahedra(
-    points: FloatArray,
-    node_ids: IntArray,
-    blocks: list[CellBlock],
-    regions: Mapping[str, IntArray],
-    node_sets: Mapping[str, IntArray],
-) -> TetMesh:
+def _tetrahedra(raw: RawMesh, points: FloatArray, blocks: list[CellBlock], regions: Mapping[str, IntArray]) -> TetMesh:
     shape = np.repeat([block.shape for block in blocks], [len(block.nodes) for block in blocks])
 
     def gathered(wanted: str) -> tuple[IntArray, IntArray]:
@@ -205,11 +194,11 @@ def _tetrahedra(
             tissues[name] = tet_row[solid]
         if len(flat):
             surfaces[name] = triangles[triangle_row[flat]]
-    outside = outer_faces(cells) if node_sets else np.empty((0, 3), dtype=np.int64)
-    for name, nodes in node_sets.items():
+    outside = outer_faces(cells) if raw.node_sets else np.empty((0, 3), dtype=np.int64)
+    for name, nodes in raw.node_sets.items():
         inside = np.zeros(len(points), dtype=bool)
         inside[nodes] = True
         faces = outside[inside[outside].all(axis=1)]
         if len(faces):
             surfaces.setdefault(name, faces)
-    return TetMesh(points, cells, tissues, surfaces, node_ids)
+    return TetMesh(points, cells, tissues, surfaces, raw.node_ids)

@@ -1,33 +1,156 @@
-"""Mesh files that meshio reads, with its many kinds of failure and its printing in one place."""
+"""Gmsh (.msh) and VTK files (.vtu, .vtk), by meshio, with its many kinds of failure and its printing in one place.
+
+Of Gmsh it passes over node numbers, groups of one name and the order of some nodes: see the Gmsh reference manual,
+sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
+"""
 
 from __future__ import annotations
 
-import contextlib
 import io
 import logging
+import re
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
+import meshio
+import numpy as np
 from meshio._mesh import topological_dimension
+from meshio.gmsh import _gmsh22, _gmsh41
 
+from dvc.arrays import IntArray
 from dvc.errors import ImageFileError
+from dvc.io.meshes.raw import RawMesh, damage_named
 
 _log = logging.getLogger("dvc.io.meshes.read")
 
 # meshio 5.3.5 reads and writes these cells, but has left them out of its own table of dimensions, and fails on them.
 topological_dimension.update({"wedge15": 3, "pyramid13": 3})
 
+# Cell arrays that hold a region's number, in the order in which they are looked for.
+_REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part", "part_id")
+_MOST_REGIONS = 256
+# Quadratic cells of Gmsh in VTK's order, of those that meshio leaves as they are.
+_TO_VTK = {
+    "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
+    "pyramid14": [0, 1, 2, 3, 4, 5, 8, 10, 6, 7, 9, 11, 12, 13],
+}
 
-def read_through_meshio(path: Path, read: Callable[[str], Any]) -> Any:
-    """Read a file by one of meshio's readers.
 
-    Raises
-    ------
-    ImageFileError
-        If it cannot, for whatever reason.
+def read_gmsh(path: Path) -> RawMesh:
+    """Read a .msh file (version 2.2 or 4.1, text or binary): its regions are the physical groups."""
+    names = _group_names(path)
+    with _names_apart(path, names) as (place, real):
+        mesh = _read(path, lambda _: meshio.gmsh.read(str(place)))
+    blocks = [(c.type, c.data[:, _TO_VTK[c.type]] if c.type in _TO_VTK else c.data) for c in mesh.cells]
+    sizes = [len(data) for _, data in blocks]
+    groups: list[tuple[str, IntArray]] = []
+    if "gmsh:physical" in mesh.cell_data:
+        tag = np.concatenate(mesh.cell_data["gmsh:physical"])
+        dimension = np.repeat([topological_dimension.get(kind, -1) for kind, _ in blocks], sizes)
+        for d, t in np.unique(np.column_stack([dimension, tag])[tag != 0], axis=0).tolist():
+            groups.append((names.get((d, t), f"physical {t}"), np.flatnonzero((dimension == d) & (tag == t))))
+    starts = np.cumsum([0, *sizes])[:-1]
+    for name, parts in mesh.cell_sets.items():  # version 4.1, where a cell may be in several groups
+        if not name.startswith("gmsh:"):
+            if len(parts) != len(starts):
+                raise ImageFileError(f"{path}: its $Elements section is cut short.")
+            pairs = zip(parts, starts, strict=True)
+            cells = np.concatenate([np.asarray(part, dtype=np.int64) + start for part, start in pairs])
+            groups.append((real[name], cells))
+    regions: dict[str, IntArray] = {}
+    for name, cells in groups:  # a volume and its surface may share a name: the shape distinguishes their cells
+        regions[name] = np.union1d(regions.get(name, np.empty(0, dtype=np.int64)), cells)
+    return RawMesh(path, mesh.points, _node_numbers(path, len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
+
+
+def _node_numbers(path: Path, count: int) -> IntArray:
+    """Node tags of a .msh file (version 2.2 or 4.1, text or binary), (count,), in the file's order.
+
+    Gmsh numbers nodes freely: from any number, with gaps, in any order. Boundary conditions refer to these numbers, so
+    they are read and never assumed.
     """
+    data = path.read_bytes()
+    with damage_named(f"{path}: its $MeshFormat section"):
+        version, mode, size = _section(data, b"MeshFormat").split()[:3]
+    if version not in (b"2.2", b"4.1"):
+        raise ImageFileError(
+            f"{path} is a Gmsh file of version {version.decode(errors='replace')}; 2.2 and 4.1 are read. "
+            "Save it again with Gmsh (Mesh.MshFileVersion = 4.1)."
+        )
+
+    def read_tags(_: str) -> IntArray:
+        with path.open("rb") as file:  # meshio reads these numbers, and keeps them to itself
+            file.seek(_start(data, b"Nodes"))
+            if version == b"2.2":
+                return np.array(_gmsh22._read_nodes(file, mode == b"0")[1], dtype=np.int64)
+            return np.array(_gmsh41._read_nodes(file, mode == b"0", int(size))[1] + 1, dtype=np.int64)
+
+    tags: IntArray = _read(path, read_tags)
+    if len(tags) != count or len(np.unique(tags)) != count:
+        raise ImageFileError(
+            f"{path}: {len(np.unique(tags))} different node numbers were found for {count} nodes; the file is damaged."
+        )
+    return tags
+
+
+_GROUP = re.compile(rb'^[ \t]*(\d+)[ \t]+(\d+)[ \t]+"(.*)"[ \t]*\r?$', re.MULTILINE)
+
+
+def _group_names(path: Path) -> dict[tuple[int, int], str]:
+    """Names of a .msh file's physical groups by dimension and tag; a volume and its surface may share one."""
+    try:
+        named = _section(path.read_bytes(), b"PhysicalNames")
+    except ValueError:
+        return {}
+    return {(int(d), int(tag)): name.decode(errors="replace") for d, tag, name in _GROUP.findall(named)}
+
+
+@contextmanager
+def _names_apart(path: Path, names: dict[tuple[int, int], str]) -> Iterator[tuple[Path, dict[str, str]]]:
+    """A file in which every group has a name of its own, as meshio needs it, and the real name of each of these."""
+    if len(set(names.values())) == len(names):
+        yield path, {name: name for name in names.values()}
+        return
+    data = path.read_bytes()
+    old = _section(data, b"PhysicalNames")
+    with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
+        copy = Path(folder) / path.name
+        copy.write_bytes(data.replace(old, _GROUP.sub(rb'\1 \2 "\1 \2"', old), 1))
+        yield copy, {f"{dimension} {tag}": name for (dimension, tag), name in names.items()}
+
+
+def _section(data: bytes, name: bytes) -> bytes:
+    start = _start(data, name)
+    return data[start : data.index(b"$End" + name, start)]
+
+
+def _start(data: bytes, name: bytes) -> int:
+    return data.index(b"\n", data.index(b"$" + name)) + 1
+
+
+def read_vtk(path: Path) -> RawMesh:
+    """Read a .vtu or .vtk file; its nodes have no numbers and are counted from 0."""
+    mesh = _read(path, meshio.vtu.read if path.suffix.lower() == ".vtu" else meshio.vtk.read)
+    regions: dict[str, IntArray] = {}
+    arrays = {name.casefold(): name for name in mesh.cell_data}
+    for wanted in _REGION_ARRAYS:
+        if wanted in arrays:
+            values = np.concatenate(mesh.cell_data[arrays[wanted]])
+            values = values[:, 0] if values.shape[1:] == (1,) else values  # as legacy VTK has scalars
+            numbers = np.unique(values)
+            if values.ndim == 1 and len(numbers) <= _MOST_REGIONS and np.all(numbers == np.round(numbers)):
+                regions = {f"{arrays[wanted]} {int(n)}": np.flatnonzero(values == n) for n in numbers}
+                break
+    blocks = [(block.type, block.data) for block in mesh.cells]
+    return RawMesh(path, mesh.points, np.arange(len(mesh.points)), blocks, regions, at_nodes=mesh.point_data)
+
+
+def _read(path: Path, read: Callable[[str], Any]) -> Any:
+    """Read a file by one of meshio's readers; refused if that fails, for whatever reason."""
     with silenced() as said, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -41,11 +164,11 @@ def read_through_meshio(path: Path, read: Callable[[str], Any]) -> Any:
             ) from error
 
 
-@contextlib.contextmanager
+@contextmanager
 def silenced() -> Iterator[io.StringIO]:
     """Keep what meshio prints off the terminal, and log it."""
     said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    with redirect_stdout(said), redirect_stderr(said):
         yield said
     if said.getvalue().strip():
         _log.info("meshio: %s", " ".join(said.getvalue().split()))

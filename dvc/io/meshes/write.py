@@ -1,14 +1,12 @@
 """Results on the user's own mesh: VTU to look at, CSV of nodal displacements for the user's solver.
 
-Values come in LPS mm; what is written is in the mesh file's own frame and unit, so that a displacement can be
-taken over as a boundary condition as it stands.
+Values come in LPS mm and are written in the mesh file's own frame and unit, so that a displacement can be used as a
+boundary condition as it stands.
 """
 
 from __future__ import annotations
 
 import csv
-import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,8 +14,9 @@ import meshio
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
+from dvc.io import StrPath
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS, MeshFile
 from dvc.io.meshes.through_meshio import silenced
 from dvc.trust.verdict import LEVELS, Verdict
@@ -27,55 +26,23 @@ VERDICT_FIELD = "verdict_0_trust_1_use_with_care_2_do_not_trust"
 
 
 def write_on_mesh(
-    path: str | os.PathLike[str],
+    path: StrPath,
     mesh: MeshFile,
     point_data: Mapping[str, FloatArray],
     cell_data: Mapping[str, FloatArray],
     verdict: Verdict | None = None,
-) -> dict[str, int]:
+) -> None:
     """Write results on the user's own mesh as a VTU file (binary), in the mesh file's own frame and unit.
 
-    Parameters
-    ----------
-    path : path
-        The file to write, ending in .vtu. It appears under this name only when it is whole.
-    mesh : MeshFile
-        The user's mesh; written with all its nodes and cells, whatever their kind.
-    point_data, cell_data : mapping of str to array
-        One row for each node of ``mesh``, or for each cell through all its blocks; in LPS. (n,) is a scalar,
-        (n, 3) a vector and (n, 3, 3) a tensor in space, both turned into the mesh's frame (principal values
-        are three scalars, not a vector). A name that ends in ``_mm`` is a length: it is converted to the
-        mesh's unit, and so is the ending of its name. NaN stays NaN. The nodes' own numbers are added as
-        ``node``.
-    verdict : Verdict, optional
-        Whether the results may be trusted: field data of the name `VERDICT_FIELD`.
-
-    Returns
-    -------
-    dict of str to int
-        For each array, as it is named in the file, the number of rows that hold a NaN.
-
-    Raises
-    ------
-    InputError
-        If an array has not one row for each node or cell, or the file would replace the mesh itself.
-    OutputError
-        If the file cannot be written.
+    The data, in LPS, have one row for each node of `mesh`, or for each cell through all its blocks. (n,) is a scalar,
+    (n, 3) a vector and (n, 3, 3) a tensor, both turned into the mesh's frame (principal values are three scalars, not a
+    vector). A name that ends in ``_mm`` is a length: it and the ending of its name are converted to the mesh's unit.
+    NaN stays NaN. The nodes' own numbers are added as ``node``, the verdict as field data (`VERDICT_FIELD`).
     """
     path = Path(path)
     _check_name(path, ".vtu", mesh)
-    undefined: dict[str, int] = {}
-
-    def own(data: Mapping[str, FloatArray], rows: int, what: str) -> dict[str, FloatArray]:
-        converted = {}
-        for own_name, values in data.items():
-            name, array = _in_own_frame(mesh, own_name, np.asarray(values, dtype=np.float64), rows, what)
-            undefined[name] = int(np.count_nonzero(np.isnan(array.reshape(rows, -1)).any(axis=1)))
-            converted[name] = array
-        return converted
-
-    at_nodes = own(point_data, len(mesh.points_mm), "node")
-    in_cells = own(cell_data, mesh.cell_count, "cell")
+    at_nodes = dict(_in_own_frame(mesh, *item, len(mesh.points_mm), "node") for item in point_data.items())
+    in_cells = dict(_in_own_frame(mesh, *item, mesh.cell_count, "cell") for item in cell_data.items())
     ends = np.cumsum([len(block.nodes) for block in mesh.blocks])[:-1]
     results = meshio.Mesh(
         _own_points(mesh),
@@ -87,69 +54,35 @@ def write_on_mesh(
         meshio.vtu.write(part, results, binary=True)
         if verdict is not None:
             _add_verdict(part, verdict)
-    return undefined
 
 
-def write_nodal_displacements(
-    path: str | os.PathLike[str], mesh: MeshFile, u_mm: FloatArray, verdict: Verdict | None = None
-) -> int:
-    """Write the displacement of every node of the user's mesh as CSV, ready as boundary conditions.
+def write_nodal_displacements(path: StrPath, mesh: MeshFile, u_mm: FloatArray, verdict: Verdict | None = None) -> int:
+    """Write the displacement `u_mm` (n, 3; LPS mm) of every node of the user's mesh as CSV, for boundary conditions.
 
-    The columns are ``node,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm``, or ``x_m`` and so on for a mesh in metres: the
-    mesh file's own node numbers, frame and unit. A JSON file beside it (same name, ending .json) declares
-    them.
-
-    Parameters
-    ----------
-    path : path
-        The file to write, ending in .csv. It appears under this name only when it is whole.
-    mesh : MeshFile
-        The user's mesh.
-    u_mm : (n, 3)
-        Displacement at ``mesh.points_mm``, LPS mm; NaN where the measurement is not defined.
-    verdict : Verdict, optional
-        Whether they may be trusted; told in the JSON file.
-
-    Returns
-    -------
-    int
-        Number of nodes without a displacement. Their last three columns are empty; they are not zero.
-
-    Raises
-    ------
-    InputError
-        If ``u_mm`` has not one row for each node.
-    OutputError
-        If the file cannot be written.
+    The columns are ``node,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm``, or ``x_m`` and so on for a mesh in metres: the mesh
+    file's own node numbers, frame and unit. A JSON file beside it (same name, ending .json) declares them. Where `u_mm`
+    is NaN, the last three columns are empty, not zero; the number of such nodes is returned.
     """
     path = Path(path)
     _check_name(path, ".csv", mesh)
-    u = np.asarray(u_mm, dtype=np.float64)
-    if u.shape != mesh.points_mm.shape:
-        raise InputError(f"u_mm must have shape {mesh.points_mm.shape}, a row for each node; got {u.shape}.")
-    _, own_u = _in_own_frame(mesh, "u_mm", u, len(u), "node")
+    if np.shape(u_mm) != mesh.points_mm.shape:
+        raise InputError(f"u_mm must have shape {mesh.points_mm.shape}, a row for each node; got {np.shape(u_mm)}.")
+    _, own_u = _in_own_frame(mesh, "u_mm", u_mm, len(u_mm), "node")
     undefined = np.asarray(np.isnan(own_u).any(axis=1))
     columns = ["node", *(f"{axis}_{mesh.unit}" for axis in ("x", "y", "z", "ux", "uy", "uz"))]
     has_numbers = mesh.path.suffix.lower() not in {".vtu", ".vtk"}
-    declared: dict[str, object] = {
-        "mesh": mesh.path.name,
-        "frame": mesh.frame,
-        "unit": mesh.unit,
-        "columns": columns,
-        "node": "number in the mesh file" if has_numbers else "index in the mesh file, counted from 0",
-        "nodes": len(u),
-        "nodes_without_displacement": int(np.count_nonzero(undefined)),
-    }
-    if verdict is not None:
-        declared["verdict"] = verdict.as_dict()
+    node = "number in the mesh file" if has_numbers else "index in the mesh file, counted from 0"
+    missing_nodes = int(np.count_nonzero(undefined))
+    declared: dict[str, object] = {"mesh": mesh.path.name, "frame": mesh.frame, "unit": mesh.unit, "columns": columns}
+    declared |= {"node": node, "nodes": len(own_u), "nodes_without_displacement": missing_nodes}
     with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(columns)
-        for node, X, u_X, missing in zip(mesh.node_ids, _own_points(mesh), own_u, undefined, strict=True):
-            numbers = [f"{x:.10g}" for x in (X if missing else (*X, *u_X))]
-            rows.writerow([int(node), *numbers, *([""] * 3 if missing else [])])
-    write_whole(path.with_suffix(".json"), json.dumps(declared, indent=2) + "\n")
-    return int(np.count_nonzero(undefined))
+        for number, X, u_X, missing in zip(mesh.node_ids, _own_points(mesh), own_u, undefined, strict=True):
+            values = [f"{x:.10g}" for x in (X if missing else (*X, *u_X))]
+            rows.writerow([int(number), *values, *([""] * 3 if missing else [])])
+    write_json(path.with_suffix(".json"), declared | ({} if verdict is None else {"verdict": verdict.as_dict()}))
+    return missing_nodes
 
 
 def _add_verdict(vtu: Path, verdict: Verdict) -> None:
@@ -166,6 +99,7 @@ def _own_points(mesh: MeshFile) -> FloatArray:
 
 def _in_own_frame(mesh: MeshFile, name: str, values: FloatArray, rows: int, what: str) -> tuple[str, FloatArray]:
     """Turn an LPS mm array into the mesh file's frame and unit; its name tells whether it is a length."""
+    values = np.asarray(values, dtype=np.float64)
     if values.ndim == 0 or len(values) != rows or values.shape[1:] not in {(), (3,), (3, 3)}:
         raise InputError(
             f"{name!r} must have a row for each of the {rows} {what}s, of a scalar, a vector (3,) or a "

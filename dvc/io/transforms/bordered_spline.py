@@ -1,4 +1,4 @@
-"""A displacement with borders as a file: what no transform of ITK can hold, for results that are read again."""
+"""A displacement with strain discontinuities as a file of our own, as no ITK transform can hold one."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _UNREADABLE = OSError, EOFError, zlib.error, zipfile.BadZipFile, ValueError, Key
 
 
 def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
-    """Write a displacement with borders, LPS mm, whole or not at all.
+    """Write a displacement with strain discontinuities, LPS mm, whole or not at all.
 
-    Of the borders the tissues' numbers are kept, from which their depths are computed again.
+    Of the interfaces only the tissues' numbers are kept, from which the depths are computed again.
     """
     with whole_file(path) as part, part.open("wb") as file:
         np.savez_compressed(
@@ -44,13 +44,7 @@ def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
 
 
 def read_bordered_spline(path: Path | str) -> BorderedSpline:
-    """Read what `write_bordered_spline` wrote.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is no such displacement.
-    """
+    """Read what `write_bordered_spline` wrote."""
     try:
         with np.load(io.BytesIO(Path(path).read_bytes())) as file:
             if int(file["format"]) != _FORMAT:
@@ -73,17 +67,13 @@ _latest: list[Interfaces] = []
 
 
 def _between(grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Interfaces:
-    """Interfaces as they were last found, if these are the same; found anew otherwise."""
-    known = _latest[-1] if _latest else None
-    if (
-        known is None
-        or (known.rest, known.reach_mm) != (rest, reach_mm)
-        or not np.array_equal(_rows_of(known.grid), _rows_of(grid))
-        or not np.array_equal(known.own, own)
-    ):
-        known = Interfaces.between(grid, own, rest, reach_mm)
-        _latest[:] = [known]
-    return known
+    """The latest interfaces, if these are the same; otherwise computed anew."""
+    for known in _latest:
+        same_grid = np.array_equal(_rows_of(known.grid), _rows_of(grid))
+        if same_grid and (known.rest, known.reach_mm) == (rest, reach_mm) and np.array_equal(known.own, own):
+            return known
+    _latest[:] = [Interfaces.between(grid, own, rest, reach_mm)]
+    return _latest[0]
 
 
 def _rows_of(grid: Grid) -> FloatArray:

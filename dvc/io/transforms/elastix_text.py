@@ -19,18 +19,8 @@ _BAD_NAME = re.compile(r"[.,:;!@#$%^&'()*+|<>?\"\s]")
 def parse_parameters(text: str) -> dict[str, tuple[str, ...]]:
     """Read the parameters of an elastix parameter or transform file, all values as text.
 
-    One parameter per line, ``(Name value "text value" ...)``; what follows ``//`` is a comment, even inside
-    quotes, as elastix has it.
-
-    Raises
-    ------
-    ParameterError
-        With the number of the line that elastix would not take either.
-
-    Examples
-    --------
-    >>> parse_parameters('(Metric "AdvancedNormalizedCorrelation")  // or another' + chr(10) + '(Size 4 5 6)')
-    {'Metric': ('AdvancedNormalizedCorrelation',), 'Size': ('4', '5', '6')}
+    One parameter per line, ``(Name value "text value" ...)``; what follows ``//`` is a comment, even inside quotes, as
+    elastix has it. A line that elastix would not take is refused with its number.
     """
     parameters: dict[str, tuple[str, ...]] = {}
     for number, text_line in enumerate(text.split("\n"), start=1):
@@ -57,19 +47,11 @@ def parse_parameters(text: str) -> dict[str, tuple[str, ...]]:
 def format_parameters(parameters: Mapping[str, Sequence[Value]]) -> str:
     """Text of an elastix parameter or transform file: numbers with all digits, all else in quotes.
 
-    Raises
-    ------
-    ParameterError
-        For a text that elastix' syntax cannot hold: a quote, a line break or ``//`` inside.
-
-    Examples
-    --------
     >>> print(format_parameters({"Spacing": [0.1, 2], "UseDirectionCosines": [True]}), end="")
     (Spacing 0.1 2)
     (UseDirectionCosines "true")
     """
-    lines = [f"({name} {' '.join(_formatted(name, v) for v in values)})\n" for name, values in parameters.items()]
-    return "".join(lines)
+    return "".join(f"({name} {' '.join(_formatted(name, v) for v in values)})\n" for name, values in parameters.items())
 
 
 def _formatted(name: str, value: Value) -> str:

@@ -1,11 +1,8 @@
-"""Transform files of elastix and ITK, read to a Deformation.
-
-All of them map points of the fixed (reference) image to points of the moving one, in LPS mm; so does a
-Deformation.
-"""
+"""Transforms of elastix and ITK, and displacement images, read to a Deformation: fixed to moving points, LPS mm."""
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,17 +11,19 @@ from typing import Any
 
 import numpy as np
 import SimpleITK as sitk
+from scipy.spatial.transform import Rotation
 
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
-from dvc.errors import InputError, ParameterError
+from dvc.errors import ImageFileError, InputError, ParameterError
 from dvc.images.image import Grid
 from dvc.images.itk_image import from_sitk as image_from_sitk
+from dvc.io import StrPath
+from dvc.io.images.nrrd import nrrd_fields
+from dvc.io.images.read import read_header
 from dvc.io.transforms.bordered_spline import read_bordered_spline
 from dvc.io.transforms.elastix_text import Parameters, parse_parameters
-
-StrPath = str | os.PathLike[str]
 
 _ITK_SUFFIXES = (".h5", ".hdf5", ".tfm", ".mat")
 _ITK_TEXT = b"#Insight Transform File"
@@ -51,15 +50,15 @@ class Added:
 def read_transform(path: StrPath) -> Deformation:
     """Read a transform file: elastix' TransformParameters (.txt), ITK's (.h5, .tfm, .mat, .txt), or ours (.npz).
 
-    elastix' chain of initial transforms is followed, combined as each file says: "Compose" (T(x) =
-    T1(T0(x))) or "Add". An initial transform's name is looked for beside the file that names it.
+    elastix' chain of initial transforms is followed, combined as each file says: "Compose" (T(x) = T1(T0(x))) or
+    "Add". An initial transform's name is looked for beside the file that names it.
 
     Returns
     -------
     Deformation
-        Of fixed points to moving points, LPS mm. A `BSpline` is NaN outside its valid region, where elastix
-        and ITK answer with the identity. A displacement field inside an ITK file is interpolated by cubic
-        splines (ITK: linearly).
+        Of fixed points to moving points, LPS mm. A `BSpline` is NaN outside its valid region, where elastix and ITK
+        answer with the identity. A displacement field inside an ITK file is interpolated by cubic splines (ITK:
+        linearly).
 
     Raises
     ------
@@ -78,35 +77,75 @@ def read_transform(path: StrPath) -> Deformation:
     return _read_elastix(place, ())
 
 
+def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplacement:
+    """Read a displacement image, in mm: three components per voxel (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd).
+
+    Parameters
+    ----------
+    frame : {"LPS", "RAS"}, optional
+        Frame of the components. Where the file, or the JSON file of the same stem beside it (key "frame"), gives the
+        frame too, both must agree. MetaImage is LPS, NRRD is LPS where its space is; NIfTI files differ by the
+        program that wrote them, so that it must be given.
+
+    Returns
+    -------
+    SampledDisplacement
+        On the grid of the image; voxels that are NaN are undefined.
+
+    Raises
+    ------
+    InputError
+        If there is no such file.
+    ImageFileError
+        If the file is damaged, not a 3D image of three components, in another unit than mm, or holds infinite
+        values, or if its geometry or frame is missing or contradictory.
+    """
+    place = Path(path)
+    if not place.is_file():
+        raise InputError(f"{place}: no such displacement image. Check the path.")
+    declared = {frame, _frame_beside(place)}
+    try:
+        stored = read_header(place, vectors=True)
+        if stored.unit != "mm":
+            raise ImageFileError(f"{place}: lengths in {stored.unit}; a displacement in mm is needed.")
+        declared |= {_frame_of_header(place)}
+        values = stored.load()
+    except OSError as failure:
+        raise ImageFileError(f"{place}: not readable as a displacement image ({failure}).") from failure
+    frames = sorted(f for f in declared if f is not None)
+    if len(frames) != 1 or frames[0] not in ("LPS", "RAS"):
+        raise ImageFileError(
+            f"{place}: the components' frame must be LPS or RAS, and told alike wherever it is told; "
+            f"found {frames or 'none'}. Pass frame=, or set 'frame' in the JSON file beside it."
+        )
+    infinite = np.isinf(values).any(axis=-1)
+    if infinite.any():
+        first = tuple(int(n) for n in np.argwhere(infinite)[0])
+        raise ImageFileError(
+            f"{place}: the displacement of {int(infinite.sum())} of {infinite.size} voxels is infinite, the first at "
+            f"index {first}. Where it is not known, it is NaN: repair the file, or make it again."
+        )
+    signs = np.array([1.0, 1.0, 1.0] if frames[0] == "LPS" else [-1.0, -1.0, 1.0])
+    try:
+        return SampledDisplacement(stored.grid, values * signs)
+    except InputError as wrong:
+        raise ImageFileError(f"{place}: {wrong}") from wrong
+
+
 def rigid_from_elastix(parameters: Parameters) -> RigidMotion:
     """Read an elastix EulerTransform from its parameter map alone (an initial transform is left out).
 
     ``x = R (X - c) + c + t``, with ``R = Rz Rx Ry``, or ``Rz Ry Rx`` where ComputeZYX is "true".
-
-    Raises
-    ------
-    ParameterError
-        If it is another kind of transform, or parameters are missing.
     """
     _require(parameters, ("EulerTransform",))
     a, b, c, *shift = _numbers(parameters, "TransformParameters", 6)
-    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
-    rotation = z @ y @ x if _word(parameters, "ComputeZYX", "false") == "true" else z @ x @ y
-    return RigidMotion.about(_numbers(parameters, "CenterOfRotationPoint", 3), rotation, np.array(shift))
+    zyx = _word(parameters, "ComputeZYX", "false") == "true"
+    rotation = Rotation.from_euler("ZYX", [c, b, a]) if zyx else Rotation.from_euler("ZXY", [c, a, b])
+    return RigidMotion.about(_numbers(parameters, "CenterOfRotationPoint", 3), rotation.as_matrix(), np.array(shift))
 
 
 def bspline_from_elastix(parameters: Parameters) -> BSpline:
-    """Read an elastix B-spline from its parameter map alone (an initial transform is left out).
-
-    Coefficients may be NaN.
-
-    Raises
-    ------
-    ParameterError
-        If it is another kind of transform, not cubic, cyclic, or numbers are missing.
-    """
+    """Read an elastix B-spline from its parameter map alone (an initial transform is left out); NaN is let pass."""
     _require(parameters, ("BSplineTransform", "RecursiveBSplineTransform"))
     if _word(parameters, "BSplineTransformSplineOrder", "3") != "3":
         raise ParameterError("BSplineTransformSplineOrder is not 3; only cubic B-splines are read.")
@@ -160,17 +199,13 @@ def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
         raise ParameterError(f"{path}: its initial transforms lead back to itself.")
     try:
         parameters = parse_parameters(path.read_text())
+        last = _last_of_chain(path, parameters)
     except (OSError, UnicodeDecodeError) as failure:
         raise InputError(f"{path}: not readable as an elastix transform file ({failure}).") from failure
     except ParameterError as wrong:
         raise ParameterError(f"{path}: {wrong}") from wrong
-    try:
-        last = _last_of_chain(path, parameters)
-    except ParameterError as wrong:
-        raise ParameterError(f"{path}: {wrong}") from wrong
-    name = _word(parameters, "InitialTransformParameterFileName", "") or _word(
-        parameters, "InitialTransformParametersFileName", _NO_INITIAL
-    )
+    older = _word(parameters, "InitialTransformParametersFileName", _NO_INITIAL)
+    name = _word(parameters, "InitialTransformParameterFileName", "") or older
     if name == _NO_INITIAL:
         return last
     initial = path.parent / name  # an absolute name stays what it is
@@ -185,13 +220,10 @@ def _read_elastix(path: Path, chain: tuple[Path, ...]) -> Deformation:
         return Composed([*_flat(first), last])
     if how != "Add":
         raise ParameterError(f"{path}: HowToCombineTransforms is '{how}'; it is Compose or Add.")
-    if isinstance(first, BSpline) and isinstance(last, BSpline) and _same(first.control, last.control):
-        return last.plus(first)
+    splines = [part for part in (first, last) if isinstance(part, BSpline)]
+    if len(splines) == 2 and splines[0].control.same_as(splines[1].control, tolerance_voxels=_SAME_CONTROL):
+        return splines[1].plus(splines[0])
     return Added((first, last))
-
-
-def _same(control: Grid, other: Grid) -> bool:
-    return control.same_as(other, tolerance_voxels=_SAME_CONTROL)
 
 
 def _last_of_chain(path: Path, parameters: Parameters) -> Deformation:
@@ -283,3 +315,30 @@ def _from_sitk(transform: Any) -> Deformation:
     if isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform):
         return RigidMotion.about(np.array(transform.GetCenter()), matrix, np.array(shift))
     return _about(np.array(transform.GetCenter()), matrix, np.array(shift))
+
+
+def _frame_beside(path: Path) -> str | None:
+    stem = path.name.removesuffix(".gz").rsplit(".", maxsplit=1)[0]
+    beside = path.with_name(stem + ".json")
+    if not beside.is_file():
+        return None
+    try:
+        header = json.loads(beside.read_text(encoding="utf-8"))
+        frame, unit = header.get("frame"), header.get("unit", "mm")
+    except (OSError, ValueError, AttributeError) as failure:
+        raise ImageFileError(f"{beside}: not readable as a JSON object ({failure}).") from failure
+    if unit != "mm" or header.get("configuration", "reference") != "reference":
+        raise ImageFileError(f"{beside}: a displacement in mm on the reference configuration is needed; got {header}.")
+    return None if frame is None else str(frame)
+
+
+def _frame_of_header(place: Path) -> str | None:
+    """Frame of the components, where the format fixes it."""
+    name = place.name.lower()
+    if name.endswith((".mha", ".mhd")):
+        return "LPS"
+    if not name.endswith((".nrrd", ".nhdr")):
+        return None
+    fields = nrrd_fields(place)[0]
+    in_lps = fields.get("space", "").lower() in ("left-posterior-superior", "lps")
+    return "LPS" if in_lps and "measurement frame" not in fields else None

@@ -18,10 +18,9 @@ from dvc.deformation.protocol import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.images.itk_image import to_sitk
+from dvc.io import StrPath
 from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE, write_bordered_spline
 from dvc.io.transforms.elastix_text import Value, format_parameters
-
-StrPath = str | os.PathLike[str]
 
 ELASTIX_FILES = ("TransformParameters.0.txt", "TransformParameters.1.txt")
 """Names of the files of a chain: a B-spline, and the rigid motion that follows."""
@@ -29,30 +28,11 @@ _NO_INITIAL = "NoInitialTransform"
 
 
 def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion | None, reference: Grid) -> list[Path]:
-    """Write ``x = R (X + u(X)) + t`` as a chain of elastix transform files that transformix reads.
+    """Write ``x = R (X + u(X)) + t`` as a chain of elastix transform files that transformix reads; the last is for it.
 
-    TransformParameters.0.txt holds the B-spline; TransformParameters.1.txt, where ``then`` is given, the
-    motion that follows, with the first as its initial transform. Coefficients are written with all their
-    digits.
-
-    Parameters
-    ----------
-    folder : existing folder
-    bspline : BSpline
-    then : RigidMotion, optional
-        The motion (R, t) after the B-spline.
-    reference : Grid
-        The grid that transformix resamples a moving image to; either handedness.
-
-    Returns
-    -------
-    list of Path
-        The files; the last is the one to give to transformix.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written; nothing is left under its name.
+    TransformParameters.0.txt holds the B-spline; TransformParameters.1.txt, where `then` (R, t) is given, the motion
+    that follows, with the first as its initial transform. transformix resamples moving images to `reference`, of either
+    handedness.
     """
     image = _image_parameters(reference)
     stages = {ELASTIX_FILES[0]: _bspline_parameters(bspline)}
@@ -78,37 +58,24 @@ def _bspline_parameters(bspline: BSpline) -> dict[str, Sequence[Value]]:
         "NumberOfParameters": [bspline.coefficients_mm.size],
         "TransformParameters": np.concatenate([c.ravel(order="F") for c in bspline.coefficients_mm]).tolist(),
         "InitialTransformParameterFileName": [_NO_INITIAL],
-        "GridSize": list(control.shape),
-        "GridIndex": [0, 0, 0],
-        "GridSpacing": control.spacing_mm.tolist(),
-        "GridOrigin": control.origin_mm.tolist(),
+        "GridSize": list(control.shape), "GridIndex": [0, 0, 0],
+        "GridSpacing": control.spacing_mm.tolist(), "GridOrigin": control.origin_mm.tolist(),
         "GridDirection": control.direction.T.ravel().tolist(),
-        "BSplineTransformSplineOrder": [3],
-        "UseCyclicTransform": [False],
-    }
+        "BSplineTransformSplineOrder": [3], "UseCyclicTransform": [False],
+    }  # fmt: skip
 
 
 def _image_parameters(grid: Grid) -> dict[str, Sequence[Value]]:
     return {
-        "HowToCombineTransforms": ["Compose"],
-        "FixedImageDimension": [3],
-        "MovingImageDimension": [3],
-        "FixedInternalImagePixelType": ["float"],
-        "MovingInternalImagePixelType": ["float"],
-        "Size": list(grid.shape),
-        "Index": [0, 0, 0],
-        "Spacing": grid.spacing_mm.tolist(),
-        "Origin": grid.origin_mm.tolist(),
-        "Direction": grid.direction.T.ravel().tolist(),
-        "UseDirectionCosines": [True],
-        "ResampleInterpolator": ["FinalBSplineInterpolator"],
-        "FinalBSplineInterpolationOrder": [3],
-        "Resampler": ["DefaultResampler"],
-        "DefaultPixelValue": [0],
-        "ResultImageFormat": ["nii.gz"],
-        "ResultImagePixelType": ["float"],
-        "CompressResultImage": [True],
-    }
+        "HowToCombineTransforms": ["Compose"], "FixedImageDimension": [3], "MovingImageDimension": [3],
+        "FixedInternalImagePixelType": ["float"], "MovingInternalImagePixelType": ["float"],
+        "Size": list(grid.shape), "Index": [0, 0, 0],
+        "Spacing": grid.spacing_mm.tolist(), "Origin": grid.origin_mm.tolist(),
+        "Direction": grid.direction.T.ravel().tolist(), "UseDirectionCosines": [True],
+        "ResampleInterpolator": ["FinalBSplineInterpolator"], "FinalBSplineInterpolationOrder": [3],
+        "Resampler": ["DefaultResampler"], "DefaultPixelValue": [0],
+        "ResultImageFormat": ["nii.gz"], "ResultImagePixelType": ["float"], "CompressResultImage": [True],
+    }  # fmt: skip
 
 
 def _euler_angles(rotation: FloatArray) -> list[float]:
@@ -118,8 +85,7 @@ def _euler_angles(rotation: FloatArray) -> list[float]:
     # From Rz Rx = R Ry^T and not from R: where x is close to a right angle, y is hardly determined, and z
     # must be the one that belongs to the y chosen.
     z = np.arctan2(
-        rotation[1, 0] * np.cos(y) + rotation[1, 2] * np.sin(y),
-        rotation[0, 0] * np.cos(y) + rotation[0, 2] * np.sin(y),
+        rotation[1, 0] * np.cos(y) + rotation[1, 2] * np.sin(y), rotation[0, 0] * np.cos(y) + rotation[0, 2] * np.sin(y)
     )
     return [float(x), float(y), float(z)]
 
@@ -129,16 +95,9 @@ def write_itk_transform(
 ) -> Path:
     """Write ``x = R (X + u(X)) + t`` as an ITK composite transform (.h5 or .tfm), as 3D Slicer reads it.
 
-    A B-spline is written as one. ITK has no spline whose gradient jumps at tissue interfaces: of a `BorderedSpline` u
-    is written at the voxels on which it was found, the box around the tissue, and of any other displacement at those
-    of ``grid``. Between them ITK interpolates linearly; outside the box, as outside a B-spline, it takes u as 0.
-
-    Raises
-    ------
-    InputError
-        If the name ends in neither, or the displacement needs a grid and none is given.
-    OutputError
-        If the file cannot be written; nothing is left under its name.
+    A B-spline is written as one. ITK has no spline with strain discontinuities: of a `BorderedSpline` u is written at
+    the voxels of its interfaces, the box around the tissue, and of any other displacement at those of `grid`. Between
+    them ITK interpolates linearly; outside the box, as outside a B-spline, it takes u as 0.
     """
     place = Path(path)
     if place.suffix.lower() not in (".h5", ".tfm"):
@@ -180,29 +139,19 @@ def _(displacement: BorderedSpline, grid: Grid | None) -> sitk.Transform:
 
 
 @singledispatch
-def write_displacement_as_found(
-    displacement: Deformation, folder: Path, then: RigidMotion | None, reference: Grid
-) -> None:
-    """Write a displacement as it was found, with its own gradient, in the files that hold it: those of its kind.
+def write_displacement_as_found(found: Deformation, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
+    """Write a displacement with its own gradient, and the motion `then` (R, t), to the files that hold its kind.
 
-    A `BSpline` as elastix' text files, with the motion that follows; a `BorderedSpline` as a file of its own. Of any
-    other kind there is no such file, and its displacement image has to do.
-
-    Parameters
-    ----------
-    folder : existing folder
-    then : RigidMotion, optional
-        The motion (R, t) after the displacement.
-    reference : Grid
-        The grid that transformix resamples a moving image to.
+    A `BSpline` as elastix' text files (grid of transformix: `reference`); a `BorderedSpline` as a file of its own. Any
+    other kind has no such file: its displacement image must do.
     """
 
 
 @write_displacement_as_found.register
-def _(displacement: BSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
-    write_elastix_transform(folder, displacement, then, reference)
+def _(found: BSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
+    write_elastix_transform(folder, found, then, reference)
 
 
 @write_displacement_as_found.register
-def _(displacement: BorderedSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
-    write_bordered_spline(folder / BORDERED_SPLINE, displacement)
+def _(found: BorderedSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
+    write_bordered_spline(folder / BORDERED_SPLINE, found)

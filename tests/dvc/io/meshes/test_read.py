@@ -267,8 +267,7 @@ def test_results_come_back_in_the_frame_and_unit_of_the_users_mesh(
     u, _ = MOVED.evaluate(mesh.points_mm)
     _, gradients = MOVED.evaluate(mesh.centroids_mm)
     out = tmp_path / "out.vtu"
-    missing = write_on_mesh(out, mesh, {"u_mm": u}, {"H": gradients, "max_shear": np.linspace(0, 1, 50)})
-    assert missing == {f"u_{unit}": 0, "H": 0, "max_shear": 0}
+    write_on_mesh(out, mesh, {"u_mm": u}, {"H": gradients, "max_shear": np.linspace(0, 1, 50)})
 
     back = meshio.read(out)
     own_points, _ = block()
@@ -310,7 +309,7 @@ def test_a_node_without_a_displacement_is_empty_and_counted_never_zero(tmp_path:
     declared = json.loads((tmp_path / "bc.json").read_text())
     assert declared["nodes_without_displacement"] == 2
     assert declared["node"] == "index in the mesh file, counted from 0"
-    assert write_on_mesh(tmp_path / "out.vtu", mesh, {"u_mm": u}, {}) == {"u_mm": 2}
+    write_on_mesh(tmp_path / "out.vtu", mesh, {"u_mm": u}, {})
     assert np.isnan(meshio.read(tmp_path / "out.vtu").point_data["u_mm"]).sum() == 4
 
 

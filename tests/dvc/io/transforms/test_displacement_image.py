@@ -17,7 +17,7 @@ import dvc
 from dvc.deformation.protocol import Deformation, SampledDisplacement
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid
-from dvc.io.transforms.displacement_image import read_displacement
+from dvc.io.transforms.read import read_displacement
 
 OBLIQUE = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 PERMUTED = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
