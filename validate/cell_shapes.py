@@ -1,9 +1,4 @@
-"""Shapes of cells by their nodes (VTK's order): faces as triangles, and interpolated mid-face and mid-cell nodes.
-
-A quadratic cell has a node in the middle of each edge; some kinds also have one in the middle of each quadrangle and
-of the cell. Where these are missing they are interpolated, so that the cell can be cut into tetrahedra of half its
-size.
-"""
+"""Shapes of cells by their nodes (VTK's order): faces as triangles, and interpolated mid-face and mid-cell nodes."""
 
 from __future__ import annotations
 
@@ -18,21 +13,11 @@ Nodes = tuple[int, ...]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """Geometry of a kind of cell, of any order.
+    """Geometry of a kind of cell, of any order."""
 
-    Attributes
-    ----------
-    corners : (c, 3)
-        Reference coordinates.
-    edges : tuple of pairs of corners
-        In the order of the nodes in their middles.
-    faces : tuple of corners
-        Going around; quadrangles in the order of the nodes in their middles.
-    """
-
-    corners: FloatArray
-    edges: tuple[Nodes, ...]
-    faces: tuple[Nodes, ...]
+    corners: FloatArray  # (c, 3) reference coordinates
+    edges: tuple[Nodes, ...]  # pairs of corners, in the order of the nodes in their middles
+    faces: tuple[Nodes, ...]  # corners going around; quadrangles in the order of the nodes in their middles
 
     @property
     def quadrangles(self) -> tuple[Nodes, ...]:
@@ -55,14 +40,9 @@ class Shape:
         """Reference coordinates of corners and middles of edges."""
         return np.concatenate([self.corners, [self.corners[list(edge)].mean(axis=0) for edge in self.edges]])
 
-    def in_face(self, face: Nodes) -> tuple[Nodes, FloatArray]:
-        """Nodes along the rim of a face, and the weights with which they give the value in its middle."""
-        rim = self.around(face)
-        return rim, weights(self.nodes[list(rim)], self.corners[list(face)].mean(axis=0))
-
-    def in_body(self) -> FloatArray:
-        """Weights with which the nodes give the value at the mean of the corners."""
-        return weights(self.nodes, self.corners.mean(axis=0))
+    def weights(self, nodes: Nodes, corners: Nodes) -> FloatArray:
+        """Weights with which ``nodes`` give the value at the mean of ``corners``."""
+        return weights(self.nodes[list(nodes)], self.corners[list(corners)].mean(axis=0))
 
     def halved(self, face: Nodes) -> IntArray:
         """Triangles (k, 3) of half its size that make up a face of a quadratic cell.
@@ -89,12 +69,12 @@ def weights(nodes: FloatArray, point: FloatArray) -> FloatArray:
     >>> weights(np.concatenate([corners, middles]), np.zeros(3)).round(9).tolist()
     [-0.25, -0.25, -0.25, -0.25, 0.5, 0.5, 0.5, 0.5]
     """
-    return np.asarray(np.linalg.pinv(_monomials(nodes).T) @ _monomials(point[None])[0])
 
+    def monomials(at: FloatArray) -> FloatArray:
+        x, y, z = at.T
+        return np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
 
-def _monomials(at: FloatArray) -> FloatArray:
-    x, y, z = at.T
-    return np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
+    return np.asarray(np.linalg.pinv(monomials(nodes).T) @ monomials(point[None])[0])
 
 
 _SQUARE = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]

@@ -20,13 +20,11 @@ class CohortRank:
 
     Attributes
     ----------
-    model : str
     subjects : int
         Number of subjects with a result of every model.
-    mean, low, high : float
-        Mean normalised area between curves, and its 95 % interval over subjects (Student's t); NaN for one subject.
-    least, greatest : float
-        Over the subjects.
+    mean, low, high, least, greatest : float
+        Mean normalised area between curves, its 95 % interval over subjects (Student's t; NaN for one subject), and
+        its range.
     nearest_in : int
         Subjects in which it has the smallest area.
     behind, behind_low, behind_high : float
@@ -53,18 +51,13 @@ class CohortRank:
 
 
 def rank_over_subjects(shares: Mapping[str, Mapping[str, float]]) -> tuple[CohortRank, ...]:
-    """Rank models over the subjects that have a result of each, the best first.
+    """Rank models by their normalised areas between curves, by subject, over the subjects that have all; best first.
 
     Subjects are taken as an independent sample of one population. Intervals are those of a mean: they narrow with more
     subjects, and include the measurement error as far as it varies between subjects.
 
     Differences have Tukey's simultaneous 95 % intervals (honestly significant difference, subjects as blocks: Kutner
     and others, Applied Linear Statistical Models, section 21.5), which assume one residual variance for all models.
-
-    Parameters
-    ----------
-    shares : mapping of model to mapping of subject to float
-        Normalised area between curves.
 
     Raises
     ------
@@ -80,14 +73,10 @@ def rank_over_subjects(shares: Mapping[str, Mapping[str, float]]) -> tuple[Cohor
     first, nearest, half = table[order[0]], np.argmin(table, axis=0), _simultaneous(table)
     ranks = []
     for at in order:
-        mean, low, high = _mean(table[at])
-        behind = float((table[at] - first).mean())
-        ranks.append(
-            CohortRank(
-                names[at], len(subjects), mean, low, high, float(table[at].min()), float(table[at].max()),
-                int(np.count_nonzero(nearest == at)), behind, behind - half, behind + half,
-            )
-        )  # fmt: skip
+        row, behind = table[at], float((table[at] - first).mean())
+        extremes, nearest_in = (float(row.min()), float(row.max())), int(np.count_nonzero(nearest == at))
+        differences = behind, behind - half, behind + half
+        ranks.append(CohortRank(names[at], len(subjects), *_mean(row), *extremes, nearest_in, *differences))
     return tuple(ranks)
 
 
