@@ -18,8 +18,16 @@ from validate.agreement import Agreement, SkinDisplacement, agreements, skin_dis
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
 from validate.extrapolation import LEVELLED
 from validate.fe_result import FeResult
-from validate.location import LEAST_ML, CellGraph, Overlap, Threshold, overlap, read_thresholds
-from validate.location_intervals import LOCATION_DRAWS, with_intervals
+from validate.location import (
+    LEAST_ML,
+    LOCATION_DRAWS,
+    CellGraph,
+    Overlap,
+    Threshold,
+    overlap,
+    read_thresholds,
+    with_intervals,
+)
 from validate.mapping import ALL, MappedFields, map_fields
 
 _STRAINED = 0.01
@@ -68,7 +76,6 @@ class LoadCase:
 
     Attributes
     ----------
-    load : str
     read : callable
         Gives the measured deformation (tissue relative to its bone, reference configuration, LPS mm) and the models'
         results. It is called whenever they are needed, so that files may be read again rather than kept in memory.
@@ -107,19 +114,10 @@ class LoadComparison:
 
     Attributes
     ----------
-    case : LoadCase
-    labels : LabelMap
-        Of the unloaded image.
-    bones : tuple of str
-        Labels of bone.
-    criteria : Criteria
-    fields : MappedFields
-        Measured and simulated, in the cells compared.
+    labels, bones : LabelMap, tuple of str
+        Of the unloaded image, and which of its labels are bone.
     areas : tuple of Area
         By model and tissue; that of all soft tissue first. Those of `NOTHING` come last.
-    overlaps : tuple of Overlap
-    agreements : tuple of Agreement
-    skin : tuple of SkinDisplacement
     bands : mapping of tissue to Band
         Empty where the measurement uncertainty is unknown.
     """
@@ -167,21 +165,7 @@ def compare_load(
 ) -> LoadComparison:
     """Compare models with the measurement of one load, at the centroids of one mesh's cells.
 
-    Parameters
-    ----------
-    case : LoadCase
-    labels : LabelMap
-        Of the unloaded image: tissues, and distance to bone.
-    bones : sequence of str
-        Labels of bone.
-    mesh : TetMesh, optional
-        Where fields are compared; the first model's mesh by default.
-    criteria : Criteria, optional
-
-    Raises
-    ------
-    InputError
-        As `validate.mapping.map_fields`.
+    Parameters as in `validate.compare`, errors as in `validate.map_fields`.
     """
     by = criteria or Criteria()
     measured, results = case.read()
@@ -189,11 +173,18 @@ def compare_load(
     fields = map_fields(mesh if mesh is not None else results[0].mesh, labels, bones, measured, models)
     truths: list[FloatArray] = []
     known = {} if case.error is None else _bands(fields, case, case.error, by, truths)
-    skin = [skin_displacement(fields, r.name, case.load, r.deformation, measured, -case.axes[:, 0]) for r in results]
-    rows = [row for name in models for row in agreements(fields, name, case.load)]
-    areas, overlaps = _areas(fields, case.load, known, by), _overlaps(fields, case, by, truths)
+    normal = -case.axes[:, 0]
     return LoadComparison(
-        case, labels, tuple(bones), by, fields, tuple(areas), tuple(overlaps), tuple(rows), tuple(skin), known
+        case=case,
+        labels=labels,
+        bones=tuple(bones),
+        criteria=by,
+        fields=fields,
+        areas=tuple(_areas(fields, case.load, known, by)),
+        overlaps=tuple(_overlaps(fields, case, by, truths)),
+        agreements=tuple(row for name in models for row in agreements(fields, name, case.load)),
+        skin=tuple(skin_displacement(fields, name, case.load, of, measured, normal) for name, of in models.items()),
+        bands=known,
     )
 
 
@@ -218,16 +209,15 @@ def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Crite
 def _overlaps(fields: MappedFields, case: LoadCase, by: Criteria, truths: Sequence[FloatArray]) -> Sequence[Overlap]:
     common, cells = fields.common, CellGraph.of(fields.mesh)
     measured = np.where(common, fields.measured.max_shear, -1.0)
+    simulated = {name: np.where(common, model.max_shear, -1.0) for name, model in fields.models.items()}
     rows = [
-        overlap(
-            name, case.load, threshold.max_shear, measured, np.where(common, model.max_shear, -1.0), cells, by.least_ml
-        )
-        for name, model in fields.models.items()
+        overlap(name, case.load, threshold.max_shear, measured, shear, cells, by.least_ml)
+        for name, shear in simulated.items()
         for threshold in by.thresholds
     ]
     if case.error is None:
         return rows
-    shears = {name: model.max_shear[common] for name, model in fields.models.items()}
+    shears = {name: shear[common] for name, shear in simulated.items()}
     return with_intervals(rows, truths, shears, cells.part(common), by.least_ml, case.error.factor)
 
 
@@ -240,12 +230,9 @@ def _bands(
     fields: MappedFields, case: LoadCase, error: ErrorTable, by: Criteria, first: list[FloatArray]
 ) -> dict[str, Band]:
     """Bands by tissue; the ``first`` truths drawn for them are kept, for the intervals of location."""
-    common = fields.common
-    seed = zlib.crc32(case.load.encode()) + by.seed
-    draws = TruthDraws(
-        fields.points_mm[common], fields.measured.max_shear[common], [str(t).lower() for t in fields.tissue[common]],
-        fields.to_bone_mm[common], error, seed,
-    )  # fmt: skip
+    common, seed = fields.common, zlib.crc32(case.load.encode()) + by.seed
+    shear, tissues = fields.measured.max_shear[common], [str(t).lower() for t in fields.tissue[common]]
+    draws = TruthDraws(fields.points_mm[common], shear, tissues, fields.to_bone_mm[common], error, seed)
 
     def truths() -> Iterator[FloatArray]:
         for truth in draws.many(DRAWS):
@@ -253,12 +240,6 @@ def _bands(
                 first.append(truth.astype(np.float32))
             yield truth
 
-    return bands(
-        truths(),
-        {name: shear[common] for name, shear in _shears(fields).items()},
-        fields.volumes_ml[common],
-        {name: where[common] for name, where in _tissues(fields).items()},
-        error.factor,
-        draws.narrowed,
-        by.strains,
-    )
+    models = {name: shear[common] for name, shear in _shears(fields).items()}
+    inside = {name: where[common] for name, where in _tissues(fields).items()}
+    return bands(truths(), models, fields.volumes_ml[common], inside, error.factor, draws.narrowed, by.strains)

@@ -15,7 +15,7 @@ from fe import LoadStep
 from mrstrain.records.provenance import versions
 from validate import Comparison, Criteria
 from validate.curves import DRAWS
-from validate.location_intervals import LOCATION_DRAWS
+from validate.location import LOCATION_DRAWS
 
 # Checked against the publishers' records or the projects' own pages; a paper whose DOI was not found goes without.
 _PAPERS = {

@@ -34,7 +34,7 @@ from validate import (
     read_thresholds,
 )
 from validate.agreement import agreement, skin_on_plate
-from validate.location_intervals import with_intervals
+from validate.location import with_intervals
 
 SIDE = 20.0
 
