@@ -65,10 +65,10 @@ class MappedFields:
     @property
     def common(self) -> BoolArray:
         """Cells (n,) in which the measurement and every model are defined: all are compared on the same tissue."""
-        return np.asarray(np.all([field.defined for field in self.fields.values()], axis=0))
+        return np.asarray(np.all([field.defined for field in self.by_name.values()], axis=0))
 
     @property
-    def fields(self) -> dict[str, Field]:
+    def by_name(self) -> dict[str, Field]:
         """Every field by name, that of the measurement first, as "measured"."""
         return {"measured": self.measured, **self.models}
 
@@ -81,11 +81,11 @@ class MappedFields:
     def curves(self, tissue: str, strains: FloatArray) -> dict[str, FloatArray]:
         """Volume (mL) of a tissue (or `ALL`) above each strain (k,), of "measured" and each model, in common cells."""
         where = self.common & ((self.tissue == tissue) | (tissue == ALL))
-        return {n: volume_above(f.max_shear[where], self.volumes_ml[where], strains) for n, f in self.fields.items()}
+        return {n: volume_above(f.max_shear[where], self.volumes_ml[where], strains) for n, f in self.by_name.items()}
 
     def coverage(self) -> dict[str, float]:
         """Volume (mL) of the mesh, of the part where each field is defined, and of the common part."""
-        volumes = {name: float(self.volumes_ml[field.defined].sum()) for name, field in self.fields.items()}
+        volumes = {name: float(self.volumes_ml[field.defined].sum()) for name, field in self.by_name.items()}
         common = float(self.volumes_ml[self.common].sum())
         return {"mesh": float(self.volumes_ml.sum())} | volumes | {"common": common}
 

@@ -25,10 +25,8 @@ class Ranking:
 
     Attributes
     ----------
-    areas : tuple of Area
-        Over all loads, of the models that have every load, the best first; levelled ones last.
-    nothing : Area
-        Of `NOTHING`.
+    areas, nothing : tuple of Area, Area
+        Over all loads: of the models that have every load, the best first and levelled ones last; and of `NOTHING`.
     statements : tuple of str
         Which model fits best and which differences are significant: over all loads, then under each.
     not_distinguishable : mapping of load to Pairs
@@ -103,15 +101,12 @@ def _under(one: LoadComparison, pairs: Pairs) -> str:
         low = one.criteria.strains[0]
         return f"{one.load}: less than 1 % of the tissue exceeds {low:g}, so the area metric is not informative."
     distrusted = one.case.verdict is not None and one.case.verdict.level == "distrust"
-    caveat = " Its registration is not to be trusted." if distrusted else ""
+    caveat = " Its registration is not to be trusted." * distrusted
     return _statement(f"under {one.load}", one.ranked(), pairs, caveat) if ALL in one.bands else ""
 
 
 def _statement(where: str, ranked: Sequence[Area], pairs: Pairs, caveat: str) -> str:
-    """The best model, those that do not differ significantly from it, and neighbouring ranks that do not; or nothing.
-
-    A single model has no rank.
-    """
+    """The best model, and ranks that do not differ significantly from it or their neighbours; "" for a single model."""
     if len(ranked) < 2:
         return ""
     best, *others = (a.model for a in ranked)

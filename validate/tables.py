@@ -42,17 +42,9 @@ _Row = TypeVar("_Row")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """A volume-strain curve.
+    """A volume-strain curve: the volume of tissue that exceeds each maximum shear strain, (k,).
 
-    Attributes
-    ----------
-    load, tissue : str
-    field : str
-        "measured", a model, or an edge of the 95 % band of the true curve: "measured, low", "measured, high".
-    max_shear : (k,)
-        Maximum shear strain.
-    volume_above_ml : (k,)
-        Volume of tissue that exceeds it.
+    Its field is "measured", a model, or an edge of the 95 % band of the true curve: "measured, low", "measured, high".
     """
 
     load: str
@@ -67,11 +59,11 @@ def curves_of(one: LoadComparison) -> list[Curve]:
     at = np.arange(0.0, 1.5 * one.criteria.strains[1] + _STEP / 2, _STEP)
     made = []
     for tissue in (ALL, *one.fields.tissues):
-        if tissue in one.bands:
-            band = one.bands[tissue]
-            for name, edge in ((LOWER, band.low_ml), (UPPER, band.high_ml)):
-                made.append(Curve(one.load, tissue, name, at, np.interp(at, band.strains, edge)))
-        made += [Curve(one.load, tissue, name, at, above) for name, above in one.fields.curves(tissue, at).items()]
+        volumes = one.fields.curves(tissue, at)
+        if band := one.bands.get(tissue):
+            edges = {LOWER: band.low_ml, UPPER: band.high_ml}
+            volumes = {name: np.interp(at, band.strains, edge) for name, edge in edges.items()} | volumes
+        made += [Curve(one.load, tissue, name, at, above) for name, above in volumes.items()]
     return made
 
 
@@ -82,13 +74,7 @@ def write_rows(path: Path, rows: Sequence[Any], verdicts: Mapping[str, str]) -> 
 
 
 def read_rows(path: Path, kind: type[_Row]) -> tuple[_Row, ...]:
-    """Read what `write_rows` wrote, to the six digits of the file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read as such a table.
-    """
+    """Read what `write_rows` wrote, to the six digits of the file; one that is no such table is an `InputError`."""
     readers = {f.name: _READERS[str(f.type)] for f in fields(kind)}  # type: ignore[arg-type]
     return tuple(kind(**{name: read(row[name]) for name, read in readers.items()}) for row in _rows(path, readers))
 
@@ -147,30 +133,23 @@ def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
 
 def write_fields(path: Path, one: LoadComparison) -> None:
     """Measured and simulated maximum shear strain and displacement in the cells compared, for ParaView."""
-    mapped = one.fields
-    arrays: dict[str, FloatArray] = {}
-    for name, field in {"measured": mapped.measured, **mapped.models}.items():
-        arrays |= {f"{name}_max_shear": field.max_shear, f"{name}_u_mm": field.u_mm}
-    arrays["to_bone_mm"] = mapped.to_bone_mm
-    arrays["compared"] = mapped.common.astype(np.float64)
-    mesh = meshio.Mesh(
-        mapped.mesh.points_mm, [("tetra", mapped.mesh.cells)], cell_data={n: [a] for n, a in arrays.items()}
-    )
+    mapped, arrays = one.fields, dict[str, list[FloatArray]]()
+    for name, field in mapped.by_name.items():
+        arrays |= {f"{name}_max_shear": [field.max_shear], f"{name}_u_mm": [field.u_mm]}
+    arrays |= {"to_bone_mm": [mapped.to_bone_mm], "compared": [mapped.common.astype(np.float64)]}
+    mesh = meshio.Mesh(mapped.mesh.points_mm, [("tetra", mapped.mesh.cells)], cell_data=arrays)
     with whole_file(path) as part:
         meshio.vtu.write(part, mesh, binary=True)
 
 
 def write_on_image(folder: Path, one: LoadComparison) -> None:
     """Each model's displacement and maximum shear strain on the label map's voxels; NaN outside labels or model."""
-    labels = one.labels
-    inside = labels.labels > 0
+    grid, inside = one.labels.grid, one.labels.labels > 0
     for result in one.case.read()[1]:
-        u = np.full((*labels.grid.shape, 3), np.nan, dtype=np.float32)
-        shear = np.full(labels.grid.shape, np.nan, dtype=np.float32)
-        u[inside], H = evaluate_on_grid(result.deformation, labels.grid, inside)
+        u = np.full((*grid.shape, 3), np.nan, dtype=np.float32)
+        shear = np.full(grid.shape, np.nan, dtype=np.float32)
+        u[inside], H = evaluate_on_grid(result.deformation, grid, inside)
         shear[inside] = StrainField.from_gradient(H).max_shear
-        write_image(folder / f"{result.name}_max_shear.nii.gz", Image(labels.grid, shear))
-        write_vectors(
-            folder / f"{result.name}_displacement.nii.gz", labels.grid, u, ("x", "y", "z"),
-            f"displacement u(X) of tissue in the model {result.name}", "LPS", unit="mm",
-        )  # fmt: skip
+        write_image(folder / f"{result.name}_max_shear.nii.gz", Image(grid, shear))
+        about = f"displacement u(X) of tissue in the model {result.name}"
+        write_vectors(folder / f"{result.name}_displacement.nii.gz", grid, u, ("x", "y", "z"), about, "LPS", unit="mm")
