@@ -79,20 +79,20 @@ def read_rows(path: Path, kind: type[_Row]) -> tuple[_Row, ...]:
     return tuple(kind(**{name: read(row[name]) for name, read in readers.items()}) for row in _rows(path, readers))
 
 
-def write_curves(path: Path, curves: Iterable[Curve], verdicts: Mapping[str, str]) -> None:
+def write_curves(folder: Path, curves: Iterable[Curve], verdicts: Mapping[str, str]) -> None:
     """Write curves, a row for each point."""
     points = (
         (c.load, c.tissue, c.field, strain, volume, verdicts.get(c.load, ""))
         for c in curves
         for strain, volume in zip(c.max_shear.tolist(), c.volume_above_ml.tolist(), strict=True)
     )
-    _write(path, _CURVE_COLUMNS, points)
+    _write(folder / CURVES, _CURVE_COLUMNS, points)
 
 
-def read_curves(path: Path) -> tuple[Curve, ...]:
+def read_curves(folder: Path) -> tuple[Curve, ...]:
     """Read what `write_curves` wrote; errors as `read_rows`."""
     points: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
-    for row in _rows(path, _CURVE_COLUMNS):
+    for row in _rows(folder / CURVES, _CURVE_COLUMNS):
         key = row["load"], row["tissue"], row["field"]
         points.setdefault(key, []).append((float(row["max_shear"]), float(row["volume_above_ml"])))
     return tuple(Curve(*key, *np.array(of).T) for key, of in points.items())
