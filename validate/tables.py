@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +15,7 @@ import numpy as np
 
 from dvc import Image, StrainField, evaluate_on_grid, write_image, write_vectors
 from dvc.arrays import FloatArray
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_csv
 from dvc.errors import InputError
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
@@ -70,7 +69,7 @@ def curves_of(one: LoadComparison) -> list[Curve]:
 def write_rows(path: Path, rows: Sequence[Any], verdicts: Mapping[str, str]) -> None:
     """Write rows of one of the `TABLES`, each with the verdict on its load (empty: there is none)."""
     head = [*(f.name for f in fields(TABLES[path.name])), "verdict"]
-    _write(path, head, ((*astuple(row), verdicts.get(row.load, "")) for row in rows))
+    write_csv(path, head, ((*astuple(row), verdicts.get(row.load, "")) for row in rows))
 
 
 def read_rows(path: Path, kind: type[_Row]) -> tuple[_Row, ...]:
@@ -86,7 +85,7 @@ def write_curves(folder: Path, curves: Iterable[Curve], verdicts: Mapping[str, s
         for c in curves
         for strain, volume in zip(c.max_shear.tolist(), c.volume_above_ml.tolist(), strict=True)
     )
-    _write(folder / CURVES, _CURVE_COLUMNS, points)
+    write_csv(folder / CURVES, _CURVE_COLUMNS, points)
 
 
 def read_curves(folder: Path) -> tuple[Curve, ...]:
@@ -96,14 +95,6 @@ def read_curves(folder: Path) -> tuple[Curve, ...]:
         key = row["load"], row["tissue"], row["field"]
         points.setdefault(key, []).append((float(row["max_shear"]), float(row["volume_above_ml"])))
     return tuple(Curve(*key, *np.array(of).T) for key, of in points.items())
-
-
-def _write(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in rows)
-    write_whole(path, text.getvalue())
 
 
 def _rows(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:

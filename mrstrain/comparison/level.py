@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import meshio
 import numpy as np
@@ -68,19 +66,15 @@ def level(
     ----------
     load0 : path
         The unloaded image.
-    model, model_mesh, model_unit, model_frame
+    model, reading
         A folder with a file for each load, and how it is read; as in `compare`.
     out : path
         Gets a folder named as the model and "-levelled", for `compare` beside the model itself, and one ending in
         "-work" with the warped images and, by load, their registration.
-    subject_files
-        As in `register`; the bone is needed.
+    subject_files, engine
+        As in `register` for the measurement; the bone is needed, and unknown elastix parameters are accepted.
     loads : sequence of str
         Names of the loads; all of the model's files by default.
-    engine
-        That of the measurement, as in `register`. Unknown elastix parameters are accepted.
-    reading
-        As in `compare`.
     seeded
         Threads of each registration; the seed is also that of the fresh noise.
     progress : callable, optional
@@ -115,39 +109,21 @@ def level(
     about = engine.model_dump(exclude={"parameters"}) | {"volume": volume} | seeded.plain()
     about |= {"bone_label": subject_files.bone_label} | reading.model_dump(exclude={"model_mesh"})
     _prepare(target, name, images, provenance("level", {**subject.files, **sources}, about))
-    options = {
-        "subject_files": subject_files, "registration": how, "running": Running(**dict(seeded)), "progress": progress
-    }  # fmt: skip
-    failures = _register_each(load0, results, target / name, options)
-    return Levelled(target / name, (*notes, *smoothed, *failures))
-
-
-def _register_each(
-    load0: Path | str, results: Mapping[str, FeResult], folder: Path, options: Mapping[str, Any]
-) -> list[str]:
-    """Register each warped image and write what it gives on the model's mesh; a sentence for each that failed.
-
-    Every load has a folder of its own, since a study levels several at once.
-    """
-    work, failures = folder.with_name(f"{folder.name}-work"), []
+    work, failures = target / f"{name}-work", []
     for load, result in results.items():
-        registered = work / "registered" / load
+        registered = work / "registered" / load  # a folder of its own, since a study levels several loads at once
         try:
             register.with_options(
-                load0,
-                [work / "images" / f"{load}.nii.gz"],
-                out=registered,
-                scans=Scans(),
-                onto=MeshAndAxes(),
-                **options,
-            )
+                load0, [work / "images" / f"{load}.nii.gz"], out=registered, scans=Scans(), onto=MeshAndAxes(),
+                subject_files=subject_files, registration=how, running=Running(**dict(seeded)), progress=progress,
+            )  # fmt: skip
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")
         else:
-            _write(folder / f"{load}.vtu", result, registered)
+            _write(target / name / f"{load}.vtu", result, registered)
     if len(failures) == len(results):
         raise RegistrationError(" ".join(failures))
-    return failures
+    return Levelled(target / name, (*notes, *smoothed, *failures))
 
 
 def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int) -> tuple[dict[str, Image], list[str]]:
@@ -194,5 +170,4 @@ def _write(path: Path, result: FeResult, registered: Path) -> None:
     written = meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"displacement_mm": u}, {"region": [region]})
     with whole_file(path) as part:
         meshio.vtu.write(part, written, binary=True)
-    names = {str(number): name for number, name in enumerate(mesh.regions, start=1)}
-    write_whole(path.with_suffix(".json"), json.dumps({"regions": names}) + "\n")
+    write_json(path.with_suffix(".json"), {"regions": dict(enumerate(mesh.regions, start=1))})

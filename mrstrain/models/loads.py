@@ -10,8 +10,6 @@ import numpy as np
 from dvc.errors import InputError
 from fe import LoadStep
 
-Vector = tuple[float, float, float]
-
 LOADS = (
     LoadStep("Load1", 140.0),
     LoadStep("Load2", 15.0),

@@ -102,6 +102,5 @@ def mesh(
     del how["limit_s"]  # no mesh depends on it
     record = provenance("mesh", inputs, how | {"bones": list(labelling.bones)})
     write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
-    plate = Plate(_INFERIOR, _FORWARD)
-    figures.write_figure(target.with_suffix(".png"), figures.mesh_slice(made, plate))
+    figures.write_figure(target.with_suffix(".png"), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))
     return Meshed(target, made, quality)
