@@ -17,7 +17,7 @@ class Shape:
 
     corners: FloatArray  # (c, 3) reference coordinates
     edges: tuple[Nodes, ...]  # pairs of corners, in the order of the nodes in their middles
-    faces: tuple[Nodes, ...]  # corners going around; quadrangles in the order of the nodes in their middles
+    faces: tuple[Nodes, ...]  # corners going around, seen from outside; quadrangles in the order of their middles
 
     @property
     def quadrangles(self) -> tuple[Nodes, ...]:
@@ -89,17 +89,17 @@ SHAPES = {
     "hexahedron": Shape(
         np.array([(x, y, z) for z in (-1.0, 1.0) for x, y in _SQUARE]),
         ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)),
-        ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 1, 2, 3), (4, 5, 6, 7)),
+        ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 1), (4, 5, 6, 7)),
     ),
     "wedge": Shape(
         np.array([(x, y, z) for z in (-1.0, 1.0) for x, y in _THIRDS]),
         ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5)),
-        ((0, 1, 2), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
+        ((0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
     ),
     "pyramid": Shape(
         np.array([*((x, y, 0.0) for x, y in _SQUARE), (0.0, 0.0, 1.0)]),
         ((0, 1), (1, 2), (2, 3), (3, 0), (0, 4), (1, 4), (2, 4), (3, 4)),
-        ((0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
+        ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
     ),
 }  # fmt: skip
 """Volume cells, by meshio's names."""

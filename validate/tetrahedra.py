@@ -147,15 +147,15 @@ def _quadratic_faces(own: IntArray, shape: Shape) -> _Faces:
 def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: IntArray, block: CellBlock) -> IntArray:
     """Tetrahedra (k, 4) of positive volume over triangles (k, 3) around the middles (m,) of the cells (k,) they are of.
 
-    Every triangle's normal has to point away from the middle once the faces are followed consistently; a cell where one
-    does not is folded, which its volume shows: tetrahedra of a valid cell add up to the volume its faces enclose.
+    The triangles of a cell have the same sense around its surface. All their normals have to point away from the middle,
+    or all towards it if the file counts the other way round; a cell where one does not is folded, which its volume
+    shows: tetrahedra of a valid cell add up to the volume that its faces enclose.
     """
     tets = np.concatenate([triangles, middle[cell][:, None]], axis=1)
     corner = points[tets]
     volume = np.linalg.det(corner[:, 1:] - corner[:, :1])
-    signed = volume * _turning(triangles, cell)
     size = np.bincount(cell, np.abs(volume))
-    folded = np.abs(np.bincount(cell, signed)) < (1.0 - _FLAT) * size
+    folded = np.abs(np.bincount(cell, volume)) < (1.0 - _FLAT) * size
     folded |= np.bincount(cell, np.abs(volume) <= _FLAT * size[cell]) > 0
     if folded.any():
         raise GeometryError(
@@ -163,32 +163,6 @@ def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: In
             f"{block.nodes[np.argmax(folded)].tolist()}. Mend the mesh where it was made."
         )
     return np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)
-
-
-def _turning(triangles: IntArray, cell: IntArray) -> FloatArray:
-    """+1 or -1 for each triangle, so that all triangles of a cell have the same sense around its surface.
-
-    Two triangles of a closed surface that share an edge have the same sense if they traverse it in opposite directions.
-    """
-    count = len(triangles)
-    start, end = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
-    owner = np.repeat(np.arange(count), 3)
-    key = np.stack([cell[owner], np.minimum(start, end), np.maximum(start, end)])
-    order = np.lexsort(key)
-    first, second = order[0::2], order[1::2]
-    same = np.where((start < end)[first] == (start < end)[second], -1.0, 1.0)
-    turn = np.zeros(count)
-    _, at = np.unique(cell, return_index=True)
-    turn[at] = 1.0
-    a, b = owner[first], owner[second]
-    for _ in range(count):
-        before = np.count_nonzero(turn)
-        for one, other in ((a, b), (b, a)):
-            known = (turn[one] != 0.0) & (turn[other] == 0.0)
-            turn[other[known]] = turn[one[known]] * same[known]
-        if np.count_nonzero(turn) == before:
-            break
-    return turn
 
 
 def _surfaces(mesh: MeshFile) -> dict[str, list[tuple[int, ...]]]:
