@@ -11,7 +11,7 @@ from dvc import Deformation
 from dvc.arrays import FloatArray, IntArray
 from dvc.deformation.nodal import OnMesh
 from dvc.mesh import outer_faces
-from validate.mapping import ALL, MappedFields
+from validate.mapping import MappedFields
 
 TO_BONE_MM = (0.0, 3.0, 6.0, 12.0)
 """Lower ends of the bins of distance to bone, mm."""
@@ -70,15 +70,7 @@ def agreement(
     volumes_ml: FloatArray,
     rmse: float | None = None,
 ) -> Agreement | None:
-    """Agreement of two fields (n,) without gaps; None for fewer than ten cells.
-
-    Examples
-    --------
-    >>> x = np.linspace(0.0, 1.0, 20)
-    >>> row = agreement("a", "Load1", "max_shear", "fat", x, 2.0 * x + 0.1, np.ones(20))
-    >>> round(row.slope, 9), round(row.intercept, 9), round(row.r2, 9), round(row.bias, 9)
-    (2.0, 0.1, 1.0, 0.6)
-    """
+    """Agreement of two fields (n,) without gaps; None for fewer than ten cells."""
     if len(measured) < _LEAST:
         return None
     weight = volumes_ml / volumes_ml.sum()
@@ -100,7 +92,7 @@ def agreement(
 def agreements(fields: MappedFields, model: str, load: str) -> list[Agreement]:
     """Agreement of maximum shear strain and displacement: all soft tissue, each tissue, and by distance to bone."""
     common, field = fields.common, fields.models[model]
-    parts = {ALL: common} | {tissue: common & (fields.tissue == tissue) for tissue in fields.tissues}
+    parts = fields.parts
     for low, high in pairwise((*TO_BONE_MM, np.inf)):
         name = f"{low:g} to {high:g} mm from bone" if np.isfinite(high) else f"over {low:g} mm from bone"
         parts[name] = common & (fields.to_bone_mm >= low) & (fields.to_bone_mm < high)

@@ -61,13 +61,6 @@ def weights(nodes: FloatArray, point: FloatArray) -> FloatArray:
     """Weights (n,) by which values at nodes (n, 3) give that at a point (3,), exact for every quadratic field.
 
     The least ones that do so: those of the serendipity elements in the middles of their faces and bodies.
-
-    Examples
-    --------
-    >>> corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    >>> middles = np.array([[0.0, -1, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0]])
-    >>> weights(np.concatenate([corners, middles]), np.zeros(3)).round(9).tolist()
-    [-0.25, -0.25, -0.25, -0.25, 0.5, 0.5, 0.5, 0.5]
     """
 
     def monomials(at: FloatArray) -> FloatArray:

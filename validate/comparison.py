@@ -23,7 +23,7 @@ from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
 from validate.extrapolation import LEVELLED
-from validate.limitations import limitations, verdict_on
+from validate.limitations import doubts_of, limitations, verdict_on
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
 from validate.location import Overlap
 from validate.mapping import ALL
@@ -169,8 +169,9 @@ class Comparison:
         target.mkdir(parents=True, exist_ok=True)
         tables.remove_earlier(target, list(self.coverage_ml))
         about = dict(record) if record is not None else {"parameters": {"strains": list(self.strains)}}
-        colours = list(dict.fromkeys(name for load in self.coverage_ml for name in self._models(load)))
-        sections = [overview(self.loads, self.ranking, self.warnings, self._beside_verdict())]
+        colours = list(dict.fromkeys(name for one in self.loads for name in one.fields.models))
+        notes = [note for note in self.notes if note not in doubts_of(self.verdict)]
+        sections = [overview(self.loads, self.ranking, self.warnings, notes)]
         for one in self.loads:
             pictures, viewer = draw(one, colours)
             with whole_folder(target / one.load) as part:
@@ -213,14 +214,6 @@ class Comparison:
             by_load, rows["location.csv"], rows["agreement.csv"], rows["travel.csv"], tables.read_curves(place),
             ranking, (low, high), coverage, verdict, verdicts, notes,
         )  # fmt: skip
-
-    def _models(self, load: str) -> list[str]:
-        return [name for name in self.coverage_ml[load] if name not in ("mesh", "measured", "common")]
-
-    def _beside_verdict(self) -> list[str]:
-        """Notes that are no reasons of the verdict."""
-        reasons = () if self.verdict is None or self.verdict.level == "trust" else self.verdict.reasons
-        return [note for note in self.notes if note not in reasons]
 
     def _write_tables(self, target: Path) -> None:
         known = {load: of for load, of in self.verdicts.items() if of is not None}
@@ -285,7 +278,6 @@ def compare(
         fields = loads[-1].fields
         odd += [f"{case.load}: {slip}" for name in fields.models if (slip := displacement_slip(fields, name))]
     verdict = verdict_on({case.load: case.verdict for case in cases}, odd)
-    doubts = () if verdict is None or verdict.level == "trust" else verdict.reasons
     return Comparison(
         areas=tuple(a for one in loads for a in one.areas),
         overlaps=tuple(o for one in loads for o in one.overlaps),
@@ -297,7 +289,7 @@ def compare(
         coverage_ml={one.load: one.fields.coverage() for one in loads},
         verdict=verdict,
         verdicts={case.load: case.verdict for case in cases},
-        notes=(*notes, *doubts, *limitations(loads)),
+        notes=(*notes, *doubts_of(verdict), *limitations(loads)),
         warnings=tuple(odd),
         loads=tuple(loads),
     )

@@ -65,13 +65,9 @@ def read_result(
     ----------
     name : str
         Of the model, as it stands in tables.
-    path : path
-        With mesh and displacement, or a table of nodal displacements on ``mesh``.
-    mesh : path, optional
-        Mesh of a table.
-    unit : {"mm", "m"}
-        Of coordinates and displacements.
-    frame : {"LPS", "RAS"}
+    path, mesh : path
+        With mesh and displacement, or a table of nodal displacements and the mesh that they belong to.
+    unit, frame : {"mm", "m"}, {"LPS", "RAS"}
         Of coordinates and displacements.
     to_image : (4, 4), optional
         Rigid map of the model's frame to the image's, LPS mm, applied after unit and frame; it also rotates the

@@ -14,8 +14,8 @@ from dvc.arrays import FloatArray
 from dvc.report.figures import REGION_COLOURS
 from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet
-from validate.agreement import Agreement
-from validate.curves import Area, Band
+from validate.curves import Area
+from validate.load_comparison import LoadComparison
 from validate.mapping import ALL, MappedFields, filled_from_nearest
 from validate.tables import LOWER, UPPER, Curve
 
@@ -28,22 +28,16 @@ _BINS = 60
 _Panel = tuple[FloatArray, Mapping[str, FloatArray], tuple[FloatArray, FloatArray, FloatArray] | None]
 
 
-def volume_strain(
-    fields: MappedFields,
-    bands: Mapping[str, Band],
-    strains: tuple[float, float],
-    tissues: Sequence[str],
-    colours: Sequence[str],
-) -> bytes:
+def volume_strain(one: LoadComparison, tissues: Sequence[str], colours: Sequence[str]) -> bytes:
     """Volume of tissue above each maximum shear strain: measured (black) and models, in the same cells.
 
     The grey band contains the true curve in 95 % of cases, by the measurement's error model; areas are
     taken between the dotted lines.
     """
-    at = np.linspace(0.0, 1.5 * strains[1], _POINTS)
-    edges = {name: (band.strains, band.low_ml, band.high_ml) for name, band in bands.items()}
-    panels = {tissue: (at, fields.curves(tissue, at), edges.get(tissue)) for tissue in tissues}
-    return png_bytes(_curves(panels, strains, colours))
+    at = np.linspace(0.0, 1.5 * one.criteria.strains[1], _POINTS)
+    edges = {name: (band.strains, band.low_ml, band.high_ml) for name, band in one.bands.items()}
+    panels = {tissue: (at, one.fields.curves(tissue, at), edges.get(tissue)) for tissue in tissues}
+    return png_bytes(_curves(panels, one.criteria.strains, colours))
 
 
 def _curves(panels: Mapping[str, _Panel], strains: tuple[float, float], colours: Sequence[str]) -> Figure:
@@ -124,11 +118,7 @@ def _panels(count: int, most: int = 2, size_in: tuple[float, float] = (WIDTH_IN,
 
 
 def slices(
-    fields: MappedFields,
-    measured: Deformation,
-    displacements: Mapping[str, FloatArray],
-    axes: FloatArray,
-    point_mm: FloatArray,
+    one: LoadComparison, measured: Deformation, displacements: Mapping[str, FloatArray], point_mm: FloatArray
 ) -> bytes:
     """Maximum shear strain on a slice, measured and simulated, on the deformed tissue.
 
@@ -136,7 +126,8 @@ def slices(
     undefined. A node beyond the measurement is drawn with the displacement of the nearest one within. Letters name the
     sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
-    return png_bytes(slice_sheet(fields.mesh, slice_panels(fields, measured, displacements), axes, point_mm))
+    panels = slice_panels(one.fields, measured, displacements)
+    return png_bytes(slice_sheet(one.fields.mesh, panels, one.case.axes, point_mm))
 
 
 def slice_panels(fields: MappedFields, measured: Deformation, displacements: Mapping[str, FloatArray]) -> list[Slice]:
@@ -165,16 +156,15 @@ def scatter(fields: MappedFields) -> bytes:
     return png_bytes(figure)
 
 
-def differences(fields: MappedFields, rows: Sequence[Agreement], quantity: str) -> bytes:
+def differences(one: LoadComparison, quantity: str) -> bytes:
     """Bland-Altman plot: simulated minus measured over the mean of both, cell by cell; darker is more volume.
 
     The solid line is the mean difference, dashed lines are the limits of agreement, 1.96 standard deviations away.
     """
-    limits = {row.model: row for row in rows if (row.quantity, row.part) == (quantity, ALL)}
-    names = [name for name in fields.models if name in limits]
-    figure, spots = _by_model(max(1, len(names)))
-    where = fields.common
-    for spot, name in zip(spots, names, strict=False):
+    fields, where = one.fields, one.fields.common
+    limits = {row.model: row for row in one.agreements if (row.quantity, row.part) == (quantity, ALL)}
+    figure, spots = _by_model(max(1, len(limits)))
+    for spot, name in zip(spots, limits, strict=False):
         x, y = (
             field.max_shear[where] if quantity == "max_shear" else np.linalg.norm(field.u_mm[where], axis=1)
             for field in (fields.measured, fields.models[name])

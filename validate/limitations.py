@@ -31,6 +31,11 @@ def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[str] =
     return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
 
 
+def doubts_of(verdict: Verdict | None) -> tuple[str, ...]:
+    """Reasons of a verdict below trust."""
+    return () if verdict is None or verdict.level == "trust" else verdict.reasons
+
+
 def limitations(loads: Sequence[LoadComparison]) -> list[str]:
     """What the measurement of each load lacks, and which models cover little of the mesh, in sentences."""
     cases = [one.case for one in loads]

@@ -10,24 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from dvc import Deformation, LabelMap, TetMesh, Verdict, plate_axes
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.trust.error_model import ErrorTable
 from dvc.trust.truth_draws import TruthDraws
+from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
 from validate.extrapolation import LEVELLED
 from validate.fe_result import FeResult
-from validate.location import (
-    LEAST_ML,
-    LOCATION_DRAWS,
-    CellGraph,
-    Overlap,
-    Threshold,
-    overlap,
-    read_thresholds,
-    with_intervals,
-)
+from validate.location import Overlap, Threshold
 from validate.mapping import ALL, MappedFields, map_fields
 
 _STRAINED = 0.01
@@ -46,10 +38,8 @@ class Criteria:
     ----------
     strains : (low, high)
         Range of maximum shear strain over which volume-strain curves are compared.
-    thresholds : tuple of Threshold
-        Maximum shear strains above which clusters are compared.
-    least_ml : float
-        Volume of the smallest cluster that counts, mL.
+    thresholds, least_ml : tuple of Threshold, float
+        Maximum shear strains above which clusters are compared, and volume of the smallest cluster that counts, mL.
     seed : int
         Of the truths drawn from the error model; draws of different loads are independent.
 
@@ -60,8 +50,8 @@ class Criteria:
     """
 
     strains: tuple[float, float] = RANGE
-    thresholds: tuple[Threshold, ...] = field(default_factory=read_thresholds)
-    least_ml: float = LEAST_ML
+    thresholds: tuple[Threshold, ...] = field(default_factory=location.read_thresholds)
+    least_ml: float = location.LEAST_ML
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -81,11 +71,9 @@ class LoadCase:
         results. It is called whenever they are needed, so that files may be read again rather than kept in memory.
     axes : (3, 3)
         Of the plate, LPS; see `dvc.plate_axes`. By default the plate pushes to superior and shears to anterior.
-    error : ErrorTable or None
-        Error of the measured maximum shear strain; without it no figure has an interval, and no difference is
-        significant.
-    verdict : Verdict or None
-        On the measurement.
+    error, verdict : ErrorTable, Verdict, or None
+        Error of the measured maximum shear strain, without which no figure has an interval, and no difference is
+        significant; and the verdict on the measurement.
     aligned_on : str
         What the rigid alignment was computed on: "bone", "image" or "none"; empty if unknown.
     image : path or None
@@ -188,16 +176,9 @@ def compare_load(
     )
 
 
-def _tissues(fields: MappedFields) -> dict[str, BoolArray]:
-    """Cells compared: all, and by tissue."""
-    common = fields.common
-    parts = {name: common & (fields.tissue == name) for name in fields.tissues}
-    return {ALL: common} | {name: cells for name, cells in parts.items() if cells.any()}
-
-
 def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Criteria) -> Iterator[Area]:
     for name, shear in _shears(fields).items():
-        for tissue, where in _tissues(fields).items():
+        for tissue, where in fields.parts.items():
             volumes = fields.volumes_ml[where]
             area = area_between(fields.measured.max_shear[where], shear[where], volumes, by.strains)
             normalised = area / volumes.sum() / (by.strains[1] - by.strains[0])
@@ -207,18 +188,18 @@ def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Crite
 
 
 def _overlaps(fields: MappedFields, case: LoadCase, by: Criteria, truths: Sequence[FloatArray]) -> Sequence[Overlap]:
-    common, cells = fields.common, CellGraph.of(fields.mesh)
+    common, cells = fields.common, location.CellGraph.of(fields.mesh)
     measured = np.where(common, fields.measured.max_shear, -1.0)
     simulated = {name: np.where(common, model.max_shear, -1.0) for name, model in fields.models.items()}
     rows = [
-        overlap(name, case.load, threshold.max_shear, measured, shear, cells, by.least_ml)
+        location.overlap(name, case.load, threshold.max_shear, measured, shear, cells, by.least_ml)
         for name, shear in simulated.items()
         for threshold in by.thresholds
     ]
     if case.error is None:
         return rows
     shears = {name: shear[common] for name, shear in simulated.items()}
-    return with_intervals(rows, truths, shears, cells.part(common), by.least_ml, case.error.factor)
+    return location.with_intervals(rows, truths, shears, cells.part(common), by.least_ml, case.error.factor)
 
 
 def _shears(fields: MappedFields) -> dict[str, FloatArray]:
@@ -236,10 +217,10 @@ def _bands(
 
     def truths() -> Iterator[FloatArray]:
         for truth in draws.many(DRAWS):
-            if len(first) < LOCATION_DRAWS:
+            if len(first) < location.LOCATION_DRAWS:
                 first.append(truth.astype(np.float32))
             yield truth
 
     models = {name: shear[common] for name, shear in _shears(fields).items()}
-    inside = {name: where[common] for name, where in _tissues(fields).items()}
+    inside = {name: where[common] for name, where in fields.parts.items()}
     return bands(truths(), models, fields.volumes_ml[common], inside, error.factor, draws.narrowed, by.strains)

@@ -1,7 +1,4 @@
-"""Strain location: clusters of tissue above a strain threshold, measured and simulated, and their distance.
-
-Its uncertainty comes from the same figures for truths drawn from the measurement's error model.
-"""
+"""Strain location: clusters of tissue above a strain threshold, their overlap and distance, with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -44,13 +41,7 @@ class Threshold:
 
 
 def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
-    """Read a table with columns max_shear and source; by default the one in the package.
-
-    Raises
-    ------
-    InputError
-        If there is no such table, or a value is no strain between 0 and 3.
-    """
+    """Read a CSV table of max_shear (0 to 3; errors are `InputError`) and source; by default the one in the package."""
     place = path if path is not None else files("validate") / "thresholds.csv"
     try:
         rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines(), restval=""))
@@ -225,10 +216,7 @@ class StrainedRegion:
         return float(self._volumes[self.above & other.above].sum())
 
     def distance95(self, other: StrainedRegion, most: int | None = None) -> float:
-        """95th percentile (by volume) of the distance of these cells to the nearest of another region, mm.
-
-        With ``most``, of at most so many of the cells, taken at equal steps.
-        """
+        """95th percentile (by volume) of these cells' distance (of ``most`` at equal steps) to another region, mm."""
         cells = np.flatnonzero(self.above)
         cells = cells[:: max(1, len(cells) // most)] if most else cells
         alone = ~other.above[cells]

@@ -73,6 +73,12 @@ class MappedFields:
         return {"measured": self.measured, **self.models}
 
     @property
+    def parts(self) -> dict[str, BoolArray]:
+        """Cells (n,) that are compared: `ALL`, and those of each tissue that has any."""
+        parts = {name: self.common & (self.tissue == name) for name in self.tissues}
+        return {ALL: self.common} | {name: cells for name, cells in parts.items() if cells.any()}
+
+    @property
     def tissues(self) -> list[str]:
         """Names of the tissues, the largest first."""
         names = np.unique(self.tissue)

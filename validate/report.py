@@ -59,16 +59,15 @@ def _pictures(
     fields, axes, bone = one.fields, one.case.axes, one.bones[0]
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
     tissues = [name for name in (ALL, *fields.tissues) if any(a.tissue == name for a in one.areas)]
-    curves = figures.volume_strain(fields, one.bands, one.criteria.strains, tissues[:_PANELS], colours)
+    curves = figures.volume_strain(one, tissues[:_PANELS], colours)
     point = lowest_bone_point(one.labels, bone, axes)
     across = (fields.mesh.points_mm - point) @ axes[:, 2]
     through = f"It goes through the lowest point of {bone}."
     if not across.min() < 0.0 < across.max():
         point = fields.mesh.bounds_mm.mean(axis=0)
         through = f"The lowest point of {bone} lies beside the mesh: the slice goes through the mesh's middle instead."
-    slices = figures.slices(fields, measured, displacements, axes, point)
-    scatter = figures.scatter(fields)
-    shear, u = (figures.differences(fields, one.agreements, quantity) for quantity in ("max_shear", "u_mm"))
+    slices, scatter = figures.slices(one, measured, displacements, point), figures.scatter(fields)
+    shear, u = (figures.differences(one, quantity) for quantity in ("max_shear", "u_mm"))
     differences = caption_of(figures.differences)
     return {
         "curves": Picture("Volume above a strain", caption_of(figures.volume_strain), curves),
@@ -81,7 +80,7 @@ def _pictures(
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
     """Point of a bone furthest along the plate's outward normal, LPS mm; the mean of several."""
-    points = labels.grid.points(np.isin(labels.labels, [n for n, name in labels.names.items() if name == bone]))
+    points = labels.region(bone).points()
     height = points @ axes[:, 0]
     return np.asarray(points[height < height.min() + 0.5 * labels.grid.spacing_mm.min()].mean(axis=0))
 

@@ -147,9 +147,9 @@ def _quadratic_faces(own: IntArray, shape: Shape) -> _Faces:
 def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: IntArray, block: CellBlock) -> IntArray:
     """Tetrahedra (k, 4) of positive volume over triangles (k, 3) around the middles (m,) of the cells (k,) they are of.
 
-    The triangles of a cell have the same sense around its surface. All their normals have to point away from the middle,
-    or all towards it if the file counts the other way round; a cell where one does not is folded, which its volume
-    shows: tetrahedra of a valid cell add up to the volume that its faces enclose.
+    The triangles of a cell have the same sense around its surface. The normals of all have to point away from the
+    middle, or of all towards it if the file counts the other way round; a cell where one does not is folded, which its
+    volume shows: tetrahedra of a valid cell add up to the volume that its faces enclose.
     """
     tets = np.concatenate([triangles, middle[cell][:, None]], axis=1)
     corner = points[tets]

@@ -74,7 +74,7 @@ def compare(
     labelling, reading, directions, comparison
         Their fields are given as keywords, such as ``strains=...``.
     progress : callable, optional
-        Gets case, stage, fraction.
+        ``progress(case, stage, fraction)``.
 
     Raises
     ------

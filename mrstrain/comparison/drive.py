@@ -6,21 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import fe
 from dvc import Deformation, TetMesh
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import REGIONS, result_folders
 from dvc.worker import usable_cores
-from fe import (
-    Material,
-    RegionFigures,
-    check_materials,
-    clear_simulation,
-    read_tet_mesh,
-    region_figures,
-    write_regions_csv,
-    write_state,
-)
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
 from mrstrain.models.simulate import material_sets
 from mrstrain.options.door import door
@@ -70,14 +61,12 @@ def drive(
         Gets a folder for each material set (SET-driven) with ``LOAD.vtu``, for `compare`, and a folder ``boundary``
         with the displacements as boundary conditions for ANSYS, Abaqus and FEBio, by the mesh's node numbers, in its
         unit and frame.
-    material, coordinates
+    material, coordinates, progress
         As in `simulate`.
     loads : sequence of str
         Names of measured loads; all by default.
     threads : int, optional
         Of the solver; all cores by default.
-    progress : callable, optional
-        ``progress(case, stage, fraction)``.
 
     Raises
     ------
@@ -86,10 +75,10 @@ def drive(
     """
     target, place, tell = Path(out), Path(mesh), progress or (lambda *_: None)
     unit, frame, sets = coordinates.mesh_unit, coordinates.mesh_frame, material.sets
-    read = read_tet_mesh(place, unit=unit, frame=frame)
+    read = fe.read_tet_mesh(place, unit=unit, frame=frame)
     laws = {one.name: one.for_regions(read.regions) for one in material_sets(sets)}
     for region_laws, _ in laws.values():
-        check_materials(read, region_laws)
+        fe.check_materials(read, region_laws)
     measurements = result_folders(Path(dvc), loads)
     if loose := [m.load for m in measurements if m.aligned_on == "none"]:
         raise InputError(
@@ -103,7 +92,7 @@ def drive(
     make_output(target)
     for folder in (target / BOUNDARY, *folders.values()):
         make_output(folder)
-        clear_simulation(folder)
+        fe.clear_simulation(folder)
     inputs = {"mesh": [place], "measured": [f for m in measurements for f in m.files]}
     inputs["sets"] = [Path(s) for s in sets if str(s).endswith(".toml")]
     record = provenance("drive", inputs, coordinates.plain())
@@ -125,10 +114,10 @@ def drive(
 
 
 def _drive_set(
-    folder: Path, mesh: TetMesh, laws: Mapping[str, Material], measured: Mapping[str, Deformation], threads: int
+    folder: Path, mesh: TetMesh, laws: Mapping[str, fe.Material], measured: Mapping[str, Deformation], threads: int
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
     """Simulate all loads with one material set, and write them: the outcome of each load, and lines for a person."""
-    rows, outcome, log, lines = list[RegionFigures](), dict[str, dict[str, float]](), list[str](), list[str]()
+    rows, outcome, log, lines = list[fe.RegionFigures](), dict[str, dict[str, float]](), list[str](), list[str]()
     name = folder.name.removesuffix(ENDING)
     for load, field in measured.items():
         try:
@@ -138,14 +127,14 @@ def _drive_set(
         except MrstrainError as failure:
             lines.append(f"{name}: {failure}")
             continue
-        write_state(folder / f"{load}.vtu", mesh, state, laws)
+        fe.write_state(folder / f"{load}.vtu", mesh, state, laws)
         outcome[load] = {"reached": state.reached, "iterations": state.iterations, "seconds": round(state.seconds, 1)}
-        own = region_figures(mesh, state, laws)
+        own = fe.region_figures(mesh, state, laws)
         rows += own
         figures = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p90:.3f}" for r in own)
         part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the displacement was reached;"
         lines.append(f"{name}, {load}:{part} max. shear, median / 90th percentile: {figures}")
-    write_regions_csv(folder / REGIONS, rows)
+    fe.write_regions_csv(folder / REGIONS, rows)
     write_whole(folder / SETTINGS, IN_IMAGE)
     write_whole(folder / "log.txt", "\n".join(log) + "\n")
     return outcome, lines

@@ -16,17 +16,9 @@ from dvc.io.result_folder import PROVENANCE, result_folders
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.register import register
+from mrstrain.options import measurement as options
 from mrstrain.options.comparison import ModelReading
 from mrstrain.options.door import door
-from mrstrain.options.measurement import (
-    EngineOptions,
-    MeshAndAxes,
-    RegistrationOptions,
-    Running,
-    Scans,
-    Seeded,
-    SubjectFiles,
-)
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
@@ -53,11 +45,11 @@ def level(
     model: Path | str,
     *,
     out: Path | str,
-    subject_files: SubjectFiles,
+    subject_files: options.SubjectFiles,
     loads: Sequence[str] = (),
-    engine: EngineOptions,
+    engine: options.EngineOptions,
     reading: ModelReading,
-    seeded: Seeded,
+    seeded: options.Seeded,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Levelled:
     """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
@@ -73,12 +65,10 @@ def level(
         "-work" with the warped images and, by load, their registration.
     subject_files, engine
         As in `register` for the measurement; the bone is needed, and unknown elastix parameters are accepted.
-    loads : sequence of str
-        Names of the loads; all of the model's files by default.
+    loads, progress
+        As in `compare`; by default all loads that the model has a file of.
     seeded
         Threads of each registration; the seed is also that of the fresh noise.
-    progress : callable, optional
-        ``progress(case, stage, fraction)``.
 
     Raises
     ------
@@ -92,7 +82,7 @@ def level(
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
     # The extrapolated displacement outside the model's mesh is not isochoric: volume is kept whatever the images show.
     volume = volume_kept(engine)
-    how = RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
+    how = options.RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
     engine_of(how, labelled=subject_files.labels is not None)  # refused now rather than after the images are made
     subject = read_subject(load0, subject_files)
     of_load, notes = model_files(
@@ -114,8 +104,9 @@ def level(
         registered = work / "registered" / load  # a folder of its own, since a study levels several loads at once
         try:
             register.with_options(
-                load0, [work / "images" / f"{load}.nii.gz"], out=registered, scans=Scans(), onto=MeshAndAxes(),
-                subject_files=subject_files, registration=how, running=Running(**dict(seeded)), progress=progress,
+                load0, [work / "images" / f"{load}.nii.gz"], out=registered, subject_files=subject_files,
+                registration=how, scans=options.Scans(), onto=options.MeshAndAxes(),
+                running=options.Running(**dict(seeded)), progress=progress,
             )  # fmt: skip
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")

@@ -16,17 +16,9 @@ from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, 
 from mrstrain.models.loads import LOADS
 from mrstrain.models.mesh import mesh as make_mesh
 from mrstrain.models.simulate import Progress, simulate
+from mrstrain.options import modelling as options
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
-from mrstrain.options.modelling import (
-    Directions,
-    Followed,
-    Labelling,
-    MeshCoordinates,
-    Meshing,
-    PlateOptions,
-    SimulationOptions,
-)
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import file_hash, provenance
 
@@ -69,10 +61,10 @@ def converge(
     edges_mm: Sequence[float],
     *,
     out: Path | str,
-    labelling: Labelling,
-    followed: Followed,
+    labelling: options.Labelling,
+    followed: options.Followed,
     loads: Sequence[LoadStep] = LOADS,
-    directions: Directions,
+    directions: options.Directions,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Converged:
@@ -114,7 +106,7 @@ def converge(
     for edge, place in places.items():
         if not _is_of(place, inputs, labelling.bones):
             make_mesh.with_options(
-                labels, out=place, labelling=labelling, meshing=Meshing(edge_mm=edge),
+                labels, out=place, labelling=labelling, meshing=options.Meshing(edge_mm=edge),
                 watch=lambda share, edge=edge: tell(f"{edge:g} mm", "meshing", share),  # type: ignore[misc]
             )  # fmt: skip
     sizes = np.array([cell_size_mm(read_tet_mesh(place)) for place in places.values()])
@@ -122,8 +114,9 @@ def converge(
     values = []
     for edge, place in places.items():
         made = simulate.with_options(
-            place, out=target / f"simulated-{edge:g}", simulation=SimulationOptions(sets=(material,)), loads=loads,
-            plate_options=PlateOptions(**dict(directions)), coordinates=MeshCoordinates(), cores=Cores(workers=workers),
+            place, out=target / f"simulated-{edge:g}", simulation=options.SimulationOptions(sets=(material,)),
+            loads=loads, plate_options=options.PlateOptions(**dict(directions)),
+            coordinates=options.MeshCoordinates(), cores=Cores(workers=workers),
             progress=lambda case, stage, share, edge=edge: tell(f"{edge:g} mm, {case}", stage, share),  # type: ignore[misc]
         )  # fmt: skip
         if not made.complete:

@@ -72,13 +72,7 @@ def _in_programs(law: Material) -> list[str]:
 
 
 def fit(
-    curve: Path | str,
-    law: str,
-    *,
-    out: Path | str,
-    test: str | None = None,
-    nu: float = 0.4999,
-    tissue: str = "fat",
+    curve: Path | str, law: str, *, out: Path | str, test: str | None = None, nu: float = 0.4999, tissue: str = "fat"
 ) -> Fitted:
     """Fit a law to the curves of a CSV file.
 

@@ -12,27 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+import fe
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.worker import Worker, each_in_workers, usable_cores
-from fe import (
-    Checkpoint,
-    LoadState,
-    LoadStep,
-    MaterialSet,
-    Observer,
-    Plate,
-    Problem,
-    Simulation,
-    SolverOptions,
-    clear_simulation,
-    fixed_facets,
-    material_set,
-    problems_of,
-    read_tet_mesh,
-    solve,
-    write_state,
-)
 from fe.restart import ENDING, fingerprint, read_checkpoint, write_checkpoint
 from mrstrain.models.loads import LOADS
 from mrstrain.options.door import door
@@ -51,7 +34,7 @@ class Simulations:
     """What `simulate` gave: a simulation for each material parameter set, and why others failed."""
 
     out: Path
-    sets: tuple[Simulation, ...]
+    sets: tuple[fe.Simulation, ...]
     failures: Mapping[str, str]
 
     @property
@@ -72,7 +55,7 @@ def simulate(
     *,
     out: Path | str,
     simulation: SimulationOptions,
-    loads: Sequence[LoadStep] = LOADS,
+    loads: Sequence[fe.LoadStep] = LOADS,
     plate_options: PlateOptions,
     towards: Mapping[str, tuple[Vector, Vector]] | None = None,
     coordinates: MeshCoordinates,
@@ -105,19 +88,19 @@ def simulate(
     """
     place, target, tell = Path(mesh), Path(out), progress or (lambda *_: None)
     sets, limit_s = simulation.sets, simulation.limit_s
-    read = read_tet_mesh(place, unit=coordinates.mesh_unit, frame=coordinates.mesh_frame)
+    read = fe.read_tet_mesh(place, unit=coordinates.mesh_unit, frame=coordinates.mesh_frame)
     chosen = material_sets(sets)
     towards = dict(towards or {})
     if strangers := towards.keys() - {load.name for load in loads}:
         raise InputError(f"Directions are given for {', '.join(sorted(strangers))}, which is none of the loads.")
     usual = (plate_options.plate_normal, plate_options.shear_direction)
     contact = plate_options.model_dump(exclude={"plate_normal", "shear_direction"})
-    plates = {load.name: Plate(*towards.get(load.name, usual), **contact) for load in loads}
-    held = fixed_facets(read, simulation.fixed)
+    plates = {load.name: fe.Plate(*towards.get(load.name, usual), **contact) for load in loads}
+    held = fe.fixed_facets(read, simulation.fixed)
     jobs = [
         (one, problem)
         for one in chosen
-        for problem in problems_of(read, one.for_regions(read.regions)[0], plates, loads, held, simulation.element)
+        for problem in fe.problems_of(read, one.for_regions(read.regions)[0], plates, loads, held, simulation.element)
     ]
     refuse_touching_inputs(target, [one.name for one in chosen], [place])
     make_output(target)
@@ -128,9 +111,9 @@ def simulate(
     given = coordinates.plain() | contact | {"fixed": list(held), "limit_s": limit_s, "mesh_made": _mesh_made(place)}
     at_once = max(1, min(cores.workers or usable_cores(), len(jobs)))
     each = cores.threads or max(1, usable_cores() // at_once)
-    options = SolverOptions(each, np.inf if limit_s is None else limit_s)
+    options = fe.SolverOptions(each, np.inf if limit_s is None else limit_s)
 
-    def record(one: Simulation) -> dict[str, object]:
+    def record(one: fe.Simulation) -> dict[str, object]:
         return provenance("simulate", files, given | one.parameters())
 
     run = _Run(target, jobs, record, simulation.decks, tell)
@@ -140,9 +123,9 @@ def simulate(
     return Simulations(target, tuple(run.done[one.name] for one in chosen if one.name in run.done), run.failures)
 
 
-def material_sets(names: Sequence[str]) -> list[MaterialSet]:
+def material_sets(names: Sequence[str]) -> list[fe.MaterialSet]:
     """Material parameter sets by the names of published ones or of files; one or more are needed, each once."""
-    chosen = [material_set(name) for name in names]
+    chosen = [fe.material_set(name) for name in names]
     if not chosen or len({one.name for one in chosen}) < len(chosen):
         raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, names)) or 'none'}.")
     return chosen
@@ -153,16 +136,16 @@ class _Run:
     """Paths solved in workers, and each set's tables written as soon as its last path is there."""
 
     target: Path
-    jobs: Sequence[tuple[MaterialSet, Problem]]
-    record: Callable[[Simulation], dict[str, object]]
+    jobs: Sequence[tuple[fe.MaterialSet, fe.Problem]]
+    record: Callable[[fe.Simulation], dict[str, object]]
     decks: bool
     progress: Progress
-    done: dict[str, Simulation] = field(default_factory=dict)
+    done: dict[str, fe.Simulation] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
-    ended: dict[int, list[LoadState]] = field(default_factory=dict)
+    ended: dict[int, list[fe.LoadState]] = field(default_factory=dict)
     writing: threading.Lock = field(default_factory=threading.Lock)
 
-    def path(self, chosen: MaterialSet, problem: Problem, options: SolverOptions, worker: Worker) -> None:
+    def path(self, chosen: fe.MaterialSet, problem: fe.Problem, options: fe.SolverOptions, worker: Worker) -> None:
         """Solve one path."""
         case = f"{chosen.name}, {' '.join(step.name for step in problem.loads)}"
         with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
@@ -183,11 +166,11 @@ class _Run:
                 self._write(chosen, problems)
         self.progress(case, "simulating", 1.0)
 
-    def _write(self, chosen: MaterialSet, problems: Sequence[Problem]) -> None:
+    def _write(self, chosen: fe.MaterialSet, problems: Sequence[fe.Problem]) -> None:
         states = [state for one in problems for state in self.ended[id(one)]]
         if not states:
             return
-        made, folder = Simulation.of(chosen, problems, states), self.target / chosen.name
+        made, folder = fe.Simulation.of(chosen, problems, states), self.target / chosen.name
         if self.decks:
             try:
                 made.write_decks(folder)
@@ -197,10 +180,10 @@ class _Run:
         self.done[chosen.name] = made
 
 
-def _make_empty(folder: Path, loads: Sequence[LoadStep]) -> None:
+def _make_empty(folder: Path, loads: Sequence[fe.LoadStep]) -> None:
     """Make a set's folder, without what an earlier simulation wrote but for checkpoints of these loads."""
     make_output(folder)
-    clear_simulation(folder)
+    fe.clear_simulation(folder)
     for left in folder.glob(f"*{ENDING}"):
         if left.name.removesuffix(ENDING) not in {load.name for load in loads}:
             left.unlink()
@@ -217,28 +200,28 @@ def _mesh_made(place: Path) -> dict[str, object] | None:
     return None
 
 
-def solve_in_folder(problem: Problem, options: SolverOptions, folder: Path, share: Path) -> list[LoadState]:
+def solve_in_folder(problem: fe.Problem, options: fe.SolverOptions, folder: Path, share: Path) -> list[fe.LoadState]:
     """Solve one path in a worker, resuming an earlier run's in the folder if that was made from the same.
 
     Each load's files are there as soon as it is reached; ``share`` is a file that holds the share that is done.
     """
     files = _Files(problem, folder, share)
-    return solve(problem, options, files, files.earlier())
+    return fe.solve(problem, options, files, files.earlier())
 
 
-class _Files(Observer):
+class _Files(fe.Observer):
     """Files of a path in its folder: a load's results and checkpoint when it is reached, a log of each step."""
 
-    def __init__(self, problem: Problem, folder: Path, share: Path) -> None:
+    def __init__(self, problem: fe.Problem, folder: Path, share: Path) -> None:
         self._problem, self._folder, self._share = problem, folder, share
         self._log = folder / f"log-{problem.loads[0].name}.txt"
         self._made_from = {load.name: fingerprint(problem, n) for n, load in enumerate(problem.loads, start=1)}
         self._last = time.monotonic()
         write_whole(self._log, "")
 
-    def earlier(self) -> list[Checkpoint]:
+    def earlier(self) -> list[fe.Checkpoint]:
         """Where the first loads came to in an earlier run; the last may have been on its way."""
-        kept: list[Checkpoint] = []
+        kept: list[fe.Checkpoint] = []
         for load in self._problem.loads:
             checkpoint = read_checkpoint(self._checkpoint_of(load), self._made_from[load.name])
             if checkpoint is None:
@@ -263,15 +246,15 @@ class _Files(Observer):
         part.write_text(f"{done:.4f}")
         part.replace(self._share)
 
-    def converged(self, load: LoadStep, checkpoint: Checkpoint) -> None:
+    def converged(self, load: fe.LoadStep, checkpoint: fe.Checkpoint) -> None:
         if time.monotonic() - self._last > _EVERY_S:
             write_checkpoint(self._checkpoint_of(load), checkpoint, self._made_from[load.name])
             self._last = time.monotonic()
 
-    def ended(self, state: LoadState) -> None:
+    def ended(self, state: fe.LoadState) -> None:
         if state.checkpoint is not None and len(state.curve) > 1:
             write_checkpoint(self._checkpoint_of(state.load), state.checkpoint, self._made_from[state.load.name])
-            write_state(self._folder / f"{state.load.name}.vtu", self._problem.mesh, state, self._problem.materials)
+            fe.write_state(self._folder / f"{state.load.name}.vtu", self._problem.mesh, state, self._problem.materials)
 
-    def _checkpoint_of(self, load: LoadStep) -> Path:
+    def _checkpoint_of(self, load: fe.LoadStep) -> Path:
         return self._folder / f"{load.name}{ENDING}"
