@@ -43,13 +43,13 @@ def extrapolated(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacem
     known = inside | bone
     nearest = distance_transform_edt(~known, sampling=grid.spacing_mm, return_distances=False, return_indices=True)
     whole: FloatArray = u[tuple(nearest)]
-    width = _SMOOTH_MM / grid.spacing_mm
-    for axis in range(3):
-        part = whole[..., axis]
-        for _ in range(_ROUNDS):
-            part = np.where(known, u[..., axis], gaussian_filter(part, width, mode="nearest"))
-        whole[..., axis] = part
+    for _ in range(_ROUNDS):
+        whole = np.where(known[..., None], u, _smoothed(grid, whole))
     return _unfolded(grid, whole)
+
+
+def _smoothed(grid: Grid, u: FloatArray) -> FloatArray:
+    return np.asarray(gaussian_filter(u, _SMOOTH_MM / grid.spacing_mm, mode="nearest", axes=(0, 1, 2)))
 
 
 def _unfolded(grid: Grid, u: FloatArray) -> SampledDisplacement:
@@ -68,6 +68,5 @@ def _unfolded(grid: Grid, u: FloatArray) -> SampledDisplacement:
         if not folded.any():
             break
         weight = np.clip(gaussian_filter(folded.astype(np.float64), width) * 8.0 * np.pi**1.5 * width.prod(), 0.0, 1.0)
-        smooth = np.stack([gaussian_filter(u[..., axis], width, mode="nearest") for axis in range(3)], axis=-1)
-        u = u + weight[..., None] * (smooth - u)
+        u = u + weight[..., None] * (_smoothed(grid, u) - u)
     return field

@@ -81,15 +81,11 @@ def read_result(
         As `dvc.io.meshes.read.read_mesh`.
     """
     place = Path(path)
-    if place.suffix.lower() == ".csv":
-        if mesh is None:
-            raise InputError(f"{place}: a table of displacements needs the mesh of its nodes (--model-mesh).")
-        source = read_mesh(mesh, unit=unit, frame=frame)
-        values = _from_table(place, source)
-    else:
-        source = read_mesh(place, unit=unit, frame=frame)
-        values = _beside_mesh(place, source)
-    u = values * MM_PER_UNIT[unit] * TO_LPS[frame]
+    is_table = place.suffix.lower() == ".csv"
+    if is_table and mesh is None:
+        raise InputError(f"{place}: a table of displacements needs the mesh of its nodes (--model-mesh).")
+    source = read_mesh((is_table and mesh) or place, unit=unit, frame=frame)
+    u = (_from_table if is_table else _beside_mesh)(place, source) * MM_PER_UNIT[unit] * TO_LPS[frame]
     tets, carry = linear_tetrahedra(source)
     used = np.unique(carry.indices)
     missing = ~np.isfinite(u[used]).all(axis=1)
@@ -143,8 +139,8 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
         raise InputError(f"{place} has no displacements: write them with *NODE FILE, U.")
     if place.suffix.lower() == ".msh" and (np.diff(source.node_ids) <= 0).any():
         raise InputError(
-            f"{place}: its nodes do not stand in the order of their numbers, so that displacements may "
-            "belong to others. Write it as VTU."
+            f"{place}: its nodes do not stand in the order of their numbers, so that displacements may belong to "
+            "others. Write it as VTU."
         )
     known = {name.casefold(): name for name in source.at_nodes}
     name = next((known[wanted] for wanted in _NAMES if wanted in known), None)
@@ -175,7 +171,7 @@ def _from_table(place: Path, source: MeshFile) -> FloatArray:
         )
     columns = [named.index(node), *(named.index(c) for c in parts)]
     try:
-        numbers = np.array([[float(row[c]) for c in columns] for row in rows])
+        numbers = np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, 4)
     except (ValueError, IndexError) as error:
         raise InputError(f"{place}: a row is no node and three numbers ({error}).") from error
     index = {int(n): i for i, n in enumerate(source.node_ids)}
@@ -204,12 +200,10 @@ def check_overlap(path: Path, mesh: TetMesh, grid: Grid) -> None:
     if lies_in(1.0, (1.0, 1.0, 1.0)):
         return
     fitting = [(size, frame) for (a, size), (b, frame) in product(_SCALES.items(), _TURNS.items()) if lies_in(a, b)]
+    hint = (
+        f"It would with {' and '.join(fitting[0])}." if fitting else "Give the map to the image's frame (--to-image)."
+    )
     raise GeometryError(
-        f"{path} does not lie in the image. Model: {box_told(*mesh.bounds_mm)}; image: "
-        f"{box_told(*grid.bounds_mm())} (LPS mm). "
-        + (
-            f"It would with {' and '.join(fitting[0])}."
-            if fitting
-            else "Give the map to the image's frame (--to-image)."
-        )
+        f"{path} does not lie in the image. Model: {box_told(*mesh.bounds_mm)}; image: {box_told(*grid.bounds_mm())} "
+        f"(LPS mm). {hint}"
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+import validate
 from dvc import Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
@@ -22,8 +23,6 @@ from mrstrain.options.model import Vector
 from mrstrain.options.modelling import Directions, LabelMapFile
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
-from validate import Comparison, Criteria, LoadCase, check_in_tissue, check_models, check_overlap, read_thresholds
-from validate import compare as compare_loads
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +30,7 @@ class Compared:
     """What `compare` gave: the comparison, and the parts of its report."""
 
     out: Path
-    comparison: Comparison
+    comparison: validate.Comparison
     sections: tuple[Section, ...]
     closing: tuple[Section, ...]
 
@@ -82,7 +81,8 @@ def compare(
         If measurement and models have no load in common, or as in `validate.compare`.
     """
     target, tell, tissues = Path(out), progress or (lambda *_: None), read_labels(labelling.labels, labelling.names)
-    criteria = Criteria(comparison.strains, read_thresholds(comparison.thresholds), comparison.least_ml)
+    thresholds = validate.read_thresholds(comparison.thresholds)
+    criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
     bones, usual = labelling.bones, _axes(directions.plate_normal, directions.shear_direction)
     own = {load: _axes(*of) for load, of in (towards or {}).items()}
     measurements = result_folders(Path(dvc), loads)
@@ -97,10 +97,19 @@ def compare(
     compared = [m for m in measurements if m.load in files]
     cases = [_case(m, files[m.load], tissues.grid, own.get(m.load, usual)) for m in compared]
     # Every file is read once before anything is computed or removed, and again in its turn: together they fill memory.
-    warnings = check_models(cases, tissues, bones)
+    warnings = validate.check_models(cases, tissues, bones)
     make_output(target)
-    record = provenance("compare", inputs, _parameters(bones, usual, own, criteria, how, files))
-    result = compare_loads(
+    given = {
+        "bones": list(bones), "plate_axes_lps": usual.tolist(), "strains": list(criteria.strains),
+        "plate_axes_lps_of": {load: axes.tolist() for load, axes in own.items()},
+        "least_cluster_ml": criteria.least_ml,
+        "thresholds": [[t.max_shear, t.source] for t in criteria.thresholds],
+        "model_unit": how.unit, "model_frame": how.frame,
+        "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": criteria.seed,
+        "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
+    }  # fmt: skip
+    record = provenance("compare", inputs, given)
+    result = validate.compare(
         cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings,
         progress=lambda fraction: tell("compare", "comparing", fraction),
     )  # fmt: skip
@@ -128,45 +137,23 @@ def _inputs(
     return {
         "measured": [f for m in measurements for f in m.files],
         "models": [*(file.path for file in results), *meshes],
-        "labels": [labelling.labels],
-        "names": [] if labelling.names is None else [labelling.names],
+        **labelling.files,
         "mesh": [] if mesh is None else [mesh],
         "error_models": [f for m in measurements if (f := m.folder / ERROR_MODEL).is_file()],
     }
 
 
-def _parameters(
-    bones: Sequence[str],
-    axes: FloatArray,
-    own_axes: Mapping[str, FloatArray],
-    criteria: Criteria,
-    reading: Reading,
-    files: Mapping[str, Sequence[ModelFile]],
-) -> dict[str, object]:
-    """Everything else that the comparison depends on, for its record."""
-    to_image = reading.to_image
-    return {
-        "bones": list(bones), "plate_axes_lps": axes.tolist(), "strains": list(criteria.strains),
-        "plate_axes_lps_of": {load: own.tolist() for load, own in own_axes.items()},
-        "least_cluster_ml": criteria.least_ml,
-        "thresholds": [[t.max_shear, t.source] for t in criteria.thresholds],
-        "model_unit": reading.unit, "model_frame": reading.frame,
-        "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": criteria.seed,
-        "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
-    }  # fmt: skip
-
-
 def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
     """The mesh where all fields are compared, which has to lie in the labelled soft tissue."""
     mesh = read_tet_mesh(path)
-    check_overlap(path, mesh, labels.grid)
-    check_in_tissue(path, mesh, labels, bones)
+    validate.check_overlap(path, mesh, labels.grid)
+    validate.check_in_tissue(path, mesh, labels, bones)
     return mesh
 
 
-def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> LoadCase:
+def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> validate.LoadCase:
     image = measurement.folder / REGISTERED
-    return LoadCase(
+    return validate.LoadCase(
         measurement.load, lambda: (measurement.deformation(), [file.read(grid) for file in files]), axes,
         measurement.table, measurement.verdict, measurement.aligned_on, image if image.is_file() else None,
     )  # fmt: skip

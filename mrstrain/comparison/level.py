@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import meshio
 import numpy as np
 
-from dvc import Image, Subject, tissue_mask, write_image
-from dvc.atomic_files import whole_file, write_json, write_whole
+from dvc import Image, Subject, TetMesh, tissue_mask, write_image
+from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.io.result_folder import PROVENANCE, result_folders
+from fe import write_tet_mesh
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.register import register
@@ -155,10 +155,4 @@ def _write(path: Path, result: FeResult, registered: Path) -> None:
     mesh = result.mesh
     (measured,) = result_folders(registered)
     u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)
-    region = np.zeros(len(mesh.cells), dtype=np.int64)
-    for number, cells in enumerate(mesh.regions.values(), start=1):
-        region[cells] = number
-    written = meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"displacement_mm": u}, {"region": [region]})
-    with whole_file(path) as part:
-        meshio.vtu.write(part, written, binary=True)
-    write_json(path.with_suffix(".json"), {"regions": dict(enumerate(mesh.regions, start=1))})
+    write_tet_mesh(path, TetMesh(mesh.points_mm, mesh.cells, mesh.regions), {}, {"displacement_mm": u})

@@ -93,8 +93,8 @@ def converge(
     if len(edges) < _FEWEST:
         raise InputError(f"A study of convergence needs {_FEWEST} edge lengths or more; got {len(edges)}.")
     target = Path(out)
-    inputs = {"labels": Path(labels)} | ({} if labelling.names is None else {"names": labelling.names})
-    refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], list(inputs.values()))
+    inputs = {"labels": [Path(labels)], **labelling.files}
+    refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], [Path(labels), *labelling.paths])
     make_output(target)
     tell, region, material = progress or (lambda *_: None), followed.region, followed.material
     known = list(read_labels(labels, labelling.names).names.values())
@@ -143,12 +143,12 @@ def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], floa
     return values
 
 
-def _is_of(place: Path, inputs: dict[str, Path], bones: Sequence[str]) -> bool:
+def _is_of(place: Path, inputs: dict[str, list[Path]], bones: Sequence[str]) -> bool:
     """Whether a mesh is there and was made from these files as they are now, with the same bones cut out."""
     about = place.with_suffix(".json")
     if not (place.is_file() and about.is_file()):
         return False
-    hashes = {role: [file_hash(path)] for role, path in inputs.items()}
+    hashes = {role: [file_hash(path) for path in paths] for role, paths in inputs.items()}
     try:
         record = json.loads(about.read_text(encoding="utf-8"))
         known = {role: [f["sha256"] for f in files] for role, files in record["inputs"].items()}

@@ -20,7 +20,7 @@ LOADS = (
 
 
 def load_named(text: str) -> LoadStep:
-    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR; each a force in N or, with mm after it, the plate's displacement."""
+    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR: forces in N or, with mm after them, the plate's displacements."""
     name, _, asked = text.partition("=")
     found = [re.fullmatch(r"\s*([^\s]+?)\s*(mm|N)?\s*", part) for part in asked.split(",")]
     try:
