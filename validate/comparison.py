@@ -140,6 +140,8 @@ class Comparison:
     ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:
         """Write tables, fields, pictures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
 
+        It gives the sections of the report, and the closing ones.
+
         Parameters
         ----------
         folder : path
@@ -151,17 +153,10 @@ class Comparison:
         on_image : bool
             Also write each model's displacement and maximum shear strain on the voxels of the label map.
 
-        Returns
-        -------
-        sections, closing
-            Parts of the report.
-
         Raises
         ------
-        InputError
-            If the comparison was read back: its fields are not in memory.
-        OutputError
-            If the folder cannot be written.
+        InputError, OutputError
+            If the comparison was read back, without its fields; if the folder cannot be written.
         """
         if not self.loads:
             raise InputError("A comparison that was read back has no fields to write; copy its folder instead.")
@@ -198,31 +193,29 @@ class Comparison:
             If the folder holds no comparison.
         """
         place = Path(folder)
-        rows = {name: tables.read_rows(place / name, kind) for name, kind in tables.TABLES.items()}
+        areas, overlaps, agreements, skin = tables.read_tables(place)
         try:
             content = json.loads((place / tables.RECORD).read_text(encoding="utf-8"))
             low, high = content["parameters"]["strains"]
             pairs = {load: tuple((a, b) for a, b in of) for load, of in content["not_told_apart"].items()}
             verdicts = {load: _verdict(of) for load, of in content["verdict_by_load"].items()}
-            *areas, nothing = (a for a in rows["areas.csv"] if a.load == ALL_LOADS)
-            ranking = Ranking(tuple(areas), nothing, tuple(content["told_apart"]), pairs)
+            *totals, nothing = (a for a in areas if a.load == ALL_LOADS)
+            ranking = Ranking(tuple(totals), nothing, tuple(content["told_apart"]), pairs)
             coverage, verdict, notes = content["coverage_ml"], _verdict(content["verdict"]), tuple(content["notes"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{place / tables.RECORD} is no record of a comparison ({error}).") from error
-        by_load = tuple(a for a in rows["areas.csv"] if a.load != ALL_LOADS)
+        by_load, curves = tuple(a for a in areas if a.load != ALL_LOADS), tables.read_curves(place)
         return cls(
-            by_load, rows["location.csv"], rows["agreement.csv"], rows["travel.csv"], tables.read_curves(place),
-            ranking, (low, high), coverage, verdict, verdicts, notes,
-        )  # fmt: skip
+            by_load, overlaps, agreements, skin, curves, ranking, (low, high), coverage, verdict, verdicts, notes
+        )
 
     def _write_tables(self, target: Path) -> None:
         known = {load: of for load, of in self.verdicts.items() if of is not None}
         levels = {load: of.level for load, of in known.items()}
         levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
         areas = (*self.areas, *self.ranking.areas, self.ranking.nothing)
-        for name, rows in zip(tables.TABLES, (areas, self.overlaps, self.agreements, self.skin), strict=True):
-            tables.write_rows(target / name, rows, levels)
-        tables.write_curves(target, self.curves, levels)
+        rows = (areas, self.overlaps, self.agreements, self.skin)
+        tables.write_tables(target, rows, self.curves, levels)
 
     def _record(self) -> dict[str, object]:
         return {

@@ -85,10 +85,8 @@ def simulate_driven(
         Every cell in one region; the surface set "bone" does not move.
     measured : Deformation
         Of tissue relative to its bone, reference configuration, LPS mm.
-    threads : int
-        Of the linear solver.
-    tell : callable
-        Gets a line for each increment.
+    threads, tell : int, callable
+        Threads of the linear solver; ``tell`` gets a line for each increment.
 
     Raises
     ------

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import meshio
 import numpy as np
@@ -24,19 +24,13 @@ from validate.location import Overlap
 from validate.mapping import ALL
 
 RECORD = "comparison.json"
-TABLES: Mapping[str, type[Any]] = {
-    "areas.csv": Area,
-    "location.csv": Overlap,
-    "agreement.csv": Agreement,
-    "travel.csv": SkinDisplacement,
-}
+TABLES = {"areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement}
 CURVES = "curves.csv"
 LOWER, UPPER = "measured, low", "measured, high"
 """Fields of the curves that bound the 95 % band of the true one."""
 _CURVE_COLUMNS = ("load", "tissue", "field", "max_shear", "volume_above_ml", "verdict")
 _STEP = 0.005  # of the curves that are written
 _READERS = {"int": int, "float": float, "str": str}
-_Row = TypeVar("_Row")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,20 +60,16 @@ def curves_of(one: LoadComparison) -> list[Curve]:
     return made
 
 
-def write_rows(path: Path, rows: Sequence[Any], verdicts: Mapping[str, str]) -> None:
-    """Write rows of one of the `TABLES`, each with the verdict on its load (empty: there is none)."""
-    head = [*(f.name for f in fields(TABLES[path.name])), "verdict"]
-    write_csv(path, head, ((*astuple(row), verdicts.get(row.load, "")) for row in rows))
+def write_tables(
+    folder: Path, tables: Sequence[Sequence[Any]], curves: Iterable[Curve], verdicts: Mapping[str, str]
+) -> None:
+    """Write the rows of each of the `TABLES`, in their order, and a row for each point of the curves.
 
-
-def read_rows(path: Path, kind: type[_Row]) -> tuple[_Row, ...]:
-    """Read what `write_rows` wrote, to the six digits of the file; one that is no such table is an `InputError`."""
-    readers = {f.name: _READERS[str(f.type)] for f in fields(kind)}  # type: ignore[arg-type]
-    return tuple(kind(**{name: read(row[name]) for name, read in readers.items()}) for row in _rows(path, readers))
-
-
-def write_curves(folder: Path, curves: Iterable[Curve], verdicts: Mapping[str, str]) -> None:
-    """Write curves, a row for each point."""
+    Each has the verdict on its load; empty if there is none.
+    """
+    for (name, kind), rows in zip(TABLES.items(), tables, strict=True):
+        head = [*(f.name for f in fields(kind)), "verdict"]
+        write_csv(folder / name, head, ((*astuple(row), verdicts.get(row.load, "")) for row in rows))
     points = (
         (c.load, c.tissue, c.field, strain, volume, verdicts.get(c.load, ""))
         for c in curves
@@ -88,8 +78,18 @@ def write_curves(folder: Path, curves: Iterable[Curve], verdicts: Mapping[str, s
     write_csv(folder / CURVES, _CURVE_COLUMNS, points)
 
 
+def read_tables(folder: Path) -> list[tuple[Any, ...]]:
+    """Rows of each of the `TABLES`, to the six digits of the file; one that is no such table is an `InputError`."""
+    tables: list[tuple[Any, ...]] = []
+    for name, kind in TABLES.items():
+        readers = {f.name: _READERS[str(f.type)] for f in fields(kind)}
+        rows = _rows(folder / name, readers)
+        tables.append(tuple(kind(**{of: read(row[of]) for of, read in readers.items()}) for row in rows))
+    return tables
+
+
 def read_curves(folder: Path) -> tuple[Curve, ...]:
-    """Read what `write_curves` wrote; errors as `read_rows`."""
+    """The curves that `write_tables` wrote; errors as `read_tables`."""
     points: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for row in _rows(folder / CURVES, _CURVE_COLUMNS):
         key = row["load"], row["tissue"], row["field"]
