@@ -31,8 +31,8 @@ _Panel = tuple[FloatArray, Mapping[str, FloatArray], tuple[FloatArray, FloatArra
 def volume_strain(one: LoadComparison, tissues: Sequence[str], colours: Sequence[str]) -> bytes:
     """Volume of tissue above each maximum shear strain: measured (black) and models, in the same cells.
 
-    The grey band contains the true curve in 95 % of cases, by the measurement's error model; areas are
-    taken between the dotted lines.
+    The grey band contains the true curve in 95 % of cases, by the measurement's error model; areas are taken between
+    the dotted lines.
     """
     at = np.linspace(0.0, 1.5 * one.criteria.strains[1], _POINTS)
     edges = {name: (band.strains, band.low_ml, band.high_ml) for name, band in one.bands.items()}
@@ -46,14 +46,11 @@ def _curves(panels: Mapping[str, _Panel], strains: tuple[float, float], colours:
         if band is not None:
             axes.fill_between(*band, color=_BAND, linewidth=0, label="95 % of truths")
         for name, above in volumes_ml.items():
-            if name == "measured":
-                axes.plot(at, above, color="black", linewidth=2.2, label=name)
-            else:
-                axes.plot(at, above, color=_colour(colours.index(name)), linewidth=1.5, label=name)
+            colour, width = ("black", 2.2) if name == "measured" else (_colour(colours.index(name)), 1.5)
+            axes.plot(at, above, color=colour, linewidth=width, label=name)
         for edge in strains:
             axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
-        axes.set_xlim(0.0, at[-1])
-        axes.set_ylim(0.0, None)
+        axes.set(xlim=(0.0, at[-1]), ylim=(0.0, None))
         label_axes(axes, "maximum shear strain", "volume above, mL")
         axes.set_title(title, color=INK, **FONT)
     spots[0].legend(fontsize=9, frameon=False)
@@ -92,8 +89,7 @@ def areas_by_load(areas: Sequence[Area]) -> Figure:
         axes.plot(at, [a.best_ml for a in rows], "o", color=_colour(number), label=model)
         axes.vlines(at, [a.low_ml for a in rows], [a.high_ml for a in rows], color=_colour(number), linewidth=1.8)
     axes.set_xticks(range(len(loads)), loads)
-    axes.set_xlim(-0.5, len(loads) - 0.5)
-    axes.set_ylim(0.0, None)
+    axes.set(xlim=(-0.5, len(loads) - 0.5), ylim=(0.0, None))
     label_axes(axes, "", "area between curves, mL")
     axes.legend(fontsize=9, frameon=False)
     return figure
@@ -117,24 +113,22 @@ def _panels(count: int, most: int = 2, size_in: tuple[float, float] = (WIDTH_IN,
     return figure, spots[:count]
 
 
-def slices(
-    one: LoadComparison, measured: Deformation, displacements: Mapping[str, FloatArray], point_mm: FloatArray
-) -> bytes:
+def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatArray], point_mm: FloatArray) -> bytes:
     """Maximum shear strain on a slice, measured and simulated, on the deformed tissue.
 
     The slice contains the plate's normal and the direction of shear; the same cells in one colour scale. Grey is
     undefined. A node beyond the measurement is drawn with the displacement of the nearest one within. Letters name the
     sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
-    panels = slice_panels(one.fields, measured, displacements)
+    panels = slice_panels(one.fields, measured, u_mm)
     return png_bytes(slice_sheet(one.fields.mesh, panels, one.case.axes, point_mm))
 
 
-def slice_panels(fields: MappedFields, measured: Deformation, displacements: Mapping[str, FloatArray]) -> list[Slice]:
-    """Panels of `slices`: the measurement, then each model, with displacements (n, 3) at the mesh's nodes."""
+def slice_panels(fields: MappedFields, measured: Deformation, u_mm: Mapping[str, FloatArray]) -> list[Slice]:
+    """Panels of `slices`: the measurement, then each model, with its displacement (n, 3) at the mesh's nodes."""
     u = filled_from_nearest(measured.displacement(fields.mesh.points_mm), fields.mesh.points_mm)
     panels = [Slice("measured", u, fields.measured.max_shear)]
-    return panels + [Slice(name, displacements[name], field.max_shear) for name, field in fields.models.items()]
+    return panels + [Slice(name, u_mm[name], field.max_shear) for name, field in fields.models.items()]
 
 
 def scatter(fields: MappedFields) -> bytes:

@@ -70,11 +70,11 @@ class StrainCluster:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellGraph:
-    """Cells of a mesh, their centroids in the reference configuration (LPS), and which of them share a face."""
+    """Cells of a mesh: volumes (n,), centroids (n, 3) in the reference configuration (LPS), shared faces (n, n)."""
 
-    volumes_ml: FloatArray  # (n,)
-    points_mm: FloatArray  # (n, 3)
-    adjacency: sparse.csr_matrix  # (n, n)
+    volumes_ml: FloatArray
+    points_mm: FloatArray
+    adjacency: sparse.csr_matrix
 
     @classmethod
     def of(cls, mesh: TetMesh) -> CellGraph:

@@ -16,8 +16,7 @@ from dvc.trust.regions import volume_above
 ALL = "all soft tissue"
 """Name of all compared tissue together."""
 
-OTHER = "unnamed"
-"""Tissue of cells that are named neither by the mesh nor by the label map."""
+_OTHER = "unnamed"  # tissue of cells that are named neither by the mesh nor by the label map
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,7 +143,7 @@ def map_fields(
     """
     check_bones(labels, bones)
     points = mesh.centroids_mm
-    tissue = tissues_of(mesh, labels, points)
+    tissue = tissues_of(mesh, labels)
     soft = ~np.isin(tissue, list(bones))
     bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
     distance, _ = cKDTree(labels.grid.points(bone)).query(points[soft])
@@ -160,13 +159,13 @@ def map_fields(
     return fields
 
 
-def tissues_of(mesh: TetMesh, labels: LabelMap, points: FloatArray, *, by_mesh: bool = True) -> np.ndarray:
+def tissues_of(mesh: TetMesh, labels: LabelMap, *, by_mesh: bool = True) -> np.ndarray:
     """Tissue of each cell (m,) str: the mesh's region where it is called as a label, else the label at its centroid."""
     names = set(labels.names.values())
-    tissue = np.full(len(points), OTHER, dtype=f"<U{max(len(n) for n in (*names, OTHER))}")
-    nearest = np.rint(labels.grid.indices_of(points)).astype(np.int64)
+    tissue = np.full(len(mesh.cells), _OTHER, dtype=f"<U{max(len(n) for n in (*names, _OTHER))}")
+    nearest = np.rint(labels.grid.indices_of(mesh.centroids_mm)).astype(np.int64)
     inside = ((nearest >= 0) & (nearest < np.array(labels.grid.shape))).all(axis=1)
-    number = np.zeros(len(points), dtype=np.int64)
+    number = np.zeros(len(mesh.cells), dtype=np.int64)
     number[inside] = labels.labels[tuple(nearest[inside].T)]
     for value, name in labels.names.items():
         tissue[number == value] = name

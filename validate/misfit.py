@@ -52,7 +52,7 @@ def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[st
 def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence[str]) -> float:
     """Overlap of a mesh and the labelled soft tissue, as a fraction of the smaller volume; refused if under 85 %."""
     soft = [number for number, name in labels.names.items() if name not in bones]
-    tissue = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=False)
+    tissue = tissues_of(mesh, labels, by_mesh=False)
     inside = np.isin(tissue, [labels.names[number] for number in soft])
     labelled = np.isin(labels.labels, soft)
     smaller = min(mesh.volumes_mm3.sum(), np.count_nonzero(labelled) * labels.grid.voxel_volume_mm3)
@@ -75,7 +75,7 @@ def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[st
     if overlap < _GOOD_OVERLAP:
         warnings.append(f"{overlap:.0%} of the model lies in the labelled soft tissue; is its frame right?")
     names = [name for name in labels.names.values() if name not in bones]
-    tissue, of_mesh = (tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=by_mesh) for by_mesh in (False, True))
+    tissue, of_mesh = (tissues_of(mesh, labels, by_mesh=by_mesh) for by_mesh in (False, True))
     both, volume = np.isin(tissue, names) & np.isin(of_mesh, names), mesh.volumes_mm3
     same = float(volume[both & (of_mesh == tissue)].sum() / max(volume[both].sum(), 1e-12))
     if both.any() and same < _SAME_TISSUE:

@@ -145,15 +145,14 @@ def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], floa
 
 def _is_of(place: Path, inputs: dict[str, list[Path]], bones: Sequence[str]) -> bool:
     """Whether a mesh is there and was made from these files as they are now, with the same bones cut out."""
-    about = place.with_suffix(".json")
-    if not (place.is_file() and about.is_file()):
+    if not place.is_file():
         return False
     hashes = {role: [file_hash(path) for path in paths] for role, paths in inputs.items()}
     try:
-        record = json.loads(about.read_text(encoding="utf-8"))
+        record = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
         known = {role: [f["sha256"] for f in files] for role, files in record["inputs"].items()}
         return bool(known == hashes and record["parameters"]["bones"] == list(bones))
-    except (ValueError, KeyError, TypeError, AttributeError):  # not what `mesh` writes
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # not what `mesh` writes
         return False
 
 
