@@ -61,16 +61,9 @@ class Agreement:
 
 
 def agreement(
-    model: str,
-    load: str,
-    quantity: str,
-    part: str,
-    measured: FloatArray,
-    simulated: FloatArray,
-    volumes_ml: FloatArray,
-    rmse: float | None = None,
+    of: tuple[str, str, str, str], measured: FloatArray, simulated: FloatArray, volumes_ml: FloatArray
 ) -> Agreement | None:
-    """Agreement of two fields (n,) without gaps; None for fewer than ten cells."""
+    """Agreement of fields (n,) without gaps, ``of`` a model, load, quantity and part; None for fewer than ten cells."""
     if len(measured) < _LEAST:
         return None
     weight = volumes_ml / volumes_ml.sum()
@@ -83,9 +76,8 @@ def agreement(
     spread = float(np.sqrt(weight @ (y - x) ** 2))
     bias = y0 - x0
     return Agreement(
-        model, load, quantity, part, len(measured), float(volumes_ml.sum()), x0, y0, slope, y0 - slope * x0,
-        xy**2 / (xx * yy), float(np.hypot(bias, spread)) if rmse is None else rmse, 2.0 * xy / (xx + yy + bias**2),
-        bias, bias - 1.96 * spread, bias + 1.96 * spread,
+        *of, len(measured), float(volumes_ml.sum()), x0, y0, slope, y0 - slope * x0, xy**2 / (xx * yy),
+        float(np.hypot(bias, spread)), 2.0 * xy / (xx + yy + bias**2), bias, bias - 1.96 * spread, bias + 1.96 * spread,
     )  # fmt: skip
 
 
@@ -101,14 +93,13 @@ def agreements(fields: MappedFields, model: str, load: str) -> list[Agreement]:
         volumes = fields.volumes_ml[where]
         u, v = fields.measured.u_mm[where], field.u_mm[where]
         rmse = float(np.sqrt(volumes @ ((v - u) ** 2).sum(axis=1) / volumes.sum())) if where.any() else 0.0
-        shears = fields.measured.max_shear[where], field.max_shear[where]
-        rows.append(agreement(model, load, "max_shear", part, *shears, volumes))
-        lengths = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
-        row = agreement(model, load, "u_mm", part, *lengths, volumes, rmse)
-        pooled = agreement(model, load, "u_mm", part, u.ravel(), v.ravel(), np.repeat(volumes, 3))
+        shears, of_u = (fields.measured.max_shear[where], field.max_shear[where]), (model, load, "u_mm", part)
+        rows.append(agreement((model, load, "max_shear", part), *shears, volumes))
+        row = agreement(of_u, np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1), volumes)
+        pooled = agreement(of_u, u.ravel(), v.ravel(), np.repeat(volumes, 3))
         if row is not None and pooled is not None:
             by_component = ("slope", "intercept", "r2", "concordance")
-            rows.append(replace(row, **{name: getattr(pooled, name) for name in by_component}))
+            rows.append(replace(row, rmse=rmse, **{name: getattr(pooled, name) for name in by_component}))
     return [row for row in rows if row is not None]
 
 

@@ -74,7 +74,7 @@ def test_a_graded_field_has_its_means_by_distance_to_bone() -> None:
 
 def test_both_limits_of_bland_and_altman_have_their_closed_form() -> None:
     x = np.linspace(0.1, 0.5, 40)
-    found = agreement("m", "l", "max_shear", "fat", x, x + np.tile([0.01, 0.05], 20), np.ones(40))
+    found = agreement(("m", "l", "max_shear", "fat"), x, x + np.tile([0.01, 0.05], 20), np.ones(40))
     assert found is not None
     assert (found.bias, found.lower, found.upper) == pytest.approx((0.03, 0.03 - 1.96 * 0.02, 0.03 + 1.96 * 0.02))
 
