@@ -134,12 +134,12 @@ class LoadComparison:
         above = volumes[self.fields.measured.max_shear[where] > self.criteria.strains[0]].sum()
         return bool(above < _STRAINED * volumes.sum())
 
-    def ranked(self, tissue: str = ALL) -> list[Area]:
-        """Areas of the ranked models in a tissue, the smallest first: the estimate where the uncertainty is known.
+    def ranked(self) -> list[Area]:
+        """Areas of the ranked models in all soft tissue, the smallest first, by the estimate where there is one.
 
         Levelled models are not ranked, since no bias is removed from their areas; nor is `NOTHING`.
         """
-        models = (a for a in self.areas if a.tissue == tissue and a.model != NOTHING and not a.model.endswith(LEVELLED))
+        models = (a for a in self.areas if a.tissue == ALL and a.model != NOTHING and not a.model.endswith(LEVELLED))
         return sorted(models, key=lambda a: a.best_ml)
 
 

@@ -101,7 +101,7 @@ SHAPES = {
 
 _log = logging.getLogger("validate.tetrahedra")
 
-# A ten-node tetrahedron: four corners, and the octahedron between them around one of its diagonals.
+# A ten-node tetrahedron, in cells of positive volume: four corners, and the octahedron between them around a diagonal.
 _TETRA10 = np.array(
     [(0, 4, 6, 7), (4, 1, 5, 8), (6, 5, 2, 9), (7, 8, 9, 3), (6, 8, 4, 5), (6, 8, 5, 9), (6, 8, 9, 7), (6, 8, 7, 4)]
 )
@@ -131,7 +131,7 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
         if not whole and block.kind != block.shape:
             _log.warning("Of cells of kind %s only the corner nodes are used.", block.kind)
         if block.shape == "tetra":
-            children = _tetrahedra(block)
+            children = block.nodes[:, _TETRA10] if whole else block.corners[:, None]
             cells.append(children.reshape(-1, 4))
             parents.append(np.repeat(numbers, children.shape[1]))
             faces += _quadratic_faces(block.nodes, SHAPES["tetra"]) if whole else _linear_faces(block)
@@ -150,7 +150,8 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
     order = np.argsort(parent, kind="stable")
     starts = np.searchsorted(parent[order], np.arange(mesh.cell_count + 1))
     members = {
-        name: np.concatenate([order[starts[c] : starts[c + 1]] for c in index]) for name, index in mesh.regions.items()
+        name: np.concatenate([order[:0], *(order[starts[c] : starts[c + 1]] for c in index)])
+        for name, index in mesh.regions.items()
     }
     regions = {name: cells_of for name, cells_of in members.items() if len(cells_of)}
     surfaces = {name: _on_surface(corners, faces, len(mesh.points_mm)) for name, corners in _surfaces(mesh).items()}
@@ -182,16 +183,6 @@ class _Nodes:
         self.carry = sparse.vstack([self.carry, share], format="csr")
         self.points = np.concatenate([self.points, share @ self._own])
         return np.arange(before, before + count)
-
-
-def _tetrahedra(block: CellBlock) -> IntArray:
-    """Children (m, c, 4) of linear or quadratic tetrahedra, the same way round as their parents."""
-    if block.kind != "tetra10":
-        return block.corners[:, None]
-    reference = SHAPES["tetra"].nodes[_TETRA10]
-    flip = np.linalg.det(reference[:, 1:] - reference[:, :1]) < 0.0
-    ordered = np.where(flip[:, None], _TETRA10[:, [0, 1, 3, 2]], _TETRA10)
-    return block.nodes[:, ordered]
 
 
 def _linear_faces(block: CellBlock) -> _Faces:

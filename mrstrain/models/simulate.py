@@ -242,9 +242,7 @@ class _Files(fe.Observer):
             raise OutputError(f"{self._log}: cannot be written ({reason}). Has the disk room?") from error
 
     def progress(self, done: float) -> None:
-        part = self._share.with_suffix(".part")
-        part.write_text(f"{done:.4f}")
-        part.replace(self._share)
+        write_whole(self._share, f"{done:.4f}")
 
     def converged(self, load: fe.LoadStep, checkpoint: fe.Checkpoint) -> None:
         if time.monotonic() - self._last > _EVERY_S:
