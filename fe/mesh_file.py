@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import meshio
 import numpy as np
 
 from dvc import TetMesh, read_mesh
-from dvc.arrays import IntArray
+from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import whole_file, write_whole
 from dvc.errors import InputError
 from fe.surface_sets import known_name
@@ -19,10 +20,12 @@ _FIRST_FACET = 101  # numbers of facets in the array "region"; those of tissues 
 _MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, beside its components
 
 
-def write_tet_mesh(path: Path, mesh: TetMesh, about: dict[str, object]) -> None:
+def write_tet_mesh(
+    path: Path, mesh: TetMesh, about: dict[str, object], at_nodes: Mapping[str, FloatArray] | None = None
+) -> None:
     """Write a mesh as VTU, LPS mm: tetrahedra and named triangles, numbered in ``region``.
 
-    The names, and what is known ``about`` it, stand in a JSON file of the same name.
+    The names, and what is known ``about`` it, stand in a JSON file of the same name; ``at_nodes`` becomes point data.
     """
     tissues = {name: number for number, name in enumerate(mesh.regions, start=1)}
     facets = {name: number for number, name in enumerate(mesh.facets, start=_FIRST_FACET)}
@@ -34,7 +37,7 @@ def write_tet_mesh(path: Path, mesh: TetMesh, about: dict[str, object]) -> None:
     blocks = [("tetra", mesh.cells)] + ([("triangle", triangles)] if len(triangles) else [])
     numbers = [number] + ([flat] if len(triangles) else [])
     with whole_file(path) as part:
-        meshio.vtu.write(part, meshio.Mesh(mesh.points_mm, blocks, cell_data={"region": numbers}), binary=True)
+        meshio.vtu.write(part, meshio.Mesh(mesh.points_mm, blocks, at_nodes, {"region": numbers}), binary=True)
     names = {str(number): name for named in (tissues, facets) for name, number in named.items()}
     write_whole(_names_of(path), json.dumps({"regions": names} | about, indent=2) + "\n")
 

@@ -1,5 +1,4 @@
 from .agreement import Agreement, SkinDisplacement, agreements, skin_displacement
-from .cohort import CohortRank, rank_over_subjects
 from .comparison import Comparison, compare
 from .curves import RANGE, Area, Band, area_between, bands, check_range
 from .extrapolation import LEVELLED, extrapolated
@@ -11,7 +10,7 @@ from .location import LEAST_ML, CellGraph, Overlap, StrainCluster, Threshold, ov
 from .mapping import ALL, Field, MappedFields, check_bones, filled_from_nearest, map_fields
 from .measured_boundary import boundary_displacement, simulate_driven, write_boundary_conditions
 from .misfit import check_in_tissue, check_models, displacement_slip, misfits
-from .ranking import ALL_LOADS, Ranking, rank_over_loads
+from .ranking import ALL_LOADS, CohortRank, Ranking, rank_over_loads, rank_over_subjects
 from .tables import Curve
 
 __all__ = [

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from dvc import Deformation
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import FloatArray, IntArray
 from dvc.deformation.nodal import OnMesh
 from dvc.mesh import outer_faces
-from validate.mapping import ALL, MappedFields
+from validate.mapping import MappedFields
 
 TO_BONE_MM = (0.0, 3.0, 6.0, 12.0)
 """Lower ends of the bins of distance to bone, mm."""
@@ -23,20 +24,15 @@ _INWARD_MM = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Agreement of one quantity in one part of the tissue.
+    """Agreement of one quantity, "max_shear" or "u_mm", in one part of the tissue; a row of agreement.csv.
+
+    For displacement, means, bias and limits are those of its magnitude in mm; regression and concordance pool its three
+    components, so that a wrong direction shows.
 
     Attributes
     ----------
-    model, load, quantity, part : str
-        The quantity is "max_shear" or "u_mm". For displacement, means, bias and limits are those of its magnitude;
-        regression and concordance pool its three components, so that a wrong direction shows.
-    cells : int
-    volume_ml : float
-    measured_mean, model_mean : float
-    slope, intercept : float
-        Least-squares regression of the model on the measurement.
-    r2 : float
-        Squared correlation.
+    slope, intercept, r2 : float
+        Least-squares regression of the model on the measurement, and the squared correlation.
     rmse : float
         Root mean square of model minus measurement; for displacement, of the magnitude of the difference vector, mm.
     concordance : float
@@ -65,24 +61,9 @@ class Agreement:
 
 
 def agreement(
-    model: str,
-    load: str,
-    quantity: str,
-    part: str,
-    measured: FloatArray,
-    simulated: FloatArray,
-    volumes_ml: FloatArray,
-    rmse: float | None = None,
+    of: tuple[str, str, str, str], measured: FloatArray, simulated: FloatArray, volumes_ml: FloatArray
 ) -> Agreement | None:
-    """Agreement of two fields (n,) without gaps; None for fewer than ten cells.
-
-    Examples
-    --------
-    >>> x = np.linspace(0.0, 1.0, 20)
-    >>> row = agreement("a", "Load1", "max_shear", "fat", x, 2.0 * x + 0.1, np.ones(20))
-    >>> round(row.slope, 9), round(row.intercept, 9), round(row.r2, 9), round(row.bias, 9)
-    (2.0, 0.1, 1.0, 0.6)
-    """
+    """Agreement of fields (n,) without gaps, ``of`` a model, load, quantity and part; None for fewer than ten cells."""
     if len(measured) < _LEAST:
         return None
     weight = volumes_ml / volumes_ml.sum()
@@ -95,21 +76,16 @@ def agreement(
     spread = float(np.sqrt(weight @ (y - x) ** 2))
     bias = y0 - x0
     return Agreement(
-        model, load, quantity, part, len(measured), float(volumes_ml.sum()), x0, y0, slope, y0 - slope * x0,
-        xy**2 / (xx * yy),
-        float(np.hypot(bias, spread)) if rmse is None else rmse,
-        2.0 * xy / (xx + yy + bias**2),
-        bias, bias - 1.96 * spread, bias + 1.96 * spread,
+        *of, len(measured), float(volumes_ml.sum()), x0, y0, slope, y0 - slope * x0, xy**2 / (xx * yy),
+        float(np.hypot(bias, spread)), 2.0 * xy / (xx + yy + bias**2), bias, bias - 1.96 * spread, bias + 1.96 * spread,
     )  # fmt: skip
 
 
 def agreements(fields: MappedFields, model: str, load: str) -> list[Agreement]:
     """Agreement of maximum shear strain and displacement: all soft tissue, each tissue, and by distance to bone."""
     common, field = fields.common, fields.models[model]
-    parts: dict[str, BoolArray] = {ALL: common}
-    parts |= {tissue: common & (fields.tissue == tissue) for tissue in fields.tissues}
-    ends = (*TO_BONE_MM[1:], np.inf)
-    for low, high in zip(TO_BONE_MM, ends, strict=True):
+    parts = fields.parts
+    for low, high in pairwise((*TO_BONE_MM, np.inf)):
         name = f"{low:g} to {high:g} mm from bone" if np.isfinite(high) else f"over {low:g} mm from bone"
         parts[name] = common & (fields.to_bone_mm >= low) & (fields.to_bone_mm < high)
     rows = []
@@ -117,23 +93,13 @@ def agreements(fields: MappedFields, model: str, load: str) -> list[Agreement]:
         volumes = fields.volumes_ml[where]
         u, v = fields.measured.u_mm[where], field.u_mm[where]
         rmse = float(np.sqrt(volumes @ ((v - u) ** 2).sum(axis=1) / volumes.sum())) if where.any() else 0.0
-        rows.append(
-            agreement(model, load, "max_shear", part, fields.measured.max_shear[where], field.max_shear[where], volumes)
-        )
-        lengths = agreement(
-            model, load, "u_mm", part, np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1), volumes, rmse
-        )
-        vectors = agreement(model, load, "u_mm", part, u.ravel(), v.ravel(), np.repeat(volumes, 3))
-        if lengths is not None and vectors is not None:
-            rows.append(
-                replace(
-                    lengths,
-                    slope=vectors.slope,
-                    intercept=vectors.intercept,
-                    r2=vectors.r2,
-                    concordance=vectors.concordance,
-                )
-            )
+        shears, of_u = (fields.measured.max_shear[where], field.max_shear[where]), (model, load, "u_mm", part)
+        rows.append(agreement((model, load, "max_shear", part), *shears, volumes))
+        row = agreement(of_u, np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1), volumes)
+        pooled = agreement(of_u, u.ravel(), v.ravel(), np.repeat(volumes, 3))
+        if row is not None and pooled is not None:
+            by_component = ("slope", "intercept", "r2", "concordance")
+            rows.append(replace(row, rmse=rmse, **{name: getattr(pooled, name) for name in by_component}))
     return [row for row in rows if row is not None]
 
 
@@ -143,7 +109,6 @@ class SkinDisplacement:
 
     Attributes
     ----------
-    model, load : str
     nodes : int
         Nodes of the skin on the model's plate where both fields are defined.
     measured_mm, model_mm : float
@@ -182,13 +147,7 @@ def skin_on_plate(model: OnMesh, normal: FloatArray) -> IntArray:
 def skin_displacement(
     fields: MappedFields, name: str, load: str, model: OnMesh, measured: Deformation, normal: FloatArray
 ) -> SkinDisplacement:
-    """Mean displacement, measured and simulated, 1 mm inside the skin that lies on the plate.
-
-    Parameters
-    ----------
-    normal : (3,)
-        The plate's outward unit normal, LPS.
-    """
+    """Displacement, measured and simulated, 1 mm inside the skin on the plate of outward unit ``normal`` (3,), LPS."""
     nodes = skin_on_plate(model, normal)
     inside = model.mesh.points_mm[nodes] - _INWARD_MM * normal
     both = measured.displacement(inside), model.displacement(inside)
@@ -201,6 +160,4 @@ def skin_displacement(
     change = [float(volumes @ field.jacobian[where]) - 1.0 for field in (fields.measured, fields.models[name])]
     along = [float(-m @ normal) for m in mean]
     across = [float(np.linalg.norm(m - (m @ normal) * normal)) for m in mean]
-    return SkinDisplacement(
-        name, load, int(known.sum()), along[0], along[1], across[0], across[1], change[0], change[1]
-    )
+    return SkinDisplacement(name, load, int(known.sum()), *along, *across, *change)

@@ -19,31 +19,18 @@ from dvc.errors import InputError
 from dvc.report.page import Section, record_lines, write_report
 from dvc.report.sheet import png_bytes
 from dvc.trust.verdict import worst
-from validate import figures
+from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
 from validate.extrapolation import LEVELLED
-from validate.limitations import limitations, verdict_on
+from validate.limitations import doubts_of, limitations, verdict_on
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
 from validate.location import Overlap
 from validate.mapping import ALL
 from validate.misfit import check_models, displacement_slip
 from validate.ranking import ALL_LOADS, Ranking, rank_over_loads
-from validate.report import closing_sections, draw, load_sections, overview, ranks, shown
-from validate.tables import (
-    CURVES,
-    RECORD,
-    TABLES,
-    Curve,
-    curves_of,
-    read_curves,
-    read_rows,
-    remove_earlier,
-    write_curves,
-    write_fields,
-    write_on_image,
-    write_rows,
-)
+from validate.report import area_rows, closing_sections, draw, load_sections, overview, shown
+from validate.tables import Curve
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,13 +39,9 @@ class Comparison:
 
     Attributes
     ----------
-    areas : tuple of Area
-        Area between volume-strain curves by load, model and tissue.
-    overlaps : tuple of Overlap
-        Location: clusters above thresholds.
-    agreements : tuple of Agreement
-        Cell by cell: regression, concordance, limits of agreement.
-    skin : tuple of SkinDisplacement
+    areas, overlaps, agreements, skin : tuple of Area, Overlap, Agreement, SkinDisplacement
+        Rows by load and model: area between volume-strain curves by tissue, location of clusters above thresholds,
+        agreement cell by cell, displacement of the skin.
     curves : tuple of Curve
         Volume-strain curves, measured and simulated.
     ranking : Ranking
@@ -67,14 +50,10 @@ class Comparison:
         Range of maximum shear strain of the areas.
     coverage_ml : mapping of load to mapping
         Volume of the mesh, of what each field defines of it, and of what is common to all.
-    verdict : Verdict or None
-        On the registrations and on slips of the models; None where nothing is known.
-    verdicts : mapping of load to Verdict or None
-        On each registration.
-    notes : tuple of str
-        Limitations of this comparison.
-    warnings : tuple of str
-        What looks wrong about a model.
+    verdict, verdicts : Verdict or None, mapping of load to Verdict or None
+        On the registrations and on slips of the models, None where nothing is known; and on each registration.
+    notes, warnings : tuple of str
+        Limitations of this comparison, and what looks wrong about a model.
     loads : tuple of LoadComparison
         Fields, by load; empty for a comparison that was read back.
     """
@@ -113,15 +92,8 @@ class Comparison:
     def _repr_html_(self) -> str:
         """For a notebook: the answer, the areas of all soft tissue, and the curves."""
         loads = list(self.coverage_ml)
-        areas = {(a.model, a.load): a for a in self.areas if a.tissue == ALL}
-        over_all = {a.model: a for a in (*self.ranking.areas, self.ranking.nothing)}
         head = ["model", "rank", *loads, *(["all loads"] if len(loads) > 1 else [])]
-        rows = [
-            [name, ranks(self.ranking, name)]
-            + [shown(areas[name, load]) if (name, load) in areas else "–" for load in loads]
-            + ([shown(of)] if len(loads) > 1 else [])
-            for name, of in over_all.items()
-        ]
+        rows = [row[: len(head)] for row in area_rows(self.areas, self.ranking, loads)]
         table = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
         titles = "".join(f"<th>{html.escape(name)}</th>" for name in head)
         verdict = "" if self.verdict is None else f"<p>Verdict on the inputs: <b>{self.verdict.words}</b></p>"
@@ -137,7 +109,7 @@ class Comparison:
         """One sentence: the best match, or for a single model its area."""
         if self.ranking.statements:
             return self.ranking.statements[0]
-        ranked = self.ranking.areas or tuple(a for a in self.areas if a.tissue == ALL and a.model != NOTHING)
+        ranked = self.ranking.areas or [a for a in self.areas if a.tissue == ALL and a.model != NOTHING]
         best = min(ranked, key=lambda a: a.best_ml)
         return f"{best.model}: area between curves {shown(best)} mL ({best.load}), normalised {best.share:.1%}."
 
@@ -168,6 +140,8 @@ class Comparison:
     ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:
         """Write tables, fields, pictures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
 
+        It gives the sections of the report, and the closing ones.
+
         Parameters
         ----------
         folder : path
@@ -179,41 +153,34 @@ class Comparison:
         on_image : bool
             Also write each model's displacement and maximum shear strain on the voxels of the label map.
 
-        Returns
-        -------
-        sections, closing : tuple of Section
-            Of the report.
-
         Raises
         ------
-        InputError
-            If the comparison was read back: its fields are not in memory.
-        OutputError
-            If the folder cannot be written.
+        InputError, OutputError
+            If the comparison was read back, without its fields; if the folder cannot be written.
         """
         if not self.loads:
             raise InputError("A comparison that was read back has no fields to write; copy its folder instead.")
         target = Path(folder)
         target.mkdir(parents=True, exist_ok=True)
-        remove_earlier(target, list(self.coverage_ml))
+        tables.remove_earlier(target, list(self.coverage_ml))
         about = dict(record) if record is not None else {"parameters": {"strains": list(self.strains)}}
-        colours = list(dict.fromkeys(name for load in self.coverage_ml for name in self._models(load)))
-        sections = [overview(self.loads, self.ranking, self.warnings, self._beside_verdict())]
+        colours = list(dict.fromkeys(name for one in self.loads for name in one.fields.models))
+        notes = [note for note in self.notes if note not in doubts_of(self.verdict)]
+        sections = [overview(self.loads, self.ranking, self.warnings, notes)]
         for one in self.loads:
-            drawn = draw(one, colours)
+            pictures, viewer = draw(one, colours)
             with whole_folder(target / one.load) as part:
-                write_fields(part / "fields.vtu", one)
-                for stem, picture in drawn.pictures.items():
+                tables.write_fields(part / "fields.vtu", one)
+                for stem, picture in pictures.items():
                     (part / f"{stem}.png").write_bytes(picture.png)
                 if on_image:
-                    write_on_image(part, one)
+                    tables.write_on_image(part, one)
                 write_json(part / "provenance.json", about | {"verdict": _plain(one.case.verdict)})
-            sections += load_sections(one, drawn)
+            sections += load_sections(one, pictures, viewer)
         self._write_tables(target)
-        write_json(target / RECORD, self._record() | about)
-        closing = closing_sections(self.loads[0].criteria.thresholds, methods)
-        title, lines = "Models against the measurement", record_lines(about)
-        write_report(target / "report.html", title, self.verdict, sections, closing, lines)
+        write_json(target / tables.RECORD, self._record() | about)
+        closing, title = closing_sections(self.loads[0].criteria.thresholds, methods), "Models against the measurement"
+        write_report(target / "report.html", title, self.verdict, sections, closing, record_lines(about))
         return tuple(sections), tuple(closing)
 
     @classmethod
@@ -226,40 +193,29 @@ class Comparison:
             If the folder holds no comparison.
         """
         place = Path(folder)
-        rows = {name: read_rows(place / name, kind) for name, kind in TABLES.items()}
+        areas, overlaps, agreements, skin = tables.read_tables(place)
         try:
-            content = json.loads((place / RECORD).read_text(encoding="utf-8"))
+            content = json.loads((place / tables.RECORD).read_text(encoding="utf-8"))
             low, high = content["parameters"]["strains"]
             pairs = {load: tuple((a, b) for a, b in of) for load, of in content["not_told_apart"].items()}
             verdicts = {load: _verdict(of) for load, of in content["verdict_by_load"].items()}
-            *areas, nothing = (a for a in rows["areas.csv"] if a.load == ALL_LOADS)
-            ranking = Ranking(tuple(areas), nothing, tuple(content["told_apart"]), pairs)
+            *totals, nothing = (a for a in areas if a.load == ALL_LOADS)
+            ranking = Ranking(tuple(totals), nothing, tuple(content["told_apart"]), pairs)
             coverage, verdict, notes = content["coverage_ml"], _verdict(content["verdict"]), tuple(content["notes"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{place / RECORD} is no record of a comparison ({error}).") from error
-        by_load = tuple(a for a in rows["areas.csv"] if a.load != ALL_LOADS)
+            raise InputError(f"{place / tables.RECORD} is no record of a comparison ({error}).") from error
+        by_load, curves = tuple(a for a in areas if a.load != ALL_LOADS), tables.read_curves(place)
         return cls(
-            by_load, rows["location.csv"], rows["agreement.csv"], rows["travel.csv"], read_curves(place / CURVES),
-            ranking, (low, high), coverage, verdict, verdicts, notes,
-        )  # fmt: skip
-
-    def _models(self, load: str) -> list[str]:
-        return [name for name in self.coverage_ml[load] if name not in ("mesh", "measured", "common")]
-
-    def _beside_verdict(self) -> list[str]:
-        """Notes that are no reasons of the verdict."""
-        reasons = () if self.verdict is None or self.verdict.level == "trust" else self.verdict.reasons
-        return [note for note in self.notes if note not in reasons]
+            by_load, overlaps, agreements, skin, curves, ranking, (low, high), coverage, verdict, verdicts, notes
+        )
 
     def _write_tables(self, target: Path) -> None:
-        levels = {load: "" if of is None else of.level for load, of in self.verdicts.items()}
-        known = [of for of in self.verdicts.values() if of is not None]
-        levels[ALL_LOADS] = worst(known).level if known else ""
-        totals = (*self.ranking.areas, self.ranking.nothing)
-        rows = ((*self.areas, *totals), self.overlaps, self.agreements, self.skin)
-        for name, of in zip(TABLES, rows, strict=True):
-            write_rows(target / name, of, levels)
-        write_curves(target / CURVES, self.curves, levels)
+        known = {load: of for load, of in self.verdicts.items() if of is not None}
+        levels = {load: of.level for load, of in known.items()}
+        levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
+        areas = (*self.areas, *self.ranking.areas, self.ranking.nothing)
+        rows = (areas, self.overlaps, self.agreements, self.skin)
+        tables.write_tables(target, rows, self.curves, levels)
 
     def _record(self) -> dict[str, object]:
         return {
@@ -290,14 +246,10 @@ def compare(
     ----------
     cases : sequence of LoadCase
         Each with at least one model.
-    labels : LabelMap
-        Of the unloaded image: tissues, and distance to bone.
-    bones : sequence of str
-        Labels of bone.
+    labels, bones : LabelMap, sequence of str
+        Tissues of the unloaded image, and which of them are bone.
     mesh : TetMesh, optional
         Where fields are compared; by default the mesh of each load's first model.
-    criteria : Criteria, optional
-        Range of strain, thresholds, smallest cluster.
     notes : sequence of str
         What else is known about the models.
     warnings : sequence of str, optional
@@ -308,7 +260,7 @@ def compare(
     Raises
     ------
     InputError, GeometryError
-        As `check_models` and `validate.load_comparison.compare_load`.
+        As `check_models` and `map_fields`.
     """
     by = criteria or Criteria()
     odd = list(check_models(cases, labels, bones) if warnings is None else warnings)
@@ -319,19 +271,18 @@ def compare(
         fields = loads[-1].fields
         odd += [f"{case.load}: {slip}" for name in fields.models if (slip := displacement_slip(fields, name))]
     verdict = verdict_on({case.load: case.verdict for case in cases}, odd)
-    doubts = () if verdict is None or verdict.level == "trust" else verdict.reasons
     return Comparison(
         areas=tuple(a for one in loads for a in one.areas),
         overlaps=tuple(o for one in loads for o in one.overlaps),
         agreements=tuple(a for one in loads for a in one.agreements),
         skin=tuple(s for one in loads for s in one.skin),
-        curves=tuple(curve for one in loads for curve in curves_of(one)),
+        curves=tuple(curve for one in loads for curve in tables.curves_of(one)),
         ranking=rank_over_loads(loads),
         strains=by.strains,
         coverage_ml={one.load: one.fields.coverage() for one in loads},
         verdict=verdict,
         verdicts={case.load: case.verdict for case in cases},
-        notes=(*notes, *doubts, *limitations(loads)),
+        notes=(*notes, *doubts_of(verdict), *limitations(loads)),
         warnings=tuple(odd),
         loads=tuple(loads),
     )

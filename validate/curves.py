@@ -33,13 +33,7 @@ _EVERY = 4  # of so many draws one is made a perfect model
 
 
 def check_range(strains: tuple[float, float]) -> None:
-    """Refuse a range of strain over which curves cannot be compared.
-
-    Raises
-    ------
-    InputError
-        If it does not rise from 0 or more to 3 or less.
-    """
+    """Refuse with an `InputError` a range of maximum shear strain that does not rise from 0 or more to 3 or less."""
     if not 0.0 <= strains[0] < strains[1] <= MOST_STRAIN:
         raise InputError(
             f"The range of strain must rise from 0 or more to {MOST_STRAIN:g} or less (no percent); got "
@@ -73,11 +67,9 @@ class Area:
 
     Attributes
     ----------
-    model, load, tissue : str
-    ml : float
-        As measured, with the measurement's bias and noise.
-    share : float
-        The same normalised by the tissue's volume and the width of the range.
+    ml, share : float
+        As measured, with the measurement's bias and noise; and normalised by the tissue's volume and the width of the
+        range.
     estimate_ml : float
         Median of the areas to the truths drawn, which removes the measurement's bias. NaN, as are those below, if the
         measurement uncertainty is unknown.
@@ -109,8 +101,7 @@ class Band:
 
     Attributes
     ----------
-    strains : (k,)
-    low_ml, high_ml : (k,)
+    strains, low_ml, high_ml : (k,)
         95 % band of the true V.
     areas_ml : mapping of model to (draws,)
         Area to each truth drawn.
@@ -158,11 +149,8 @@ def bands(
     ----------
     truths : iterable of (n,)
         Maximum shear strain of each truth drawn, in the cells; see `dvc.trust.truth_draws.TruthDraws`.
-    models : mapping of name to (n,)
-        Maximum shear strain in the cells.
-    volumes_ml : (n,)
-    tissues : mapping of name to (n,) bool
-    widening : float
+    models, tissues : mapping of name to (n,)
+        Maximum shear strain of each model in the cells, and which of the cells belong to each tissue.
     narrowed : callable
         Narrows a truth drawn (n,) to the spread of a perfect model: `dvc.trust.truth_draws.TruthDraws.narrowed`.
     strains : (low, high)
@@ -178,35 +166,32 @@ def bands(
     inner = np.linspace(low, high, _GRID)
     outer = np.linspace(0.0, 1.5 * high, _GRID)
     step = inner[1] - inner[0]
-    curves = {
-        name: {model: volume_above(shear[inside], volumes_ml[inside], inner) for model, shear in models.items()}
-        for name, inside in tissues.items()
-    }
+
+    def curves_of(shear: FloatArray, strains: FloatArray) -> dict[str, FloatArray]:
+        return {name: volume_above(shear[inside], volumes_ml[inside], strains) for name, inside in tissues.items()}
+
+    def area(first: FloatArray, second: FloatArray) -> float:
+        return float(np.trapezoid(np.abs(first - second), dx=step))
+
+    curves = {model: curves_of(shear, inner) for model, shear in models.items()}
     drawn: dict[str, list[FloatArray]] = {name: [] for name in tissues}
     areas: dict[str, dict[str, list[float]]] = {name: {model: [] for model in models} for name in tissues}
-    perfect: dict[str, FloatArray] = {}
     floors: dict[str, list[float]] = {name: [] for name in tissues}
+    perfect: dict[str, FloatArray] = {}
     for number, truth in enumerate(truths):
-        for name, inside in tissues.items():
-            both = volume_above(truth[inside], volumes_ml[inside], np.concatenate([outer, inner]))
+        for name, both in curves_of(truth, np.concatenate([outer, inner])).items():
             curve = both[len(outer) :]
             drawn[name].append(both[: len(outer)])
-            for model, simulated in curves[name].items():
-                areas[name][model].append(float(np.trapezoid(np.abs(simulated - curve), dx=step)))
+            for model, simulated in curves.items():
+                areas[name][model].append(area(simulated[name], curve))
             if name in perfect:
-                floors[name].append(float(np.trapezoid(np.abs(perfect.pop(name) - curve), dx=step)))
+                floors[name].append(area(perfect.pop(name), curve))
         if number % _EVERY == 0:
-            narrow = narrowed(truth)
-            perfect = {n: volume_above(narrow[inside], volumes_ml[inside], inner) for n, inside in tissues.items()}
+            perfect = curves_of(narrowed(truth), inner)
     result = {}
     for name, inside in tissues.items():
         least, _, most = widened(np.array(drawn[name]), widening)
-        result[name] = Band(
-            outer,
-            least,
-            np.minimum(most, volumes_ml[inside].sum()),
-            {model: np.array(drawn_areas) for model, drawn_areas in areas[name].items()},
-            float(np.median(floors[name])),
-            widening,
-        )
+        most, floor = np.minimum(most, volumes_ml[inside].sum()), float(np.median(floors[name]))
+        of_models = {model: np.array(drawn_areas) for model, drawn_areas in areas[name].items()}
+        result[name] = Band(outer, least, most, of_models, floor, widening)
     return result

@@ -6,6 +6,8 @@ the unloaded image, fresh noise is added, and the pair is registered as the scan
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
@@ -22,28 +24,16 @@ _MENDING, _LEAST_VOLUME = 12, 0.1
 
 
 def extrapolated(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacement:
-    """A model's displacement at every voxel: as simulated in its mesh, zero in bone, smoothly extrapolated elsewhere.
+    """A model's displacement at every voxel of the unloaded image's grid; ``bone`` (ni, nj, nk) bool on the same grid.
 
-    Parameters
-    ----------
-    model : OnMesh
-    grid : Grid
-        Of the unloaded image.
-    bone : (ni, nj, nk) bool
-
-    Raises
-    ------
-    InputError
-        If no voxel lies in the mesh.
+    It is as simulated in the model's mesh, zero in bone, and smoothly extrapolated elsewhere. A model in whose mesh no
+    voxel lies is refused with an `InputError`.
     """
-    low, high = model.mesh.bounds_mm
-    at = grid.indices_of(
-        np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    )
+    at = grid.indices_of(np.array(list(product(*model.mesh.bounds_mm.T))))
     first = np.clip(np.floor(at.min(axis=0)).astype(int), 0, grid.shape)
     last = np.clip(np.ceil(at.max(axis=0)).astype(int) + 1, 0, grid.shape)
     box = np.zeros(grid.shape, dtype=bool)
-    box[first[0] : last[0], first[1] : last[1], first[2] : last[2]] = True
+    box[tuple(map(slice, first, last))] = True
     u = np.full((*grid.shape, 3), np.nan)
     u[box] = evaluate_on_grid(model, grid, box)[0]
     inside = np.isfinite(u).all(axis=-1)
@@ -53,13 +43,13 @@ def extrapolated(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacem
     known = inside | bone
     nearest = distance_transform_edt(~known, sampling=grid.spacing_mm, return_distances=False, return_indices=True)
     whole: FloatArray = u[tuple(nearest)]
-    width = _SMOOTH_MM / grid.spacing_mm
-    for axis in range(3):
-        part = whole[..., axis]
-        for _ in range(_ROUNDS):
-            part = np.where(known, u[..., axis], gaussian_filter(part, width, mode="nearest"))
-        whole[..., axis] = part
+    for _ in range(_ROUNDS):
+        whole = np.where(known[..., None], u, _smoothed(grid, whole))
     return _unfolded(grid, whole)
+
+
+def _smoothed(grid: Grid, u: FloatArray) -> FloatArray:
+    return np.asarray(gaussian_filter(u, _SMOOTH_MM / grid.spacing_mm, mode="nearest", axes=(0, 1, 2)))
 
 
 def _unfolded(grid: Grid, u: FloatArray) -> SampledDisplacement:
@@ -68,16 +58,15 @@ def _unfolded(grid: Grid, u: FloatArray) -> SampledDisplacement:
     A model is linear in each cell; where a cell is nearly flat the spline through the voxels overshoots.
     """
     width = _SMOOTH_MM / grid.spacing_mm
+    inner = np.zeros(grid.shape, dtype=bool)
+    inner[1:-1, 1:-1, 1:-1] = True
     for _ in range(_MENDING):
         field = SampledDisplacement(grid, u)
-        inner = np.zeros(grid.shape, dtype=bool)
-        inner[1:-1, 1:-1, 1:-1] = True
         _, H = evaluate_on_grid(field, grid, inner)
         folded = np.zeros(grid.shape, dtype=bool)
         folded[inner] = np.linalg.det(H + np.eye(3)) < _LEAST_VOLUME
         if not folded.any():
             break
         weight = np.clip(gaussian_filter(folded.astype(np.float64), width) * 8.0 * np.pi**1.5 * width.prod(), 0.0, 1.0)
-        smooth = np.stack([gaussian_filter(u[..., axis], width, mode="nearest") for axis in range(3)], axis=-1)
-        u = u + weight[..., None] * (smooth - u)
+        u = u + weight[..., None] * (_smoothed(grid, u) - u)
     return field

@@ -38,16 +38,7 @@ _MOST_MM = 200.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeResult:
-    """A model's result for one load.
-
-    Attributes
-    ----------
-    name : str
-        Of the model.
-    path : Path
-    deformation : OnMesh
-        On linear tetrahedra, reference configuration, LPS mm of the image.
-    """
+    """A model's result for one load, on linear tetrahedra in the reference configuration, LPS mm of the image."""
 
     name: str
     path: Path
@@ -74,13 +65,9 @@ def read_result(
     ----------
     name : str
         Of the model, as it stands in tables.
-    path : path
-        With mesh and displacement, or a table of nodal displacements on ``mesh``.
-    mesh : path, optional
-        Mesh of a table.
-    unit : {"mm", "m"}
-        Of coordinates and displacements.
-    frame : {"LPS", "RAS"}
+    path, mesh : path
+        With mesh and displacement, or a table of nodal displacements and the mesh that they belong to.
+    unit, frame : {"mm", "m"}, {"LPS", "RAS"}
         Of coordinates and displacements.
     to_image : (4, 4), optional
         Rigid map of the model's frame to the image's, LPS mm, applied after unit and frame; it also rotates the
@@ -94,21 +81,12 @@ def read_result(
         As `dvc.io.meshes.read.read_mesh`.
     """
     place = Path(path)
-    if place.suffix.lower() == ".csv":
-        if mesh is None:
-            raise InputError(
-                f"{place}: a table of displacements needs the mesh that its nodes belong to (--model-mesh)."
-            )
-        source = read_mesh(mesh, unit=unit, frame=frame)
-        values = _from_table(place, source)
-    else:
-        source = read_mesh(place, unit=unit, frame=frame)
-        values = _beside_mesh(place, source)
-    u = values * MM_PER_UNIT[unit] * TO_LPS[frame]
+    is_table = place.suffix.lower() == ".csv"
+    if is_table and mesh is None:
+        raise InputError(f"{place}: a table of displacements needs the mesh of its nodes (--model-mesh).")
+    source = read_mesh((is_table and mesh) or place, unit=unit, frame=frame)
+    u = (_from_table if is_table else _beside_mesh)(place, source) * MM_PER_UNIT[unit] * TO_LPS[frame]
     tets, carry = linear_tetrahedra(source)
-    names = _names_of_regions(place)
-    regions = {names.get(region, region): cells for region, cells in tets.regions.items()}
-    tets = TetMesh(tets.points_mm, tets.cells, regions, tets.facets, tets.node_ids)
     used = np.unique(carry.indices)
     missing = ~np.isfinite(u[used]).all(axis=1)
     if missing.any():
@@ -117,17 +95,17 @@ def read_result(
             f"{place}: {np.count_nonzero(missing)} of {len(missing)} nodes have no displacement, first node {first}. "
             "Export all nodes of the tissue."
         )
-    moved = np.asarray(carry @ np.nan_to_num(u))
-    if to_image is not None:
-        rigid = _rigid(to_image)
-        tets = TetMesh(rigid.apply(tets.points_mm), tets.cells, tets.regions, tets.facets, tets.node_ids)
-        moved = moved @ rigid.matrix.T
+    rigid = _rigid(np.eye(4) if to_image is None else to_image)
+    moved = np.asarray(carry @ np.nan_to_num(u)) @ rigid.matrix.T
     largest = float(np.linalg.norm(moved, axis=1).max())
     if not 0.0 < largest < _MOST_MM:
         raise InputError(
             f"{place}: the largest displacement is {largest:.3g} mm, which is implausible for tissue under a plate. Is "
             "the unit right, and the load step the last one?"
         )
+    names = _names_of_regions(place)
+    regions = {names.get(region, region): cells for region, cells in tets.regions.items()}
+    tets = TetMesh(rigid.apply(tets.points_mm), tets.cells, regions, tets.facets, tets.node_ids)
     return FeResult(name, place, OnMesh(tets, moved))
 
 
@@ -137,8 +115,7 @@ def _names_of_regions(place: Path) -> dict[str, str]:
     for file, key in tables:
         try:
             record = json.loads(file.read_text(encoding="utf-8"))
-            table = record.get(key) or record.get("parameters", {}).get(key)
-            if table:
+            if table := record.get(key) or record.get("parameters", {}).get(key):
                 return {f"region {number}": str(name) for number, name in table.items()}
         except (OSError, ValueError, AttributeError):
             continue
@@ -162,20 +139,20 @@ def _beside_mesh(place: Path, source: MeshFile) -> FloatArray:
         raise InputError(f"{place} has no displacements: write them with *NODE FILE, U.")
     if place.suffix.lower() == ".msh" and (np.diff(source.node_ids) <= 0).any():
         raise InputError(
-            f"{place}: its nodes do not stand in the order of their numbers, so that displacements may "
-            "belong to others. Write it as VTU."
+            f"{place}: its nodes do not stand in the order of their numbers, so that displacements may belong to "
+            "others. Write it as VTU."
         )
     known = {name.casefold(): name for name in source.at_nodes}
-    for wanted in _NAMES:
-        if wanted in known:
-            values = source.at_nodes[known[wanted]]
-            if values.shape != source.points_mm.shape:
-                raise InputError(f"{place}: its array '{known[wanted]}' has shape {values.shape}, not three per node.")
-            return values
-    raise InputError(
-        f"{place} has no displacement at its nodes; its arrays are {', '.join(source.at_nodes) or 'none'}. Call it "
-        f"{_NAMES[1]!r}, in the unit of the coordinates."
-    )
+    name = next((known[wanted] for wanted in _NAMES if wanted in known), None)
+    if name is None:
+        raise InputError(
+            f"{place} has no displacement at its nodes; its arrays are {', '.join(source.at_nodes) or 'none'}. Call it "
+            f"{_NAMES[1]!r}, in the unit of the coordinates."
+        )
+    values = source.at_nodes[name]
+    if values.shape != source.points_mm.shape:
+        raise InputError(f"{place}: its array '{name}' has shape {values.shape}, not three per node.")
+    return values
 
 
 def _from_table(place: Path, source: MeshFile) -> FloatArray:
@@ -194,7 +171,7 @@ def _from_table(place: Path, source: MeshFile) -> FloatArray:
         )
     columns = [named.index(node), *(named.index(c) for c in parts)]
     try:
-        numbers = np.array([[float(row[c]) for c in columns] for row in rows])
+        numbers = np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, 4)
     except (ValueError, IndexError) as error:
         raise InputError(f"{place}: a row is no node and three numbers ({error}).") from error
     index = {int(n): i for i, n in enumerate(source.node_ids)}
@@ -216,16 +193,17 @@ def check_overlap(path: Path, mesh: TetMesh, grid: Grid) -> None:
     GeometryError
         With both boxes, and with what would bring the model there, if a unit or a frame does.
     """
-    points = mesh.points_mm
-    if np.mean(grid.contains(points)) >= _INSIDE:
+
+    def lies_in(scale: float, signs: tuple[float, ...]) -> bool:
+        return bool(np.mean(grid.contains(mesh.points_mm * scale * np.array(signs))) >= _INSIDE)
+
+    if lies_in(1.0, (1.0, 1.0, 1.0)):
         return
-    fitting = []
-    for (scale, size), (signs, turned) in product(_SCALES.items(), _TURNS.items()):
-        if np.mean(grid.contains(points * scale * np.array(signs))) >= _INSIDE:
-            fitting.append(f"{size} and {turned}")
-    low, high = grid.bounds_mm()
+    fitting = [(size, frame) for (a, size), (b, frame) in product(_SCALES.items(), _TURNS.items()) if lies_in(a, b)]
+    hint = (
+        f"It would with {' and '.join(fitting[0])}." if fitting else "Give the map to the image's frame (--to-image)."
+    )
     raise GeometryError(
-        f"{path} does not lie in the image. Model: {box_told(points.min(axis=0), points.max(axis=0))}; image: "
-        f"{box_told(low, high)} (LPS mm). "
-        + (f"It would with {fitting[0]}." if fitting else "Give the map to the image's frame (--to-image).")
+        f"{path} does not lie in the image. Model: {box_told(*mesh.bounds_mm)}; image: {box_told(*grid.bounds_mm())} "
+        f"(LPS mm). {hint}"
     )

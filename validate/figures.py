@@ -14,8 +14,8 @@ from dvc.arrays import FloatArray
 from dvc.report.figures import REGION_COLOURS
 from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.figures import Slice, slice_sheet
-from validate.agreement import Agreement
-from validate.curves import Area, Band
+from validate.curves import Area
+from validate.load_comparison import LoadComparison
 from validate.mapping import ALL, MappedFields, filled_from_nearest
 from validate.tables import LOWER, UPPER, Curve
 
@@ -24,51 +24,37 @@ _COLUMNS = 3
 _BAND = "#b8bfc9"
 _BINS = 60
 
+# Strains, the volumes above them by name, and the edges of the 95 % band of the true curve.
+_Panel = tuple[FloatArray, Mapping[str, FloatArray], tuple[FloatArray, FloatArray, FloatArray] | None]
 
-def volume_strain(
-    fields: MappedFields,
-    bands: Mapping[str, Band],
-    strains: tuple[float, float],
-    tissues: Sequence[str],
-    colours: Sequence[str],
-) -> bytes:
+
+def volume_strain(one: LoadComparison, tissues: Sequence[str], colours: Sequence[str]) -> bytes:
     """Volume of tissue above each maximum shear strain: measured (black) and models, in the same cells.
 
-    The grey band contains the true curve in 95 % of cases, by the measurement's error model; areas are
-    taken between the dotted lines.
+    The grey band contains the true curve in 95 % of cases, by the measurement's error model; areas are taken between
+    the dotted lines.
     """
-    figure, panels = _panels(len(tissues))
-    at = np.linspace(0.0, 1.5 * strains[1], _POINTS)
-    for axes, tissue in zip(panels, tissues, strict=True):
-        band = bands.get(tissue)
-        edges = None if band is None else (band.strains, band.low_ml, band.high_ml)
-        _draw_curves(axes, at, fields.curves(tissue, at), edges, strains, colours)
-        axes.set_title(tissue, color=INK, **FONT)
-    panels[0].legend(fontsize=9, frameon=False)
-    return png_bytes(figure)
+    at = np.linspace(0.0, 1.5 * one.criteria.strains[1], _POINTS)
+    edges = {name: (band.strains, band.low_ml, band.high_ml) for name, band in one.bands.items()}
+    panels = {tissue: (at, one.fields.curves(tissue, at), edges.get(tissue)) for tissue in tissues}
+    return png_bytes(_curves(panels, one.criteria.strains, colours))
 
 
-def _draw_curves(
-    axes: Axes,
-    at: FloatArray,
-    volumes_ml: Mapping[str, FloatArray],
-    band: tuple[FloatArray, FloatArray, FloatArray] | None,
-    strains: tuple[float, float],
-    colours: Sequence[str],
-) -> None:
-    """Volume above each strain ``at``, measured and simulated, with the 95 % band of the true curve."""
-    if band is not None:
-        axes.fill_between(*band, color=_BAND, linewidth=0, label="95 % of truths")
-    for name, above in volumes_ml.items():
-        if name == "measured":
-            axes.plot(at, above, color="black", linewidth=2.2, label=name)
-        else:
-            axes.plot(at, above, color=_colour(colours.index(name)), linewidth=1.5, label=name)
-    for edge in strains:
-        axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
-    axes.set_xlim(0.0, at[-1])
-    axes.set_ylim(0.0, None)
-    label_axes(axes, "maximum shear strain", "volume above, mL")
+def _curves(panels: Mapping[str, _Panel], strains: tuple[float, float], colours: Sequence[str]) -> Figure:
+    figure, spots = _panels(len(panels))
+    for axes, (title, (at, volumes_ml, band)) in zip(spots, panels.items(), strict=True):
+        if band is not None:
+            axes.fill_between(*band, color=_BAND, linewidth=0, label="95 % of truths")
+        for name, above in volumes_ml.items():
+            colour, width = ("black", 2.2) if name == "measured" else (_colour(colours.index(name)), 1.5)
+            axes.plot(at, above, color=colour, linewidth=width, label=name)
+        for edge in strains:
+            axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
+        axes.set(xlim=(0.0, at[-1]), ylim=(0.0, None))
+        label_axes(axes, "maximum shear strain", "volume above, mL")
+        axes.set_title(title, color=INK, **FONT)
+    spots[0].legend(fontsize=9, frameon=False)
+    return figure
 
 
 def _colour(number: int) -> str:
@@ -84,15 +70,12 @@ def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Fig
     for curve in curves:
         by_load.setdefault(curve.load, {})[curve.field] = curve
     models = [name for name in dict.fromkeys(c.field for c in curves) if name not in ("measured", LOWER, UPPER)]
-    figure, panels = _panels(len(by_load))
-    for axes, (load, of) in zip(panels, by_load.items(), strict=True):
+    panels: dict[str, _Panel] = {}
+    for load, of in by_load.items():
         at = of["measured"].max_shear
         band = (at, of[LOWER].volume_above_ml, of[UPPER].volume_above_ml) if LOWER in of else None
-        volumes = {name: of[name].volume_above_ml for name in ("measured", *models) if name in of}
-        _draw_curves(axes, at, volumes, band, strains, models)
-        axes.set_title(load, color=INK, **FONT)
-    panels[0].legend(fontsize=9, frameon=False)
-    return figure
+        panels[load] = at, {name: of[name].volume_above_ml for name in ("measured", *models) if name in of}, band
+    return _curves(panels, strains, models)
 
 
 def areas_by_load(areas: Sequence[Area]) -> Figure:
@@ -106,16 +89,23 @@ def areas_by_load(areas: Sequence[Area]) -> Figure:
         axes.plot(at, [a.best_ml for a in rows], "o", color=_colour(number), label=model)
         axes.vlines(at, [a.low_ml for a in rows], [a.high_ml for a in rows], color=_colour(number), linewidth=1.8)
     axes.set_xticks(range(len(loads)), loads)
-    axes.set_xlim(-0.5, len(loads) - 0.5)
-    axes.set_ylim(0.0, None)
+    axes.set(xlim=(-0.5, len(loads) - 0.5), ylim=(0.0, None))
     label_axes(axes, "", "area between curves, mL")
     axes.legend(fontsize=9, frameon=False)
     return figure
 
 
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    rows, columns = -(-count // 2), min(count, 2)
-    figure = Figure(figsize=(WIDTH_IN, 3.4 * rows), dpi=DPI, facecolor="white", layout="constrained")
+def _by_model(count: int) -> tuple[Figure, list[Axes]]:
+    """Square panels."""
+    columns = min(count, _COLUMNS)
+    width = WIDTH_IN if columns > 1 else 0.62 * WIDTH_IN
+    return _panels(count, columns, (width, width / columns))
+
+
+def _panels(count: int, most: int = 2, size_in: tuple[float, float] = (WIDTH_IN, 3.4)) -> tuple[Figure, list[Axes]]:
+    """A figure of so many panels, at ``most`` so many in a row, each row of a width and height."""
+    rows, columns = -(-count // most), min(count, most)
+    figure = Figure(figsize=(size_in[0], size_in[1] * rows), dpi=DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     spots = list(figure.subplots(rows, columns, squeeze=False).ravel())
     for spot in spots[count:]:
@@ -123,27 +113,22 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
     return figure, spots[:count]
 
 
-def slices(
-    fields: MappedFields,
-    measured: Deformation,
-    displacements: Mapping[str, FloatArray],
-    axes: FloatArray,
-    point_mm: FloatArray,
-) -> bytes:
+def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatArray], point_mm: FloatArray) -> bytes:
     """Maximum shear strain on a slice, measured and simulated, on the deformed tissue.
 
     The slice contains the plate's normal and the direction of shear; the same cells in one colour scale. Grey is
     undefined. A node beyond the measurement is drawn with the displacement of the nearest one within. Letters name the
     sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
-    return png_bytes(slice_sheet(fields.mesh, slice_panels(fields, measured, displacements), axes, point_mm))
+    panels = slice_panels(one.fields, measured, u_mm)
+    return png_bytes(slice_sheet(one.fields.mesh, panels, one.case.axes, point_mm))
 
 
-def slice_panels(fields: MappedFields, measured: Deformation, displacements: Mapping[str, FloatArray]) -> list[Slice]:
-    """Panels of `slices`: the measurement, then each model, with displacements (n, 3) at the mesh's nodes."""
+def slice_panels(fields: MappedFields, measured: Deformation, u_mm: Mapping[str, FloatArray]) -> list[Slice]:
+    """Panels of `slices`: the measurement, then each model, with its displacement (n, 3) at the mesh's nodes."""
     u = filled_from_nearest(measured.displacement(fields.mesh.points_mm), fields.mesh.points_mm)
     panels = [Slice("measured", u, fields.measured.max_shear)]
-    return panels + [Slice(name, displacements[name], field.max_shear) for name, field in fields.models.items()]
+    return panels + [Slice(name, u_mm[name], field.max_shear) for name, field in fields.models.items()]
 
 
 def scatter(fields: MappedFields) -> bytes:
@@ -151,18 +136,13 @@ def scatter(fields: MappedFields) -> bytes:
 
     Both agree on the line.
     """
-    names = list(fields.models)
-    figure, spots = _by_model(len(names))
+    figure, spots = _by_model(len(fields.models))
     where = fields.common
     x, volumes = fields.measured.max_shear[where], fields.volumes_ml[where]
-    most = max(
-        0.1, *(float(np.quantile(f.max_shear[where], 0.995)) for f in (fields.measured, *fields.models.values()))
-    )
-    for spot, name in zip(spots, names, strict=True):
-        spot.hist2d(
-            x, fields.models[name].max_shear[where], bins=_BINS, range=((0.0, most), (0.0, most)), weights=volumes,
-            norm="log", cmap="Blues",
-        )  # fmt: skip
+    most = max(0.1, *(float(np.quantile(f.max_shear[where], 0.995)) for f in fields.by_name.values()))
+    for spot, (name, field) in zip(spots, fields.models.items(), strict=True):
+        y, ranges = field.max_shear[where], ((0.0, most), (0.0, most))
+        spot.hist2d(x, y, bins=_BINS, range=ranges, weights=volumes, norm="log", cmap="Blues")
         spot.plot([0.0, most], [0.0, most], color=INK, linewidth=0.9)
         spot.set_title(name, color=INK, **FONT)
         spot.set_aspect("equal")
@@ -170,16 +150,15 @@ def scatter(fields: MappedFields) -> bytes:
     return png_bytes(figure)
 
 
-def differences(fields: MappedFields, rows: Sequence[Agreement], quantity: str) -> bytes:
+def differences(one: LoadComparison, quantity: str) -> bytes:
     """Bland-Altman plot: simulated minus measured over the mean of both, cell by cell; darker is more volume.
 
     The solid line is the mean difference, dashed lines are the limits of agreement, 1.96 standard deviations away.
     """
-    limits = {row.model: row for row in rows if (row.quantity, row.part) == (quantity, ALL)}
-    names = [name for name in fields.models if name in limits]
-    figure, spots = _by_model(max(1, len(names)))
-    where = fields.common
-    for spot, name in zip(spots, names, strict=False):
+    fields, where = one.fields, one.fields.common
+    limits = {row.model: row for row in one.agreements if (row.quantity, row.part) == (quantity, ALL)}
+    figure, spots = _by_model(max(1, len(limits)))
+    for spot, name in zip(spots, limits, strict=False):
         x, y = (
             field.max_shear[where] if quantity == "max_shear" else np.linalg.norm(field.u_mm[where], axis=1)
             for field in (fields.measured, fields.models[name])
@@ -191,17 +170,6 @@ def differences(fields: MappedFields, rows: Sequence[Agreement], quantity: str) 
         unit = "" if quantity == "max_shear" else ", mm"
         label_axes(spot, f"mean of both{unit}", f"simulated - measured{unit}")
     return png_bytes(figure)
-
-
-def _by_model(count: int) -> tuple[Figure, list[Axes]]:
-    rows, columns = -(-count // _COLUMNS), min(count, _COLUMNS)
-    width = WIDTH_IN if columns > 1 else 0.62 * WIDTH_IN
-    figure = Figure(figsize=(width, rows * (width / columns)), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    spots = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for spot in spots[count:]:
-        spot.set_visible(False)
-    return figure, spots[:count]
 
 
 def over_subjects(shares: Mapping[str, Mapping[str, float]], models: Sequence[str]) -> bytes:

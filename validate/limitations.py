@@ -31,32 +31,35 @@ def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[str] =
     return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
 
 
+def doubts_of(verdict: Verdict | None) -> tuple[str, ...]:
+    """Reasons of a verdict below trust."""
+    return () if verdict is None or verdict.level == "trust" else verdict.reasons
+
+
 def limitations(loads: Sequence[LoadComparison]) -> list[str]:
     """What the measurement of each load lacks, and which models cover little of the mesh, in sentences."""
-    cases = [one.case for one in loads]
-    notes = [
-        f"{case.load}: the bone's motion was not removed from this measurement: displacements are not the tissue's "
-        "alone."
-        for case in cases
-        if case.aligned_on == "none"
-    ]
-    notes += [
-        f"{case.load}: the coverage of its intervals is unknown (an error model of one subject): they are not widened."
-        for case in cases
-        if case.error is not None and np.isnan(case.error.widening)
-    ]
-    unknown = [case.load for case in cases if case.error is None]
-    if unknown:
+    notes = []
+    for one in loads:
+        load, error, volumes = one.load, one.case.error, one.fields.coverage()
+        if one.case.aligned_on == "none":
+            notes.append(
+                f"{load}: the bone's motion was not removed from this measurement: displacements are not the tissue's "
+                "alone."
+            )
+        if error is not None and np.isnan(error.widening):
+            notes.append(
+                f"{load}: the coverage of its intervals is unknown (an error model of one subject): they are not "
+                "widened."
+            )
+        notes += [
+            f"{load}: {name} covers {volumes[name] / volumes['mesh']:.0%} of the mesh, and all models are scored on "
+            "the tissue that every one covers."
+            for name in one.fields.models
+            if volumes[name] < _COVERED * volumes["mesh"]
+        ]
+    if unknown := [one.load for one in loads if one.case.error is None]:
         notes.append(
             f"{', '.join(unknown)}: the measurement uncertainty is unknown (no error_model.json beside the results): "
             "no difference counts as significant."
         )
-    for one in loads:
-        volumes = one.fields.coverage()
-        notes += [
-            f"{one.load}: {name} covers {volumes[name] / volumes['mesh']:.0%} of the mesh, and all models are scored "
-            "on the tissue that every one covers."
-            for name in one.fields.models
-            if volumes[name] < _COVERED * volumes["mesh"]
-        ]
     return notes

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from dvc import Deformation, LabelMap, TetMesh, Verdict, plate_axes
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.trust.error_model import ErrorTable
 from dvc.trust.truth_draws import TruthDraws
+from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
 from validate.extrapolation import LEVELLED
 from validate.fe_result import FeResult
-from validate.location import LEAST_ML, CellGraph, Overlap, Threshold, overlap, read_thresholds
-from validate.location_intervals import LOCATION_DRAWS, with_intervals
+from validate.location import Overlap, Threshold
 from validate.mapping import ALL, MappedFields, map_fields
 
 _STRAINED = 0.01
@@ -38,10 +38,8 @@ class Criteria:
     ----------
     strains : (low, high)
         Range of maximum shear strain over which volume-strain curves are compared.
-    thresholds : tuple of Threshold
-        Maximum shear strains above which clusters are compared.
-    least_ml : float
-        Volume of the smallest cluster that counts, mL.
+    thresholds, least_ml : tuple of Threshold, float
+        Maximum shear strains above which clusters are compared, and volume of the smallest cluster that counts, mL.
     seed : int
         Of the truths drawn from the error model; draws of different loads are independent.
 
@@ -52,8 +50,8 @@ class Criteria:
     """
 
     strains: tuple[float, float] = RANGE
-    thresholds: tuple[Threshold, ...] = field(default_factory=read_thresholds)
-    least_ml: float = LEAST_ML
+    thresholds: tuple[Threshold, ...] = field(default_factory=location.read_thresholds)
+    least_ml: float = location.LEAST_ML
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -68,17 +66,14 @@ class LoadCase:
 
     Attributes
     ----------
-    load : str
     read : callable
         Gives the measured deformation (tissue relative to its bone, reference configuration, LPS mm) and the models'
         results. It is called whenever they are needed, so that files may be read again rather than kept in memory.
     axes : (3, 3)
         Of the plate, LPS; see `dvc.plate_axes`. By default the plate pushes to superior and shears to anterior.
-    error : ErrorTable or None
-        Error of the measured maximum shear strain; without it no figure has an interval, and no difference is
-        significant.
-    verdict : Verdict or None
-        On the measurement.
+    error, verdict : ErrorTable, Verdict, or None
+        Error of the measured maximum shear strain, without which no figure has an interval, and no difference is
+        significant; and the verdict on the measurement.
     aligned_on : str
         What the rigid alignment was computed on: "bone", "image" or "none"; empty if unknown.
     image : path or None
@@ -107,19 +102,10 @@ class LoadComparison:
 
     Attributes
     ----------
-    case : LoadCase
-    labels : LabelMap
-        Of the unloaded image.
-    bones : tuple of str
-        Labels of bone.
-    criteria : Criteria
-    fields : MappedFields
-        Measured and simulated, in the cells compared.
+    labels, bones : LabelMap, tuple of str
+        Of the unloaded image, and which of its labels are bone.
     areas : tuple of Area
         By model and tissue; that of all soft tissue first. Those of `NOTHING` come last.
-    overlaps : tuple of Overlap
-    agreements : tuple of Agreement
-    skin : tuple of SkinDisplacement
     bands : mapping of tissue to Band
         Empty where the measurement uncertainty is unknown.
     """
@@ -148,12 +134,12 @@ class LoadComparison:
         above = volumes[self.fields.measured.max_shear[where] > self.criteria.strains[0]].sum()
         return bool(above < _STRAINED * volumes.sum())
 
-    def ranked(self, tissue: str = ALL) -> list[Area]:
-        """Areas of the ranked models in a tissue, the smallest first: the estimate where the uncertainty is known.
+    def ranked(self) -> list[Area]:
+        """Areas of the ranked models in all soft tissue, the smallest first, by the estimate where there is one.
 
         Levelled models are not ranked, since no bias is removed from their areas; nor is `NOTHING`.
         """
-        models = (a for a in self.areas if a.tissue == tissue and a.model != NOTHING and not a.model.endswith(LEVELLED))
+        models = (a for a in self.areas if a.tissue == ALL and a.model != NOTHING and not a.model.endswith(LEVELLED))
         return sorted(models, key=lambda a: a.best_ml)
 
 
@@ -167,21 +153,7 @@ def compare_load(
 ) -> LoadComparison:
     """Compare models with the measurement of one load, at the centroids of one mesh's cells.
 
-    Parameters
-    ----------
-    case : LoadCase
-    labels : LabelMap
-        Of the unloaded image: tissues, and distance to bone.
-    bones : sequence of str
-        Labels of bone.
-    mesh : TetMesh, optional
-        Where fields are compared; the first model's mesh by default.
-    criteria : Criteria, optional
-
-    Raises
-    ------
-    InputError
-        As `validate.mapping.map_fields`.
+    Parameters as in `validate.compare`, errors as in `validate.map_fields`.
     """
     by = criteria or Criteria()
     measured, results = case.read()
@@ -189,24 +161,24 @@ def compare_load(
     fields = map_fields(mesh if mesh is not None else results[0].mesh, labels, bones, measured, models)
     truths: list[FloatArray] = []
     known = {} if case.error is None else _bands(fields, case, case.error, by, truths)
-    skin = [skin_displacement(fields, r.name, case.load, r.deformation, measured, -case.axes[:, 0]) for r in results]
-    rows = [row for name in models for row in agreements(fields, name, case.load)]
-    areas, overlaps = _areas(fields, case.load, known, by), _overlaps(fields, case, by, truths)
+    normal = -case.axes[:, 0]
     return LoadComparison(
-        case, labels, tuple(bones), by, fields, tuple(areas), tuple(overlaps), tuple(rows), tuple(skin), known
+        case=case,
+        labels=labels,
+        bones=tuple(bones),
+        criteria=by,
+        fields=fields,
+        areas=tuple(_areas(fields, case.load, known, by)),
+        overlaps=tuple(_overlaps(fields, case, by, truths)),
+        agreements=tuple(row for name in models for row in agreements(fields, name, case.load)),
+        skin=tuple(skin_displacement(fields, name, case.load, of, measured, normal) for name, of in models.items()),
+        bands=known,
     )
-
-
-def _tissues(fields: MappedFields) -> dict[str, BoolArray]:
-    """Cells compared: all, and by tissue."""
-    common = fields.common
-    parts = {name: common & (fields.tissue == name) for name in fields.tissues}
-    return {ALL: common} | {name: cells for name, cells in parts.items() if cells.any()}
 
 
 def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Criteria) -> Iterator[Area]:
     for name, shear in _shears(fields).items():
-        for tissue, where in _tissues(fields).items():
+        for tissue, where in fields.parts.items():
             volumes = fields.volumes_ml[where]
             area = area_between(fields.measured.max_shear[where], shear[where], volumes, by.strains)
             normalised = area / volumes.sum() / (by.strains[1] - by.strains[0])
@@ -216,19 +188,18 @@ def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Crite
 
 
 def _overlaps(fields: MappedFields, case: LoadCase, by: Criteria, truths: Sequence[FloatArray]) -> Sequence[Overlap]:
-    common, cells = fields.common, CellGraph.of(fields.mesh)
+    common, cells = fields.common, location.CellGraph.of(fields.mesh)
     measured = np.where(common, fields.measured.max_shear, -1.0)
+    simulated = {name: np.where(common, model.max_shear, -1.0) for name, model in fields.models.items()}
     rows = [
-        overlap(
-            name, case.load, threshold.max_shear, measured, np.where(common, model.max_shear, -1.0), cells, by.least_ml
-        )
-        for name, model in fields.models.items()
+        location.overlap(name, case.load, threshold.max_shear, measured, shear, cells, by.least_ml)
+        for name, shear in simulated.items()
         for threshold in by.thresholds
     ]
     if case.error is None:
         return rows
-    shears = {name: model.max_shear[common] for name, model in fields.models.items()}
-    return with_intervals(rows, truths, shears, cells.part(common), by.least_ml, case.error.factor)
+    shears = {name: shear[common] for name, shear in simulated.items()}
+    return location.with_intervals(rows, truths, shears, cells.part(common), by.least_ml, case.error.factor)
 
 
 def _shears(fields: MappedFields) -> dict[str, FloatArray]:
@@ -240,25 +211,16 @@ def _bands(
     fields: MappedFields, case: LoadCase, error: ErrorTable, by: Criteria, first: list[FloatArray]
 ) -> dict[str, Band]:
     """Bands by tissue; the ``first`` truths drawn for them are kept, for the intervals of location."""
-    common = fields.common
-    seed = zlib.crc32(case.load.encode()) + by.seed
-    draws = TruthDraws(
-        fields.points_mm[common], fields.measured.max_shear[common], [str(t).lower() for t in fields.tissue[common]],
-        fields.to_bone_mm[common], error, seed,
-    )  # fmt: skip
+    common, seed = fields.common, zlib.crc32(case.load.encode()) + by.seed
+    shear, tissues = fields.measured.max_shear[common], [str(t).lower() for t in fields.tissue[common]]
+    draws = TruthDraws(fields.points_mm[common], shear, tissues, fields.to_bone_mm[common], error, seed)
 
     def truths() -> Iterator[FloatArray]:
         for truth in draws.many(DRAWS):
-            if len(first) < LOCATION_DRAWS:
+            if len(first) < location.LOCATION_DRAWS:
                 first.append(truth.astype(np.float32))
             yield truth
 
-    return bands(
-        truths(),
-        {name: shear[common] for name, shear in _shears(fields).items()},
-        fields.volumes_ml[common],
-        {name: where[common] for name, where in _tissues(fields).items()},
-        error.factor,
-        draws.narrowed,
-        by.strains,
-    )
+    models = {name: shear[common] for name, shear in _shears(fields).items()}
+    inside = {name: where[common] for name, where in fields.parts.items()}
+    return bands(truths(), models, fields.volumes_ml[common], inside, error.factor, draws.narrowed, by.strains)

@@ -1,12 +1,15 @@
-"""Strain location: clusters of tissue above a strain threshold, measured and simulated, and their distance."""
+"""Strain location: clusters of tissue above a strain threshold, their overlap and distance, with 95 % intervals."""
 
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -17,9 +20,16 @@ from dvc import TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import FACES
+from dvc.trust.error_model import widened
 
 LEAST_ML = 0.1
 """Volume of the smallest cluster that counts by default, mL."""
+
+LOCATION_DRAWS = 60
+"""Truths drawn for the location of a load: the first of those drawn for the curves."""
+
+_CELLS = 1000  # of a draw, for the Hausdorff distance: its percentile moves by 0.7 points, between draws by far more
+_ENOUGH = 0.5  # fraction of the draws that must have a value
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +41,7 @@ class Threshold:
 
 
 def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
-    """Read a table with columns max_shear and source; by default the one in the package.
-
-    Raises
-    ------
-    InputError
-        If there is no such table, or a value is no strain between 0 and 3.
-    """
+    """Read a CSV table of max_shear (0 to 3; errors are `InputError`) and source; by default the one in the package."""
     place = path if path is not None else files("validate") / "thresholds.csv"
     try:
         rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines(), restval=""))
@@ -56,15 +60,7 @@ def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StrainCluster:
-    """Connected cells above a threshold.
-
-    Attributes
-    ----------
-    cells : (k,)
-    volume_ml, mean_shear : float
-    centroid_mm : (3,)
-        Reference configuration, LPS.
-    """
+    """Connected cells (k,) above a threshold; their centroid (3,) in the reference configuration, LPS mm."""
 
     cells: IntArray
     volume_ml: float
@@ -74,15 +70,7 @@ class StrainCluster:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellGraph:
-    """Cells of a mesh and which of them share a face.
-
-    Attributes
-    ----------
-    volumes_ml : (n,)
-    points_mm : (n, 3)
-        Centroids, reference configuration, LPS.
-    adjacency : (n, n) sparse
-    """
+    """Cells of a mesh: volumes (n,), centroids (n, 3) in the reference configuration (LPS), shared faces (n, n)."""
 
     volumes_ml: FloatArray
     points_mm: FloatArray
@@ -138,26 +126,19 @@ class Overlap:
 
     Attributes
     ----------
-    model, load : str
-    threshold : float
-        Maximum shear strain.
     measured_ml, model_ml : float
         Volume of the clusters; the volume-strain curves also hold what lies above outside clusters.
-    measured_clusters, model_clusters : int
-        Their number.
     measured_mean, model_mean : float
         Volume-weighted mean of the maximum shear strain in them; NaN where there is none.
     dice : float
         Dice coefficient: twice the common volume over the sum of both.
-    centroids_mm : float
-        Distance of the centroids of all clusters together, mm.
-    largest_mm : float
-        The same of the largest cluster of each, mm.
+    centroids_mm, largest_mm : float
+        Distance of the centroids, mm: of all clusters together, and of the largest of each.
     hausdorff95_mm : float
         Hausdorff distance at the 95th percentile (by volume), the larger of both directions, mm.
     measured_low_ml, measured_high_ml, dice_low ... : float
         95 % intervals from the measurement uncertainty, and the value that a perfect model would get; NaN where no
-        error model is known. See `validate.location_intervals`.
+        error model is known. See `validate.location.with_intervals`.
     """
 
     model: str
@@ -196,27 +177,18 @@ def overlap(
     least_ml: float = LEAST_ML,
 ) -> Overlap:
     """Compare the clusters above a threshold of two fields (n,) on the same cells; undefined figures are NaN."""
-    fields = (measured, simulated)
-    clusters = [cells.clusters(shear > threshold, shear, least_ml) for shear in fields]
-    first, second = (cells.region(shear > threshold, least_ml) for shear in fields)
-    largest = float("nan")
-    if all(clusters):
-        largest = float(np.linalg.norm(clusters[0][0].centroid_mm - clusters[1][0].centroid_mm))
+    of, to = (cells.clusters(shear > threshold, shear, least_ml) for shear in (measured, simulated))
+    first, second = (cells.region(shear > threshold, least_ml) for shear in (measured, simulated))
+    largest = float(np.linalg.norm(of[0].centroid_mm - to[0].centroid_mm)) if of and to else float("nan")
     return Overlap(
-        model, load, threshold, first.volume_ml, second.volume_ml, len(clusters[0]), len(clusters[1]),
-        first.mean_of(measured), second.mean_of(simulated), dice(first, second), centroid_distance(first, second),
-        largest, hausdorff95(first, second),
+        model, load, threshold, first.volume_ml, second.volume_ml, len(of), len(to), first.mean_of(measured),
+        second.mean_of(simulated), dice(first, second), centroid_distance(first, second), largest,
+        hausdorff95(first, second),
     )  # fmt: skip
 
 
 class StrainedRegion:
-    """Cells in clusters above a threshold.
-
-    Attributes
-    ----------
-    above : (n,) bool
-    volume_ml : float
-    """
+    """Cells (n,) in clusters ``above`` a threshold."""
 
     def __init__(self, above: BoolArray, cells: CellGraph) -> None:
         self.above = above
@@ -244,10 +216,7 @@ class StrainedRegion:
         return float(self._volumes[self.above & other.above].sum())
 
     def distance95(self, other: StrainedRegion, most: int | None = None) -> float:
-        """95th percentile (by volume) of the distance of these cells to the nearest of another region, mm.
-
-        With ``most``, of at most so many of the cells, taken at equal steps.
-        """
+        """95th percentile (by volume) of these cells' distance (of ``most`` at equal steps) to another region, mm."""
         cells = np.flatnonzero(self.above)
         cells = cells[:: max(1, len(cells) // most)] if most else cells
         alone = ~other.above[cells]
@@ -274,3 +243,57 @@ def hausdorff95(first: StrainedRegion, second: StrainedRegion, most: int | None 
     if not (first.above.any() and second.above.any()):
         return float("nan")
     return max(first.distance95(second, most), second.distance95(first, most))
+
+
+_FIGURES: dict[str, Callable[[StrainedRegion, StrainedRegion], float]] = {
+    "dice{}": dice,
+    "centroids{}_mm": centroid_distance,
+    "hausdorff95{}_mm": partial(hausdorff95, most=_CELLS),
+}
+
+
+def with_intervals(
+    overlaps: Sequence[Overlap],
+    truths: Sequence[FloatArray],
+    models: Mapping[str, FloatArray],
+    cells: CellGraph,
+    least_ml: float,
+    widening: float,
+) -> list[Overlap]:
+    """Overlaps of a load with 95 % intervals from truths drawn, and with the value that a perfect model would get.
+
+    Truths and models are the maximum shear strain in ``cells`` (n,); ``widening`` is the factor on intervals of draws,
+    see `dvc.trust.error_model.ErrorTable`. A perfect model's value is the median between one truth drawn and the next:
+    what noise alone takes from a Dice coefficient, and adds to a distance. An interval that reaches it is extended to
+    1, or to 0 mm. Distances have an interval where at least half of the truths have tissue above the threshold.
+    """
+    rows: list[Overlap] = []
+    for threshold in dict.fromkeys(o.threshold for o in overlaps):
+        regions = [cells.region(truth > threshold, least_ml) for truth in truths]
+        volume = _interval([region.volume_ml for region in regions], widening)
+        neighbours = list(pairwise(regions))
+        perfect = {figure: _interval([of(*pair) for pair in neighbours], 1.0)[1] for figure, of in _FIGURES.items()}
+        for one in (o for o in overlaps if o.threshold == threshold):
+            model = cells.region(models[one.model] > threshold, least_ml)
+            most = min(volume[2], float(cells.volumes_ml.sum()))
+            values: dict[str, Any] = {"measured_low_ml": volume[0], "measured_high_ml": most}
+            for figure, of in _FIGURES.items():
+                low, _, high = _interval([of(region, model) for region in regions], widening)
+                if of is dice:
+                    high = 1.0 if high >= perfect[figure] else high
+                elif low <= perfect[figure]:
+                    low = 0.0
+                for end, value in (("_low", low), ("_high", high), ("_perfect", perfect[figure])):
+                    values[figure.format(end)] = value
+            rows.append(replace(one, **values))
+    order = {(o.model, o.threshold): n for n, o in enumerate(overlaps)}
+    return sorted(rows, key=lambda o: order[o.model, o.threshold])
+
+
+def _interval(drawn: Sequence[float], widening: float) -> tuple[float, float, float]:
+    """Lower end, median and upper end of draws; NaN where too few have a value."""
+    known = np.array([d for d in drawn if not np.isnan(d)])
+    if len(known) < max(2.0, _ENOUGH * len(drawn)):
+        return (float("nan"),) * 3
+    low, middle, high = (float(v[0]) for v in widened(known[:, None], widening))
+    return low, middle, high

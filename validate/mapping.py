@@ -16,18 +16,17 @@ from dvc.trust.regions import volume_above
 ALL = "all soft tissue"
 """Name of all compared tissue together."""
 
-OTHER = "unnamed"
-"""Tissue of cells that are named neither by the mesh nor by the label map."""
+_OTHER = "unnamed"  # tissue of cells that are named neither by the mesh nor by the label map
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """A deformation in the cells compared.
+    """A deformation in the cells compared; NaN where not defined.
 
     Attributes
     ----------
     u_mm : (n, 3)
-        Displacement, LPS mm; NaN where not defined, as below.
+        Displacement, LPS mm.
     max_shear, jacobian : (n,)
         (E1 - E3) / 2 of the Green-Lagrange strain, and det F.
     """
@@ -48,15 +47,10 @@ class MappedFields:
 
     Attributes
     ----------
-    mesh : TetMesh
-    points_mm : (n, 3)
-    volumes_ml : (n,)
-        Of the cells.
-    tissue : (n,) str
+    points_mm, volumes_ml, tissue : (n, 3), (n,), (n,) str
+        Centroids, volumes and tissues of the cells.
     to_bone_mm : (n,)
         Distance to the surface of bone.
-    measured : Field
-    models : mapping of str to Field
     """
 
     mesh: TetMesh
@@ -70,10 +64,18 @@ class MappedFields:
     @property
     def common(self) -> BoolArray:
         """Cells (n,) in which the measurement and every model are defined: all are compared on the same tissue."""
-        kept = self.measured.defined.copy()
-        for field in self.models.values():
-            kept &= field.defined
-        return kept
+        return np.asarray(np.all([field.defined for field in self.by_name.values()], axis=0))
+
+    @property
+    def by_name(self) -> dict[str, Field]:
+        """Every field by name, that of the measurement first, as "measured"."""
+        return {"measured": self.measured, **self.models}
+
+    @property
+    def parts(self) -> dict[str, BoolArray]:
+        """Cells (n,) that are compared: `ALL`, and those of each tissue that has any."""
+        parts = {name: self.common & (self.tissue == name) for name in self.tissues}
+        return {ALL: self.common} | {name: cells for name, cells in parts.items() if cells.any()}
 
     @property
     def tissues(self) -> list[str]:
@@ -84,17 +86,13 @@ class MappedFields:
     def curves(self, tissue: str, strains: FloatArray) -> dict[str, FloatArray]:
         """Volume (mL) of a tissue (or `ALL`) above each strain (k,), of "measured" and each model, in common cells."""
         where = self.common & ((self.tissue == tissue) | (tissue == ALL))
-        fields = {"measured": self.measured, **self.models}
-        return {n: volume_above(f.max_shear[where], self.volumes_ml[where], strains) for n, f in fields.items()}
+        return {n: volume_above(f.max_shear[where], self.volumes_ml[where], strains) for n, f in self.by_name.items()}
 
     def coverage(self) -> dict[str, float]:
         """Volume (mL) of the mesh, of the part where each field is defined, and of the common part."""
-        volumes = {
-            "mesh": float(self.volumes_ml.sum()),
-            "measured": float(self.volumes_ml[self.measured.defined].sum()),
-        }
-        volumes |= {name: float(self.volumes_ml[field.defined].sum()) for name, field in self.models.items()}
-        return volumes | {"common": float(self.volumes_ml[self.common].sum())}
+        volumes = {name: float(self.volumes_ml[field.defined].sum()) for name, field in self.by_name.items()}
+        common = float(self.volumes_ml[self.common].sum())
+        return {"mesh": float(self.volumes_ml.sum())} | volumes | {"common": common}
 
 
 def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray:
@@ -108,13 +106,7 @@ def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray
 
 
 def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
-    """Refuse bones that are not in the label map.
-
-    Raises
-    ------
-    InputError
-        Naming the labels that are.
-    """
+    """Refuse bones that are not in the label map, with an `InputError` that names its labels."""
     for name in bones:
         if name not in labels.names.values():
             raise InputError(
@@ -131,11 +123,7 @@ def sample(deformation: Deformation, points_mm: FloatArray) -> Field:
 
 
 def map_fields(
-    mesh: TetMesh,
-    labels: LabelMap,
-    bones: Sequence[str],
-    measured: Deformation,
-    models: Mapping[str, Deformation],
+    mesh: TetMesh, labels: LabelMap, bones: Sequence[str], measured: Deformation, models: Mapping[str, Deformation]
 ) -> MappedFields:
     """Evaluate a measured and simulated deformations at the centroids of a mesh's cells.
 
@@ -147,8 +135,6 @@ def map_fields(
         Of the unloaded image.
     bones : sequence of str
         Labels of bone; no cell whose centroid is there is compared.
-    measured, models
-        u and grad u in the reference configuration, LPS mm.
 
     Raises
     ------
@@ -157,22 +143,15 @@ def map_fields(
     """
     check_bones(labels, bones)
     points = mesh.centroids_mm
-    tissue = tissues_of(mesh, labels, points)
+    tissue = tissues_of(mesh, labels)
     soft = ~np.isin(tissue, list(bones))
     bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
     distance, _ = cKDTree(labels.grid.points(bone)).query(points[soft])
     distance = np.maximum(distance - 0.5 * labels.grid.spacing_mm.min(), 0.0)  # from voxels' centres to the surface
-    kept = np.flatnonzero(soft)
-    if len(kept) < len(points):
-        mesh = _part(mesh, kept)
+    points, mesh = points[soft], mesh if soft.all() else _part(mesh, np.flatnonzero(soft))
+    sampled = {name: sample(model, points) for name, model in models.items()}
     fields = MappedFields(
-        mesh,
-        points[kept],
-        mesh.volumes_mm3 / 1000.0,
-        tissue[kept],
-        distance,
-        sample(measured, points[kept]),
-        {name: sample(model, points[kept]) for name, model in models.items()},
+        mesh, points, mesh.volumes_mm3 / 1000.0, tissue[soft], distance, sample(measured, points), sampled
     )
     if not fields.common.any():
         covered = "; ".join(f"{name} {volume:.1f} mL" for name, volume in fields.coverage().items())
@@ -180,20 +159,19 @@ def map_fields(
     return fields
 
 
-def tissues_of(mesh: TetMesh, labels: LabelMap, points: FloatArray, *, by_mesh: bool = True) -> np.ndarray:
+def tissues_of(mesh: TetMesh, labels: LabelMap, *, by_mesh: bool = True) -> np.ndarray:
     """Tissue of each cell (m,) str: the mesh's region where it is called as a label, else the label at its centroid."""
     names = set(labels.names.values())
-    of_mesh = {name: cells for name, cells in mesh.regions.items() if by_mesh and name in names}
-    width = max(len(n) for n in (*names, OTHER))
-    tissue = np.full(len(points), OTHER, dtype=f"<U{width}")
-    nearest = np.rint(labels.grid.indices_of(points)).astype(np.int64)
+    tissue = np.full(len(mesh.cells), _OTHER, dtype=f"<U{max(len(n) for n in (*names, _OTHER))}")
+    nearest = np.rint(labels.grid.indices_of(mesh.centroids_mm)).astype(np.int64)
     inside = ((nearest >= 0) & (nearest < np.array(labels.grid.shape))).all(axis=1)
-    number = np.zeros(len(points), dtype=np.int64)
+    number = np.zeros(len(mesh.cells), dtype=np.int64)
     number[inside] = labels.labels[tuple(nearest[inside].T)]
     for value, name in labels.names.items():
         tissue[number == value] = name
-    for name, cells in of_mesh.items():
-        tissue[cells] = name
+    for name, cells in mesh.regions.items():
+        if by_mesh and name in names:
+            tissue[cells] = name
     return tissue
 
 

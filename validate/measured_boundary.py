@@ -43,14 +43,13 @@ def boundary_displacement(mesh: TetMesh, measured: Deformation) -> tuple[IntArra
     InputError
         If more than 1 % of the nodes lie over 3 mm from any at which the measurement is defined.
     """
+    nodes, u = _boundary(mesh, measured)
+    return nodes, u[nodes]
+
+
+def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
+    """Surface nodes (k,), and the measured displacement of all nodes (n, 3), zero on the surface of bone."""
     nodes = np.unique(outer_faces(mesh.cells))
-    u = _everywhere(mesh, measured)[nodes]
-    if BONE in mesh.facets:
-        u[np.isin(nodes, mesh.facets[BONE])] = 0.0
-    return nodes, u
-
-
-def _everywhere(mesh: TetMesh, measured: Deformation) -> FloatArray:
     u = measured.displacement(mesh.points_mm)
     known = np.isfinite(u).all(axis=1)
     if not known.any():
@@ -61,7 +60,10 @@ def _everywhere(mesh: TetMesh, measured: Deformation) -> FloatArray:
             f"{np.count_nonzero(distance > _FAR_MM)} of {len(u)} nodes lie over {_FAR_MM:g} mm from any at which the "
             "measurement is defined; it does not cover the model."
         )
-    return filled_from_nearest(u, mesh.points_mm)
+    u = filled_from_nearest(u, mesh.points_mm)
+    if BONE in mesh.facets:
+        u[np.intersect1d(nodes, mesh.facets[BONE])] = 0.0
+    return nodes, u
 
 
 def simulate_driven(
@@ -75,24 +77,16 @@ def simulate_driven(
 ) -> LoadState:
     """Equilibrium of a mesh with the measured displacement prescribed on its surface.
 
+    The state has no plate. If equilibrium was lost, it is the last converged increment, and ``reached`` is below 1.
+
     Parameters
     ----------
     mesh : TetMesh
         Every cell in one region; the surface set "bone" does not move.
-    materials : mapping of region to Material
     measured : Deformation
         Of tissue relative to its bone, reference configuration, LPS mm.
-    load : str
-        Name of the load.
-    threads : int
-        Of the linear solver.
-    tell : callable
-        Gets a line for each increment.
-
-    Returns
-    -------
-    LoadState
-        Without a plate; ``reached`` is below 1 if equilibrium was lost, and the last converged increment is given.
+    threads, tell : int, callable
+        Threads of the linear solver; ``tell`` gets a line for each increment.
 
     Raises
     ------
@@ -101,9 +95,7 @@ def simulate_driven(
     """
     check_materials(mesh, materials)
     began = time.monotonic()
-    nodes, u = boundary_displacement(mesh, measured)
-    guess = _everywhere(mesh, measured)
-    guess[nodes] = u
+    nodes, guess = _boundary(mesh, measured)
     model = Model.of(mesh, materials, element("P1"))
     assembler = Assembler(model, (3 * nodes[:, None] + np.arange(3)).ravel(), {})
     solver = Solver(assembler.indptr, assembler.indices, threads=threads)
@@ -150,32 +142,22 @@ def write_boundary_conditions(
     numbers = mesh.node_ids[nodes] + (1 if mesh.node_ids.min() == 0 else 0)
     u = u_mm / MM_PER_UNIT[unit] * TO_LPS[frame]
     about = f"displacements in {unit}, {frame}, of nodes by their numbers in the mesh"
-    written = {".inp": _abaqus(numbers, u), ".mac": _ansys(numbers, u), ".feb": _febio(numbers, u)}
-    remarks = {".inp": f"** {about}; into a *STEP", ".mac": f"! {about}", ".feb": f"<!-- {about} -->"}
-    paths = []
-    for ending, lines in written.items():
-        paths.append(stem.with_name(stem.name + ending))
-        first, *others = lines
-        written_lines = [first, remarks[ending], *others] if ending == ".feb" else [remarks[ending], first, *others]
-        write_whole(paths[-1], "\n".join(written_lines) + "\n")
-    return paths
+    values = [(n, axis, value) for n, row in zip(numbers, u, strict=True) for axis, value in enumerate(row, start=1)]
+    abaqus = [f"{n}, {axis}, {axis}, {value:.9g}" for n, axis, value in values]
+    ansys = [f"D,{n},U{' XYZ'[axis]},{value:.9g}" for n, axis, value in values]
+    files = {
+        ".inp": [f"** {about}; into a *STEP", "*BOUNDARY", *abaqus],
+        ".mac": [f"! {about}", *ansys],
+        ".feb": _febio(numbers, u, about),
+    }
+    for ending, lines in files.items():
+        write_whole(stem.with_name(stem.name + ending), "\n".join(lines) + "\n")
+    return [stem.with_name(stem.name + ending) for ending in files]
 
 
-def _abaqus(numbers: IntArray, u: FloatArray) -> Iterator[str]:
-    yield "*BOUNDARY"
-    for number, row in zip(numbers, u, strict=True):
-        for axis in range(3):
-            yield f"{number}, {axis + 1}, {axis + 1}, {row[axis]:.9g}"
-
-
-def _ansys(numbers: IntArray, u: FloatArray) -> Iterator[str]:
-    for number, row in zip(numbers, u, strict=True):
-        for name, value in zip(("UX", "UY", "UZ"), row, strict=True):
-            yield f"D,{number},{name},{value:.9g}"
-
-
-def _febio(numbers: IntArray, u: FloatArray) -> Iterator[str]:
+def _febio(numbers: IntArray, u: FloatArray, about: str) -> Iterator[str]:
     yield '<?xml version="1.0" encoding="ISO-8859-1"?>'
+    yield f"<!-- {about} -->"
     yield "<!-- to be merged into a model whose load controller 1 rises from 0 to 1 -->"
     yield '<febio_spec version="4.0">'
     yield f'<Mesh><NodeSet name="outside">{",".join(map(str, numbers))}</NodeSet></Mesh>'

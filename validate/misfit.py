@@ -36,6 +36,8 @@ def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[st
         If a model does not lie in the image, or less than 85 % of it in the labelled soft tissue.
     """
     check_bones(labels, bones)
+    if not cases:
+        raise InputError("No load is given to compare.")
     warnings = []
     for case in cases:
         _, results = case.read()
@@ -44,21 +46,13 @@ def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[st
         for result in results:
             check_overlap(result.path, result.mesh, labels.grid)
             warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones)]
-    if not cases:
-        raise InputError("No load is given to compare.")
     return warnings
 
 
 def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence[str]) -> float:
-    """Overlap of a mesh and the labelled soft tissue, as a fraction of the smaller volume.
-
-    Raises
-    ------
-    GeometryError
-        If it is under 85 %.
-    """
+    """Overlap of a mesh and the labelled soft tissue, as a fraction of the smaller volume; refused if under 85 %."""
     soft = [number for number, name in labels.names.items() if name not in bones]
-    tissue = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=False)
+    tissue = tissues_of(mesh, labels, by_mesh=False)
     inside = np.isin(tissue, [labels.names[number] for number in soft])
     labelled = np.isin(labels.labels, soft)
     smaller = min(mesh.volumes_mm3.sum(), np.count_nonzero(labelled) * labels.grid.voxel_volume_mm3)
@@ -75,74 +69,50 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
 
 
 def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[str]:
-    """Check a model against the label map; a sentence for each thing that looks wrong.
-
-    Raises
-    ------
-    GeometryError
-        As `check_in_tissue`.
-    """
+    """Check a model against the label map, also as `check_in_tissue`; a sentence for each thing that looks wrong."""
     mesh, warnings = result.mesh, []
     overlap = check_in_tissue(result.path, mesh, labels, bones)
-    tissue = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=False)
-    names = [name for name in labels.names.values() if name not in bones]
-    soft = np.isin(tissue, names)
-    volume = mesh.volumes_mm3
     if overlap < _GOOD_OVERLAP:
-        warnings.append(
-            f"{result.name}: {overlap:.0%} of the model lies in the labelled soft tissue; is its frame right?"
-        )
-    of_mesh = tissues_of(mesh, labels, mesh.centroids_mm, by_mesh=True)
-    both = soft & np.isin(of_mesh, names)
+        warnings.append(f"{overlap:.0%} of the model lies in the labelled soft tissue; is its frame right?")
+    names = [name for name in labels.names.values() if name not in bones]
+    tissue, of_mesh = (tissues_of(mesh, labels, by_mesh=by_mesh) for by_mesh in (False, True))
+    both, volume = np.isin(tissue, names) & np.isin(of_mesh, names), mesh.volumes_mm3
     same = float(volume[both & (of_mesh == tissue)].sum() / max(volume[both].sum(), 1e-12))
     if both.any() and same < _SAME_TISSUE:
         warnings.append(
-            f"{result.name}: model and label map name the same tissue in {same:.0%} of the volume alone; the names of "
-            "one, or the model's frame, are wrong."
+            f"model and label map name the same tissue in {same:.0%} of the volume alone; the names of one, or the "
+            "model's frame, are wrong."
         )
-    bone = np.isin(labels.labels, [n for n, name in labels.names.items() if name in bones])
-    points = labels.grid.points(bone)
-    if len(points):
-        near = cKDTree(points).query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0] < _NEAR_BONE_MM
-        if near.any():
-            moved = float(np.median(np.linalg.norm(result.deformation.u_mm[near], axis=1)))
-            if moved > _RIGID_MM:
-                warnings.append(
-                    f"{result.name}: the model moves by {moved:.1f} mm at the bone, and the measurement is relative "
-                    "to the bone; take the bone's motion out of it."
-                )
+    bone = labels.grid.points(np.isin(labels.labels, [n for n, name in labels.names.items() if name in bones]))
+    distance = cKDTree(bone).query(mesh.points_mm, distance_upper_bound=_NEAR_BONE_MM)[0]
+    moved = np.linalg.norm(result.deformation.u_mm[distance < _NEAR_BONE_MM], axis=1)
+    if len(moved) and np.median(moved) > _RIGID_MM:
+        warnings.append(
+            f"the model moves by {np.median(moved):.1f} mm at the bone, and the measurement is relative to the bone; "
+            "take the bone's motion out of it."
+        )
     determinant = np.linalg.det(np.eye(3) + result.deformation.cell_gradients)
     change = float(volume @ np.abs(determinant - 1.0) / volume.sum())
     if change > _VOLUME_CHANGE:
         warnings.append(
-            f"{result.name}: its cells change their volume by {change:.0%} in the mean, which soft tissue does not; "
-            "are displacements in the frame and unit of the coordinates, and these the unloaded ones?"
+            f"its cells change their volume by {change:.0%} in the mean, which soft tissue does not; are displacements "
+            "in the frame and unit of the coordinates, and these the unloaded ones?"
         )
-    return warnings
+    return [f"{result.name}: {warning}" for warning in warnings]
 
 
 def displacement_slip(fields: MappedFields, name: str) -> str:
     """Whether a model's displacement fits the measured one only with another order of axes, frame or unit.
 
-    Parameters
-    ----------
-    fields : MappedFields
-        Displacement u of the measurement and v of the model in the same cells, weighted by cell volume.
-    name : str
-        Of the model.
-
-    Returns
-    -------
-    str
-        A sentence that names the slip; empty where none is detected.
+    The sentence that it gives names the slip; it is empty where none is detected.
 
     Notes
     -----
     Direction and magnitude are tested separately, since a model that is too stiff or too soft is not a slip. The
-    direction is compared by the cosine <u, v> / (|u| |v|) over all cells: a slip is reported if one of the 48 orders
-    and signs of the components reaches 0.7 and the components as stored have less than half of that. A sign or an
-    exchange that hardly changes the displacement is not reported. A slip of unit is reported if |v| / |u| is nearer to
-    1000 or 1/1000 than to 1.
+    direction is compared by the cosine <u, v> / (|u| |v|) of the measured displacement u and the model's v over all
+    cells, weighted by volume: a slip is reported if one of the 48 orders and signs of the components reaches 0.7 and
+    the components as stored have less than half of that. A sign or an exchange that hardly changes the displacement is
+    not reported. A slip of unit is reported if |v| / |u| is nearer to 1000 or 1/1000 than to 1.
     """
     where = fields.common
     weight = fields.volumes_ml[where] / fields.volumes_ml[where].sum()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from validate.fe_result import FeResult
 from validate.load_comparison import NOTHING, LoadComparison
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
-from validate.ranking import Ranking
+from validate.ranking import ALL_LOADS, Ranking
 
 _AROUND = 4  # voxels around the tissue in the viewer
 _PANELS = 4  # tissues whose curves are drawn, all soft tissue first
@@ -47,18 +47,10 @@ _CLOSING = Section(
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
-    """A load's pictures, by the stem of their files, and its viewer."""
-
-    pictures: Mapping[str, Picture]
-    viewer: Viewer
-
-
-def draw(one: LoadComparison, colours: Sequence[str]) -> Drawn:
-    """Draw one load; ``colours`` names all models in the order of their colours."""
+def draw(one: LoadComparison, colours: Sequence[str]) -> tuple[dict[str, Picture], Viewer]:
+    """A load's pictures, by the stem of their files, and its viewer; ``colours`` lists all models in colour order."""
     measured, results = one.case.read()
-    return Drawn(_pictures(one, measured, results, colours), _viewer(one, measured, results))
+    return _pictures(one, measured, results, colours), _viewer(one, measured, results)
 
 
 def _pictures(
@@ -66,23 +58,21 @@ def _pictures(
 ) -> dict[str, Picture]:
     fields, axes, bone = one.fields, one.case.axes, one.bones[0]
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
-    tissues = [name for name in fields.tissues if any(a.tissue == name for a in one.areas)]
-    curves = figures.volume_strain(fields, one.bands, one.criteria.strains, (ALL, *tissues)[:_PANELS], colours)
+    tissues = [name for name in (ALL, *fields.tissues) if any(a.tissue == name for a in one.areas)]
+    curves = figures.volume_strain(one, tissues[:_PANELS], colours)
     point = lowest_bone_point(one.labels, bone, axes)
     across = (fields.mesh.points_mm - point) @ axes[:, 2]
     through = f"It goes through the lowest point of {bone}."
     if not across.min() < 0.0 < across.max():
         point = fields.mesh.bounds_mm.mean(axis=0)
         through = f"The lowest point of {bone} lies beside the mesh: the slice goes through the mesh's middle instead."
-    slices = figures.slices(fields, measured, displacements, axes, point)
-    shear, u = (figures.differences(fields, one.agreements, quantity) for quantity in ("max_shear", "u_mm"))
+    slices, scatter = figures.slices(one, measured, displacements, point), figures.scatter(fields)
+    shear, u = (figures.differences(one, quantity) for quantity in ("max_shear", "u_mm"))
     differences = caption_of(figures.differences)
     return {
         "curves": Picture("Volume above a strain", caption_of(figures.volume_strain), curves),
         "slices": Picture("Where the strain lies", f"{caption_of(figures.slices)} {through}", slices),
-        "agreement": Picture(
-            "Maximum shear strain, cell by cell", caption_of(figures.scatter), figures.scatter(fields)
-        ),
+        "agreement": Picture("Maximum shear strain, cell by cell", caption_of(figures.scatter), scatter),
         "differences_shear": Picture("Differences of maximum shear strain", differences, shear),
         "differences_u": Picture("Differences of the displacement's magnitude", differences, u),
     }
@@ -90,14 +80,14 @@ def _pictures(
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
     """Point of a bone furthest along the plate's outward normal, LPS mm; the mean of several."""
-    points = labels.grid.points(np.isin(labels.labels, [n for n, name in labels.names.items() if name == bone]))
+    points = labels.region(bone).points()
     height = points @ axes[:, 0]
     return np.asarray(points[height < height.min() + 0.5 * labels.grid.spacing_mm.min()].mean(axis=0))
 
 
 def _at_nodes(result: FeResult, points_mm: FloatArray) -> FloatArray:
     """A model's displacement at nodes (n, 3) of the compared mesh; as stored if that is the model's own mesh."""
-    if result.mesh.points_mm.shape == points_mm.shape and np.array_equal(result.mesh.points_mm, points_mm):
+    if np.array_equal(result.mesh.points_mm, points_mm):
         return result.deformation.u_mm
     return filled_from_nearest(result.deformation.displacement(points_mm), points_mm)
 
@@ -118,11 +108,10 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
         values = np.full(grid.shape, np.nan)
         values[inside] = StrainField.from_gradient(evaluate_on_grid(field, grid, inside)[1]).max_shear
         shear.append(values)
-    seen, voxels = read_voxels(scanned) if scanned is not None else (None, np.empty(0))
-    if seen is not None and seen.same_as(labels.grid):
-        shown = np.nan_to_num(voxels[box])
-    else:
-        shown = labels.labels[box].astype(np.float64)
+    shown = labels.labels[box].astype(np.float64)
+    if scanned is not None:
+        seen, voxels = read_voxels(scanned)
+        shown = np.nan_to_num(voxels[box]) if seen.same_as(labels.grid) else shown
     most = max(0.05, float(np.ceil(20.0 * np.nanquantile(shear[0], 0.99)) / 20.0))
     return Viewer(
         "Interactive 3-D viewer",
@@ -133,7 +122,7 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
     )
 
 
-def load_sections(one: LoadComparison, drawn: Drawn) -> list[Section]:
+def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: Viewer) -> list[Section]:
     """A load's part of the report: how much and where, then cell by cell."""
     verdict = one.case.verdict
     covered = one.fields.coverage()
@@ -142,12 +131,11 @@ def load_sections(one: LoadComparison, drawn: Drawn) -> list[Section]:
         f"measurement is defined in {covered['measured']:.1f} mL."
     )
     trust = () if verdict is None else (f"Verdict on its registration: {verdict.words}.",)
-    first = tuple(drawn.pictures[stem] for stem in ("curves", "slices"))
-    others = tuple(picture for stem, picture in drawn.pictures.items() if stem not in ("curves", "slices"))
+    curves, slices, *others = pictures.values()
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
-        Section(one.load, doubtful, tables, first, (compared, *trust), (drawn.viewer,)),
-        Section(f"{one.load}, cell by cell", None, (_agreement(one), _by_distance(one)), others),
+        Section(one.load, doubtful, tables, (curves, slices), (compared, *trust), (viewer,)),
+        Section(f"{one.load}, cell by cell", None, (_agreement(one), _by_distance(one)), tuple(others)),
     ]
 
 
@@ -167,11 +155,8 @@ def _head(one: LoadComparison) -> str:
 
 def closing_sections(thresholds: Sequence[Threshold], methods: Sequence[str]) -> list[Section]:
     """How a comparison is read, sources of its thresholds, and paragraphs for a methods section if there are any."""
-    sources = Section(
-        "Thresholds of strain",
-        None,
-        (Table("Thresholds", ("maximum shear strain", "source"), tuple((t.max_shear, t.source) for t in thresholds)),),
-    )
+    rows = tuple((t.max_shear, t.source) for t in thresholds)
+    sources = Section("Thresholds of strain", None, (Table("Thresholds", ("maximum shear strain", "source"), rows),))
     return [_CLOSING, sources, *([Section(METHODS, paragraphs=tuple(methods))] if methods else [])]
 
 
@@ -181,25 +166,28 @@ def shown(area: Area) -> str:
     return f"{area.best_ml:.2f}" + (f" ({area.low_ml:.2f} to {area.high_ml:.2f})" if known else "")
 
 
-def ranks(ranking: Ranking, model: str) -> str:
+def _ranks(ranking: Ranking, model: str) -> str:
     """Rank of a model over all loads: a range if not distinguishable from neighbours, a dash if not ranked."""
     return "–".join(str(rank) for rank in dict.fromkeys(ranking.rank(model) or ("–",)))
 
 
+def area_rows(areas: Iterable[Area], ranking: Ranking, loads: Sequence[str]) -> list[tuple[str, ...]]:
+    """Name, rank, and areas of all soft tissue under each load and over all, of each model; `NOTHING` comes last."""
+    cells = {(a.model, a.load): shown(a) for a in (*ranking.areas, ranking.nothing, *areas) if a.tissue == ALL}
+    models = [name for name in dict.fromkeys(model for model, _ in cells) if name != NOTHING]
+    return [
+        (name, _ranks(ranking, name), *(cells.get((name, load), "–") for load in (*loads, ALL_LOADS)))
+        for name in (*models, NOTHING)
+    ]
+
+
 def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
-    areas = {(a.model, a.load): a for one in loads for a in one.areas if a.tissue == ALL}
-    sums = {a.model: a for a in (*ranking.areas, ranking.nothing)}
     low, high = loads[0].criteria.strains
-    names = [*sums, *dict.fromkeys(model for model, _ in areas if model not in sums)]
-    rows: dict[str, tuple[Cell, ...]] = {}
-    for name in names:
-        cells = ["–" if (area := areas.get((name, one.load))) is None else shown(area) for one in loads]
-        rows[name] = (name, ranks(ranking, name), *cells, shown(sums[name]) if name in sums else "–")
-    nothing = rows.pop(NOTHING)
+    *rows, nothing = area_rows([a for one in loads for a in one.areas], ranking, [one.load for one in loads])
     return Table(
         f"Area between the volume-strain curves of soft tissue, strains {low:g} to {high:g}, mL",
         ("model", "rank", *(_head(one) for one in loads), "all loads"),
-        tuple(rows.values()),
+        tuple(rows),
         "The best model over all loads first; the rank is a range where models are not distinguishable. Where the "
         "measurement uncertainty is known, the area is the median over the true fields drawn, with a 95 % interval; "
         "areas as measured, and by tissue, stand below and in areas.csv. Levelled models come last, with their area as "
@@ -210,9 +198,7 @@ def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
 
 def _tissues(one: LoadComparison) -> Table:
     def cells(areas: Iterable[Area]) -> tuple[tuple[Cell, ...], ...]:
-        return tuple(
-            (a.model, a.tissue, a.ml, 100.0 * a.share, a.estimate_ml, a.low_ml, a.high_ml, a.floor_ml) for a in areas
-        )
+        return tuple((a.model, a.tissue, a.ml, 100.0 * a.share, *astuple(a)[5:]) for a in areas)
 
     return Table(
         "Area between the curves, by tissue",
@@ -266,11 +252,10 @@ def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
 
 
 def _agreement(one: LoadComparison) -> Table:
-    rows = _rows_of(one, [ALL, *one.fields.tissues])
     return Table(
         "Agreement cell by cell",
         ("model", "quantity", "tissue", *_AGREED),
-        rows,
+        _rows_of(one, [ALL, *one.fields.tissues]),
         "Maximum shear strain and displacement u: means, regression of the model on the measurement, Lin's "
         "concordance, Bland and Altman's limits of agreement. For displacement these are of its magnitude, except "
         "regression and concordance (the three components pooled) and RMSE (of the difference vector). All as "
@@ -289,25 +274,19 @@ def _by_distance(one: LoadComparison) -> Table:
 
 
 def _rows_of(one: LoadComparison, parts: Sequence[str]) -> tuple[tuple[Cell, ...], ...]:
-    return tuple(
-        (a.model, {"max_shear": "shear", "u_mm": "u, mm"}[a.quantity], a.part, a.measured_mean,
-         a.model_mean, a.slope, a.intercept, a.r2, a.rmse, a.concordance, a.bias, a.lower, a.upper)
-        for a in one.agreements
-        if a.part in parts
-    )  # fmt: skip
+    names = {"max_shear": "shear", "u_mm": "u, mm"}
+    return tuple((a.model, names[a.quantity], a.part, *astuple(a)[6:]) for a in one.agreements if a.part in parts)
 
 
 def _skin(one: LoadComparison) -> Table:
-    rows = tuple(
-        (t.model, t.nodes, t.measured_mm, t.model_mm, t.measured_along_mm, t.model_along_mm,
-         100.0 * t.measured_volume_change, 100.0 * t.model_volume_change)
-        for t in one.skin
-    )  # fmt: skip
     return Table(
         "Skin under the plate, and volume change of the fat",
         ("model", "nodes", "inward, measured, mm", "model, mm", "tangential, measured, mm", "model, mm",
          "fat's volume change, measured, %", "model, %"),
-        rows,
+        tuple(
+            (t.model, *astuple(t)[2:7], 100.0 * t.measured_volume_change, 100.0 * t.model_volume_change)
+            for t in one.skin
+        ),
         "Mean displacement 1 mm inside the skin on the model's plate, against the plate's outward normal and "
         "tangential to it; mean det F - 1.",
     )  # fmt: skip

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import meshio
 import numpy as np
 
 from dvc import Image, StrainField, evaluate_on_grid, write_image, write_vectors
 from dvc.arrays import FloatArray
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_csv
 from dvc.errors import InputError
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
@@ -25,34 +24,20 @@ from validate.location import Overlap
 from validate.mapping import ALL
 
 RECORD = "comparison.json"
-TABLES: Mapping[str, type[Any]] = {
-    "areas.csv": Area,
-    "location.csv": Overlap,
-    "agreement.csv": Agreement,
-    "travel.csv": SkinDisplacement,
-}
+TABLES = {"areas.csv": Area, "location.csv": Overlap, "agreement.csv": Agreement, "travel.csv": SkinDisplacement}
 CURVES = "curves.csv"
 LOWER, UPPER = "measured, low", "measured, high"
 """Fields of the curves that bound the 95 % band of the true one."""
 _CURVE_COLUMNS = ("load", "tissue", "field", "max_shear", "volume_above_ml", "verdict")
 _STEP = 0.005  # of the curves that are written
 _READERS = {"int": int, "float": float, "str": str}
-_Row = TypeVar("_Row")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """A volume-strain curve.
+    """A volume-strain curve: the volume of tissue that exceeds each maximum shear strain, (k,).
 
-    Attributes
-    ----------
-    load, tissue : str
-    field : str
-        "measured", a model, or an edge of the 95 % band of the true curve: "measured, low", "measured, high".
-    max_shear : (k,)
-        Maximum shear strain.
-    volume_above_ml : (k,)
-        Volume of tissue that exceeds it.
+    Its field is "measured", a model, or an edge of the 95 % band of the true curve: "measured, low", "measured, high".
     """
 
     load: str
@@ -67,57 +52,49 @@ def curves_of(one: LoadComparison) -> list[Curve]:
     at = np.arange(0.0, 1.5 * one.criteria.strains[1] + _STEP / 2, _STEP)
     made = []
     for tissue in (ALL, *one.fields.tissues):
-        if tissue in one.bands:
-            band = one.bands[tissue]
-            for name, edge in ((LOWER, band.low_ml), (UPPER, band.high_ml)):
-                made.append(Curve(one.load, tissue, name, at, np.interp(at, band.strains, edge)))
-        made += [Curve(one.load, tissue, name, at, above) for name, above in one.fields.curves(tissue, at).items()]
+        volumes = one.fields.curves(tissue, at)
+        if band := one.bands.get(tissue):
+            edges = {LOWER: band.low_ml, UPPER: band.high_ml}
+            volumes = {name: np.interp(at, band.strains, edge) for name, edge in edges.items()} | volumes
+        made += [Curve(one.load, tissue, name, at, above) for name, above in volumes.items()]
     return made
 
 
-def write_rows(path: Path, rows: Sequence[Any], verdicts: Mapping[str, str]) -> None:
-    """Write rows of one of the `TABLES`, each with the verdict on its load (empty: there is none)."""
-    head = [*(f.name for f in fields(TABLES[path.name])), "verdict"]
-    _write(path, head, ((*astuple(row), verdicts.get(row.load, "")) for row in rows))
+def write_tables(
+    folder: Path, tables: Sequence[Sequence[Any]], curves: Iterable[Curve], verdicts: Mapping[str, str]
+) -> None:
+    """Write the rows of each of the `TABLES`, in their order, and a row for each point of the curves.
 
-
-def read_rows(path: Path, kind: type[_Row]) -> tuple[_Row, ...]:
-    """Read what `write_rows` wrote, to the six digits of the file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read as such a table.
+    Each has the verdict on its load; empty if there is none.
     """
-    readers = {f.name: _READERS[str(f.type)] for f in fields(kind)}  # type: ignore[arg-type]
-    return tuple(kind(**{name: read(row[name]) for name, read in readers.items()}) for row in _rows(path, readers))
-
-
-def write_curves(path: Path, curves: Iterable[Curve], verdicts: Mapping[str, str]) -> None:
-    """Write curves, a row for each point."""
+    for (name, kind), rows in zip(TABLES.items(), tables, strict=True):
+        head = [*(f.name for f in fields(kind)), "verdict"]
+        write_csv(folder / name, head, ((*astuple(row), verdicts.get(row.load, "")) for row in rows))
     points = (
         (c.load, c.tissue, c.field, strain, volume, verdicts.get(c.load, ""))
         for c in curves
         for strain, volume in zip(c.max_shear.tolist(), c.volume_above_ml.tolist(), strict=True)
     )
-    _write(path, _CURVE_COLUMNS, points)
+    write_csv(folder / CURVES, _CURVE_COLUMNS, points)
 
 
-def read_curves(path: Path) -> tuple[Curve, ...]:
-    """Read what `write_curves` wrote; errors as `read_rows`."""
+def read_tables(folder: Path) -> list[tuple[Any, ...]]:
+    """Rows of each of the `TABLES`, to the six digits of the file; one that is no such table is an `InputError`."""
+    tables: list[tuple[Any, ...]] = []
+    for name, kind in TABLES.items():
+        readers = {f.name: _READERS[str(f.type)] for f in fields(kind)}
+        rows = _rows(folder / name, readers)
+        tables.append(tuple(kind(**{of: read(row[of]) for of, read in readers.items()}) for row in rows))
+    return tables
+
+
+def read_curves(folder: Path) -> tuple[Curve, ...]:
+    """The curves that `write_tables` wrote; errors as `read_tables`."""
     points: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
-    for row in _rows(path, _CURVE_COLUMNS):
+    for row in _rows(folder / CURVES, _CURVE_COLUMNS):
         key = row["load"], row["tissue"], row["field"]
         points.setdefault(key, []).append((float(row["max_shear"]), float(row["volume_above_ml"])))
     return tuple(Curve(*key, *np.array(of).T) for key, of in points.items())
-
-
-def _write(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in rows)
-    write_whole(path, text.getvalue())
 
 
 def _rows(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:
@@ -147,30 +124,23 @@ def remove_earlier(folder: Path, loads: Sequence[str]) -> None:
 
 def write_fields(path: Path, one: LoadComparison) -> None:
     """Measured and simulated maximum shear strain and displacement in the cells compared, for ParaView."""
-    mapped = one.fields
-    arrays: dict[str, FloatArray] = {}
-    for name, field in {"measured": mapped.measured, **mapped.models}.items():
-        arrays |= {f"{name}_max_shear": field.max_shear, f"{name}_u_mm": field.u_mm}
-    arrays["to_bone_mm"] = mapped.to_bone_mm
-    arrays["compared"] = mapped.common.astype(np.float64)
-    mesh = meshio.Mesh(
-        mapped.mesh.points_mm, [("tetra", mapped.mesh.cells)], cell_data={n: [a] for n, a in arrays.items()}
-    )
+    mapped, arrays = one.fields, dict[str, list[FloatArray]]()
+    for name, field in mapped.by_name.items():
+        arrays |= {f"{name}_max_shear": [field.max_shear], f"{name}_u_mm": [field.u_mm]}
+    arrays |= {"to_bone_mm": [mapped.to_bone_mm], "compared": [mapped.common.astype(np.float64)]}
+    mesh = meshio.Mesh(mapped.mesh.points_mm, [("tetra", mapped.mesh.cells)], cell_data=arrays)
     with whole_file(path) as part:
         meshio.vtu.write(part, mesh, binary=True)
 
 
 def write_on_image(folder: Path, one: LoadComparison) -> None:
     """Each model's displacement and maximum shear strain on the label map's voxels; NaN outside labels or model."""
-    labels = one.labels
-    inside = labels.labels > 0
+    grid, inside = one.labels.grid, one.labels.labels > 0
     for result in one.case.read()[1]:
-        u = np.full((*labels.grid.shape, 3), np.nan, dtype=np.float32)
-        shear = np.full(labels.grid.shape, np.nan, dtype=np.float32)
-        u[inside], H = evaluate_on_grid(result.deformation, labels.grid, inside)
+        u = np.full((*grid.shape, 3), np.nan, dtype=np.float32)
+        shear = np.full(grid.shape, np.nan, dtype=np.float32)
+        u[inside], H = evaluate_on_grid(result.deformation, grid, inside)
         shear[inside] = StrainField.from_gradient(H).max_shear
-        write_image(folder / f"{result.name}_max_shear.nii.gz", Image(labels.grid, shear))
-        write_vectors(
-            folder / f"{result.name}_displacement.nii.gz", labels.grid, u, ("x", "y", "z"),
-            f"displacement u(X) of tissue in the model {result.name}", "LPS", unit="mm",
-        )  # fmt: skip
+        write_image(folder / f"{result.name}_max_shear.nii.gz", Image(grid, shear))
+        about = f"displacement u(X) of tissue in the model {result.name}"
+        write_vectors(folder / f"{result.name}_displacement.nii.gz", grid, u, ("x", "y", "z"), about, "LPS", unit="mm")

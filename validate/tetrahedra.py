@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
@@ -12,11 +13,95 @@ from dvc import MeshFile, TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import GeometryError
 from dvc.io.meshes.read import CellBlock
-from validate.cell_shapes import SHAPES, Shape
+
+Nodes = tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """Geometry of a kind of cell, of any order."""
+
+    corners: FloatArray  # (c, 3) reference coordinates
+    edges: tuple[Nodes, ...]  # pairs of corners, in the order of the nodes in their middles
+    faces: tuple[Nodes, ...]  # corners going around, seen from outside; quadrangles in the order of their middles
+
+    @property
+    def quadrangles(self) -> tuple[Nodes, ...]:
+        """Faces with four corners."""
+        return tuple(face for face in self.faces if len(face) == 4)
+
+    @property
+    def edged(self) -> int:
+        """Number of corners and edges: the nodes that every quadratic cell of this shape has."""
+        return len(self.corners) + len(self.edges)
+
+    def around(self, face: Nodes) -> Nodes:
+        """Nodes of a quadratic cell along the rim of a face: a corner, the middle of an edge, and so on."""
+        middle = {frozenset(edge): len(self.corners) + n for n, edge in enumerate(self.edges)}
+        pairs = zip(face, (*face[1:], face[0]), strict=True)
+        return tuple(n for a, b in pairs for n in (a, middle[frozenset((a, b))]))
+
+    @property
+    def nodes(self) -> FloatArray:
+        """Reference coordinates of corners and middles of edges."""
+        return np.concatenate([self.corners, [self.corners[list(edge)].mean(axis=0) for edge in self.edges]])
+
+    def weights(self, nodes: Nodes, corners: Nodes) -> FloatArray:
+        """Weights with which values at ``nodes`` give that at the mean of ``corners``, exact for every quadratic field.
+
+        The least ones that do so: those of the serendipity elements in the middles of their faces and bodies.
+        """
+
+        def monomials(at: FloatArray) -> FloatArray:
+            x, y, z = at.T
+            return np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
+
+        point = self.corners[list(corners)].mean(axis=0)
+        return np.asarray(np.linalg.pinv(monomials(self.nodes[list(nodes)]).T) @ monomials(point[None])[0])
+
+    def halved(self, face: Nodes) -> IntArray:
+        """Triangles (k, 3) of half its size that make up a face of a quadratic cell.
+
+        A quadrangle's have its middle in common: node number `edged` and on, in the order of the quadrangles.
+        """
+        rim = self.around(face)
+        if len(face) == 3:
+            a, ab, b, bc, c, ca = rim
+            return np.array([(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)])
+        middle = self.edged + self.quadrangles.index(face)
+        return np.array([(rim[i], rim[(i + 1) % 8], middle) for i in range(8)])
+
+
+_SQUARE = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
+_THIRDS = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]
+
+SHAPES = {
+    "tetra": Shape(
+        np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]),
+        ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)),
+        ((0, 1, 2), (0, 1, 3), (1, 2, 3), (2, 0, 3)),
+    ),
+    "hexahedron": Shape(
+        np.array([(x, y, z) for z in (-1.0, 1.0) for x, y in _SQUARE]),
+        ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)),
+        ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (3, 7, 6, 2), (0, 3, 2, 1), (4, 5, 6, 7)),
+    ),
+    "wedge": Shape(
+        np.array([(x, y, z) for z in (-1.0, 1.0) for x, y in _THIRDS]),
+        ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5)),
+        ((0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
+    ),
+    "pyramid": Shape(
+        np.array([*((x, y, 0.0) for x, y in _SQUARE), (0.0, 0.0, 1.0)]),
+        ((0, 1), (1, 2), (2, 3), (3, 0), (0, 4), (1, 4), (2, 4), (3, 4)),
+        ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
+    ),
+}  # fmt: skip
+"""Volume cells, by meshio's names."""
 
 _log = logging.getLogger("validate.tetrahedra")
 
-# A ten-node tetrahedron: four corners, and the octahedron between them around one of its diagonals.
+# A ten-node tetrahedron, in cells of positive volume: four corners, and the octahedron between them around a diagonal.
 _TETRA10 = np.array(
     [(0, 4, 6, 7), (4, 1, 5, 8), (6, 5, 2, 9), (7, 8, 9, 3), (6, 8, 4, 5), (6, 8, 5, 9), (6, 8, 9, 7), (6, 8, 7, 4)]
 )
@@ -35,38 +120,27 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
     diagonal from their lowest node; quadratic ones through all their nodes, and those that the middles of quadrangles
     and of the cell lack by the element's own interpolation, into tetrahedra of half the cell's size. Kinds with nodes
     in some of these places only are taken by their corners, which is said in the log (``validate.tetrahedra``). Regions
-    and named surfaces are kept.
-
-    Returns
-    -------
-    tets : TetMesh
-    carry : (nodes of tets, nodes of the file)
-
-    Raises
-    ------
-    GeometryError
-        If a cell is folded.
+    and named surfaces are kept. A folded cell is refused with a `GeometryError`.
     """
     nodes = _Nodes(mesh.points_mm)
-    cells: list[IntArray] = []
-    parents: list[IntArray] = []
-    faces: _Faces = []
-    at = 0
-    for block in mesh.blocks:
-        numbers = at + np.arange(len(block.nodes))
-        at += len(block.nodes)
+    cells, parents, faces = list[IntArray](), list[IntArray](), _Faces()
+    for numbers, block in _numbered(mesh):
         if block.shape not in SHAPES:
             continue
         whole = block.nodes.shape[1] in _SIZES[block.shape]
         if not whole and block.kind != block.shape:
             _log.warning("Of cells of kind %s only the corner nodes are used.", block.kind)
         if block.shape == "tetra":
-            children = _tetrahedra(block)
+            children = block.nodes[:, _TETRA10] if whole else block.corners[:, None]
             cells.append(children.reshape(-1, 4))
             parents.append(np.repeat(numbers, children.shape[1]))
             faces += _quadratic_faces(block.nodes, SHAPES["tetra"]) if whole else _linear_faces(block)
             continue
-        made, middle = _quadratic(block, nodes) if whole else _linear(block, nodes)
+        if whole:
+            made, middle = _quadratic(block, nodes)
+        else:
+            corners = block.corners.shape[1]
+            made, middle = _linear_faces(block), nodes.add(block.corners, np.full(corners, 1.0 / corners))
         faces += made
         triangles = np.concatenate([part.reshape(-1, 3) for _, part in made])
         of = np.concatenate([np.repeat(np.arange(len(part)), part.shape[1]) for _, part in made])
@@ -75,63 +149,40 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
     every, parent = np.concatenate(cells), np.concatenate(parents)
     order = np.argsort(parent, kind="stable")
     starts = np.searchsorted(parent[order], np.arange(mesh.cell_count + 1))
-    regions = {}
-    for name, index in mesh.regions.items():
-        members = [order[starts[c] : starts[c + 1]] for c in index]
-        if sum(map(len, members)):
-            regions[name] = np.concatenate(members)
-    facets = {
-        name: triangles
-        for name, corners in _surfaces(mesh)
-        if len(triangles := _on_surface(corners, faces, len(mesh.points_mm)))
+    members = {
+        name: np.concatenate([order[:0], *(order[starts[c] : starts[c + 1]] for c in index)])
+        for name, index in mesh.regions.items()
     }
-    made_of = TetMesh(nodes.points, every, regions, facets, np.arange(len(nodes.points)))
-    return made_of, nodes.carry[made_of.node_ids]
+    regions = {name: cells_of for name, cells_of in members.items() if len(cells_of)}
+    surfaces = {name: _on_surface(corners, faces, len(mesh.points_mm)) for name, corners in _surfaces(mesh).items()}
+    facets = {name: triangles for name, triangles in surfaces.items() if len(triangles)}
+    tets = TetMesh(nodes.points, every, regions, facets, np.arange(len(nodes.points)))
+    return tets, nodes.carry[tets.node_ids]
+
+
+def _numbered(mesh: MeshFile) -> Iterator[tuple[IntArray, CellBlock]]:
+    """The blocks of a file, each with the numbers of its cells."""
+    at = 0
+    for block in mesh.blocks:
+        yield at + np.arange(len(block.nodes)), block
+        at += len(block.nodes)
 
 
 class _Nodes:
-    """A file's nodes, and new ones between them."""
+    """A file's nodes, and new ones between them: ``points`` (n, 3) LPS mm, and ``carry`` (n, nodes of the file)."""
 
     def __init__(self, points: FloatArray) -> None:
-        self._points, self._known = [points], len(points)
-        self._first = len(points)
-        self._weights = [sparse.identity(len(points), format="csr")]
+        self.points, self._own = points, points
+        self.carry = sparse.identity(len(points), format="csr")
 
     def add(self, between: IntArray, shares: FloatArray) -> IntArray:
         """New nodes (m,) between the file's own (m, k), by shares (k,)."""
-        count = len(between)
+        count, before = len(between), len(self.points)
         row = np.repeat(np.arange(count), between.shape[1])
-        share = sparse.csr_matrix((np.tile(shares, count), (row, between.ravel())), shape=(count, self._first))
-        self._weights.append(share)
-        self._points.append(np.asarray(share @ self._points[0]))
-        self._known += count
-        return np.arange(self._known - count, self._known)
-
-    @property
-    def points(self) -> FloatArray:
-        """All nodes, (n, 3) LPS mm."""
-        return np.concatenate(self._points)
-
-    @property
-    def carry(self) -> sparse.csr_matrix:
-        """Weights of the file's nodes in each, (n, nodes of the file)."""
-        return sparse.vstack(self._weights, format="csr")
-
-
-def _tetrahedra(block: CellBlock) -> IntArray:
-    """Children (m, c, 4) of linear or quadratic tetrahedra, the same way round as their parents."""
-    if block.kind != "tetra10":
-        return block.corners[:, None]
-    reference = SHAPES["tetra"].nodes[_TETRA10]
-    flip = np.linalg.det(reference[:, 1:] - reference[:, :1]) < 0.0
-    ordered = np.where(flip[:, None], _TETRA10[:, [0, 1, 3, 2]], _TETRA10)
-    return block.nodes[:, ordered]
-
-
-def _linear(block: CellBlock, nodes: _Nodes) -> tuple[_Faces, IntArray]:
-    """Faces of linear cells as triangles, and the cells' middles (m,)."""
-    count = block.corners.shape[1]
-    return _linear_faces(block), nodes.add(block.corners, np.full(count, 1.0 / count))
+        share = sparse.csr_matrix((np.tile(shares, count), (row, between.ravel())), shape=(count, len(self._own)))
+        self.carry = sparse.vstack([self.carry, share], format="csr")
+        self.points = np.concatenate([self.points, share @ self._own])
+        return np.arange(before, before + count)
 
 
 def _linear_faces(block: CellBlock) -> _Faces:
@@ -153,14 +204,16 @@ def _quadratic(block: CellBlock, nodes: _Nodes) -> tuple[_Faces, IntArray]:
     own, edged = block.nodes, shape.edged
     if own.shape[1] == edged:
         # the middle of a quadrangle is one node for both its cells
-        rims, shares = zip(*(shape.in_face(face) for face in shape.quadrangles), strict=True)
+        rims = [shape.around(face) for face in shape.quadrangles]
         rim = np.concatenate([own[:, list(r)] for r in rims])
         _, first, which = np.unique(np.sort(rim[:, ::2], axis=1), axis=0, return_index=True, return_inverse=True)
-        middles = nodes.add(rim[first], shares[0])[which.ravel()].reshape(len(rims), -1).T
+        in_face = shape.weights(rims[0], shape.quadrangles[0])
+        middles = nodes.add(rim[first], in_face)[which.ravel()].reshape(len(rims), -1).T
         own = np.concatenate([own, middles], axis=1)
     if block.kind == "hexahedron27":
         return _quadratic_faces(own, shape), own[:, 26]
-    return _quadratic_faces(own, shape), nodes.add(own[:, :edged], shape.in_body())
+    in_body = shape.weights(tuple(range(edged)), tuple(range(len(shape.corners))))
+    return _quadratic_faces(own, shape), nodes.add(own[:, :edged], in_body)
 
 
 def _quadratic_faces(own: IntArray, shape: Shape) -> _Faces:
@@ -170,16 +223,15 @@ def _quadratic_faces(own: IntArray, shape: Shape) -> _Faces:
 def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: IntArray, block: CellBlock) -> IntArray:
     """Tetrahedra (k, 4) of positive volume over triangles (k, 3) around the middles (m,) of the cells (k,) they are of.
 
-    Every triangle's normal has to point away from the middle once the faces are followed consistently; a cell where one
-    does not is folded. It is detected by
-    volume: the tetrahedra of a valid cell add up to the volume that its faces enclose.
+    The triangles of a cell have the same sense around its surface. The normals of all have to point away from the
+    middle, or of all towards it if the file counts the other way round; a cell where one does not is folded, which its
+    volume shows: tetrahedra of a valid cell add up to the volume that its faces enclose.
     """
     tets = np.concatenate([triangles, middle[cell][:, None]], axis=1)
     corner = points[tets]
     volume = np.linalg.det(corner[:, 1:] - corner[:, :1])
-    signed = volume * _turning(triangles, cell)
     size = np.bincount(cell, np.abs(volume))
-    folded = np.abs(np.bincount(cell, signed)) < (1.0 - _FLAT) * size
+    folded = np.abs(np.bincount(cell, volume)) < (1.0 - _FLAT) * size
     folded |= np.bincount(cell, np.abs(volume) <= _FLAT * size[cell]) > 0
     if folded.any():
         raise GeometryError(
@@ -189,42 +241,12 @@ def _outward(points: FloatArray, triangles: IntArray, middle: IntArray, cell: In
     return np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)
 
 
-def _turning(triangles: IntArray, cell: IntArray) -> FloatArray:
-    """+1 or -1 for each triangle, so that all triangles of a cell have the same sense around its surface.
-
-    Two triangles of a closed surface that share an edge have the same sense if they traverse it in opposite
-    directions.
-    """
-    count = len(triangles)
-    start, end = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
-    owner = np.repeat(np.arange(count), 3)
-    key = np.stack([cell[owner], np.minimum(start, end), np.maximum(start, end)])
-    order = np.lexsort(key)
-    first, second = order[0::2], order[1::2]
-    same = np.where((start < end)[first] == (start < end)[second], -1.0, 1.0)
-    turn = np.zeros(count)
-    _, at = np.unique(cell, return_index=True)
-    turn[at] = 1.0
-    a, b = owner[first], owner[second]
-    for _ in range(count):
-        before = np.count_nonzero(turn)
-        known = (turn[a] != 0.0) & (turn[b] == 0.0)
-        turn[b[known]] = turn[a[known]] * same[known]
-        known = (turn[b] != 0.0) & (turn[a] == 0.0)
-        turn[a[known]] = turn[b[known]] * same[known]
-        if np.count_nonzero(turn) == before:
-            break
-    return turn
-
-
-def _surfaces(mesh: MeshFile) -> Iterable[tuple[str, list[tuple[int, ...]]]]:
+def _surfaces(mesh: MeshFile) -> dict[str, list[tuple[int, ...]]]:
     """Faces of each named surface, by their corners: the flat cells of a region, or triangles of a set of nodes."""
     flat: dict[int, tuple[int, ...]] = {}
-    at = 0
-    for block in mesh.blocks:
+    for numbers, block in _numbered(mesh):
         if block.shape in ("triangle", "quad"):
-            flat |= {at + n: tuple(corners) for n, corners in enumerate(block.corners.tolist())}
-        at += len(block.nodes)
+            flat |= zip(numbers.tolist(), map(tuple, block.corners.tolist()), strict=True)
     named = {
         name: rows for name, index in mesh.regions.items() if (rows := [flat[c] for c in index.tolist() if c in flat])
     }
@@ -232,7 +254,7 @@ def _surfaces(mesh: MeshFile) -> Iterable[tuple[str, list[tuple[int, ...]]]]:
         by_id = np.argsort(mesh.node_ids)
         place = by_id[np.searchsorted(mesh.node_ids, mesh.tets.node_ids, sorter=by_id)]
         named = {name: [tuple(r) for r in place[rows].tolist()] for name, rows in mesh.tets.facets.items()} | named
-    return named.items()
+    return named
 
 
 def _on_surface(corners: list[tuple[int, ...]], faces: _Faces, count: int) -> IntArray:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+import validate
 from dvc import Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
@@ -16,22 +17,12 @@ from dvc.report.page import Section
 from fe import read_tet_mesh
 from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import ModelFile, Reading, model_files
-from mrstrain.models.loads import Vector
 from mrstrain.options.comparison import ComparisonOn, ModelReading
 from mrstrain.options.door import door
+from mrstrain.options.model import Vector
 from mrstrain.options.modelling import Directions, LabelMapFile
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
-from validate import (
-    Comparison,
-    Criteria,
-    LoadCase,
-    check_in_tissue,
-    check_models,
-    check_overlap,
-    compare as compare_loads,
-    read_thresholds,
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +30,7 @@ class Compared:
     """What `compare` gave: the comparison, and the parts of its report."""
 
     out: Path
-    comparison: Comparison
+    comparison: validate.Comparison
     sections: tuple[Section, ...]
     closing: tuple[Section, ...]
 
@@ -82,7 +73,7 @@ def compare(
     labelling, reading, directions, comparison
         Their fields are given as keywords, such as ``strains=...``.
     progress : callable, optional
-        Gets case, stage, fraction.
+        ``progress(case, stage, fraction)``.
 
     Raises
     ------
@@ -90,26 +81,35 @@ def compare(
         If measurement and models have no load in common, or as in `validate.compare`.
     """
     target, tell, tissues = Path(out), progress or (lambda *_: None), read_labels(labelling.labels, labelling.names)
-    criteria = Criteria(comparison.strains, read_thresholds(comparison.thresholds), comparison.least_ml)
-    axes, bones, mesh = (
-        _Axes.of(directions.plate_normal, directions.shear_direction, towards or {}),
-        labelling.bones,
-        comparison.mesh,
-    )
+    thresholds = validate.read_thresholds(comparison.thresholds)
+    criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
+    bones, usual = labelling.bones, _axes(directions.plate_normal, directions.shear_direction)
+    own = {load: _axes(*of) for load, of in (towards or {}).items()}
     measurements = result_folders(Path(dvc), loads)
-    usual = Reading(reading.model_mesh, reading.model_unit, reading.model_frame, to_image)
-    files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], usual)
-    inputs = _inputs(measurements, files, labelling.labels, labelling.names, mesh)
+    how = Reading(reading.model_mesh, reading.model_unit, reading.model_frame, to_image)
+    files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], how)
+    inputs = _inputs(measurements, files, labelling, comparison.mesh)
     refuse_touching_inputs(target, list(files), [path for paths in inputs.values() for path in paths])
-    _refuse_as_output(target, [Path(dvc), *(m.folder for m in measurements), *map(Path, models)])
-    common = None if mesh is None else _common_mesh(mesh, tissues, bones)
+    folders = [Path(dvc), *(m.folder for m in measurements), *map(Path, models)]
+    if target.resolve() in [folder.resolve() for folder in folders]:
+        raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
+    common = None if comparison.mesh is None else _common_mesh(comparison.mesh, tissues, bones)
     compared = [m for m in measurements if m.load in files]
-    cases = [_case(m, files[m.load], tissues.grid, axes[m.load]) for m in compared]
+    cases = [_case(m, files[m.load], tissues.grid, own.get(m.load, usual)) for m in compared]
     # Every file is read once before anything is computed or removed, and again in its turn: together they fill memory.
-    warnings = check_models(cases, tissues, bones)
+    warnings = validate.check_models(cases, tissues, bones)
     make_output(target)
-    record = provenance("compare", inputs, _parameters(bones, axes, criteria, usual, files))
-    result = compare_loads(
+    given = {
+        "bones": list(bones), "plate_axes_lps": usual.tolist(), "strains": list(criteria.strains),
+        "plate_axes_lps_of": {load: axes.tolist() for load, axes in own.items()},
+        "least_cluster_ml": criteria.least_ml,
+        "thresholds": [[t.max_shear, t.source] for t in criteria.thresholds],
+        "model_unit": how.unit, "model_frame": how.frame,
+        "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": criteria.seed,
+        "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
+    }  # fmt: skip
+    record = provenance("compare", inputs, given)
+    result = validate.compare(
         cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings,
         progress=lambda fraction: tell("compare", "comparing", fraction),
     )  # fmt: skip
@@ -120,27 +120,16 @@ def compare(
     return Compared(target, result, sections, closing)
 
 
-class _Axes(dict[str, FloatArray]):
-    """The plate's axes (3, 3) by load, for loads in directions of their own; ``usual`` for all others."""
-
-    usual: FloatArray
-
-    @classmethod
-    def of(cls, normal: Sequence[float], shear: Sequence[float], towards: Mapping[str, tuple[Vector, Vector]]) -> _Axes:
-        made = cls({load: plate_axes(-np.asarray(away), along) for load, (away, along) in towards.items()})
-        made.usual = plate_axes(-np.asarray(normal, dtype=np.float64), shear)
-        return made
-
-    def __missing__(self, load: str) -> FloatArray:
-        return self.usual
+def _axes(normal: Sequence[float], shear: Sequence[float]) -> FloatArray:
+    """The plate's axes (3, 3) from its outward normal and the direction of shear, LPS."""
+    return plate_axes(-np.asarray(normal, dtype=np.float64), shear)
 
 
 def _inputs(
     measurements: Sequence[ResultFolder],
     files: Mapping[str, Sequence[ModelFile]],
-    labels: Path,
-    names: Path | str | None,
-    mesh: Path | str | None,
+    labelling: LabelMapFile,
+    mesh: Path | None,
 ) -> dict[str, list[Path]]:
     """All files that are read, by role."""
     results = [file for of in files.values() for file in of]
@@ -148,55 +137,23 @@ def _inputs(
     return {
         "measured": [f for m in measurements for f in m.files],
         "models": [*(file.path for file in results), *meshes],
-        "labels": [labels],
-        "names": [] if names is None else [Path(names)],
-        "mesh": [] if mesh is None else [Path(mesh)],
+        **labelling.files,
+        "mesh": [] if mesh is None else [mesh],
         "error_models": [f for m in measurements if (f := m.folder / ERROR_MODEL).is_file()],
     }
-
-
-def _parameters(
-    bones: Sequence[str],
-    axes: _Axes,
-    criteria: Criteria,
-    reading: Reading,
-    files: Mapping[str, Sequence[ModelFile]],
-) -> dict[str, object]:
-    """Everything else that the comparison depends on, for its record."""
-    to_image = reading.to_image
-    return {
-        "bones": list(bones), "plate_axes_lps": axes.usual.tolist(), "strains": list(criteria.strains),
-        "plate_axes_lps_of": {load: own.tolist() for load, own in axes.items()},
-        "least_cluster_ml": criteria.least_ml,
-        "thresholds": [[t.max_shear, t.source] for t in criteria.thresholds],
-        "model_unit": reading.unit, "model_frame": reading.frame,
-        "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": criteria.seed,
-        "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
-    }  # fmt: skip
-
-
-def _refuse_as_output(target: Path, folders: Sequence[Path]) -> None:
-    for folder in folders:
-        if target.resolve() == folder.resolve():
-            raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
 
 
 def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
     """The mesh where all fields are compared, which has to lie in the labelled soft tissue."""
     mesh = read_tet_mesh(path)
-    check_overlap(path, mesh, labels.grid)
-    check_in_tissue(path, mesh, labels, bones)
+    validate.check_overlap(path, mesh, labels.grid)
+    validate.check_in_tissue(path, mesh, labels, bones)
     return mesh
 
 
-def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> LoadCase:
+def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> validate.LoadCase:
     image = measurement.folder / REGISTERED
-    return LoadCase(
-        measurement.load,
-        lambda: (measurement.deformation(), [file.read(grid) for file in files]),
-        axes,
-        measurement.table,
-        measurement.verdict,
-        measurement.aligned_on,
-        image if image.is_file() else None,
-    )
+    return validate.LoadCase(
+        measurement.load, lambda: (measurement.deformation(), [file.read(grid) for file in files]), axes,
+        measurement.table, measurement.verdict, measurement.aligned_on, image if image.is_file() else None,
+    )  # fmt: skip

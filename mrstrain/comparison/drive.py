@@ -6,23 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import fe
 from dvc import Deformation, TetMesh
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
-from dvc.io.result_folder import REGIONS, ResultFolder, result_folders
+from dvc.io.result_folder import REGIONS, result_folders
 from dvc.worker import usable_cores
-from fe import (
-    Material,
-    RegionFigures,
-    check_materials,
-    clear_simulation,
-    material_set,
-    read_tet_mesh,
-    region_figures,
-    write_regions_csv,
-    write_state,
-)
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
+from mrstrain.models.simulate import material_sets
 from mrstrain.options.door import door
 from mrstrain.options.modelling import MaterialSets, MeshCoordinates
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
@@ -70,14 +61,12 @@ def drive(
         Gets a folder for each material set (SET-driven) with ``LOAD.vtu``, for `compare`, and a folder ``boundary``
         with the displacements as boundary conditions for ANSYS, Abaqus and FEBio, by the mesh's node numbers, in its
         unit and frame.
-    material, coordinates
+    material, coordinates, progress
         As in `simulate`.
     loads : sequence of str
         Names of measured loads; all by default.
     threads : int, optional
         Of the solver; all cores by default.
-    progress : callable, optional
-        ``progress(case, stage, fraction)``.
 
     Raises
     ------
@@ -86,20 +75,24 @@ def drive(
     """
     target, place, tell = Path(out), Path(mesh), progress or (lambda *_: None)
     unit, frame, sets = coordinates.mesh_unit, coordinates.mesh_frame, material.sets
-    read = read_tet_mesh(place, unit=unit, frame=frame)
-    chosen = [material_set(name) for name in sets]
-    if not chosen or len({one.name for one in chosen}) < len(chosen):
-        raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
-    laws = {one.name: one.for_regions(read.regions) for one in chosen}
+    read = fe.read_tet_mesh(place, unit=unit, frame=frame)
+    laws = {one.name: one.for_regions(read.regions) for one in material_sets(sets)}
     for region_laws, _ in laws.values():
-        check_materials(read, region_laws)
+        fe.check_materials(read, region_laws)
     measurements = result_folders(Path(dvc), loads)
-    _refuse_bone_motion(measurements)
+    if loose := [m.load for m in measurements if m.aligned_on == "none"]:
+        raise InputError(
+            f"{', '.join(loose)}: the bone's motion was not removed from this measurement, and the model's bone does "
+            "not move. Register with a bone."
+        )
     measured = {m.load: m.deformation() for m in measurements}
     prescribed = {load: boundary_displacement(read, field) for load, field in measured.items()}
     folders = {name: target / (name + ENDING) for name in laws}
     refuse_touching_inputs(target, [BOUNDARY, *(f.name for f in folders.values())], [place, Path(dvc)])
-    _prepare(target, [target / BOUNDARY, *folders.values()])
+    make_output(target)
+    for folder in (target / BOUNDARY, *folders.values()):
+        make_output(folder)
+        fe.clear_simulation(folder)
     inputs = {"mesh": [place], "measured": [f for m in measurements for f in m.files]}
     inputs["sets"] = [Path(s) for s in sets if str(s).endswith(".toml")]
     record = provenance("drive", inputs, coordinates.plain())
@@ -107,43 +100,24 @@ def drive(
         write_boundary_conditions(target / BOUNDARY / load, read, nodes, u, unit=unit, frame=frame)
     doubtful = [(m.load, m.verdict) for m in measurements if m.verdict and m.verdict.reasons]
     lines = [f"{load}: verdict on the measurement: {verdict.words}" for load, verdict in doubtful]
-    complete = True
+    complete, regions = True, {str(n): region for n, region in enumerate(read.regions, start=1)}
     for number, (name, (region_laws, notes)) in enumerate(laws.items()):
         tell("drive", "simulating", number / len(laws))
         outcome, messages = _drive_set(folders[name], read, region_laws, measured, threads or usable_cores())
         complete = complete and [of["reached"] for of in outcome.values()] == [1.0] * len(measured)
         lines += messages
-        regions = {str(n): region for n, region in enumerate(read.regions, start=1)}
-        write_json(
-            folders[name] / "simulation.json",
-            {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": name,
-             "laws": {region: law.description for region, law in region_laws.items()}} | record,
-        )  # fmt: skip
+        about = {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": name}
+        about |= {"laws": {region: law.description for region, law in region_laws.items()}}
+        write_json(folders[name] / "simulation.json", about | record)
     tell("drive", "simulating", 1.0)
     return Driven(target, complete, tuple(lines))
 
 
-def _prepare(target: Path, folders: Sequence[Path]) -> None:
-    make_output(target)
-    for folder in folders:
-        make_output(folder)
-        clear_simulation(folder)
-
-
-def _refuse_bone_motion(measurements: Sequence[ResultFolder]) -> None:
-    loose = [m.load for m in measurements if m.aligned_on == "none"]
-    if loose:
-        raise InputError(
-            f"{', '.join(loose)}: the bone's motion was not removed from this measurement, and the model's bone does "
-            "not move. Register with a bone."
-        )
-
-
 def _drive_set(
-    folder: Path, mesh: TetMesh, laws: Mapping[str, Material], measured: Mapping[str, Deformation], threads: int
+    folder: Path, mesh: TetMesh, laws: Mapping[str, fe.Material], measured: Mapping[str, Deformation], threads: int
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
     """Simulate all loads with one material set, and write them: the outcome of each load, and lines for a person."""
-    rows, outcome, log, lines = list[RegionFigures](), dict[str, dict[str, float]](), list[str](), list[str]()
+    rows, outcome, log, lines = list[fe.RegionFigures](), dict[str, dict[str, float]](), list[str](), list[str]()
     name = folder.name.removesuffix(ENDING)
     for load, field in measured.items():
         try:
@@ -153,18 +127,14 @@ def _drive_set(
         except MrstrainError as failure:
             lines.append(f"{name}: {failure}")
             continue
-        write_state(folder / f"{load}.vtu", mesh, state, laws)
-        outcome[load] = {
-            "reached": state.reached,
-            "iterations": state.iterations,
-            "seconds": round(state.seconds, 1),
-        }
-        own = region_figures(mesh, state, laws)
+        fe.write_state(folder / f"{load}.vtu", mesh, state, laws)
+        outcome[load] = {"reached": state.reached, "iterations": state.iterations, "seconds": round(state.seconds, 1)}
+        own = fe.region_figures(mesh, state, laws)
         rows += own
         figures = "; ".join(f"{r.region} {r.shear_p50:.3f} / {r.shear_p90:.3f}" for r in own)
         part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the displacement was reached;"
         lines.append(f"{name}, {load}:{part} max. shear, median / 90th percentile: {figures}")
-    write_regions_csv(folder / REGIONS, rows)
+    fe.write_regions_csv(folder / REGIONS, rows)
     write_whole(folder / SETTINGS, IN_IMAGE)
     write_whole(folder / "log.txt", "\n".join(log) + "\n")
     return outcome, lines

@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import meshio
 import numpy as np
 
-from dvc import Image, Subject, tissue_mask, write_image
-from dvc.atomic_files import whole_file, write_json, write_whole
+from dvc import Image, Subject, TetMesh, tissue_mask, write_image
+from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.io.result_folder import PROVENANCE, result_folders
+from fe import write_tet_mesh
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.register import register
+from mrstrain.options import measurement as options
 from mrstrain.options.comparison import ModelReading
 from mrstrain.options.door import door
-from mrstrain.options.measurement import (
-    EngineOptions,
-    MeshAndAxes,
-    RegistrationOptions,
-    Running,
-    Scans,
-    Seeded,
-    SubjectFiles,
-)
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
@@ -55,11 +45,11 @@ def level(
     model: Path | str,
     *,
     out: Path | str,
-    subject_files: SubjectFiles,
+    subject_files: options.SubjectFiles,
     loads: Sequence[str] = (),
-    engine: EngineOptions,
+    engine: options.EngineOptions,
     reading: ModelReading,
-    seeded: Seeded,
+    seeded: options.Seeded,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Levelled:
     """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
@@ -68,23 +58,17 @@ def level(
     ----------
     load0 : path
         The unloaded image.
-    model, model_mesh, model_unit, model_frame
+    model, reading
         A folder with a file for each load, and how it is read; as in `compare`.
     out : path
         Gets a folder named as the model and "-levelled", for `compare` beside the model itself, and one ending in
         "-work" with the warped images and, by load, their registration.
-    subject_files
-        As in `register`; the bone is needed.
-    loads : sequence of str
-        Names of the loads; all of the model's files by default.
-    engine
-        That of the measurement, as in `register`. Unknown elastix parameters are accepted.
-    reading
-        As in `compare`.
+    subject_files, engine
+        As in `register` for the measurement; the bone is needed, and unknown elastix parameters are accepted.
+    loads, progress
+        As in `compare`; by default all loads that the model has a file of.
     seeded
         Threads of each registration; the seed is also that of the fresh noise.
-    progress : callable, optional
-        ``progress(case, stage, fraction)``.
 
     Raises
     ------
@@ -98,7 +82,7 @@ def level(
         raise InputError(f"{place} is no folder with a model's results, a file for each load.")
     # The extrapolated displacement outside the model's mesh is not isochoric: volume is kept whatever the images show.
     volume = volume_kept(engine)
-    how = RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
+    how = options.RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
     engine_of(how, labelled=subject_files.labels is not None)  # refused now rather than after the images are made
     subject = read_subject(load0, subject_files)
     of_load, notes = model_files(
@@ -115,39 +99,22 @@ def level(
     about = engine.model_dump(exclude={"parameters"}) | {"volume": volume} | seeded.plain()
     about |= {"bone_label": subject_files.bone_label} | reading.model_dump(exclude={"model_mesh"})
     _prepare(target, name, images, provenance("level", {**subject.files, **sources}, about))
-    options = {
-        "subject_files": subject_files, "registration": how, "running": Running(**dict(seeded)), "progress": progress
-    }  # fmt: skip
-    failures = _register_each(load0, results, target / name, options)
-    return Levelled(target / name, (*notes, *smoothed, *failures))
-
-
-def _register_each(
-    load0: Path | str, results: Mapping[str, FeResult], folder: Path, options: Mapping[str, Any]
-) -> list[str]:
-    """Register each warped image and write what it gives on the model's mesh; a sentence for each that failed.
-
-    Every load has a folder of its own, since a study levels several at once.
-    """
-    work, failures = folder.with_name(f"{folder.name}-work"), []
+    work, failures = target / f"{name}-work", []
     for load, result in results.items():
-        registered = work / "registered" / load
+        registered = work / "registered" / load  # a folder of its own, since a study levels several loads at once
         try:
             register.with_options(
-                load0,
-                [work / "images" / f"{load}.nii.gz"],
-                out=registered,
-                scans=Scans(),
-                onto=MeshAndAxes(),
-                **options,
-            )
+                load0, [work / "images" / f"{load}.nii.gz"], out=registered, subject_files=subject_files,
+                registration=how, scans=options.Scans(), onto=options.MeshAndAxes(),
+                running=options.Running(**dict(seeded)), progress=progress,
+            )  # fmt: skip
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")
         else:
-            _write(folder / f"{load}.vtu", result, registered)
+            _write(target / name / f"{load}.vtu", result, registered)
     if len(failures) == len(results):
         raise RegistrationError(" ".join(failures))
-    return failures
+    return Levelled(target / name, (*notes, *smoothed, *failures))
 
 
 def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int) -> tuple[dict[str, Image], list[str]]:
@@ -188,11 +155,4 @@ def _write(path: Path, result: FeResult, registered: Path) -> None:
     mesh = result.mesh
     (measured,) = result_folders(registered)
     u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)
-    region = np.zeros(len(mesh.cells), dtype=np.int64)
-    for number, cells in enumerate(mesh.regions.values(), start=1):
-        region[cells] = number
-    written = meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"displacement_mm": u}, {"region": [region]})
-    with whole_file(path) as part:
-        meshio.vtu.write(part, written, binary=True)
-    names = {str(number): name for number, name in enumerate(mesh.regions, start=1)}
-    write_whole(path.with_suffix(".json"), json.dumps({"regions": names}) + "\n")
+    write_tet_mesh(path, TetMesh(mesh.points_mm, mesh.cells, mesh.regions), {}, {"displacement_mm": u})

@@ -15,7 +15,7 @@ from fe import LoadStep
 from mrstrain.records.provenance import versions
 from validate import Comparison, Criteria
 from validate.curves import DRAWS
-from validate.location_intervals import LOCATION_DRAWS
+from validate.location import LOCATION_DRAWS
 
 # Checked against the publishers' records or the projects' own pages; a paper whose DOI was not found goes without.
 _PAPERS = {
@@ -54,21 +54,11 @@ def methods(
 ) -> tuple[str, ...]:
     """Paragraphs for a methods section, the references last.
 
-    Parameters
-    ----------
-    measured : mapping of load to path
-        Folders of the measurement, with their ``provenance.json`` where `register` or `strain` wrote them.
-    models : mapping of name to path
-        A result's file of each; a ``simulation.json`` beside it records how it was computed.
-    comparison : Comparison
-    criteria : Criteria
-        What it was computed by.
+    ``measured`` are the measurement's folders by load, with their ``provenance.json`` where `register` or `strain`
+    wrote them; ``models`` a result's file of each, with a ``simulation.json`` beside it if it was computed here.
     """
-    parts = [
-        _measured(measured),
-        *_simulated(models, measured),
-        _compared(len(comparison.loads[0].fields.points_mm), criteria),
-    ]
+    parts = [_measured(measured), *_simulated(models, measured)]
+    parts.append(_compared(len(comparison.loads[0].fields.points_mm), criteria))
     if any(one.bands for one in comparison.loads):
         parts.append(_uncertainty(measured))
     parts.append(f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue).")
@@ -116,16 +106,14 @@ def _registration(record: Record) -> str:
     how = methods_of(parameters, versions)
     if record.get("command") != "register" or not how:
         return _GIVEN
-    align = {
-        "bone": "The loaded image was aligned with the unloaded one rigidly on the bone, and then",
-        "image": "The loaded image was aligned with the unloaded one rigidly on the whole image, and then",
-    }.get(str(parameters.get("align")), "The loaded image was, without rigid alignment,")
+    aligned_on = {"bone": "the bone", "image": "the whole image"}.get(str(parameters.get("align")))
+    before = f" aligned with the unloaded one rigidly on {aligned_on}, and then" if aligned_on else ""
     if parameters.get("align") != "none":
         how += "; rigid alignment by Gauss-Newton least squares (Baker 2004)"
     return (
-        f"{align} registered non-rigidly {how}; seed {parameters.get('seed')}. Beforehand the smooth receive field was "
-        "taken out of both images (N4, Tustison 2010, as implemented in SimpleITK "
-        f"{versions.get('SimpleITK', '?')}, Lowekamp 2013)."
+        f"The loaded image was{before or ', without rigid alignment,'} registered non-rigidly {how}; seed "
+        f"{parameters.get('seed')}. Beforehand the smooth receive field was taken out of both images (N4, Tustison "
+        f"2010, as implemented in SimpleITK {versions.get('SimpleITK', '?')}, Lowekamp 2013)."
     )
 
 
@@ -135,7 +123,7 @@ def _files(record: Record) -> str:
         return ""
     versions, inputs = record.get("versions", {}), record.get("inputs", {})
     formats = sorted({format_of(file["name"]) for role in _IMAGES for file in inputs.get(role, [])})
-    done = (
+    read = (
         f"Images ({', '.join(formats)}) were read, and maps (NIfTI, NRRD) written," if formats else "Maps were written"
     )
     of_dicom = (
@@ -143,56 +131,45 @@ def _files(record: Record) -> str:
         "pixels are compressed in one of the JPEG formats)"
     )
     return (
-        f" {done} by mrstrain's own code, with nibabel "
-        f"{versions.get('nibabel', '?')} for the headers of NIfTI files{of_dicom if 'DICOM' in formats else ''}."
+        f" {read} by mrstrain's own code, with nibabel {versions.get('nibabel', '?')} for the headers of NIfTI "
+        f"files{of_dicom if 'DICOM' in formats else ''}."
     )
 
 
 def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list[str]:
     """How models were computed: those of ours by their own records, others by their files."""
-    parts, others, groups = [], [], dict[str, list[str]]()
-    driven, levelled = [], dict[str, list[str]]()
-    published = False
+    sets, driven, others, published = list[str](), list[str](), list[str](), False
+    solvers, levelled = dict[str, list[str]](), dict[str, list[str]]()
     for name, path in models.items():
         record = _record(path.parent / "simulation.json")
-        parameters = record.get("parameters", {})
-        if record.get("command") == "drive":
-            driven.append(_driven(name, record))
+        command, given = record.get("command"), record.get("parameters", {})
+        if command == "drive":
+            laws = "; ".join(f"{region}: {law}" for region, law in record["laws"].items())
+            driven.append(f"{name}: with mrstrain {record.get('versions', {}).get('mrstrain', '?')} ({laws}).")
             published = published or record["set"] in _PUBLISHED
-            continue
-        if _record(path.parent / PROVENANCE).get("command") == "level":
+        elif _record(path.parent / PROVENANCE).get("command") == "level":
             levelled.setdefault(_levelled(path, measured), []).append(name)
-            continue
-        if record.get("command") != "simulate" or "set" not in parameters:
+        elif command == "simulate" and "set" in given:
+            laws = "; ".join(f"{region}: {law['law']}" for region, law in given["laws"].items())
+            sets.append(f"{name}: {given['title']} ({laws}).")
+            published = published or given["set"] in _PUBLISHED
+            solvers.setdefault(_solver(record), []).append(name)
+        else:
             others.append(f"{name} ({path.suffix[1:]})")
-            continue
-        laws = "; ".join(f"{region}: {law['law']}" for region, law in parameters["laws"].items())
-        parts.append(f"{name}: {parameters['title']} ({laws}).")
-        published = published or parameters["set"] in _PUBLISHED
-        groups.setdefault(_solver(record), []).append(name)
-    sentences = []
-    if parts:
-        sentences.append(" ".join([*(f"{_listed(names)} {how}" for how, names in groups.items()), *parts]))
-    if driven:
-        sentences.append(f"{_DRIVEN} {' '.join(driven)}")
-    if published:
-        sentences.append("Published sets of laws are those that Trebbi 2023 compiled.")
-    sentences += [f"{_listed(names)}: {how}" for how, names in levelled.items()]
-    if others:
-        sentences.append(f"Results of other programs were taken as given: {_listed(others)}.")
-    return sentences
+    ours = " ".join([*(f"{_listed(names)} {how}" for how, names in solvers.items()), *sets])
+    return [
+        *([ours] if sets else []),
+        *([f"{_DRIVEN} {' '.join(driven)}"] if driven else []),
+        *(["Published sets of laws are those that Trebbi 2023 compiled."] if published else []),
+        *(f"{_listed(names)}: {how}" for how, names in levelled.items()),
+        *([f"Results of other programs were taken as given: {_listed(others)}."] if others else []),
+    ]
 
 
 _DRIVEN = (
     "Driven models bear no force: each node on the outside of the mesh was moved by the measured displacement, or held "
     "where the mesh names it bone, and those inside follow from the laws."
 )
-
-
-def _driven(name: str, record: Record) -> str:
-    """One model whose outside went where it was measured."""
-    laws = "; ".join(f"{region}: {law}" for region, law in record["laws"].items())
-    return f"{name}: with mrstrain {record.get('versions', {}).get('mrstrain', '?')} ({laws})."
 
 
 def _levelled(path: Path, measured: Mapping[str, Path]) -> str:
@@ -214,10 +191,8 @@ def _along(axes: Sequence[Sequence[float]], column: int, sign: float = 1.0) -> s
 def _solver(record: Record) -> str:
     parameters, versions = record["parameters"], record.get("versions", {})
     made = parameters.get("mesh_made")
-    mesh = (
+    mesh = made and (
         f" on a mesh of fTetWild (Hu 2020; pytetwild {made['pytetwild']}) with edges of {made['edge_mm']:g} mm"
-        if made
-        else ""
     )
     loads = _listed([f"{step['name']} {LoadStep(**step)}" for path in parameters["paths"] for step in path])
     axes = {load: of.get("plate_axes_lps") for load, of in record.get("outcome", {}).items()}
@@ -230,7 +205,7 @@ def _solver(record: Record) -> str:
         )
     contact = "bonded to the plate from the first touch" if parameters.get("taped", True) else "without friction"
     return (
-        f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh}: {parameters['element']}; "
+        f"were computed with mrstrain {versions.get('mrstrain', '?')}{mesh or ''}: {parameters['element']}; "
         f"plate {parameters['plate']}; skin {contact}; fixed: {', '.join(parameters['fixed'])}; loads {loads}."
     )
 
@@ -264,11 +239,8 @@ def _sources(measured: Mapping[str, Path]) -> str:
 
 def _twins(measured: Mapping[str, Path]) -> str:
     """Which registrations' error bars were checked by a synthetic warp; a sentence and a space, or nothing."""
-    checked = [
-        load
-        for load, of in _errors(measured).items()
-        if any(row.get("factor") is not None for row in of.get("twin", []))
-    ]
+    factors = {load: [row.get("factor") for row in of.get("twin", [])] for load, of in _errors(measured).items()}
+    checked = [load for load, of in factors.items() if any(factor is not None for factor in of)]
     if not checked:
         return ""
     return (

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -45,11 +46,8 @@ class ModelFile:
 
     def read(self, grid: Grid) -> FeResult:
         """The result, which has to lie in the image on this grid; errors as `read_result` and `check_overlap`."""
-        how = self.reading
         try:
-            result = read_result(
-                self.name, self.path, mesh=how.mesh, unit=how.unit, frame=how.frame, to_image=how.to_image
-            )
+            result = read_result(self.name, self.path, **asdict(self.reading))
         except ExtentError as failure:
             raise ExtentError(f"{failure} The image: {box_told(*grid.bounds_mm())} (LPS mm).") from failure
         check_overlap(self.path, result.mesh, grid)
@@ -61,16 +59,12 @@ def model_files(
 ) -> tuple[dict[str, list[ModelFile]], list[str]]:
     """Files of the models by load, in the order of the models; and a sentence for each that is missing.
 
-    Raises
-    ------
-    InputError
-        If a model is not there, two have one name, or none has a file of a measured load.
+    An `InputError` says that a model is not there, two have one name, or none has a file of a measured load.
     """
     if not models:
         raise InputError("No model is given: a folder with a file for each load, or a file.")
     files: dict[str, list[ModelFile]] = {load: [] for load in loads}
-    notes: list[str] = []
-    taken: set[str] = set()
+    notes, taken = list[str](), set[str]()
     for place in models:
         name, chosen = _chosen(place, loads)
         if name in taken:
@@ -123,16 +117,14 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
 
 
 def files_named(place: Path) -> list[Path]:
-    """Files that a model's settings name, and the settings themselves where they do not lie in its folder."""
-    settings = (place if place.is_dir() else place.parent) / SETTINGS
-    if not settings.is_file():
-        return []
+    """The file of a model's settings, if it has any, and the files that they name."""
+    settings = _folder(place) / SETTINGS
     try:
-        content = tomllib.loads(settings.read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # said where the model is read
-        return [settings]
+        content = _settings(place)
+    except InputError:  # said where the model is read
+        content = {}
     named = [settings.parent / str(content[key]) for key in ("mesh", "to_image") if isinstance(content.get(key), str)]
-    return [settings, *(path for path in named if path.is_file())]
+    return [path for path in (settings, *named) if path.is_file()]
 
 
 def loads_of(place: Path, has_mesh: bool) -> list[str]:
@@ -147,30 +139,36 @@ def loads_of(place: Path, has_mesh: bool) -> list[str]:
 
 def _outcome(place: Path, key: str) -> dict[str, float]:
     """From the record of one of our simulations, by load: the fraction "reached", or "stable_share"."""
-    folder = place if place.is_dir() else place.parent
     try:
-        outcome = json.loads((folder / "simulation.json").read_text(encoding="utf-8"))["outcome"]
+        outcome = json.loads((_folder(place) / "simulation.json").read_text(encoding="utf-8"))["outcome"]
         return {load: float(of[key]) for load, of in outcome.items()}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 
 
-def _reading(place: Path, usual: Reading) -> Reading:
-    settings = (place if place.is_dir() else place.parent) / SETTINGS
-    if not settings.is_file():
-        return usual
+def _folder(place: Path) -> Path:
+    return place if place.is_dir() else place.parent
+
+
+def _settings(place: Path) -> dict[str, Any]:
+    """A model's settings; empty where it has none."""
+    settings = _folder(place) / SETTINGS
     try:
-        content = tomllib.loads(settings.read_text(encoding="utf-8"))
+        return tomllib.loads(settings.read_text(encoding="utf-8")) if settings.is_file() else {}
     except (OSError, ValueError) as error:
         raise InputError(f"{settings} is no TOML file ({error}).") from error
-    unknown = sorted(set(content) - {"mesh", "unit", "frame", "to_image"})
-    if unknown:
-        raise InputError(f"{settings}: '{unknown[0]}' is none of mesh, unit, frame, to_image.")
-    reading = replace(usual, unit=str(content.get("unit", usual.unit)), frame=str(content.get("frame", usual.frame)))
+
+
+def _reading(place: Path, usual: Reading) -> Reading:
+    folder, content = _folder(place), _settings(place)
+    if unknown := sorted(set(content) - {"mesh", "unit", "frame", "to_image"}):
+        raise InputError(f"{folder / SETTINGS}: '{unknown[0]}' is none of mesh, unit, frame, to_image.")
+    own: dict[str, Any] = {key: str(content[key]) for key in ("unit", "frame") if key in content}
     if "mesh" in content:
-        reading = replace(reading, mesh=settings.parent / str(content["mesh"]))
-    if isinstance(content.get("to_image"), str):
-        reading = replace(reading, to_image=read_matrix(settings.parent / content["to_image"]))
-    elif "to_image" in content:
-        reading = replace(reading, to_image=np.asarray(content["to_image"], dtype=np.float64))
-    return reading
+        own["mesh"] = folder / str(content["mesh"])
+    if "to_image" in content:
+        matrix = content["to_image"]
+        own["to_image"] = (
+            read_matrix(folder / matrix) if isinstance(matrix, str) else np.array(matrix, dtype=np.float64)
+        )
+    return replace(usual, **own)

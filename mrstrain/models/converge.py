@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,23 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from dvc import read_labels
-from dvc.atomic_files import write_json, write_whole
+from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError, MrstrainError
 from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
 from mrstrain.models.loads import LOADS
 from mrstrain.models.mesh import mesh as make_mesh
 from mrstrain.models.simulate import Progress, simulate
+from mrstrain.options import modelling as options
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
-from mrstrain.options.modelling import (
-    Directions,
-    Followed,
-    Labelling,
-    MeshCoordinates,
-    Meshing,
-    PlateOptions,
-    SimulationOptions,
-)
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import file_hash, provenance
 
@@ -71,10 +61,10 @@ def converge(
     edges_mm: Sequence[float],
     *,
     out: Path | str,
-    labelling: Labelling,
-    followed: Followed,
+    labelling: options.Labelling,
+    followed: options.Followed,
     loads: Sequence[LoadStep] = LOADS,
-    directions: Directions,
+    directions: options.Directions,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Converged:
@@ -82,14 +72,14 @@ def converge(
 
     Parameters
     ----------
-    labels, labelling
+    labels
         As in `mesh`.
     edges_mm : sequence of float
         Three edge lengths or more, mm.
     out : path
         Gets ``mesh-E.vtu`` and ``simulated-E`` for each edge length E, ``convergence.csv`` and ``convergence.png``. A
         mesh that is there already and was made from the same label map is used again.
-    followed, loads, directions, workers, progress
+    loads, workers, progress
         As in `simulate`, with one material set.
 
     Raises
@@ -103,43 +93,41 @@ def converge(
     if len(edges) < _FEWEST:
         raise InputError(f"A study of convergence needs {_FEWEST} edge lengths or more; got {len(edges)}.")
     target = Path(out)
-    inputs = {"labels": Path(labels)} | ({} if labelling.names is None else {"names": labelling.names})
-    refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], list(inputs.values()))
+    inputs = {"labels": [Path(labels)], **labelling.files}
+    refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], [Path(labels), *labelling.paths])
     make_output(target)
     tell, region, material = progress or (lambda *_: None), followed.region, followed.material
     known = list(read_labels(labels, labelling.names).names.values())
     if region not in known or region in labelling.bones:
         raise InputError(f"No soft tissue '{region}' in the label map to follow; it has {', '.join(known)}.")
-    material_set(material).for_regions(
-        [name for name in known if name not in labelling.bones]
-    )  # before hours of meshing
+    # a set that does not fit is refused before hours of meshing
+    material_set(material).for_regions([name for name in known if name not in labelling.bones])
     places = {edge: target / f"mesh-{edge:g}.vtu" for edge in edges}
-    values = []
     for edge, place in places.items():
         if not _is_of(place, inputs, labelling.bones):
             make_mesh.with_options(
-                labels, out=place, labelling=labelling, meshing=Meshing(edge_mm=edge),
+                labels, out=place, labelling=labelling, meshing=options.Meshing(edge_mm=edge),
                 watch=lambda share, edge=edge: tell(f"{edge:g} mm", "meshing", share),  # type: ignore[misc]
             )  # fmt: skip
-    sizes = [cell_size_mm(read_tet_mesh(place)) for place in places.values()]
-    extrapolate(np.array(sizes), np.array(sizes))  # refuses sizes that tell nothing, before anything is simulated
+    sizes = np.array([cell_size_mm(read_tet_mesh(place)) for place in places.values()])
+    extrapolate(sizes, sizes)  # refuses sizes that give no limit, before anything is simulated
+    values = []
     for edge, place in places.items():
         made = simulate.with_options(
-            place, out=target / f"simulated-{edge:g}", simulation=SimulationOptions(sets=(material,)), loads=loads,
-            plate_options=PlateOptions(**dict(directions)), coordinates=MeshCoordinates(), cores=Cores(workers=workers),
+            place, out=target / f"simulated-{edge:g}", simulation=options.SimulationOptions(sets=(material,)),
+            loads=loads, plate_options=options.PlateOptions(**dict(directions)),
+            coordinates=options.MeshCoordinates(), cores=Cores(workers=workers),
             progress=lambda case, stage, share, edge=edge: tell(f"{edge:g} mm, {case}", stage, share),  # type: ignore[misc]
         )  # fmt: skip
         if not made.complete:
-            raise MrstrainError(
-                f"With edges of {edge:g} mm not every load was reached: {' '.join(made.summary()[:-1])}"
-            )
+            reasons = " ".join(made.summary()[:-1])
+            raise MrstrainError(f"With edges of {edge:g} mm not every load was reached: {reasons}")
         values.append(_followed(made.sets[0], region))
-    rows = tuple(
-        Row(load, figure, tuple(v[load, figure] for v in values), _limit(sizes, [v[load, figure] for v in values]))
-        for load, figure in values[0]
-    )
-    _write(target, sizes, edges, rows, provenance("converge", inputs, {"edges_mm": edges, "material": material}))
-    return Converged(target, tuple(sizes), rows)
+    on_meshes = {key: tuple(of[key] for of in values) for key in values[0]}
+    rows = tuple(Row(*key, of, extrapolate(sizes, np.array(of))) for key, of in on_meshes.items())
+    done = Converged(target, tuple(sizes.tolist()), rows)
+    _write(done, edges, provenance("converge", inputs, {"edges_mm": edges, "material": material}))
+    return done
 
 
 def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], float]:
@@ -155,47 +143,29 @@ def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], floa
     return values
 
 
-def _limit(sizes: Sequence[float], values: Sequence[float]) -> Limit:
-    return extrapolate(np.array(sizes), np.array(values))
-
-
-def _plain(row: dict[str, object]) -> dict[str, object]:
-    """A row with None for what is not known, since JSON has no NaN."""
-    limit = row["limit"]
-    assert isinstance(limit, dict)
-    return row | {"limit": {key: value if np.isfinite(value) else None for key, value in limit.items()}}
-
-
-def _is_of(place: Path, inputs: dict[str, Path], bones: Sequence[str]) -> bool:
+def _is_of(place: Path, inputs: dict[str, list[Path]], bones: Sequence[str]) -> bool:
     """Whether a mesh is there and was made from these files as they are now, with the same bones cut out."""
-    about = place.with_suffix(".json")
-    if not (place.is_file() and about.is_file()):
+    if not place.is_file():
         return False
-    hashes = {role: [file_hash(path)] for role, path in inputs.items()}
+    hashes = {role: [file_hash(path) for path in paths] for role, paths in inputs.items()}
     try:
-        record = json.loads(about.read_text(encoding="utf-8"))
+        record = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
         known = {role: [f["sha256"] for f in files] for role, files in record["inputs"].items()}
         return bool(known == hashes and record["parameters"]["bones"] == list(bones))
-    except (ValueError, KeyError, TypeError, AttributeError):  # not what `mesh` writes
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # not what `mesh` writes
         return False
 
 
-def _write(
-    target: Path, sizes: Sequence[float], edges: Sequence[float], rows: Sequence[Row], record: dict[str, object]
-) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        ["load", "figure", *(f"edge_{e:g}_mm" for e in edges), "limit", "order", "scatter", "error_of_finest"]
-    )
-    for row in rows:
-        numbers = (*row.values, row.limit.limit, row.limit.order, row.limit.scatter, row.limit.error)
-        writer.writerow([row.load, row.figure, *(f"{v:.6g}" if np.isfinite(v) else "" for v in numbers)])
-    write_whole(target / "convergence.csv", text.getvalue())
-    curves = {f"{r.load}, {r.figure}": (r.values, r.limit) for r in rows if np.isfinite(r.limit.limit)}
-    (target / "convergence.png").unlink(missing_ok=True)
+def _write(done: Converged, edges: Sequence[float], record: dict[str, object]) -> None:
+    out, rows, table = done.out, [], []
+    for row in done.rows:
+        limit = {of: value if np.isfinite(value) else None for of, value in asdict(row.limit).items()}
+        rows.append(asdict(row) | {"limit": limit})
+        table.append([row.load, row.figure, *row.values, *limit.values()])
+    head = ["load", "figure", *(f"edge_{e:g}_mm" for e in edges), "limit", "order", "scatter", "error_of_finest"]
+    write_csv(out / "convergence.csv", head, table)
+    curves = {f"{r.load}, {r.figure}": (r.values, r.limit) for r in done.rows if np.isfinite(r.limit.limit)}
+    (out / "convergence.png").unlink(missing_ok=True)
     if curves:
-        figures.write_figure(target / "convergence.png", figures.convergence(sizes, curves))
-    write_json(
-        target / "convergence.json", {"sizes_mm": list(sizes), "rows": [_plain(asdict(r)) for r in rows]} | record
-    )
+        figures.write_figure(out / "convergence.png", figures.convergence(done.sizes_mm, curves))
+    write_json(out / "convergence.json", {"sizes_mm": list(done.sizes_mm), "rows": rows} | record)

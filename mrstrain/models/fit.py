@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 import fe
-from dvc.atomic_files import write_json, write_whole
+from dvc.atomic_files import write_csv, write_json, write_whole
 from fe import Fit, Material, Ogden, as_toml, figures, read_curves
 from fe.hyperelastic import OGDEN
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
@@ -29,30 +27,28 @@ class Fitted:
     def summary(self) -> list[str]:
         """A few lines for a person."""
         fitted = self.fit
-        lines = [fitted.material.description]
+        lines, doubts = [fitted.material.description], []
         for p in fitted.parameters:
             scale, unit = (1.0, "") if p.name.startswith("alpha") else (1000.0, " kPa")
-            lines.append(
-                f"  {p.name} {scale * p.value:.4g}{unit}, 95 % from {scale * p.low:.4g} to {scale * p.high:.4g}"
-            )
-        lines.append("R2 " + ", ".join(f"{mode} {r2:.4f}" for mode, r2 in fitted.r2.items()))
-        for mode, (low, high) in fitted.reached.items():
-            stable = fitted.stable[mode]
-            lines.append(
-                f"{mode}: measured at stretches {low:.3g} to {high:.3g}, stable from {stable[0]:.3g} to {stable[1]:.3g}"
-            )
-        lines += _in_programs(fitted.material)
-        for p in fitted.parameters:
+            low, high = scale * p.low, scale * p.high
+            lines.append(f"  {p.name} {scale * p.value:.4g}{unit}, 95 % from {low:.4g} to {high:.4g}")
             if p.at_bound:
-                lines.append(
+                doubts.append(
                     f"These curves do not determine {p.name}: alone they would have it lower than a law may have it, "
                     "and its value is that bound. Measure nearer to a stretch of 1, or take a law with fewer "
                     "parameters."
                 )
             elif p.low <= 0.0 <= p.high:
-                lines.append(
+                doubts.append(
                     f"These curves do not determine {p.name}: its interval holds 0. Take a law with fewer parameters."
                 )
+        lines.append("R2 " + ", ".join(f"{mode} {r2:.4f}" for mode, r2 in fitted.r2.items()))
+        for mode, (low, high) in fitted.reached.items():
+            least, most = fitted.stable[mode]
+            lines.append(
+                f"{mode}: measured at stretches {low:.3g} to {high:.3g}, stable from {least:.3g} to {most:.3g}"
+            )
+        lines += [*_in_programs(fitted.material), *doubts]
         if not fitted.stable_where_measured:
             lines.append("NOT stable (Drucker) at every stretch measured: take another law, or simulate less strain.")
         lines += [f"These curves cannot tell it from: {other.description}" for other in fitted.others]
@@ -64,25 +60,19 @@ def _in_programs(law: Material) -> list[str]:
     if not isinstance(law, Ogden):
         return []
     pairs = law.vector[OGDEN:].reshape(-1, 2).tolist()
-    numbers = {
-        "ANSYS (mu, alpha)": [(2000.0 * mu / alpha, alpha) for mu, alpha in pairs],
-        "Abaqus, CalculiX (mu, alpha)": [(1000.0 * mu, alpha) for mu, alpha in pairs],
-        "FEBio (c, m)": [(2000.0 * mu, alpha) for mu, alpha in pairs],
+    moduli = {
+        "ANSYS (mu, alpha)": [2000.0 * mu / alpha for mu, alpha in pairs],
+        "Abaqus, CalculiX (mu, alpha)": [1000.0 * mu for mu, _ in pairs],
+        "FEBio (c, m)": [2000.0 * mu for mu, _ in pairs],
     }
     return [
-        f"  as {program}: " + "; ".join(f"{first:.4g} kPa, {second:.4g}" for first, second in values)
-        for program, values in numbers.items()
+        f"  as {program}: " + "; ".join(f"{mu:.4g} kPa, {alpha:.4g}" for mu, (_, alpha) in zip(of, pairs, strict=True))
+        for program, of in moduli.items()
     ]
 
 
 def fit(
-    curve: Path | str,
-    law: str,
-    *,
-    out: Path | str,
-    test: str | None = None,
-    nu: float = 0.4999,
-    tissue: str = "fat",
+    curve: Path | str, law: str, *, out: Path | str, test: str | None = None, nu: float = 0.4999, tissue: str = "fat"
 ) -> Fitted:
     """Fit a law to the curves of a CSV file.
 
@@ -111,30 +101,21 @@ def fit(
     fitted = fe.fit(curves, law, nu)
     refuse_touching_inputs(target, _FILES, [path])
     make_output(target)
-    given = {"law": law, "test": test, "nu": nu, "tissue": tissue}
-    record = provenance("fit", {"curve": path}, given)
-    content = asdict(fitted) | {
+    about = {
         "material": fitted.material.description,
-        "others": [o.description for o in fitted.others],
+        "others": [other.description for other in fitted.others],
+        "mu_of_ogden": "initial shear modulus of the term, MPa (Abaqus' convention)",
+        "in_programs": [line.strip() for line in _in_programs(fitted.material)],
+        "stable_where_measured": fitted.stable_where_measured,
+        "provenance": provenance("fit", {"curve": path}, {"law": law, "test": test, "nu": nu, "tissue": tissue}),
     }
-    write_json(
-        target / "fit.json",
-        content
-        | {
-            "mu_of_ogden": "initial shear modulus of the term, MPa (Abaqus' convention)",
-            "in_programs": [line.strip() for line in _in_programs(fitted.material)],
-            "stable_where_measured": fitted.stable_where_measured,
-            "provenance": record,
-        },
-    )
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["test", "stretch", "nominal_stress_kpa", "fitted_kpa"])
+    write_json(target / "fit.json", asdict(fitted) | about)
+    rows = []
     for c in curves:
         modelled = 1000.0 * fitted.material.nominal_stress(c.stretch, c.mode)
-        for row in np.column_stack([c.stretch, 1000.0 * c.stress_mpa, modelled]):
-            writer.writerow([c.mode, *(f"{v:.8g}" for v in row)])
-    write_whole(target / "fit.csv", text.getvalue())
+        numbers = np.column_stack([c.stretch, 1000.0 * c.stress_mpa, modelled])
+        rows += [[c.mode, *(f"{value:.8g}" for value in row)] for row in numbers]
+    write_csv(target / "fit.csv", ("test", "stretch", "nominal_stress_kpa", "fitted_kpa"), rows)
     figures.write_figure(target / "fit.png", figures.stress_stretch(curves, fitted))
     source = f"{law} fitted to {path.name}"
     if at_bound := [p.name for p in fitted.parameters if p.at_bound]:

@@ -10,8 +10,6 @@ import numpy as np
 from dvc.errors import InputError
 from fe import LoadStep
 
-Vector = tuple[float, float, float]
-
 LOADS = (
     LoadStep("Load1", 140.0),
     LoadStep("Load2", 15.0),
@@ -22,15 +20,7 @@ LOADS = (
 
 
 def load_named(text: str) -> LoadStep:
-    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR; each a force in N, or, with mm after it, the plate's displacement.
-
-    Examples
-    --------
-    >>> print(load_named("Load3=15,45"))
-    15 N normal, 45 N shear
-    >>> print(load_named("Load3=15,8mm"))
-    15 N normal, 8 mm shear
-    """
+    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR: forces in N or, with mm after them, the plate's displacements."""
     name, _, asked = text.partition("=")
     found = [re.fullmatch(r"\s*([^\s]+?)\s*(mm|N)?\s*", part) for part in asked.split(",")]
     try:

@@ -90,18 +90,17 @@ def mesh(
     target = Path(out)
     if target.suffix.lower() != ".vtu":
         raise InputError(f"--out is the mesh itself and ends in .vtu; got {target}.")
-    inputs = {"labels": Path(labels)} | ({} if labelling.names is None else {"names": labelling.names})
-    written = [target, target.with_suffix(".json"), target.with_suffix(".png")]
-    for path in inputs.values():
-        if path.resolve() in [w.resolve() for w in written]:
+    written = [target.with_suffix(ending).resolve() for ending in (".vtu", ".json", ".png")]
+    for path in (Path(labels), *labelling.paths):
+        if path.resolve() in [target.resolve(), *written]:
             raise OutputError(f"{path} would be replaced by a result. Choose another --out.")
     given = read_labels(labels, labelling.names)
     make_output(target.parent)
     how = meshing.model_dump()
     made, quality = mesh_labels(given, **how, bones=labelling.bones, watch=watch)
     del how["limit_s"]  # no mesh depends on it
-    record = provenance("mesh", inputs, how | {"bones": list(labelling.bones)})
+    files = {"labels": [Path(labels)], **labelling.files}
+    record = provenance("mesh", files, how | {"bones": list(labelling.bones)})
     write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
-    plate = Plate(_INFERIOR, _FORWARD)
-    figures.write_figure(target.with_suffix(".png"), figures.mesh_slice(made, plate))
+    figures.write_figure(target.with_suffix(".png"), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))
     return Meshed(target, made, quality)

@@ -5,38 +5,28 @@ from __future__ import annotations
 import json
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from dvc.errors import InputError, MrstrainError
+import fe
+from dvc.atomic_files import write_whole
+from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.worker import Worker, each_in_workers, usable_cores
-from fe import (
-    LoadState,
-    LoadStep,
-    MaterialSet,
-    Plate,
-    Problem,
-    Simulation,
-    SolverOptions,
-    clear_simulation,
-    fixed_facets,
-    material_set,
-    problems_of,
-    read_tet_mesh,
-)
-from fe.restart import ENDING
-from mrstrain.models.load_path import solve_in_folder
-from mrstrain.models.loads import LOADS, Vector
+from fe.restart import ENDING, fingerprint, read_checkpoint, write_checkpoint
+from mrstrain.models.loads import LOADS
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
+from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 
 Progress = Callable[[str, str, float], None]
+_EVERY_S = 30.0  # at most so often is an increment on the way to a load written, to resume from
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +34,7 @@ class Simulations:
     """What `simulate` gave: a simulation for each material parameter set, and why others failed."""
 
     out: Path
-    sets: tuple[Simulation, ...]
+    sets: tuple[fe.Simulation, ...]
     failures: Mapping[str, str]
 
     @property
@@ -65,7 +55,7 @@ def simulate(
     *,
     out: Path | str,
     simulation: SimulationOptions,
-    loads: Sequence[LoadStep] = LOADS,
+    loads: Sequence[fe.LoadStep] = LOADS,
     plate_options: PlateOptions,
     towards: Mapping[str, tuple[Vector, Vector]] | None = None,
     coordinates: MeshCoordinates,
@@ -98,109 +88,105 @@ def simulate(
     """
     place, target, tell = Path(mesh), Path(out), progress or (lambda *_: None)
     sets, limit_s = simulation.sets, simulation.limit_s
-    read = read_tet_mesh(place, unit=coordinates.mesh_unit, frame=coordinates.mesh_frame)
-    chosen = [material_set(name) for name in sets]
-    if not chosen or len({one.name for one in chosen}) < len(chosen):
-        raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, sets)) or 'none'}.")
+    read = fe.read_tet_mesh(place, unit=coordinates.mesh_unit, frame=coordinates.mesh_frame)
+    chosen = material_sets(sets)
     towards = dict(towards or {})
     if strangers := towards.keys() - {load.name for load in loads}:
         raise InputError(f"Directions are given for {', '.join(sorted(strangers))}, which is none of the loads.")
     usual = (plate_options.plate_normal, plate_options.shear_direction)
     contact = plate_options.model_dump(exclude={"plate_normal", "shear_direction"})
-    plates = {load.name: Plate(*towards.get(load.name, usual), **contact) for load in loads}
-    held = fixed_facets(read, simulation.fixed)
+    plates = {load.name: fe.Plate(*towards.get(load.name, usual), **contact) for load in loads}
+    held = fe.fixed_facets(read, simulation.fixed)
     jobs = [
         (one, problem)
         for one in chosen
-        for problem in problems_of(read, one.for_regions(read.regions)[0], plates, loads, held, simulation.element)
+        for problem in fe.problems_of(read, one.for_regions(read.regions)[0], plates, loads, held, simulation.element)
     ]
     refuse_touching_inputs(target, [one.name for one in chosen], [place])
     make_output(target)
     for one in chosen:
         _make_empty(target / one.name, loads)
-    files = {"mesh": [place, *_beside(place)], "sets": [Path(s) for s in sets if s.endswith(".toml")]}
-    given = {
-        **coordinates.plain(), **contact, "fixed": list(held), "limit_s": limit_s, "mesh_made": _mesh_made(place),
-    }  # fmt: skip
+    beside = [names] if (names := place.with_suffix(".json")).is_file() else []
+    files = {"mesh": [place, *beside], "sets": [Path(s) for s in sets if s.endswith(".toml")]}
+    given = coordinates.plain() | contact | {"fixed": list(held), "limit_s": limit_s, "mesh_made": _mesh_made(place)}
     at_once = max(1, min(cores.workers or usable_cores(), len(jobs)))
     each = cores.threads or max(1, usable_cores() // at_once)
-    options = SolverOptions(each, np.inf if limit_s is None else limit_s)
-    run = _Run(
-        target, jobs, lambda one: provenance("simulate", files, given | one.parameters()), simulation.decks, tell
-    )
+    options = fe.SolverOptions(each, np.inf if limit_s is None else limit_s)
+
+    def record(one: fe.Simulation) -> dict[str, object]:
+        return provenance("simulate", files, given | one.parameters())
+
+    run = _Run(target, jobs, record, simulation.decks, tell)
     each_in_workers(jobs, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
     if not run.done:
         raise MrstrainError("No simulation ended. " + " ".join(f"{n}: {r}" for n, r in run.failures.items()))
     return Simulations(target, tuple(run.done[one.name] for one in chosen if one.name in run.done), run.failures)
 
 
+def material_sets(names: Sequence[str]) -> list[fe.MaterialSet]:
+    """Material parameter sets by the names of published ones or of files; one or more are needed, each once."""
+    chosen = [fe.material_set(name) for name in names]
+    if not chosen or len({one.name for one in chosen}) < len(chosen):
+        raise InputError(f"Material sets are needed, each once; got {', '.join(map(str, names)) or 'none'}.")
+    return chosen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Run:
     """Paths solved in workers, and each set's tables written as soon as its last path is there."""
 
-    def __init__(
-        self,
-        target: Path,
-        jobs: Sequence[tuple[MaterialSet, Problem]],
-        record: Callable[[Simulation], dict[str, object]],
-        decks: bool,
-        progress: Progress,
-    ) -> None:
-        self._target, self._jobs, self._record, self._decks, self._progress = target, jobs, record, decks, progress
-        self._ended: dict[int, list[LoadState]] = {}
-        self._writing = threading.Lock()
-        self.done: dict[str, Simulation] = {}
-        self.failures: dict[str, str] = {}
+    target: Path
+    jobs: Sequence[tuple[fe.MaterialSet, fe.Problem]]
+    record: Callable[[fe.Simulation], dict[str, object]]
+    decks: bool
+    progress: Progress
+    done: dict[str, fe.Simulation] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
+    ended: dict[int, list[fe.LoadState]] = field(default_factory=dict)
+    writing: threading.Lock = field(default_factory=threading.Lock)
 
-    def path(self, chosen: MaterialSet, problem: Problem, options: SolverOptions, worker: Worker) -> None:
+    def path(self, chosen: fe.MaterialSet, problem: fe.Problem, options: fe.SolverOptions, worker: Worker) -> None:
         """Solve one path."""
         case = f"{chosen.name}, {' '.join(step.name for step in problem.loads)}"
         with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
-            share = Path(folder) / "share"
+            share, place, what = Path(folder) / "share", self.target / chosen.name, f"simulating {case}"
 
             def watch() -> None:
                 if share.exists():
-                    self._progress(case, "simulating", float(share.read_text() or 0.0))
+                    self.progress(case, "simulating", float(share.read_text() or 0.0))
 
             try:
-                states = worker.run(
-                    f"simulating {case}", solve_in_folder, problem, options, self._target / chosen.name, share,
-                    watch=watch,
-                )  # fmt: skip
+                states = worker.run(what, solve_in_folder, problem, options, place, share, watch=watch)
             except MrstrainError as failure:
                 states, self.failures[case] = [], str(failure)
-        with self._writing:
-            self._ended[id(problem)] = states
-            problems = [one for other, one in self._jobs if other is chosen]
-            if all(id(one) in self._ended for one in problems):
+        with self.writing:
+            self.ended[id(problem)] = states
+            problems = [one for other, one in self.jobs if other is chosen]
+            if all(id(one) in self.ended for one in problems):
                 self._write(chosen, problems)
-        self._progress(case, "simulating", 1.0)
+        self.progress(case, "simulating", 1.0)
 
-    def _write(self, chosen: MaterialSet, problems: Sequence[Problem]) -> None:
-        states = [state for one in problems for state in self._ended[id(one)]]
+    def _write(self, chosen: fe.MaterialSet, problems: Sequence[fe.Problem]) -> None:
+        states = [state for one in problems for state in self.ended[id(one)]]
         if not states:
             return
-        made, folder = Simulation.of(chosen, problems, states), self._target / chosen.name
-        if self._decks:
+        made, folder = fe.Simulation.of(chosen, problems, states), self.target / chosen.name
+        if self.decks:
             try:
                 made.write_decks(folder)
             except InputError as refused:
                 made = replace(made, remarks=(*made.remarks, f"No decks: {refused}"))
-        made.write(folder, record=self._record(made), fields=False)
+        made.write(folder, record=self.record(made), fields=False)
         self.done[chosen.name] = made
 
 
-def _make_empty(folder: Path, loads: Sequence[LoadStep]) -> None:
+def _make_empty(folder: Path, loads: Sequence[fe.LoadStep]) -> None:
     """Make a set's folder, without what an earlier simulation wrote but for checkpoints of these loads."""
     make_output(folder)
-    clear_simulation(folder)
+    fe.clear_simulation(folder)
     for left in folder.glob(f"*{ENDING}"):
         if left.name.removesuffix(ENDING) not in {load.name for load in loads}:
             left.unlink()
-
-
-def _beside(place: Path) -> list[Path]:
-    names = place.with_suffix(".json")
-    return [names] if names.is_file() else []
 
 
 def _mesh_made(place: Path) -> dict[str, object] | None:
@@ -212,3 +198,61 @@ def _mesh_made(place: Path) -> dict[str, object] | None:
     except (OSError, ValueError, KeyError, TypeError):
         pass
     return None
+
+
+def solve_in_folder(problem: fe.Problem, options: fe.SolverOptions, folder: Path, share: Path) -> list[fe.LoadState]:
+    """Solve one path in a worker, resuming an earlier run's in the folder if that was made from the same.
+
+    Each load's files are there as soon as it is reached; ``share`` is a file that holds the share that is done.
+    """
+    files = _Files(problem, folder, share)
+    return fe.solve(problem, options, files, files.earlier())
+
+
+class _Files(fe.Observer):
+    """Files of a path in its folder: a load's results and checkpoint when it is reached, a log of each step."""
+
+    def __init__(self, problem: fe.Problem, folder: Path, share: Path) -> None:
+        self._problem, self._folder, self._share = problem, folder, share
+        self._log = folder / f"log-{problem.loads[0].name}.txt"
+        self._made_from = {load.name: fingerprint(problem, n) for n, load in enumerate(problem.loads, start=1)}
+        self._last = time.monotonic()
+        write_whole(self._log, "")
+
+    def earlier(self) -> list[fe.Checkpoint]:
+        """Where the first loads came to in an earlier run; the last may have been on its way."""
+        kept: list[fe.Checkpoint] = []
+        for load in self._problem.loads:
+            checkpoint = read_checkpoint(self._checkpoint_of(load), self._made_from[load.name])
+            if checkpoint is None:
+                break
+            self.log(f"{load.name}: {checkpoint.reached:.0%} of it was there from an earlier run")
+            kept.append(checkpoint)
+            if checkpoint.reached < 1.0:
+                break
+        return kept
+
+    def log(self, line: str) -> None:
+        try:
+            # closed each time: there to be read meanwhile, and after a kill
+            with self._log.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"{self._log}: cannot be written ({reason}). Has the disk room?") from error
+
+    def progress(self, done: float) -> None:
+        write_whole(self._share, f"{done:.4f}")
+
+    def converged(self, load: fe.LoadStep, checkpoint: fe.Checkpoint) -> None:
+        if time.monotonic() - self._last > _EVERY_S:
+            write_checkpoint(self._checkpoint_of(load), checkpoint, self._made_from[load.name])
+            self._last = time.monotonic()
+
+    def ended(self, state: fe.LoadState) -> None:
+        if state.checkpoint is not None and len(state.curve) > 1:
+            write_checkpoint(self._checkpoint_of(state.load), state.checkpoint, self._made_from[state.load.name])
+            fe.write_state(self._folder / f"{state.load.name}.vtu", self._problem.mesh, state, self._problem.materials)
+
+    def _checkpoint_of(self, load: fe.LoadStep) -> Path:
+        return self._folder / f"{load.name}{ENDING}"

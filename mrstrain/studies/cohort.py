@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.atomic_files import write_json
+from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError
 from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
 from dvc.report.page import Picture, Section, Table, caption_of, record_lines, write_report
@@ -17,7 +17,6 @@ from dvc.trust.verdict import worst
 from mrstrain.records.inputs import make_output
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
-from mrstrain.records.tables import write_csv
 from mrstrain.studies.cohort_differences import refuse_other_laws, unlike
 from mrstrain.studies.file import FILE, read_study
 from mrstrain.studies.plan import COMPARISON

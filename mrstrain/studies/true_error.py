@@ -8,8 +8,8 @@ from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
 
+from dvc.atomic_files import write_csv
 from dvc.report.page import Section, Table
-from mrstrain.records.tables import write_csv
 from mrstrain.studies.file import Study
 from mrstrain.studies.pipeline import StageOutcome
 from phantoms import TissueError

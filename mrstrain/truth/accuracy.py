@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dvc import engine_named
-from dvc.atomic_files import write_json
+from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.registration.engines import DEFAULT
@@ -21,7 +21,6 @@ from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
-from mrstrain.records.tables import write_csv
 from mrstrain.truth.accuracy_page import write_accuracy_report
 from phantoms import (
     AccuracyCase,

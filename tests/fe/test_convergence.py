@@ -81,7 +81,8 @@ def test_meshes_are_made_once_and_simulated_each(tmp_path: Path, monkeypatch: py
     assert values == sorted(values)  # finer meshes are softer
     assert len(set(values)) == 3
     assert again.output.splitlines()[-6:] == done.output.splitlines()[-6:]
-    mesh, inputs = tmp_path / "study" / "mesh-6.vtu", {"labels": tmp_path / "map.nii.gz", "names": tmp_path / "map.csv"}
+    inputs = {"labels": [tmp_path / "map.nii.gz"], "names": [tmp_path / "map.csv"]}
+    mesh = tmp_path / "study" / "mesh-6.vtu"
     assert _is_of(mesh, inputs, ["bone"])
     assert not _is_of(mesh, inputs, ["bone", "fat"])  # with another bone cut out it is another mesh
 

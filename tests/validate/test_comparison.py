@@ -34,7 +34,7 @@ from validate import (
     read_thresholds,
 )
 from validate.agreement import agreement, skin_on_plate
-from validate.location_intervals import with_intervals
+from validate.location import with_intervals
 
 SIDE = 20.0
 
@@ -144,7 +144,7 @@ def test_a_speck_far_away_moves_nothing_and_clusters_tell_their_mean() -> None:
 def test_agreement_has_its_closed_forms() -> None:
     random = np.random.default_rng(0)
     x, noise = random.normal(0.3, 0.1, 100_000), random.normal(0.0, 0.05, 100_000)
-    found = agreement("m", "l", "max_shear", "fat", x, 0.8 * x + 0.1 + noise, np.ones(len(x)))
+    found = agreement(("m", "l", "max_shear", "fat"), x, 0.8 * x + 0.1 + noise, np.ones(len(x)))
     assert found is not None
     assert found.slope == pytest.approx(0.8, abs=0.005)
     assert found.intercept == pytest.approx(0.1, abs=0.002)
@@ -155,12 +155,9 @@ def test_agreement_has_its_closed_forms() -> None:
     assert found.rmse == pytest.approx(np.hypot(0.04, spread), rel=0.01)
     assert found.concordance == pytest.approx(2 * 0.8 * 0.01 / (0.01 + 0.0064 + 0.0025 + 0.0016), abs=0.005)
     # a cell of twice the volume counts as two cells
-    twice = agreement("m", "l", "max_shear", "fat", x[:20], x[20:40], np.repeat([1.0, 2.0], 10))
+    twice = agreement(("m", "l", "max_shear", "fat"), x[:20], x[20:40], np.repeat([1.0, 2.0], 10))
     listed = agreement(
-        "m",
-        "l",
-        "max_shear",
-        "fat",
+        ("m", "l", "max_shear", "fat"),
         np.concatenate([x[:20], x[10:20]]),
         np.concatenate([x[20:40], x[30:40]]),
         np.ones(30),

@@ -74,7 +74,7 @@ def test_a_graded_field_has_its_means_by_distance_to_bone() -> None:
 
 def test_both_limits_of_bland_and_altman_have_their_closed_form() -> None:
     x = np.linspace(0.1, 0.5, 40)
-    found = agreement("m", "l", "max_shear", "fat", x, x + np.tile([0.01, 0.05], 20), np.ones(40))
+    found = agreement(("m", "l", "max_shear", "fat"), x, x + np.tile([0.01, 0.05], 20), np.ones(40))
     assert found is not None
     assert (found.bias, found.lower, found.upper) == pytest.approx((0.03, 0.03 - 1.96 * 0.02, 0.03 + 1.96 * 0.02))
 
@@ -101,8 +101,8 @@ def test_the_slices_caption_says_where_it_lies(aside: float, words: str) -> None
     model = result("half", mesh, sheared(0.2))
     one = compare_load(case("Load1", sheared(0.4), [model]), bone)
     grid = replace(bone.grid, origin_mm=bone.grid.origin_mm + np.array([0.0, 0.0, aside]))
-    drawn = draw(replace(one, labels=replace(bone, grid=grid)), ["half"])
-    assert words in drawn.pictures["slices"].caption
+    pictures, _ = draw(replace(one, labels=replace(bone, grid=grid)), ["half"])
+    assert words in pictures["slices"].caption
 
 
 def test_curves_and_slices_are_drawn_of_each_field_itself() -> None:
