@@ -24,7 +24,7 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, ParameterError
 from dvc.images.image import Grid, Image
-from dvc.images.resample import smoothed
+from dvc.images.resample import smoothed, thinned
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.level import Level, Weights
@@ -92,16 +92,10 @@ class Parameters:
         Volume by the rule reads as volume kept, which gives the same result bit for bit unless the rule frees it
         (`Choice.frees_volume`); of a result for which it did, this text alone says too little.
         """
-        rule = {
-            "usual": USUAL_BENDING,
-            "ratio": _RATIO,
-            "powers": _POWERS,
-            "steps": [1, _LAST_STEPS],
-        }
+        rule = {"usual": USUAL_BENDING, "ratio": _RATIO, "powers": _POWERS, "steps": [1, _LAST_STEPS]}
         rims = {"blurred": _BLURRED, "bone_rim_mm": _RIM_MM}
         told = {"engine": "gauss-newton", "levels": LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
-        told |= {"roughness": NUMBERS}
-        return json.dumps(asdict(self) | {"volume": self.weights.volume} | told)
+        return json.dumps(asdict(self) | {"volume": self.weights.volume} | told | {"roughness": NUMBERS})
 
     @property
     def weights(self) -> Weights:
@@ -116,30 +110,10 @@ def fit(
     start: Deformation | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[BSpline, Choice]:
-    """Find the displacement that carries the fixed image to the moving one.
+    """Find the displacement, LPS mm, that carries the fixed image to the moving one.
 
-    Parameters
-    ----------
-    pair : AlignedPair
-        Images without their bias field; missing voxels are left out.
-    parameters : Parameters
-    start : Deformation, optional
-        First guess, u in mm LPS; where it is not defined its nearest value is taken.
-    progress : callable, optional
-        Gets the share that is done.
-
-    Returns
-    -------
-    bspline : BSpline
-        Displacement, LPS mm.
-    choice : Choice
-
-    Raises
-    ------
-    InputError
-        If the tissue has no contrast.
-    RegistrationError
-        If it diverges.
+    Where the first guess `start` (u in mm LPS) is not defined its nearest value is taken; `progress` gets the share
+    that is done. Errors as in `dvc.Engine.find`.
     """
     fixed, inside = pair.fixed, pair.compared.inside
     pictures = brightness_scaled(pair)
@@ -154,9 +128,9 @@ def fit(
     for number, (sigma_mm, factor, steps, stop_mm) in enumerate(LEVELS):
         guess = start if number == 0 else BSpline(control, turned(axes, coefficients))
         control = control_grid(fixed.grid, factor * spacing)
-        coefficients = (
-            np.zeros((3, *control.shape)) if guess is None else turned(axes.T, spline_through(guess, control))
-        )
+        coefficients = np.zeros((3, *control.shape))
+        if guess is not None:
+            coefficients = turned(axes.T, spline_through(guess, control))
         level = _level(pictures, inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps * weights.patience, stop_mm=stop_mm)
         if parameters.volume is None and number == len(LEVELS) - 2:
@@ -202,9 +176,8 @@ def choose(
         if power not in found:
             tried = replace(weights, **{name: usual * _RATIO**power})
             fitted = level.descend(
-                coefficients, tried, steps=1, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE,
-                most=_CHECK_MOST,
-            )  # fmt: skip
+                coefficients, tried, steps=1, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE, most=_CHECK_MOST
+            )
             found[power] = level.at(fitted, halves=1).variance
         return found[power]
 
@@ -255,19 +228,13 @@ def _level(
     """Images smoothed, and every so manyth voxel of them: a smooth image needs no more."""
     if sigma_mm == 0.0:
         return Level(*pictures, inside, soft, bone, control)
-    fixed, moving = (_thinned(smoothed(i, sigma_mm), sigma_mm) for i in pictures)
-    every = tuple(slice(None, None, int(n)) for n in _stride(pictures[0].grid, sigma_mm))
+    fixed, moving = (thinned(smoothed(i, sigma_mm), _every(i.grid, sigma_mm)) for i in pictures)
+    every = _every(pictures[0].grid, sigma_mm)
     return Level(fixed, moving, inside[every], soft[every], bone[every], control, _BLURRED * sigma_mm)
 
 
 def brightness_scaled(pair: AlignedPair) -> tuple[Image, Image]:
-    """Both images over the brightness of the tissue in the fixed one.
-
-    Raises
-    ------
-    InputError
-        If that is not above zero.
-    """
+    """Both images over the brightness of the tissue in the fixed one; InputError if that is not above zero."""
     scale = float(np.nanpercentile(pair.fixed.values[pair.body.inside], 75))
     if not scale > 0:
         raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
@@ -279,15 +246,8 @@ def scaled(image: Image, scale: float) -> Image:
     return Image(image.grid, image.values / np.float32(scale))
 
 
-def _stride(grid: Grid, sigma_mm: float) -> FloatArray:
-    return np.maximum(np.floor(sigma_mm / grid.spacing_mm + 1e-6), 1.0)
-
-
-def _thinned(image: Image, sigma_mm: float) -> Image:
-    stride = _stride(image.grid, sigma_mm)
-    values = image.values[tuple(slice(None, None, int(n)) for n in stride)]
-    i, j, k = values.shape
-    return Image(Grid((i, j, k), stride * image.grid.spacing_mm, image.grid.origin_mm, image.grid.direction), values)
+def _every(grid: Grid, sigma_mm: float) -> tuple[slice, ...]:
+    return tuple(slice(None, None, max(1, int(sigma_mm / s + 1e-6))) for s in grid.spacing_mm)
 
 
 def control_grid(grid: Grid, spacing_mm: FloatArray) -> Grid:
@@ -302,22 +262,16 @@ def control_grid(grid: Grid, spacing_mm: FloatArray) -> Grid:
 def spline_through(deformation: Deformation, control: Grid) -> FloatArray:
     """Coefficients (3, mi, mj, mk), LPS mm, of the spline that has a deformation's displacement at the control points.
 
-    Where it is not defined there, its nearest value is taken; the second difference at the ends is zero.
-
-    Raises
-    ------
-    InputError
-        If it is defined nowhere.
+    Where it is not defined there, its nearest value is taken (InputError if it has none); the second difference at the
+    ends is zero.
     """
     u = deformation.displacement(control.points().reshape(-1, 3)).reshape(*control.shape, 3)
     unknown = ~np.isfinite(u).all(axis=-1)
     if unknown.all():
         raise InputError("The deformation to start from is not defined anywhere in the unloaded image.")
     if unknown.any():
-        nearest = distance_transform_edt(
-            unknown, sampling=control.spacing_mm, return_distances=False, return_indices=True
-        )
-        u = u[tuple(nearest)]
+        to = distance_transform_edt(unknown, sampling=control.spacing_mm, return_distances=False, return_indices=True)
+        u = u[tuple(to)]
     c = np.moveaxis(u, -1, 0)
     for axis, n in enumerate(control.shape, start=1):
         bands = np.repeat([[1.0 / 6.0], [4.0 / 6.0], [1.0 / 6.0]], n, axis=1)
