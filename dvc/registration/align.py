@@ -1,11 +1,10 @@
 """Rigid alignment of a loaded image on a bone of the unloaded one.
 
-First a search that cannot be trapped: the bone is laid at every place of the loaded image in many
-orientations, at low resolution, and normalised correlation is taken by FFT (masked template matching; see
-D. Padfield, Masked object registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Then
-Gauss-Newton refines the best places (`dvc.registration.rigid_fit`); around the best of these, halves of the bone are
-fitted each by itself, begun to either side along each of the six ways to move. The mean of all is the result, and the
-largest distance between two halves the alignment's own measure of how well it repeats.
+First a search that cannot be trapped: the bone is placed everywhere in the loaded image in many orientations, at low
+resolution, and normalised correlation is taken by FFT (masked template matching; D. Padfield, Masked object
+registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Gauss-Newton refines the best places
+(`dvc.registration.rigid_fit`); around the best of these, halves of the bone are fitted each by itself, begun to either
+side along each of the six ways to move. Their mean is the result; the largest distance of two is its repeatability.
 """
 
 from __future__ import annotations
@@ -193,9 +192,9 @@ def _similarity(reference: Image, loaded: Image, mask: Mask, motion: RigidMotion
 def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highest: float, on: AlignOn) -> str:
     tries = _scored(reference, loaded, mask, _rotations()[:_INVERTED_TRIES], sign=-1.0)
     inverted = max((score for score, _ in tries), default=0.0)
-    found = f"the best normalised correlation found around it is {score:.2f}"
-    if not np.isfinite(score):
-        found = "nowhere does the loaded image look like it"
+    found = "nowhere does the loaded image look like it"
+    if np.isfinite(score):
+        found = f"the best normalised correlation found around it is {score:.2f}"
     told = f"The rigid alignment on the {on} failed: {found} ({_LOWEST_SIMILARITY} is needed)."
     if inverted > max(_LOWEST_SIMILARITY, highest + _CLEARLY):
         return (
@@ -227,15 +226,12 @@ def _search(reference: Image, loaded: Image, mask: Mask) -> tuple[list[RigidMoti
     centre = mask.points().mean(axis=0)[None]
     chosen: list[RigidMotion] = []
     for _, motion in scored:
-        apart = [
+        if len(chosen) < _CANDIDATES and all(
             np.linalg.norm(motion.apply(centre) - other.apply(centre)) > 2 * _SEARCH_MM
             or motion.after(other.inverse()).angle_deg > 1.5 * _ROTATION_STEP_DEG
             for other in chosen
-        ]
-        if all(apart):
+        ):
             chosen.append(motion)
-        if len(chosen) == _CANDIDATES:
-            break
     return [*chosen, RigidMotion.identity()], scored[0][0] if scored else -1.0
 
 
@@ -255,7 +251,7 @@ def _scored(
     for rotation in rotations:
         back = RigidMotion.about(centre, rotation.T, np.zeros(3))
         carried = (carry(image, template_grid, back.apply, order=1) for image in (template, weight))
-        t, w = (np.nan_to_num(values.astype(np.float64)) for values in carried)
+        t, w = (np.nan_to_num(each.astype(np.float64)) for each in carried)
         count = w.sum()
         deviation = t - (t * w).sum() / count
         energy = (w * deviation * deviation).sum()
@@ -294,5 +290,4 @@ def _scene(loaded: Image) -> tuple[Image, BoolArray]:
     i, j, k = (int(n) for n in np.maximum(np.ceil((high - low) / _SEARCH_MM) + 1, 2))
     grid = Grid((i, j, k), np.full(3, _SEARCH_MM), low)
     values = carry(smoothed(loaded, _SEARCH_MM / 2.0), grid, order=1)
-    known = np.isfinite(values)
-    return Image(grid, np.where(known, values, 0.0)), known
+    return Image(grid, np.nan_to_num(values)), np.isfinite(values)

@@ -15,6 +15,7 @@ difference of two neighbours, is correlated neither with the voxel between them 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import binary_erosion, convolve, map_coordinates, spline_filter
@@ -215,14 +216,10 @@ def _regressed(columns: FloatArray, on: FloatArray, instruments: FloatArray | No
 
 def _scenes(loaded: Image) -> dict[float, Image]:
     """The loaded image by its blur: cubic coefficients without, and values at fewer voxels the more it is blurred."""
-    scenes, now, blurred = {}, loaded, 0.0
-    for blur in sorted(_BLURS_MM):
-        if not blur:
-            scenes[blur] = Image(loaded.grid, spline_filter(loaded.values, 3, np.float32, "mirror"))
-            continue
-        now, blurred = smoothed(now, float(np.sqrt(blur**2 - blurred**2))), blur
-        now = thinned(now, _every(now.grid, blur))
-        scenes[blur] = now
+    scenes, now = {0.0: Image(loaded.grid, spline_filter(loaded.values, 3, np.float32, "mirror"))}, loaded
+    for before, blur in pairwise(sorted(_BLURS_MM)):
+        now = smoothed(now, float(np.sqrt(blur**2 - before**2)))
+        scenes[blur] = now = thinned(now, _every(now.grid, blur))
     return scenes
 
 

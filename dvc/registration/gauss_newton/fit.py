@@ -23,7 +23,7 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, ParameterError
-from dvc.images.image import Grid, Image
+from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import smoothed, thinned
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
@@ -141,7 +141,7 @@ def fit(
     choice = replace(choice, weights=weights)
     level.roughness = level.following(coefficients)
     if parameters.bending is None:
-        part = _middle(inside)
+        part = _middle(pair.compared)
         middle = Level(*pictures, inside & part, soft & part, core & part, control)
         middle.roughness = level.roughness
         choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
@@ -210,15 +210,11 @@ def _volume_asked(level: Level, coefficients: FloatArray, weights: Weights) -> f
     return level.swelling(level.descend(coefficients, looking, steps=1, stop_mm=0.0), 99.0)
 
 
-def _middle(inside: BoolArray) -> BoolArray:
+def _middle(mask: Mask) -> BoolArray:
     """The middle of a mask's box, a third of its volume: enough to choose a weight, in a third of the time."""
-    part = np.zeros_like(inside)
-    sides = []
-    for axis in range(3):
-        at = np.flatnonzero(inside.any(axis=tuple(a for a in range(3) if a != axis)))
-        margin = int(0.5 * (1.0 - _MIDDLE) * (at[-1] - at[0] + 1))
-        sides.append(slice(at[0] + margin, at[-1] + 1 - margin))
-    part[tuple(sides)] = True
+    part, box = np.zeros_like(mask.inside), mask.box()
+    margins = [int(0.5 * (1.0 - _MIDDLE) * (edge.stop - edge.start)) for edge in box]
+    part[tuple(slice(e.start + m, e.stop - m) for e, m in zip(box, margins, strict=True))] = True
     return part
 
 

@@ -49,9 +49,8 @@ class Roughness:
         length_mm = float(control.spacing_mm.mean()) / np.sqrt(2.0)
         scale = cell_mm3 * length_mm ** (4 * (laplacians - 1))
         self._here = np.full(control.shape, scale) if here is None else scale * here
-        matrices = [_second_differences(n, float(h)) for n, h in zip(control.shape, control.spacing_mm, strict=True)]
-        self._laplacian = [_diagonals(each) for each in matrices]
-        self._transposed = [_diagonals(each.T) for each in matrices]
+        self._laplacian = [_second_differences(n, h) for n, h in zip(control.shape, control.spacing_mm, strict=True)]
+        self._transposed = [np.stack([np.roll(high, 1), on, np.roll(low, -1)]) for low, on, high in self._laplacian]
         self._diagonal = self._here * _square_of_one(control.spacing_mm, laplacians)
 
     @property
@@ -96,17 +95,10 @@ class Roughness:
 
 
 def _second_differences(count: int, spacing_mm: float) -> FloatArray:
-    """Matrix (count, count) of second differences, 1/mm2; none at the two ends."""
-    found = np.diag(np.full(count, -2.0)) + np.eye(count, k=1) + np.eye(count, k=-1)
-    found[[0, -1]] = 0.0
-    return found / spacing_mm**2
-
-
-def _diagonals(matrix: FloatArray) -> FloatArray:
-    """A tridiagonal matrix (n, n) by its rows' entries below, on and above the diagonal, (3, n)."""
-    found = np.zeros((3, len(matrix)))
-    found[0, 1:], found[1], found[2, :-1] = matrix.diagonal(-1), matrix.diagonal(), matrix.diagonal(1)
-    return found
+    """Second differences, 1/mm2, none at the ends: each row's entries below, on and above the diagonal, (3, count)."""
+    rows = np.repeat([[1.0], [-2.0], [1.0]], count, axis=1) / spacing_mm**2
+    rows[:, [0, -1]] = 0.0
+    return rows
 
 
 def _square_of_one(spacing_mm: FloatArray, laplacians: int) -> float:
@@ -114,7 +106,7 @@ def _square_of_one(spacing_mm: FloatArray, laplacians: int) -> float:
     one = np.zeros((1, 7, 7, 7))
     one[0, 3, 3, 3] = 1.0
     for _ in range(laplacians):
-        one = _summed(one, [_diagonals(_second_differences(7, float(h))) for h in spacing_mm])
+        one = _summed(one, [_second_differences(7, h) for h in spacing_mm])
     return float((one**2).sum())
 
 
