@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation, RigidMotion
@@ -133,9 +133,18 @@ class Cost:
 class Engine(Protocol):
     """An engine with its parameters, which finds the non-rigid part of a registration."""
 
-    @property
-    def family(self) -> str:
-        """The name by which ``--engine`` and results know it."""
+    family: ClassVar[str]
+    """The name by which ``--engine`` and results know it."""
+    needs_labels: ClassVar[bool] = False
+    """Whether it needs a label map of the tissues."""
+    sees_brightness: ClassVar[bool] = True
+    """Whether an even offset of brightness between the images misleads it, as it does not mislead correlation."""
+    starts_anywhere: ClassVar[bool] = True
+    """Whether it can start from any displacement, or from results of its own alone."""
+    cost: ClassVar[Cost] = Cost()
+    """Time, memory and disk space that it takes."""
+    note: ClassVar[str] = ""
+    """A remark on its results for the reader of a report; empty where none is needed."""
 
     @property
     def name(self) -> str:
@@ -151,34 +160,9 @@ class Engine(Protocol):
         return True
 
     @property
-    def needs_labels(self) -> bool:
-        """Whether it needs a label map of the tissues."""
-        return False
-
-    @property
-    def sees_brightness(self) -> bool:
-        """Whether an even offset of brightness between the images misleads it, as it does not mislead correlation."""
-        return True
-
-    @property
-    def starts_anywhere(self) -> bool:
-        """Whether it can start from any displacement, or from results of its own alone."""
-        return True
-
-    @property
     def seeds(self) -> int:
         """How many independent seeds it draws random numbers from."""
         return 0
-
-    @property
-    def cost(self) -> Cost:
-        """Time, memory and disk space that it takes."""
-        return Cost()
-
-    @property
-    def note(self) -> str:
-        """A remark on its results for the reader of a report; empty where none is needed."""
-        return ""
 
     @property
     def without_error_model(self) -> str:

@@ -147,9 +147,8 @@ def _checked(name: str, text: str, *, allow_unknown: bool) -> Preset:
 
 def _check_name(file: str, parameter: str) -> None:
     known, without_label = _known()[0], _LABEL.sub("", parameter)
-    if known & {parameter, parameter.rstrip("0123456789"), without_label}:
-        return
-    if _LABEL.match(parameter) and "Metric" + without_label in known:
+    spellings = {parameter, parameter.rstrip("0123456789"), without_label}
+    if known & spellings or (_LABEL.match(parameter) and "Metric" + without_label in known):
         return
     raise ParameterError(
         f"{file}: elastix has no parameter '{parameter}' and would ignore it in silence; "

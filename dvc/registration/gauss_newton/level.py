@@ -72,8 +72,8 @@ _ONE_SPLINE = Splines()
 class Level:
     """Two images at one resolution, the control points, and the tissue that the prior is about.
 
-    `soft` voxels of the fixed image keep their volume, `stiff` ones resist strain: bone, and skin where it is to.
-    Other parameters as in `ImagePair`.
+    `soft` voxels of the fixed image keep their volume, `stiff` ones (bone, or the skin) resist strain. Other parameters
+    as in `ImagePair`.
     """
 
     def __init__(
