@@ -44,7 +44,6 @@ USUAL_VOLUME = 300.0
 _LOOKING_MM4, _FREED = 1000.0, 100.0
 _RATIO = np.sqrt(10.0)
 _POWERS = -4, 3  # powers of the ratio that are tried at the most: weights of 0.03 to 95
-_CHECK_TOLERANCE, _CHECK_MOST = 0.05, 80
 _MIDDLE = 0.7  # of each edge of the mask's box
 _LAST_STEPS = 2
 
@@ -175,9 +174,7 @@ def choose(
     def left_out(power: int) -> float:
         if power not in found:
             tried = replace(weights, **{name: usual * _RATIO**power})
-            fitted = level.descend(
-                coefficients, tried, steps=1, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE, most=_CHECK_MOST
-            )
+            fitted = level.descend(coefficients, tried, steps=1, stop_mm=0.0, halves=0)
             found[power] = level.at(fitted, halves=1).variance
         return found[power]
 

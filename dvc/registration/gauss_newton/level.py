@@ -19,7 +19,8 @@ _BLOCKS = 2.5  # blocks between two control points, about
 _LONGEST = 0.45  # of the control spacing: a step of less than that cannot fold by itself
 _HALVINGS = 4
 _SLACK = 1e-3  # the fixed image's gradient is not quite the energy's own: near the end it may rise by as much
-_TOLERANCE, _MOST = 0.1, 60
+_SOLVER = 0.1, 60  # of the conjugate gradients: reduction of the residual, most iterations
+_SOLVER_OF_HALF = 0.05, 80  # half of the voxels are fitted in one step, to choose a weight
 _SMALLEST = 1e-6
 _LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
 _FLATTEST = 0.1  # det F below this is taken as this in F^-T
@@ -139,7 +140,7 @@ class Level:
         stress[self._resists] += weight[:, None, None] * (F @ _green_lagrange(F))
         return np.asarray(self.pair.blocks.gathered(stress) + weights.bending * state.bent)
 
-    def step(self, state: State, weights: Weights, variance: float, tolerance: float, most: int) -> FloatArray:
+    def step(self, state: State, weights: Weights, variance: float, solver: tuple[float, int]) -> FloatArray:
         """The Gauss-Newton step, by conjugate gradients, preconditioned by each control point's own 3 x 3 block."""
         volume, shear = weights.volume * self._soft, weights.rigidity * self._stiff
         stiffness: Stiffness = (state.images.matrix / variance, state.cofactor, volume, shear)
@@ -161,23 +162,14 @@ class Level:
             return np.asarray(out)
 
         inverse = np.concatenate([_inverted(own) for own in np.split(diagonal, len(diagonal) // 6)])
-        return conjugate_gradients(product, force, inverse, tolerance, most)
+        return conjugate_gradients(product, force, inverse, *solver)
 
     def descend(
-        self,
-        coefficients: FloatArray,
-        weights: Weights,
-        *,
-        steps: int,
-        stop_mm: float,
-        halves: int = -1,
-        tolerance: float = _TOLERANCE,
-        most: int = _MOST,
+        self, coefficients: FloatArray, weights: Weights, *, steps: int, stop_mm: float, halves: int = -1
     ) -> FloatArray:
         """Take steps until one moves soft tissue by less than `stop_mm` (rms) or none lowers the energy.
 
-        From coefficients (3 splines, mi, mj, mk), at most so many `steps`; the voxels used are `halves` as in `at`,
-        and conjugate gradients end with a `tolerance` and the `most` iterations as in `conjugate_gradients`.
+        From coefficients (3 splines, mi, mj, mk), at most so many `steps`; the voxels used are `halves` as in `at`.
         """
         state = self.at(coefficients, halves)
         for _ in range(steps):
@@ -189,7 +181,7 @@ class Level:
                 return 0.5 * count * at.variance / variance + self.prior(at, weights)
 
             before = energy(state)
-            step = self.step(state, weights, variance, tolerance, most)
+            step = self.step(state, weights, variance, _SOLVER if halves < 0 else _SOLVER_OF_HALF)
             if not np.isfinite(step).all():
                 raise RegistrationError("The registration diverged: a step is not finite.")
             step *= min(1.0, _LONGEST / max(self._longest(step), _SMALLEST))
