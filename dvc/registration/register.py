@@ -1,8 +1,8 @@
 """From a pair of images to the deformation of the tissue: correct shading, align on the bone, register non-rigidly.
 
-The rigid motion of the bone is put into the loaded image's header, which moves the image without resampling
-it. The displacement found then maps the reference configuration straight to the bone-aligned loaded one, so it is that
-of the tissue relative to its bone; T(X) = R (X + u(X)) + t is the whole motion.
+The rigid motion of the bone is put into the loaded image's header, which moves the image without resampling it. The
+displacement u then maps the reference configuration straight to the bone-aligned loaded one, so it is that of the
+tissue relative to its bone; T(X) = R (X + u(X)) + t is the whole motion.
 """
 
 from __future__ import annotations

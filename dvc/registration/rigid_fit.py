@@ -1,14 +1,14 @@
 """A rigid motion between two images, by Gauss-Newton over the voxels of a mask, from a start right to a few mm.
 
-Sought is the motion T for which I1(T(X)) comes closest to g(X) I0(X) + o at voxels X, with a gain g quadratic in place.
-A small motion d(X) = p + w x (X - c) of the voxels before T changes I1(T(X)) by g grad I0 . d; so what is left of the
+The motion T is the one for which I1(T(X)) comes closest to g(X) I0(X) + o at voxels X, with a gain g quadratic in X.
+A small motion d(X) = p + w x (X - c) of the voxels before T changes I1(T(X)) by g grad I0 . d; so the remaining
 difference is regressed on the six columns of grad I0 . d, and T becomes T after d (inverse compositional; Baker and
-Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). Images are blurred at first, by less and less.
+Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). The images are blurred at first, by less and less.
 
-Three things would pull a mask along its edges. Shading, which its correction leaves in part: the gain takes it up.
-Noise in I0, which makes a slope too small that is regressed on it: so the gain is found with the mean of each voxel's
-six neighbours as instrument, whose noise is another (but where a scanner has interpolated its voxels). And the noise
-of a gradient between voxels, which goes with the noise beside it: that of the unloaded image at its voxels, a
+Three things would pull a mask along its edges. The bias field that its correction leaves: the gain takes it up. Noise
+in I0, which biases a regression on I0: so the gain is estimated with the mean of each voxel's six neighbours as
+instrument, whose noise is independent (unless a scanner has interpolated its voxels). And the noise of a gradient
+between voxels, which correlates with the noise beside it: the gradient of the unloaded image at its voxels, a
 difference of two neighbours, is correlated neither with the voxel between them nor with the neighbours' mean.
 """
 

@@ -1,10 +1,10 @@
 """How rough a displacement is: a weight on detail, and less of it where a displacement has been seen to have detail.
 
-Counted is the Laplacian of a cubic B-spline's coefficients, which sees detail of the control points' own size as
-sharply as any, where the spline's own second derivatives let it pass: that detail is noise's. Applied twice, times
-l^4 with l = h / sqrt(2) and h between control points (their mean over the axes), it counts as much as once at a
-wavelength of 4 h, less above and more below; a homogeneous elastic body in equilibrium, whose displacement is
-biharmonic, then costs nothing away from the control grid's faces.
+The measure is the Laplacian of a cubic B-spline's coefficients, which sees detail of the control points' own size, the
+noise's, as sharply as any, where the spline's own second derivatives let it pass. Applied twice, times l^4 with
+l = h / sqrt(2) and h between control points (their mean over the axes), it counts as much as once at a wavelength of
+4 h, less above and more below; a homogeneous elastic body in equilibrium, whose displacement is biharmonic, then costs
+nothing away from the control grid's faces.
 """
 
 from __future__ import annotations

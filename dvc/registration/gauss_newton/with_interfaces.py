@@ -1,15 +1,15 @@
 """Gauss-Newton registration where the tissues are known: strain may jump at their interfaces, and bone is rigid.
 
 The smooth displacement of `dvc.registration.gauss_newton.fit` is the start of one more stage at full resolution, for a
-`BorderedSpline` u = m v + psi w. Minimised is
+`BorderedSpline` u = m v + psi w. Its energy is
 
     1/(2 s^2) sum r^2 + b/2 int (c l^4 |Δ Δ v|^2 + 3 L^2 c l^4 |Δ Δ w|^2 + q |w|^2) + v/2 int (J - 1)^2
     + k/2 int_skin |E|^2
 
 with L the reach of an interface, q = 0.02 / mm2, and c and l as in `dvc.registration.gauss_newton.roughness`; the bone
-has no strain by construction. Images say little about the inside of a skin as thin as two voxels. How much it resists
-strain, k, is chosen as the bending is, by the residual of voxels that were left out: what the skin does moves the fat
-beside it. docs/decisions/0009 has the reasons.
+has no strain by construction. Images say little about the inside of a skin as thin as two voxels. Its resistance to
+strain, k, is chosen as the bending is, by the residual of left-out voxels: the skin's motion moves the fat beside it.
+Reasons: docs/decisions/0009.
 """
 
 from __future__ import annotations
