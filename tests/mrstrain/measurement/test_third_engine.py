@@ -119,7 +119,6 @@ def test_its_results_are_written_read_and_told(tmp_path: Path, monkeypatch) -> N
 
 
 ENGINES_KNOWN_IN = {
-    "dvc/__init__.py",
     "dvc/measurement/measure.py",  # the default, with labels and without
     "dvc/registration/engines.py",
     "mrstrain/measurement/engines.py",  # options of the command line to an engine
