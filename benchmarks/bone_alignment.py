@@ -46,7 +46,7 @@ def by_elastix(fixed: Image, moving: Image, bone: Mask, start: RigidMotion, seed
     with tempfile.TemporaryDirectory() as folder:
         parameters = read_parameter_file(RIGID).complete(seed=seed)
         found = elastix.register(fixed, moved, parameters, bone, None, None, folder)
-    return start.after(rigid_from_elastix(found.transform))
+    return start.after(rigid_from_elastix(found))
 
 
 def one(pair: HeelPair, seed: int, noise: float) -> dict[str, object]:

@@ -129,7 +129,7 @@ def measured_by(settings: Settings, pair: HeelPair, still: bool) -> dict[str, ob
         "processor_s": cpu,
         "wall_s": wall,
         "peak_gib_of_worker": peak,
-        "choice": None if found.choice is None else found.choice.as_dict(),
+        "choice": found.choice.as_dict(),
         "errors": errors(pair, still, found.displacement),
     }
 

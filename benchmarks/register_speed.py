@@ -38,7 +38,7 @@ def plain(pair: HeelPair, body: Mask, worker: Worker) -> None:
             read_parameter_file(RIGID).complete(seed=1), pair.bone, None, None, folder,
         )  # fmt: skip
         start = Path(folder) / "rigid.txt"
-        start.write_text(format_parameters(rigid.transform))
+        start.write_text(format_parameters(rigid))
         worker.run(
             "plain elastix", elastix.register, pair.reference, pair.loaded,
             load_preset("heel-mr").complete(seed=1) | RESULT, widened(body, 3.0), None, str(start), folder,

@@ -70,7 +70,7 @@ def elastix_default(reference: Image, moving: Image, mask: Mask | None, worker: 
     parameters = preset.complete(seed=seed) | {"UseMultiThreadingForMetrics": ("false",)}
     with tempfile.TemporaryDirectory() as folder:
         found = worker.run("elastix default", elastix.register, reference, moving, parameters, mask, None, None, folder)
-    return bspline_from_elastix(found.transform)
+    return bspline_from_elastix(found)
 
 
 def without_motion(image: Image, motion: RigidMotion) -> Image:

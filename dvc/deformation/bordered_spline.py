@@ -30,55 +30,28 @@ NUMBERS = {"blur": _BLUR, "sure": _SURE, "near": _NEAR, "even": _EVEN, "least_mm
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Interfaces:
-    """Where tissues meet, and the two factors that a displacement gets by it.
+    """Where tissues meet, and the two factors of a displacement that follow from it.
 
-    With b the distance (mm) from the bone at rest and d the depth of a point below the border of its own tissue,
+    With b the distance (mm) from the rigid bone and d the depth of a point below the border of its own tissue,
 
         m = tanh(b / L),   psi = m L tanh(d / L).
 
-    m is 0 in the bone, psi on every border, and their gradients jump there. The skin's border with the air is none:
-    what counts is the border with another tissue.
-
-    Attributes
-    ----------
-    grid : Grid
-    depth : (tissues, ni, nj, nk)
-        Cubic spline coefficients, mode "mirror", of each tissue's depth, mm: positive in it, negative outside.
-    own : (ni, nj, nk) int
-        Of each voxel the number of its tissue in ``depth``; in the air that of the nearest tissue.
-    rest : int
-        Number of the bone at rest; -1 where none is.
-    reach_mm : float
-        L.
+    m is 0 in the bone, psi on every border with another tissue (not with the air), and their gradients jump there.
     """
 
     grid: Grid
-    depth: FloatArray
-    own: IntArray
-    rest: int
-    reach_mm: float
+    depth: FloatArray  # (tissues, ni, nj, nk), spline coefficients of the depth in each, mm: positive in it
+    own: IntArray  # (ni, nj, nk), number of the tissue of each voxel; in the air that of the nearest
+    rest: int  # number of the rigid bone; -1 without one
+    reach_mm: float  # L
 
     @classmethod
     def of(cls, labels: LabelMap, bone: Mask | None, reach_mm: float, body: Mask | None = None) -> Interfaces:
-        """Interfaces of the tissues in a label map.
+        """Interfaces of the tissues in a label map; L is about the spacing of the control points.
 
-        Parameters
-        ----------
-        labels : LabelMap
-        bone : Mask or None
-            Bone that does not move, on the same grid; it counts as a tissue of its own, whatever its labels are.
-        reach_mm : float
-            L: about the spacing of the control points.
-        body : Mask, optional
-            On the same grid. What of it has no label belongs to the nearest tissue within 3 mm, the bone at rest never
-            being that; and is a tissue of its own beyond.
-
-        Raises
-        ------
-        GeometryError
-            If bone or body are not on the grid of the labels.
-        InputError
-            If no voxel has a label, or the reach is not above zero.
+        A bone that does not move counts as a tissue of its own, whatever its labels are. Voxels of the body without a
+        label belong to the nearest tissue (but that bone) within 3 mm, and to a tissue of their own beyond.
+        GeometryError if bone or body are on another grid; InputError if no voxel has a label, or L is not above zero.
         """
         for name, mask in (("bone", bone), ("body", body)):
             if mask is not None and not mask.grid.same_as(labels.grid):
@@ -113,16 +86,13 @@ class Interfaces:
         On a border the gradient is that of the voxel's own side.
         """
         values, slopes = np.zeros(self.grid.shape), np.zeros((*self.grid.shape, 3))
-        for number, coefficients in enumerate(self.depth):
+        for number in range(len(self.depth)):
             mine = self.own == number
-            values[mine] = self._spline_at_voxels(coefficients, mine)
-            slopes[mine] = self._slopes_at_voxels(coefficients, mine)
+            values[mine], slopes[mine] = self._at_voxels(number, mine)
         if self.rest < 0:
             return self._factors(values, slopes, np.full(values.shape, np.inf), np.zeros_like(slopes), self.own)
-        everywhere = np.ones(self.grid.shape, dtype=bool)
-        bone = self._spline_at_voxels(self.depth[self.rest], everywhere).reshape(self.grid.shape)
-        toward = self._slopes_at_voxels(self.depth[self.rest], everywhere).reshape(*self.grid.shape, 3)
-        return self._factors(values, slopes, -bone, -toward, self.own)
+        bone, toward = self._at_voxels(self.rest, np.ones(self.grid.shape, dtype=bool))
+        return self._factors(values, slopes, -bone.reshape(values.shape), -toward.reshape(slopes.shape), self.own)
 
     def at(self, points_mm: FloatArray) -> FloatArray:
         """Factors at points (n, 3) LPS mm, (n, 2, 4): of m and psi the value, and the gradient in LPS."""
@@ -131,8 +101,9 @@ class Interfaces:
         slopes = slopes @ (np.linalg.inv(self.grid.direction) / self.grid.spacing_mm[:, None])
         own = np.where(np.isnan(depths), -np.inf, depths).argmax(axis=1)
         each = np.arange(len(own))
-        free = np.full(len(own), np.inf), np.zeros((len(own), 3))
-        away, toward = free if self.rest < 0 else (-depths[:, self.rest], -slopes[:, self.rest])
+        away, toward = np.full(len(own), np.inf), np.zeros((len(own), 3))
+        if self.rest >= 0:
+            away, toward = -depths[:, self.rest], -slopes[:, self.rest]
         return self._factors(depths[each, own], slopes[each, own], away, toward, own)
 
     def _factors(
@@ -151,12 +122,11 @@ class Interfaces:
             out[own == self.rest] = 0.0
         return out
 
-    def _spline_at_voxels(self, coefficients: FloatArray, where: BoolArray) -> FloatArray:
-        return evaluate_spline(coefficients[None], np.argwhere(where).astype(np.float64), mirror=True)[0][:, 0]
-
-    def _slopes_at_voxels(self, coefficients: FloatArray, where: BoolArray) -> FloatArray:
-        per_voxel = evaluate_spline(coefficients[None], np.argwhere(where).astype(np.float64), mirror=True)[1][:, 0]
-        return np.asarray(per_voxel / self.grid.spacing_mm)
+    def _at_voxels(self, number: int, where: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Depth (n,) in a tissue at voxels, mm, and its gradient (n, 3) along the grid's axes."""
+        indices = np.argwhere(where).astype(np.float64)
+        depth, per_voxel = evaluate_spline(self.depth[number : number + 1], indices, mirror=True)
+        return depth[:, 0], per_voxel[:, 0] / self.grid.spacing_mm
 
 
 def _labelled(values: IntArray, unknown: BoolArray, spacing_mm: FloatArray) -> IntArray:
@@ -171,8 +141,8 @@ def _labelled(values: IntArray, unknown: BoolArray, spacing_mm: FloatArray) -> I
 def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
     """Signed distance from a mask's border, mm, positive inside; the border is smooth, and not made of voxels' faces.
 
-    Blurred by a Gaussian of s, a plane's mask is the normal distribution of the distance over s: near the border the
-    distance is read off from it. Further away it is that to the nearest place of the border so found.
+    Blurred by a Gaussian of s, a plane's mask is the normal distribution of the distance over s, which gives the
+    distance near the border. Further away it is that to the nearest place of this border.
     """
     blurred = gaussian_filter(inside.astype(np.float64), _BLUR, mode="nearest")
     normal = np.stack(np.gradient(blurred, *spacing_mm), axis=-1)
@@ -205,6 +175,7 @@ class BorderedSpline:
     smooth, jump : BSpline
         v and w on one control grid, LPS.
     borders : Interfaces
+        Where m and psi come from.
 
     Raises
     ------
@@ -236,15 +207,7 @@ class BorderedSpline:
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the splines' valid region."""
-        points = np.asarray(points_mm, dtype=np.float64)
-        u = np.empty((len(points), 3))
-        for start in range(0, len(points), _CHUNK):
-            some = points[start : start + _CHUNK]
-            m, psi = np.moveaxis(self.borders.at(some)[..., 0], 1, 0)
-            u[start : start + _CHUNK] = m[:, None] * self.smooth.displacement(some) + psi[
-                :, None
-            ] * self.jump.displacement(some)
-        return u
+        return self.evaluate(points_mm)[0]
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the splines' valid region."""
@@ -252,19 +215,12 @@ class BorderedSpline:
         u, H = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
         for start in range(0, len(points), _CHUNK):
             some = slice(start, start + _CHUNK)
-            u[some], H[some] = self._joined(
-                points[some], self.smooth.evaluate(points[some]), self.jump.evaluate(points[some])
-            )
+            here = points[some]
+            u[some], H[some] = self._joined(here, self.smooth.evaluate(here), self.jump.evaluate(here))
         return u, H
 
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid, in the order of ``np.argwhere(where)``.
-
-        Raises
-        ------
-        InputError
-            If ``where`` does not have the shape of ``grid``.
-        """
+        """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid; order and errors as in `BSpline`."""
         if where.shape != grid.shape:
             raise InputError(f"The mask 'where' has shape {where.shape}; its grid has {grid.shape}.")
         step = max(1, _CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: memory stays that of the result
@@ -272,11 +228,8 @@ class BorderedSpline:
         for start in range(0, grid.shape[0], step):
             box = (slice(start, start + step), slice(None), slice(None))
             here, part = grid.part(box), where[box]
-            found.append(
-                self._joined(
-                    here.points(part), self.smooth.evaluate_on_grid(here, part), self.jump.evaluate_on_grid(here, part)
-                )
-            )
+            smooth, jump = (spline.evaluate_on_grid(here, part) for spline in (self.smooth, self.jump))
+            found.append(self._joined(here.points(part), smooth, jump))
         return np.concatenate([u for u, _ in found]), np.concatenate([H for _, H in found])
 
     def _joined(
@@ -284,11 +237,9 @@ class BorderedSpline:
     ) -> tuple[FloatArray, FloatArray]:
         """Join u and H of both splines at the same points."""
         factors = self.borders.at(points)
-        value, slope = factors[..., 0], factors[..., 1:]
-        parts = (smooth, jump)
-        u = sum(value[:, f, None] * part[0] for f, part in enumerate(parts))
-        H = sum(
-            value[:, f, None, None] * part[1] + part[0][:, :, None] * slope[:, f, None, :]
-            for f, part in enumerate(parts)
-        )
-        return np.asarray(u), np.asarray(H)
+        u, H = np.zeros_like(smooth[0]), np.zeros_like(smooth[1])
+        for f, (each, gradient) in enumerate((smooth, jump)):
+            value, slope = factors[:, f, 0, None], factors[:, f, None, 1:]
+            u += value * each
+            H += value[..., None] * gradient + each[:, :, None] * slope
+        return u, H

@@ -21,6 +21,10 @@ _SUPPORT = 4
 _ALIGNED_INDEX = 1e-6
 _ON_FACE = 1e-9
 
+Axis = tuple[IntArray, FloatArray, FloatArray]
+"""Of points along an axis the first control points (n,), and the spline's values and slopes there, (n, 4)."""
+Table = tuple[Axis, Axis, Axis]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BSpline:
@@ -96,12 +100,12 @@ class BSpline:
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the valid region."""
         indices = self.control.indices_of(np.asarray(points_mm, dtype=np.float64))
-        return _evaluated(self.coefficients_mm, indices, mirror=False, gradient=False)[0]
+        return evaluate_spline(self.coefficients_mm, indices, mirror=False, gradient=False)[0]
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the valid region."""
         indices = self.control.indices_of(np.asarray(points_mm, dtype=np.float64))
-        u, per_index = _evaluated(self.coefficients_mm, indices, mirror=False, gradient=True)
+        u, per_index = evaluate_spline(self.coefficients_mm, indices, mirror=False)
         H = per_index.reshape(-1, 3) @ self._index_per_mm()
         return u, H.reshape(-1, 3, 3)
 
@@ -123,15 +127,11 @@ class BSpline:
         if placed is None:
             return self.evaluate(grid.points(where))
         order, along = placed
-        slabs = np.zeros(grid.shape[0] + 1, dtype=np.int64)
-        np.cumsum(np.count_nonzero(where, axis=(1, 2)), out=slabs[1:])
+        slabs = np.concatenate([[0], np.cumsum(np.count_nonzero(where, axis=(1, 2)))])
         u, H = np.empty((slabs[-1], 3)), np.empty((slabs[-1], 3, 3))
-        coefficients = np.ascontiguousarray(self.coefficients_mm.transpose(0, *(a + 1 for a in order)))
-        first, value, slope = zip(
-            *(spline_table(t, coefficients.shape[a + 1]) for a, t in enumerate(along)), strict=True
-        )
-        per_mm = np.ascontiguousarray(self._index_per_mm()[list(order)])
-        _on_grid(coefficients, where, slabs, first, value, slope, per_mm, u, H)
+        coefficients = np.ascontiguousarray(self.coefficients_mm.transpose(0, *(order + 1)))
+        i, j, k = (spline_table(t, coefficients.shape[a + 1]) for a, t in enumerate(along))
+        _on_grid(coefficients, where, slabs, (i, j, k), np.ascontiguousarray(self._index_per_mm()[order]), u, H)
         return u, H
 
     def plus(self, other: BSpline) -> BSpline:
@@ -152,8 +152,8 @@ class BSpline:
     def _index_per_mm(self) -> FloatArray:
         return np.asarray(np.linalg.inv(self.control.direction) / self.control.spacing_mm[:, None])
 
-    def _axis_indices(self, grid: Grid) -> tuple[tuple[int, int, int], list[FloatArray]] | None:
-        """Tell the control axis of each grid axis, and the control indices along it; None if askew."""
+    def _axis_indices(self, grid: Grid) -> tuple[IntArray, list[FloatArray]] | None:
+        """The control axis of each grid axis, and the control indices along it; None if askew."""
         closeness = np.abs(self.control.direction.T @ grid.direction)
         order = closeness.argmax(axis=0)
         if sorted(order) != [0, 1, 2]:
@@ -162,12 +162,12 @@ class BSpline:
         steps = self.control.indices_of(grid.points_at(np.eye(3))) - start  # row a: one voxel further along axis a
         along = [start[p] + steps[a, p] * np.arange(grid.shape[a]) for a, p in enumerate(order)]
         last = np.array(grid.shape) - 1.0
-        ends = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int64)
+        ends = np.array(list(np.ndindex(2, 2, 2)))
         true = self.control.indices_of(grid.points_at(ends * last))
         separable = np.stack([along[a][-ends[:, a]] for a in range(3)], axis=1)
         if np.abs(true[:, order] - separable).max() > _ALIGNED_INDEX:
             return None
-        return (int(order[0]), int(order[1]), int(order[2])), along
+        return order, along
 
 
 def _described(control: Grid) -> str:
@@ -175,30 +175,15 @@ def _described(control: Grid) -> str:
     return f"{control.shape} points every {spacing} mm from {origin}"
 
 
-def evaluate_spline(coefficients: FloatArray, indices: FloatArray, *, mirror: bool) -> tuple[FloatArray, FloatArray]:
-    """Cubic B-splines of several components, and their derivatives, at continuous indices.
-
-    Parameters
-    ----------
-    coefficients : (c, ni, nj, nk)
-    indices : (n, 3)
-        Continuous indices; one that is not finite gives NaN.
-    mirror : bool
-        True: coefficients beyond the borders are those reflected at the outermost, as mode "mirror" of
-        `scipy.ndimage`. False: NaN where the support is not wholly inside.
-
-    Returns
-    -------
-    values : (n, c)
-    slopes : (n, c, 3)
-        Derivatives with respect to the index, per voxel.
-    """
-    return _evaluated(coefficients, indices, mirror=mirror, gradient=True)
-
-
-def _evaluated(
-    coefficients: FloatArray, indices: FloatArray, *, mirror: bool, gradient: bool
+def evaluate_spline(
+    coefficients: FloatArray, indices: FloatArray, *, mirror: bool, gradient: bool = True
 ) -> tuple[FloatArray, FloatArray]:
+    """Cubic B-splines (n, c) of coefficients (c, ni, nj, nk) at continuous indices (n, 3), and their derivatives.
+
+    These (n, c, 3) are with respect to the index; none without `gradient`. With `mirror` coefficients beyond the
+    borders are those reflected at the outermost, as in mode "mirror" of `scipy.ndimage`; else NaN where the support is
+    not wholly inside. NaN for an index that is not finite.
+    """
     places = np.ascontiguousarray(indices, dtype=np.float64)
     count = len(places)
     values = np.empty((count, len(coefficients)))
@@ -211,12 +196,7 @@ def _evaluated(
 def spline_basis(f: float) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float]]:
     """Values and slopes of the four cubic B-splines that are not zero at a fraction f of an interval."""
     g = 1.0 - f
-    value = (
-        g * g * g / 6.0,
-        2.0 / 3.0 - f * f * (1.0 - 0.5 * f),
-        2.0 / 3.0 - g * g * (1.0 - 0.5 * g),
-        f * f * f / 6.0,
-    )
+    value = (g * g * g / 6.0, 2.0 / 3.0 - f * f * (1.0 - 0.5 * f), 2.0 / 3.0 - g * g * (1.0 - 0.5 * g), f * f * f / 6.0)
     slope = (-0.5 * g * g, f * (1.5 * f - 2.0), g * (2.0 - 1.5 * g), 0.5 * f * f)
     return value, slope
 
@@ -237,7 +217,7 @@ def _supported(t: float, count: int) -> bool:
 
 
 @njit(cache=True)
-def spline_table(t: FloatArray, count: int) -> tuple[IntArray, FloatArray, FloatArray]:
+def spline_table(t: FloatArray, count: int) -> Axis:
     """First control point (-1 where undefined), four values and four slopes for each index along an axis."""
     first = np.full(t.size, -1, np.int64)
     value, slope = np.zeros((t.size, 4)), np.zeros((t.size, 4))
@@ -253,12 +233,7 @@ def spline_table(t: FloatArray, count: int) -> tuple[IntArray, FloatArray, Float
 
 @njit(parallel=True, cache=True)
 def _at_indices(
-    coefficients: FloatArray,
-    indices: FloatArray,
-    mirror: bool,
-    gradient: bool,
-    values: FloatArray,
-    slopes: FloatArray,
+    coefficients: FloatArray, indices: FloatArray, mirror: bool, gradient: bool, values: FloatArray, slopes: FloatArray
 ) -> None:
     components, ni, nj, nk = coefficients.shape
     for n in prange(indices.shape[0]):
@@ -306,22 +281,16 @@ def _at_indices(
 
 @njit(parallel=True, cache=True)
 def _on_grid(
-    coefficients: FloatArray,
-    where: BoolArray,
-    slabs: IntArray,
-    first: tuple[IntArray, IntArray, IntArray],
-    value: tuple[FloatArray, FloatArray, FloatArray],
-    slope: tuple[FloatArray, FloatArray, FloatArray],
-    per_mm: FloatArray,
-    u: FloatArray,
+    coefficients: FloatArray, where: BoolArray, slabs: IntArray, table: Table, per_mm: FloatArray, u: FloatArray,
     H: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Sum over the first axis once per plane of voxels, the second once per row, the third per voxel."""
     nj, nk = where.shape[1], where.shape[2]
     mj, mk = coefficients.shape[2], coefficients.shape[3]
-    first_i, first_j, first_k = first
-    value_i, value_j, value_k = value
-    slope_i, slope_j, slope_k = slope
+    i_axis, j_axis, k_axis = table
+    first_i, value_i, slope_i = i_axis
+    first_j, value_j, slope_j = j_axis
+    first_k, value_k, slope_k = k_axis
     for i in prange(where.shape[0]):
         n = slabs[i]
         if slabs[i + 1] == n:

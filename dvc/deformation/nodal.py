@@ -15,28 +15,27 @@ from dvc.mesh import TetMesh
 _TOLERANCE = 1e-9  # of a barycentric coordinate: points on a face belong to the cells on either side
 _CELLS_PER_BIN = 2.0
 
+_Bins = tuple[FloatArray, float, IntArray, IntArray, IntArray, FloatArray]
+"""Lowest corner (3,) of the bins, their width and number along each axis, the first of each bin's members, the members'
+cells, and the first corner (m, 3) of each cell; mm."""
+
 
 class Locator:
-    """Finds the cells in which points lie.
-
-    Parameters
-    ----------
-    mesh : TetMesh
-    """
+    """Finds the cells of a mesh in which points lie."""
 
     def __init__(self, mesh: TetMesh) -> None:
         corners = mesh.points_mm[mesh.cells]
-        self._origin = corners[:, 0]
         jacobian = np.stack([corners[:, i] - corners[:, 0] for i in (1, 2, 3)], axis=2)
         self.inverse = np.asarray(np.linalg.inv(jacobian), dtype=np.float64)
-        low, high = corners.min(axis=1), corners.max(axis=1)
-        self._low = low.min(axis=0)
-        extent = high.max(axis=0) - self._low
-        self._width = float(np.cbrt(extent.prod() * _CELLS_PER_BIN / len(mesh.cells)))
-        self._shape = np.floor(extent / self._width).astype(np.int64) + 1
-        first = np.floor((low - self._low) / self._width).astype(np.int64)
-        last = np.minimum(np.floor((high - self._low) / self._width).astype(np.int64), self._shape - 1)
-        self._starts, self._members = _binned(first, last, self._shape)
+        lower, upper = corners.min(axis=1), corners.max(axis=1)
+        low = lower.min(axis=0)
+        extent = upper.max(axis=0) - low
+        width = float(np.cbrt(extent.prod() * _CELLS_PER_BIN / len(mesh.cells)))
+        shape = np.floor(extent / width).astype(np.int64) + 1
+        first = np.floor((lower - low) / width).astype(np.int64)
+        last = np.minimum(np.floor((upper - low) / width).astype(np.int64), shape - 1)
+        starts, members = _binned(first, last, shape)
+        self._bins = low, width, shape, starts, members, corners[:, 0]
 
     def find(self, points_mm: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
         """Cell of each point (n,), -1 outside the mesh, and its reference coordinates in it (n, 3).
@@ -45,28 +44,15 @@ class Locator:
         """
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         cells, inside = np.full(len(points), -1), np.full((len(points), 3), np.nan)
-        _find(
-            points, self._low, self._width, self._shape, self._starts, self._members, self._origin, self.inverse,
-            cells, inside,
-        )  # fmt: skip
+        _find(points, self._bins, self.inverse, cells, inside)
         return cells, inside
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnMesh:
-    """Displacements of a mesh's nodes as a `Deformation`: linear in each cell, with the gradient of that cell.
+    """Displacements `u_mm` (n, 3) of a mesh's nodes as a `Deformation`: linear in each cell, with its gradient.
 
-    Parameters
-    ----------
-    mesh : TetMesh
-        Reference configuration, LPS mm.
-    u_mm : (n, 3)
-        Displacement of its nodes, LPS mm.
-
-    Raises
-    ------
-    InputError
-        If there is not one finite displacement for each node.
+    Reference configuration, LPS mm. InputError if there is not one finite displacement for each node.
     """
 
     mesh: TetMesh
@@ -128,18 +114,8 @@ def _binned(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntArray,
 
 
 @njit(cache=True, parallel=True)
-def _find(
-    points: FloatArray,
-    low: FloatArray,
-    width: float,
-    shape: IntArray,
-    starts: IntArray,
-    members: IntArray,
-    origin: FloatArray,
-    inverse: FloatArray,
-    cells: IntArray,
-    inside: FloatArray,
-) -> None:
+def _find(points: FloatArray, bins: _Bins, inverse: FloatArray, cells: IntArray, inside: FloatArray) -> None:
+    low, width, shape, starts, members, origin = bins
     for n in prange(len(points)):
         bin_, known = 0, True
         for axis in range(3):

@@ -1,8 +1,7 @@
 """What moves tissue: the Deformation protocol, and the deformations that need no image.
 
-A deformation maps a point X of the reference (unloaded) configuration to x = X + u(X). It tells u in mm
-and its gradient H = du/dX (H[i, j] = du_i/dX_j, no unit), both in LPS, and answers NaN where it is not
-defined: missing is never zero.
+A deformation maps a point X of the reference (unloaded) configuration to x = X + u(X). It gives u in mm and its
+gradient H = du/dX (H[i, j] = du_i/dX_j, no unit), both in LPS, and NaN where it is not defined: missing is never zero.
 """
 
 from __future__ import annotations
@@ -28,11 +27,9 @@ class Deformation(Protocol):
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN where not defined."""
-        ...
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3) at points X (n, 3) LPS mm; NaN where not defined."""
-        ...
 
 
 @runtime_checkable
@@ -41,7 +38,6 @@ class Motion(Deformation, Protocol):
 
     def inverse(self) -> Motion:
         """The map back, from the deformed configuration to the reference."""
-        ...
 
 
 @runtime_checkable
@@ -50,7 +46,6 @@ class GridDeformation(Deformation, Protocol):
 
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
         """U and H at the voxels of ``grid`` in ``where``, ordered as ``np.argwhere(where)``."""
-        ...
 
 
 def evaluate_on_grid(
@@ -58,10 +53,7 @@ def evaluate_on_grid(
 ) -> tuple[FloatArray, FloatArray]:
     """U (n, 3) mm and H (n, 3, 3) at the voxels of a grid, by the fastest way the deformation has.
 
-    Parameters
-    ----------
-    where : (ni, nj, nk) bool
-        Voxels wanted; all by default. Results are ordered as ``np.argwhere(where)``.
+    Of the voxels in ``where`` (ni, nj, nk), all by default, in the order of ``np.argwhere(where)``.
     """
     inside = np.ones(grid.shape, dtype=bool) if where is None else np.asarray(where, dtype=bool)
     if isinstance(deformation, GridDeformation):
@@ -197,8 +189,7 @@ class Composed:
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm; NaN where any part is undefined."""
-        start = np.asarray(points_mm, dtype=np.float64)
-        x = start
+        x = start = np.asarray(points_mm, dtype=np.float64)
         for part in self.parts:
             x = x + part.displacement(x)
         return np.asarray(x - start)
@@ -234,7 +225,7 @@ class Composed:
 class Within:
     """A deformation that is defined only in a mask and up to ``margin_voxels`` (by nearest voxel) around it.
 
-    A registration extrapolates into air, where nothing was measured; this says so with NaN.
+    Beyond, in air, a registration only extrapolates: NaN.
     """
 
     whole: Deformation
@@ -245,13 +236,12 @@ class Within:
     def __post_init__(self) -> None:
         near = self.mask.inside
         if self.margin_voxels:
-            cube = np.ones((3, 3, 3), dtype=bool)
-            near = binary_dilation(near, structure=cube, iterations=self.margin_voxels)
+            near = binary_dilation(near, structure=np.ones((3, 3, 3), dtype=bool), iterations=self.margin_voxels)
         object.__setattr__(self, "_near", frozen(near, np.bool_))
 
     def _outside(self, points_mm: FloatArray) -> BoolArray:
         nearest = np.rint(self.mask.grid.indices_of(points_mm))
-        known = np.all((nearest >= 0) & (nearest < np.array(self.mask.grid.shape)), axis=1)
+        known = np.all((nearest >= 0) & (nearest < self.mask.grid.shape), axis=1)
         outside = np.ones(len(nearest), dtype=bool)
         outside[known] = ~self._near[tuple(nearest[known].astype(np.int64).T)]
         return outside
@@ -335,15 +325,9 @@ class SampledDisplacement:
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm; NaN where not defined."""
         indices = self.grid.indices_of(points_mm)
-        u = np.stack(
-            [
-                map_coordinates(c, (indices + self._shift).T, order=3, mode="mirror", prefilter=False)
-                for c in self._coefficients
-            ],
-            axis=-1,
-        )
-        u[~self._inside(indices)] = np.nan
-        return np.asarray(u)
+        at = (indices + self._shift).T
+        along = [map_coordinates(c, at, order=3, mode="mirror", prefilter=False) for c in self._coefficients]
+        return np.where(self._inside(indices)[:, None], np.stack(along, axis=-1), np.nan)
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3) of the interpolating spline; NaN where not defined."""
@@ -351,11 +335,9 @@ class SampledDisplacement:
 
         indices = self.grid.indices_of(points_mm)
         u, per_index = evaluate_spline(self._coefficients, indices + self._shift, mirror=True)
-        to_index = np.linalg.inv(self.grid.direction) / self.grid.spacing_mm[:, None]
-        H = per_index @ to_index
+        H = per_index @ (np.linalg.inv(self.grid.direction) / self.grid.spacing_mm[:, None])
         outside = ~self._inside(indices)
-        u[outside] = np.nan
-        H[outside] = np.nan
+        u[outside], H[outside] = np.nan, np.nan
         return u, H
 
 

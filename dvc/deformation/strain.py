@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from dvc.arrays import BoolArray, FloatArray, frozen
+from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
 
 _ORTHONORMAL = 1e-9
@@ -80,17 +80,12 @@ class StrainField:
         if H.ndim != 3 or H.shape[1:] != (3, 3):
             raise InputError(f"Displacement gradients have shape (n, 3, 3); got {H.shape}.")
         count = len(H)
-        strain = np.empty((count, 3, 3))
-        principal = np.empty((count, 3))
-        shear, jacobian, valid = np.empty(count), np.empty(count), np.empty(count, dtype=np.bool_)
+        strain, principal, shear, jacobian = (np.empty((count, *shape)) for shape in ((3, 3), (3,), (), ()))
+        valid = np.empty(count, dtype=np.bool_)
         _strain(H, strain, principal, shear, jacobian, valid)
-        return cls(
-            frozen(strain, np.float64),
-            frozen(principal, np.float64),
-            frozen(shear, np.float64),
-            frozen(jacobian, np.float64),
-            frozen(valid, np.bool_),
-        )
+        for array in (strain, principal, shear, jacobian, valid):
+            array.flags.writeable = False
+        return cls(strain, principal, shear, jacobian, valid)
 
     def __len__(self) -> int:
         return len(self.valid)
@@ -194,17 +189,12 @@ def _unit(direction: npt.ArrayLike, name: str) -> FloatArray:
 
 
 def principal_values(tensors: npt.ArrayLike) -> FloatArray:
-    """Eigenvalues of symmetric tensors, (n, 3) in descending order, in closed form.
+    """Eigenvalues of symmetric tensors, (n, 3) in descending order, in closed form; NaN where one is not finite.
 
     Parameters
     ----------
     tensors : (n, 3, 3)
         Symmetric; of each pair off the diagonal the mean is taken.
-
-    Returns
-    -------
-    (n, 3)
-        ``l_1 >= l_2 >= l_3``; NaN where a component is not finite.
 
     Raises
     ------
@@ -258,21 +248,13 @@ def _principal(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float)
     j2 = 0.5 * (a * a + b * b + c * c) + d * d + e * e + f * f
     j3 = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
     # a and a a as vectors of five in an orthonormal basis of the traceless symmetric tensors.
-    u = (
-        (a - b) / np.sqrt(2.0),
-        (2.0 * c - a - b) / np.sqrt(6.0),
-        np.sqrt(2.0) * d,
-        np.sqrt(2.0) * e,
-        np.sqrt(2.0) * f,
-    )
+    u = ((a - b) / np.sqrt(2.0), (2.0 * c - a - b) / np.sqrt(6.0), np.sqrt(2.0) * d, np.sqrt(2.0) * e, np.sqrt(2.0) * f)
     aa, bb, cc = a * a + d * d + e * e, d * d + b * b + f * f, e * e + f * f + c * c
+    dd, ee, ff = a * d + d * b + e * f, a * e + d * f + e * c, d * e + b * f + f * c
     v = (
-        (aa - bb) / np.sqrt(2.0),
-        (2.0 * cc - aa - bb) / np.sqrt(6.0),
-        np.sqrt(2.0) * (a * d + d * b + e * f),
-        np.sqrt(2.0) * (a * e + d * f + e * c),
-        np.sqrt(2.0) * (d * e + b * f + f * c),
-    )
+        (aa - bb) / np.sqrt(2.0), (2.0 * cc - aa - bb) / np.sqrt(6.0), np.sqrt(2.0) * dd, np.sqrt(2.0) * ee,
+        np.sqrt(2.0) * ff,
+    )  # fmt: skip
     gram = 0.0
     for i in range(4):
         for j in range(i + 1, 5):
@@ -314,10 +296,8 @@ def _strain(
                 known = known and np.isfinite(H[i, j])
         valid[n] = known
         if not known:
-            strain[n] = np.nan
-            principal[n] = np.nan
-            shear[n] = np.nan
-            jacobian[n] = np.nan
+            strain[n], principal[n] = np.nan, np.nan
+            shear[n], jacobian[n] = np.nan, np.nan
             continue
         for i in range(3):
             for j in range(i, 3):

@@ -24,6 +24,7 @@ class StrainMaps:
     Attributes
     ----------
     grid : Grid
+        Voxels, LPS mm.
     valid : (ni, nj, nk) bool
         Where the deformation is defined and lands inside the loaded image.
     displacement_mm : (ni, nj, nk, 3)
@@ -45,7 +46,7 @@ class StrainMaps:
 
     @property
     def by_quantity(self) -> dict[str, Float32Array]:
-        """What tables by region tell of: max_shear, jacobian, and displacement_mm as a length."""
+        """The quantities of tables by region: max_shear, jacobian, and displacement_mm as a length."""
         length = np.linalg.norm(self.displacement_mm, axis=-1)
         return {"max_shear": self.max_shear, "jacobian": self.jacobian, "displacement_mm": length}
 
@@ -53,25 +54,17 @@ class StrainMaps:
 def strain_maps(
     deformation: Deformation, mask: Mask, seen: Callable[[FloatArray], BoolArray] | None = None
 ) -> StrainMaps:
-    """Displacement and strain at the voxels of a mask.
+    """Displacement and strain at the voxels of a mask on the reference grid.
 
-    Parameters
-    ----------
-    deformation : Deformation
-    mask : Mask
-        Voxels wanted, on the reference grid.
-    seen : callable, optional
-        Tells of deformed points x (n, 3) LPS mm whether the loaded image shows them; others become NaN.
+    NaN where `seen` says of deformed points x (n, 3) LPS mm that the loaded image does not show them.
     """
     grid = mask.grid
     valid = np.zeros(grid.shape, dtype=bool)
-    displacement = np.full((*grid.shape, 3), np.nan, dtype=np.float32)
-    tensor = np.full((*grid.shape, 6), np.nan, dtype=np.float32)
-    shear = np.full(grid.shape, np.nan, dtype=np.float32)
-    jacobian = np.full(grid.shape, np.nan, dtype=np.float32)
+    displacement, tensor = (np.full((*grid.shape, n), np.nan, dtype=np.float32) for n in (3, 6))
+    shear, jacobian = (np.full(grid.shape, np.nan, dtype=np.float32) for _ in range(2))
     step = max(1, _SLAB_VOXELS // (grid.shape[1] * grid.shape[2]))
     for start in range(0, grid.shape[0], step):
-        slab = slice(start, min(start + step, grid.shape[0]))
+        slab = slice(start, start + step)
         where = mask.inside[slab]
         if not where.any():
             continue
@@ -87,7 +80,6 @@ def strain_maps(
             (shear, strain.max_shear),
             (jacobian, strain.jacobian),
         ):
-            kept = np.where(known.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
-            field[slab][where] = kept
+            field[slab][where] = np.where(known.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
         valid[slab][where] = known
     return StrainMaps(grid, valid, displacement, tensor, shear, jacobian)

@@ -34,6 +34,13 @@ def smoothed(image: Image, sigma_mm: float) -> Image:
     return Image(image.grid, np.where(image.missing, np.float32(np.nan), values))
 
 
+def thinned(image: Image, every: tuple[slice, ...]) -> Image:
+    """Every so manyth voxel of an image along each axis, the first among them."""
+    grid, values = image.grid, image.values[every]
+    i, j, k = values.shape
+    return Image(Grid((i, j, k), grid.spacing_mm * [one.step for one in every], grid.origin_mm, grid.direction), values)
+
+
 def shows(image: Image, points_mm: FloatArray, margin_mm: float = 0.0) -> BoolArray:
     """Whether an image has values at points (n, 3) LPS mm, and for ``margin_mm`` around along its axes.
 

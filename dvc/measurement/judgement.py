@@ -103,13 +103,13 @@ def quality_of(
         similarity=similarity,
         landmark_errors_mm=None if landmarks is None else target_registration_error(found.total, *landmarks),
         floor=floor,
-        in_bone=None if found.choice is None else found.choice.in_bone,
+        in_bone=found.choice.in_bone,
     )
     return replace(quality, verdict=with_caution(quality.verdict, found.choice))
 
 
-def with_caution(verdict: Verdict, choice: Regularisation | None) -> Verdict:
+def with_caution(verdict: Verdict, choice: Regularisation) -> Verdict:
     """The verdict, lowered by one level where the engine has a doubt of its own: to "Use with care", or below."""
-    if choice is None or not choice.caution:
+    if not choice.caution:
         return verdict
     return Verdict("caution" if verdict.level == "trust" else "distrust", (*verdict.reasons, choice.caution))

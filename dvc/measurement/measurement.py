@@ -282,10 +282,10 @@ class Measurement:
 
     def section(self, pictures: Mapping[str, Picture]) -> Section:
         """Its part of a report."""
-        choice = None if (found := self._registration) is None else found.choice
+        found = self._registration
         note = "" if found is None else found.settings.engine.note
         tables = [page.key_figures(self.quality, self.alignment), page.region_table(self.regions)]
-        tables += [] if choice is None else [page.weights_table(choice)]
+        tables += [] if found is None or not found.choice.rows() else [page.weights_table(found.choice)]
         return Section(
             self.name,
             self.verdict,
@@ -344,8 +344,8 @@ class Measurement:
         told = self.quality.as_dict() | {"alignment": dict(self.alignment)}
         found = made.registration
         if found is not None:
-            if found.choice is not None:
-                told["regularisation"] = found.choice.as_dict()
+            if chosen := found.choice.as_dict():
+                told["regularisation"] = chosen
             told["error_of_max_shear"] = self.error_bars.as_dict()
         with whole_folder(Path(folder)) as partial:
             files.write_maps(partial, self.maps, made.subject.axes, verdict)

@@ -1,21 +1,20 @@
 """Rigid alignment of a loaded image on a bone of the unloaded one.
 
-First a search that cannot be trapped: the bone is laid at every place of the loaded image in many
-orientations, at low resolution, and normalised correlation is taken by FFT (masked template matching; see
-D. Padfield, Masked object registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Then
-Gauss-Newton refines the best places (`dvc.registration.rigid_fit`); around the best of these, halves of the bone are
-fitted each by itself, begun to either side along each of the six ways to move. The mean of all is the result, and the
-largest distance between two halves the alignment's own measure of how well it repeats.
+First a search that cannot be trapped: the bone is placed everywhere in the loaded image in many orientations, at low
+resolution, and normalised correlation is taken by FFT (masked template matching; D. Padfield, Masked object
+registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Gauss-Newton refines the best places
+(`dvc.registration.rigid_fit`); around the best of these, halves of the bone are fitted each by itself, begun to either
+side along each of the six ways to move. Their mean is the result; the largest distance of two is its repeatability.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
 from scipy import fft
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from dvc.arrays import BoolArray, FloatArray
@@ -24,7 +23,8 @@ from dvc.errors import InputError, RegistrationError
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import carry, fill_missing, smoothed
 from dvc.images.similarity import local_correlation
-from dvc.registration.rigid_fit import RigidFit
+from dvc.images.tissue import widened
+from dvc.registration.rigid_fit import RigidFit, apart_mm
 
 AlignOn = Literal["bone", "image", "none"]
 
@@ -88,15 +88,10 @@ def not_aligned(reference: Image, loaded: Image, mask: Mask) -> Alignment:
 
 
 def refuse_turned_contrast(reference: Image, loaded: Image, tissue: Mask, motion: RigidMotion) -> None:
-    """Refuse images whose contrast is turned round in the tissue, for what registers by correlation.
+    """Refuse, by RegistrationError, images of inverted contrast in the tissue, for engines that need one contrast.
 
     Two images of one contrast correlate locally by more than zero even 15 mm apart (phantoms: 0.03 to 0.84), those
-    of turned contrast by as much below zero.
-
-    Raises
-    ------
-    RegistrationError
-        If they do; it names the measure that could follow.
+    of inverted contrast by as much below zero.
     """
     _, found = local_correlation(reference, carry(loaded, reference.grid, motion.apply), tissue)
     if found < -_CLEARLY:
@@ -107,26 +102,12 @@ def refuse_turned_contrast(reference: Image, loaded: Image, tissue: Mask, motion
 
 
 def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -> Alignment:
-    """Find the rigid motion of a bone, or of all that the mask holds, from the reference to the loaded image.
+    """Find the rigid motion of a mask's voxels, a bone or the whole image, from the reference to the loaded image.
 
-    Parameters
-    ----------
-    reference, loaded : Image
-        Without shading (`dvc.images.shading`), which would pull the optimum off by some hundredths of a millimetre.
-    mask : Mask
-        The bone (or tissue) on the reference grid.
-    on : {"bone", "image"}
-        What the mask holds.
-    seed : int
-        Of the halves into which the mask's voxels are divided.
-
-    Raises
-    ------
-    InputError
-        If the mask is empty, or too little of it is seen in the unloaded image.
-    RegistrationError
-        If no place of the loaded image looks like the bone, if the contrast is inverted, or if the fits of two halves
-        disagree by more than 0.5 mm: a failed alignment is not handed on.
+    The images are without bias field (`dvc.images.shading`), which would pull the optimum off by some hundredths of a
+    millimetre; the seed is that of the halves into which the mask's voxels are divided. InputError if the mask is
+    empty, or too little of it is seen in the unloaded image; RegistrationError if no place of the loaded image looks
+    like the bone, if the contrast is inverted, or if the fits of two halves disagree by more than 0.5 mm.
     """
     if not mask.inside.any():
         raise InputError("The mask to align on is empty.")
@@ -156,31 +137,19 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
         pairs = fit.halves(motion)
     except RegistrationError as why:
         raise RegistrationError(f"A half of the {on} cannot be fitted by itself ({why}): {advice}") from why
-    spread = max(_apart_mm(one, other, points) for one, other in pairs)
+    spread = max(apart_mm(one, other, points) for one, other in pairs)
     if not spread <= _LARGEST_SPREAD_MM:
         raise RegistrationError(
             f"Two rigid fits on the {on} differ by {spread:.2f} mm (at most {_LARGEST_SPREAD_MM} is accepted): {advice}"
         )
-    motion = _midway([half for pair in pairs for half in pair], points.mean(axis=0))
     centroid = points.mean(axis=0)[None]
-    return Alignment(
-        motion,
-        on,
-        before,
-        _similarity(reference, loaded, mask, motion),
-        spread,
-        motion.displacement(centroid)[0],
-    )
+    motion = _midway([half for pair in pairs for half in pair], centroid)
+    after = _similarity(reference, loaded, mask, motion)
+    return Alignment(motion, on, before, after, spread, motion.displacement(centroid)[0])
 
 
 def motion_of(deformation: Deformation, mask: Mask) -> RigidMotion:
-    """The rigid motion that comes closest, in the least squares, to what a deformation does to a mask's voxels.
-
-    Raises
-    ------
-    InputError
-        If fewer than four voxels of the mask have a displacement.
-    """
+    """The rigid motion closest, by least squares, to a deformation of a mask's voxels; InputError if it misses them."""
     X = mask.points()
     x = X + deformation.displacement(X)
     known = np.isfinite(x).all(axis=1)
@@ -193,13 +162,7 @@ def motion_of(deformation: Deformation, mask: Mask) -> RigidMotion:
 
 
 def without_motion(whole: Deformation, bone: Mask | None) -> tuple[Deformation, RigidMotion]:
-    """A deformation without the rigid motion of a mask's voxels (least squares), and that motion; whole without one.
-
-    Raises
-    ------
-    InputError
-        If it is not defined in the mask.
-    """
+    """A deformation without the rigid motion of a mask's voxels (`motion_of`), and that motion; whole without one."""
     if bone is None:
         return whole, RigidMotion.identity()
     motion = motion_of(whole, bone)
@@ -208,23 +171,13 @@ def without_motion(whole: Deformation, bone: Mask | None) -> tuple[Deformation, 
 
 def _midway(motions: list[RigidMotion], centre: FloatArray) -> RigidMotion:
     rotation = Rotation.from_matrix(np.stack([motion.rotation for motion in motions])).mean().as_matrix()
-    target = np.mean([motion.apply(centre[None])[0] for motion in motions], axis=0)
-    return RigidMotion(rotation, target - rotation @ centre)
-
-
-def _apart_mm(one: RigidMotion, other: RigidMotion, points: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.sum((one.apply(points) - other.apply(points)) ** 2, axis=1))))
-
-
-def _near(mask: Mask, margin_mm: float) -> BoolArray:
-    """Voxels in the mask and up to ``margin_mm`` around it."""
-    distance = distance_transform_edt(~mask.inside, sampling=mask.grid.spacing_mm)
-    return np.asarray(distance <= margin_mm)
+    target = np.mean([motion.apply(centre)[0] for motion in motions], axis=0)
+    return RigidMotion(rotation, target - rotation @ centre[0])
 
 
 def _similarity(reference: Image, loaded: Image, mask: Mask, motion: RigidMotion) -> float:
     """Normalised correlation of the slightly blurred images in and 2 mm around the mask; NaN without overlap."""
-    where = _near(mask, _SCORE_MARGIN_MM)
+    where = widened(mask, _SCORE_MARGIN_MM).inside
     fixed = smoothed(reference, _SCORE_BLUR_MM).values[where]
     moved = carry(smoothed(loaded, _SCORE_BLUR_MM), reference.grid, motion.apply, where, order=1)[where]
     known = np.isfinite(moved) & np.isfinite(fixed)
@@ -237,12 +190,11 @@ def _similarity(reference: Image, loaded: Image, mask: Mask, motion: RigidMotion
 
 
 def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highest: float, on: AlignOn) -> str:
-    inverted = max(
-        (s for s, _ in _scored(reference, loaded, mask, _rotations()[:_INVERTED_TRIES], sign=-1.0)), default=0.0
-    )
-    found = f"the best normalised correlation found around it is {score:.2f}"
-    if not np.isfinite(score):
-        found = "nowhere does the loaded image look like it"
+    tries = _scored(reference, loaded, mask, _rotations()[:_INVERTED_TRIES], sign=-1.0)
+    inverted = max((score for score, _ in tries), default=0.0)
+    found = "nowhere does the loaded image look like it"
+    if np.isfinite(score):
+        found = f"the best normalised correlation found around it is {score:.2f}"
     told = f"The rigid alignment on the {on} failed: {found} ({_LOWEST_SIMILARITY} is needed)."
     if inverted > max(_LOWEST_SIMILARITY, highest + _CLEARLY):
         return (
@@ -261,10 +213,10 @@ def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highe
 def _rotations() -> list[FloatArray]:
     """Rotations in steps of 9 degrees up to 27 degrees about any axis, the identity first."""
     steps = np.arange(-_ROTATION_LIMIT_DEG, _ROTATION_LIMIT_DEG + 1e-9, _ROTATION_STEP_DEG)
-    vectors = np.array([(x, y, z) for x in steps for y in steps for z in steps])
+    vectors = np.array(list(product(steps, repeat=3)))
     angle = np.linalg.norm(vectors, axis=1)
-    kept = vectors[angle <= _ROTATION_LIMIT_DEG + 1e-9]
-    kept = kept[np.argsort(np.linalg.norm(kept, axis=1), kind="stable")]
+    order = np.argsort(angle, kind="stable")
+    kept = vectors[order[angle[order] <= _ROTATION_LIMIT_DEG + 1e-9]]
     return list(Rotation.from_rotvec(np.radians(kept)).as_matrix())
 
 
@@ -274,15 +226,12 @@ def _search(reference: Image, loaded: Image, mask: Mask) -> tuple[list[RigidMoti
     centre = mask.points().mean(axis=0)[None]
     chosen: list[RigidMotion] = []
     for _, motion in scored:
-        apart = [
+        if len(chosen) < _CANDIDATES and all(
             np.linalg.norm(motion.apply(centre) - other.apply(centre)) > 2 * _SEARCH_MM
             or motion.after(other.inverse()).angle_deg > 1.5 * _ROTATION_STEP_DEG
             for other in chosen
-        ]
-        if all(apart):
+        ):
             chosen.append(motion)
-        if len(chosen) == _CANDIDATES:
-            break
     return [*chosen, RigidMotion.identity()], scored[0][0] if scored else -1.0
 
 
@@ -300,13 +249,14 @@ def _scored(
     half = (np.array(template_grid.shape) - 1) // 2
     found = []
     for rotation in rotations:
-        t, w = _rotated(template, weight, template_grid, centre, rotation)
+        back = RigidMotion.about(centre, rotation.T, np.zeros(3))
+        carried = (carry(image, template_grid, back.apply, order=1) for image in (template, weight))
+        t, w = (np.nan_to_num(each.astype(np.float64)) for each in carried)
         count = w.sum()
         deviation = t - (t * w).sum() / count
         energy = (w * deviation * deviation).sum()
-        t = w * deviation
         w_f = np.conj(fft.rfftn(w, size))
-        cross = fft.irfftn(scene_f * np.conj(fft.rfftn(t, size)), size)
+        cross = fft.irfftn(scene_f * np.conj(fft.rfftn(w * deviation, size)), size)
         mean = fft.irfftn(scene_f * w_f, size) / count
         variance = fft.irfftn(square_f * w_f, size) / count - mean**2
         covered = fft.irfftn(known_f * w_f, size) / count
@@ -325,7 +275,7 @@ def _scored(
 
 def _template(reference: Image, mask: Mask, centre: FloatArray) -> tuple[Image, Image, Grid]:
     """The reference and its weight around the mask, on a cubic low-resolution grid centred on the mask."""
-    near = Mask(mask.grid, _near(mask, _SEARCH_MARGIN_MM) & ~reference.missing)
+    near = Mask(mask.grid, widened(mask, _SEARCH_MARGIN_MM).inside & ~reference.missing)
     reach = float(np.linalg.norm(near.points() - centre, axis=1).max())
     half = int(np.ceil(reach / _SEARCH_MM)) + 1
     n = 2 * half + 1
@@ -334,20 +284,10 @@ def _template(reference: Image, mask: Mask, centre: FloatArray) -> tuple[Image, 
     return smoothed(fill_missing(reference), _SEARCH_MM / 2.0), weight, grid
 
 
-def _rotated(
-    image: Image, weight: Image, grid: Grid, centre: FloatArray, rotation: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    back = RigidMotion.about(centre, rotation.T, np.zeros(3))
-    t = np.nan_to_num(carry(image, grid, back.apply, order=1).astype(np.float64))
-    w = np.nan_to_num(carry(weight, grid, back.apply, order=1).astype(np.float64))
-    return t, w
-
-
 def _scene(loaded: Image) -> tuple[Image, BoolArray]:
     """The loaded image at low resolution on axes L, P, S, and where it is known."""
     low, high = loaded.grid.bounds_mm()
-    shape = np.maximum(np.ceil((high - low) / _SEARCH_MM).astype(int) + 1, 2)
-    grid = Grid((int(shape[0]), int(shape[1]), int(shape[2])), np.full(3, _SEARCH_MM), low)
+    i, j, k = (int(n) for n in np.maximum(np.ceil((high - low) / _SEARCH_MM) + 1, 2))
+    grid = Grid((i, j, k), np.full(3, _SEARCH_MM), low)
     values = carry(smoothed(loaded, _SEARCH_MM / 2.0), grid, order=1)
-    known = np.isfinite(values)
-    return Image(grid, np.where(known, values, 0.0)), known
+    return Image(grid, np.nan_to_num(values)), np.isfinite(values)

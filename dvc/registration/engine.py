@@ -1,14 +1,14 @@
 """What every registration engine is: it finds the displacement between two images whose bone is aligned.
 
-An engine is a frozen dataclass of its parameters that subclasses `Engine` and lies in a file of its own. What most
-engines have in common is the default here: a new one tells its name, its parameters and how it finds a displacement.
+An engine is a frozen dataclass of its parameters that subclasses `Engine` and lies in a file of its own. A new one
+defines its name, its parameters and how it finds a displacement; for the rest there are defaults.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Protocol, Self
 
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation, RigidMotion
@@ -63,22 +63,14 @@ class AlignedPair:
         """The pair on the box of the voxels compared and a few around it: control points in empty air cost time."""
         box = self.compared.box(_CROP_VOXELS)
         grid = self.fixed.grid.part(box)
-        return AlignedPair(
-            Image(grid, self.fixed.values[box]),
-            self.moving,
-            _cut(self.compared, box),
-            _cut(self.body, box),
-            None if self.bone is None else _cut(self.bone, box),
-            None if self.labels is None else LabelMap(grid, self.labels.labels[box], self.labels.names),
-        )
-
-
-def _cut(mask: Mask, box: tuple[slice, slice, slice]) -> Mask:
-    return Mask(mask.grid.part(box), mask.inside[box])
+        compared, body = (Mask(grid, mask.inside[box]) for mask in (self.compared, self.body))
+        bone = self.bone and Mask(grid, self.bone.inside[box])
+        labels = self.labels and LabelMap(grid, self.labels.labels[box], self.labels.names)
+        return AlignedPair(Image(grid, self.fixed.values[box]), self.moving, compared, body, bone, labels)
 
 
 class Displacement(Deformation, Protocol):
-    """What an engine finds: the displacement of tissue relative to its bone, LPS mm, reference configuration."""
+    """The displacement of tissue relative to its bone, LPS mm, reference configuration, as an engine finds it."""
 
     @property
     def spacing_mm(self) -> FloatArray:
@@ -86,98 +78,81 @@ class Displacement(Deformation, Protocol):
 
         Nearer than that to the end of a scan it rests on a part of the image that is not there.
         """
-        ...
 
     def turned(self, rotation: FloatArray) -> Displacement:
         """The same displacement of a body that is rotated about the world's origin."""
-        ...
 
 
-class Regularisation(Protocol):
-    """How strongly an engine smoothed a pair, and why; for an engine that decides that for each pair."""
+class Regularisation:
+    """How strongly an engine smoothed a pair, and why; as it is here for an engine that decides nothing for a pair."""
 
     @property
     def in_bone(self) -> tuple[float, float] | None:
-        """Displacement (rms, mm) and 95th percentile of the maximal shear in the bone before it was constrained."""
-        ...
+        """Displacement (rms, mm) and 95th percentile of the maximum shear in the bone before it was constrained."""
+        return None
 
     @property
     def caution(self) -> str:
         """Why the result is to be used with care; empty where there is no reason."""
-        ...
+        return ""
 
     @property
     def caption(self) -> str:
         """The rule by which the weights were chosen, in words."""
-        ...
+        return ""
 
     def rows(self) -> list[tuple[str, float, str, str | float]]:
         """Each weight: what it penalises, its value, its unit, and "used" or what it left out, % above the least."""
-        ...
+        return []
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
-        ...
+        return {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What an engine found for one pair.
-
-    Attributes
-    ----------
-    displacement : Displacement
-    choice : Regularisation or None
-        None where the engine decides nothing from the images.
-    unlike_study : str
-        Why an error model does not hold for this pair, though it is that of the engine; empty where it does.
-    """
+    """The result of an engine for one pair."""
 
     displacement: Displacement
-    choice: Regularisation | None = None
-    unlike_study: str = ""
+    choice: Regularisation = field(default_factory=Regularisation)
+    unlike_study: str = ""  # why the engine's error model does not hold for this pair; empty where it does
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What an engine takes, about.
+    """Approximate cost of an engine, for each million voxels of the unloaded image where it says so."""
 
-    Attributes
-    ----------
-    seconds_per_mvoxel : float
-        On one core, for each million voxels of the unloaded image.
-    phantom_seconds : float
-        On one core, of one phantom of an accuracy study, which is made and scored as well.
-    gib, gib_per_mvoxel : float
-        Memory beside that of alignment, and for each million voxels.
-    bytes_per_voxel : float
-        Of its results on disk, beside the maps.
-    """
-
-    seconds_per_mvoxel: float = 7.0
-    phantom_seconds: float = 30.0
-    gib: float = 0.0
+    seconds_per_mvoxel: float = 7.0  # on one core
+    phantom_seconds: float = 30.0  # on one core, to make, register and score one phantom of an accuracy study
+    gib: float = 0.0  # memory beside that of alignment
     gib_per_mvoxel: float = 0.175
-    bytes_per_voxel: float = 0.0
+    bytes_per_voxel: float = 0.0  # of its results on disk, beside the maps
 
 
 class Engine(Protocol):
     """An engine with its parameters, which finds the non-rigid part of a registration."""
 
-    @property
-    def family(self) -> str:
-        """What a user asks for by ``--engine``, and what results name the engine as."""
-        ...
+    family: ClassVar[str]
+    """The name by which ``--engine`` and results know it."""
+    needs_labels: ClassVar[bool] = False
+    """Whether it needs a label map of the tissues."""
+    sees_brightness: ClassVar[bool] = True
+    """Whether an even offset of brightness between the images misleads it, as it does not mislead correlation."""
+    starts_anywhere: ClassVar[bool] = True
+    """Whether it can start from any displacement, or from results of its own alone."""
+    cost: ClassVar[Cost] = Cost()
+    """Time, memory and disk space that it takes."""
+    note: ClassVar[str] = ""
+    """A remark on its results for the reader of a report; empty where none is needed."""
 
     @property
     def name(self) -> str:
-        """What an error model is known by."""
-        ...
+        """The name by which an error model is known."""
 
     @property
     def text(self) -> str:
         """Every parameter that decides the result; an error model holds for one such text."""
-        ...
 
     @property
     def needs_one_contrast(self) -> bool:
@@ -185,34 +160,9 @@ class Engine(Protocol):
         return True
 
     @property
-    def needs_labels(self) -> bool:
-        """Whether it needs a label map of the tissues."""
-        return False
-
-    @property
-    def sees_brightness(self) -> bool:
-        """Whether an even offset of brightness between the images misleads it, as it does not mislead correlation."""
-        return True
-
-    @property
-    def starts_anywhere(self) -> bool:
-        """Whether it can start from any displacement, whoever found it, or from results of its own alone."""
-        return True
-
-    @property
     def seeds(self) -> int:
         """How many independent seeds it draws random numbers from."""
         return 0
-
-    @property
-    def cost(self) -> Cost:
-        """Time, memory and disk space that it takes."""
-        return Cost()
-
-    @property
-    def note(self) -> str:
-        """What a reader of a report must know of its results; empty where they are like any other's."""
-        return ""
 
     @property
     def without_error_model(self) -> str:
@@ -238,7 +188,6 @@ class Engine(Protocol):
 
     def record(self) -> dict[str, object]:
         """Its parameters as plain values, for provenance."""
-        ...
 
     @classmethod
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
@@ -252,7 +201,6 @@ class Engine(Protocol):
 
         Parameters
         ----------
-        pair : AlignedPair
         start : Deformation or None
             First guess, u in mm LPS, that `check_start` let pass.
         seeds : sequence of int
@@ -269,7 +217,6 @@ class Engine(Protocol):
         RegistrationError
             If it fails or diverges.
         """
-        ...
 
 
 def other_parameters(name: str) -> str:

@@ -1,16 +1,16 @@
 """From a pair of images to the deformation of the tissue: correct shading, align on the bone, register non-rigidly.
 
-The rigid motion of the bone is put into the loaded image's header, which moves the image without resampling
-it. The displacement found then maps the reference configuration straight to the bone-aligned loaded one, so it is that
-of the tissue relative to its bone; T(X) = R (X + u(X)) + t is the whole motion.
+The rigid motion of the bone is put into the loaded image's header, which moves the image without resampling it. The
+displacement u then maps the reference configuration straight to the bone-aligned loaded one, so it is that of the
+tissue relative to its bone; T(X) = R (X + u(X)) + t is the whole motion.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import singledispatch
 from itertools import combinations
 from typing import Any, TypeVar
 
@@ -75,15 +75,17 @@ class Registration:
     tissue : Mask
         Where the deformation is wanted, on the reference grid: soft tissue and bone.
     bone : Mask or None
+        Aligned on, on the same grid.
     alignment : Alignment
         The bone's rigid motion, reference to loaded.
     displacement : Displacement
         Of tissue relative to its bone, reference configuration, LPS mm.
     settings : Settings
+        As used.
     seconds : float
         Wall time.
-    choice : Regularisation or None
-        How strongly the engine smoothed, and why; None where it decides nothing from the images.
+    choice : Regularisation
+        How strongly the engine smoothed, and why.
     unlike_study : str
         Why an error model of the engine does not hold for this pair; empty where it does.
     """
@@ -96,7 +98,7 @@ class Registration:
     displacement: Displacement
     settings: Settings
     seconds: float
-    choice: Regularisation | None = None
+    choice: Regularisation = field(default_factory=Regularisation)
     unlike_study: str = ""
 
     @property
@@ -145,10 +147,6 @@ def register(
     progress : callable, optional
         ``progress(stage, fraction)``, about twice a second.
 
-    Returns
-    -------
-    Registration
-
     Raises
     ------
     InputError
@@ -165,21 +163,14 @@ def register(
     engine, tell = chosen.engine, progress or (lambda _stage, _fraction: None)
     refuse_one_image_twice([("The unloaded image", reference), ("the loaded one", loaded)])
     body = tissue if tissue is not None else tissue_mask(reference)
-    _check_masks(reference, body, bone, chosen.align_on)
-    tissues = _checked_labels(reference, labels) if engine.needs_labels else None
+    tissues = labels if engine.needs_labels else None
+    _check(reference, body, bone, tissues, chosen)
     if start is not None:
         engine.check_start(start)
-    own = worker is None
-    runner = worker or Worker(chosen.threads)
-    try:
+    with Worker(chosen.threads) if worker is None else nullcontext(worker) as runner:
         pair, alignment, turn = _aligned(reference, loaded, body, bone, tissues, chosen, runner, tell)
-        found = engine.find(
-            pair, start=None if start is None else _turned_start(start, turn.T), seeds=_seeds(chosen)[1:],
-            worker=runner, progress=tell,
-        )  # fmt: skip
-    finally:
-        if own:
-            runner.close()
+        guess = None if start is None else _turned_start(start, turn.T)
+        found = engine.find(pair, start=guess, seeds=_seeds(chosen)[1:], worker=runner, progress=tell)
     return Registration(
         reference, loaded, body, bone, alignment.turned(turn), found.displacement.turned(turn), chosen,
         time.monotonic() - began, found.choice, found.unlike_study,
@@ -187,15 +178,9 @@ def register(
 
 
 def _aligned(
-    reference: Image,
-    loaded: Image,
-    body: Mask,
-    bone: Mask | None,
-    labels: LabelMap | None,
-    settings: Settings,
-    worker: Worker,
-    tell: Progress,
-) -> tuple[AlignedPair, Alignment, FloatArray]:
+    reference: Image, loaded: Image, body: Mask, bone: Mask | None, labels: LabelMap | None, settings: Settings,
+    worker: Worker, tell: Progress,
+) -> tuple[AlignedPair, Alignment, FloatArray]:  # fmt: skip
     """The images without bias field, aligned, in a world whose axes are those of the unloaded one; and its rotation.
 
     elastix draws samples from a box along the world's axes, which of an oblique image holds a part or nothing.
@@ -208,13 +193,16 @@ def _aligned(
     tell("aligning", 0.4)
     turn: FloatArray = Rotation.from_matrix(fixed.grid.direction).as_matrix()
     fixed, moving, body = _turned(fixed, turn.T), _turned(moving, turn.T), _turned(body.toward_lps(), turn.T)
-    bone = None if bone is None else _turned(bone.toward_lps(), turn.T)
-    labels = None if labels is None else _turned(labels.toward_lps(), turn.T)
-    alignment = _align(fixed, moving, body, bone, settings, worker)
-    if settings.align_on == "none" and settings.engine.needs_one_contrast:  # a rigid alignment refuses it by itself
-        refuse_turned_contrast(fixed, moving, body, alignment.motion)
+    bone = bone and _turned(bone.toward_lps(), turn.T)
+    labels = labels and _turned(labels.toward_lps(), turn.T)
+    rigid, on = bone if settings.align_on == "bone" else None, settings.align_on
+    if on == "none":
+        alignment = not_aligned(fixed, moving, body)
+        if settings.engine.needs_one_contrast:  # a rigid alignment refuses it by itself
+            refuse_turned_contrast(fixed, moving, body, alignment.motion)
+    else:
+        alignment = worker.run("aligning the bone", align, fixed, moving, rigid or body, on, _seeds(settings)[0])
     tell("aligning", 1.0)
-    rigid = bone if settings.align_on == "bone" else None
     return AlignedPair.of(fixed, moving, alignment.motion, body, rigid, labels), alignment, turn
 
 
@@ -223,13 +211,7 @@ def _turned(scan: _Scan, rotation: FloatArray) -> _Scan:
 
 
 def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:
-    """Refuse scans of which two are the same image, told by the names given with them.
-
-    Raises
-    ------
-    InputError
-        Naming the two.
-    """
+    """Refuse scans of which two are the same image, by an InputError with the names given with them."""
     for (one, image), (other, second) in combinations(images, 2):
         if image.grid.same_as(second.grid) and np.array_equal(image.values, second.values, equal_nan=True):
             raise InputError(
@@ -238,49 +220,28 @@ def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:
             )
 
 
-def _check_masks(reference: Image, body: Mask, bone: Mask | None, on: AlignOn) -> None:
-    if on == "bone" and bone is None:
+def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | None, settings: Settings) -> None:
+    if settings.align_on == "bone" and bone is None:
         raise InputError(
             "Aligning on the bone needs its mask on the unloaded image: give --bone, or --align image or none."
         )
-    for name, mask in (("tissue", body), ("bone", bone)):
-        if mask is None:
-            continue
-        if not mask.grid.same_as(reference.grid):
-            raise InputError(f"The {name} mask is not on the unloaded image's grid; bring it there (fit_mask).")
-        if not mask.inside.any():
-            raise InputError(f"The {name} mask is empty.")
-
-
-def _checked_labels(reference: Image, labels: LabelMap | None) -> LabelMap:
-    if labels is None:
+    if settings.engine.needs_labels and labels is None:
         raise InputError("Strain may jump at tissue interfaces only where a label map tells them: give --labels, too.")
-    if not labels.grid.same_as(reference.grid):
-        raise InputError("The label map is not on the unloaded image's grid; bring it there (fit_mask).")
-    if not labels.labels.any():
-        raise InputError("The label map is empty.")
-    return labels
+    for name, given in (("tissue mask", body), ("bone mask", bone), ("label map", labels)):
+        if given is None:
+            continue
+        if not given.grid.same_as(reference.grid):
+            raise InputError(f"The {name} is not on the unloaded image's grid; bring it there (fit_mask).")
+        if not (given.labels if isinstance(given, LabelMap) else given.inside).any():
+            raise InputError(f"The {name} is empty.")
 
 
-@singledispatch
 def _turned_start(start: Deformation, rotation: FloatArray) -> Deformation:
-    """The start in a world that is rotated about its origin."""
+    """The start in a world that is rotated about its origin; a B-spline remains one."""
+    if isinstance(start, BSpline):
+        return start.turned(rotation)
     there = RigidMotion(rotation, np.zeros(3))
     return Composed([there.inverse(), start, there])
-
-
-@_turned_start.register
-def _(start: BSpline, rotation: FloatArray) -> Deformation:  # and a B-spline still, which elastix needs
-    return start.turned(rotation)
-
-
-def _align(
-    reference: Image, loaded: Image, body: Mask, bone: Mask | None, settings: Settings, worker: Worker
-) -> Alignment:
-    if settings.align_on == "none":
-        return not_aligned(reference, loaded, body)
-    mask = bone if settings.align_on == "bone" and bone is not None else body
-    return worker.run("aligning the bone", align, reference, loaded, mask, settings.align_on, _seeds(settings)[0])
 
 
 def _seeds(settings: Settings) -> list[int]:

@@ -1,20 +1,21 @@
 """A rigid motion between two images, by Gauss-Newton over the voxels of a mask, from a start right to a few mm.
 
-Sought is the motion T for which I1(T(X)) comes closest to g(X) I0(X) + o at voxels X, with a gain g quadratic in place.
-A small motion d(X) = p + w x (X - c) of the voxels before T changes I1(T(X)) by g grad I0 . d; so what is left of the
+The motion T is the one for which I1(T(X)) comes closest to g(X) I0(X) + o at voxels X, with a gain g quadratic in X.
+A small motion d(X) = p + w x (X - c) of the voxels before T changes I1(T(X)) by g grad I0 . d; so the remaining
 difference is regressed on the six columns of grad I0 . d, and T becomes T after d (inverse compositional; Baker and
-Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). Images are blurred at first, by less and less.
+Matthews 2004, doi:10.1023/B:VISI.0000011205.11775.fd). The images are blurred at first, by less and less.
 
-Three things would pull a mask along its edges. Shading, which its correction leaves in part: the gain takes it up.
-Noise in I0, which makes a slope too small that is regressed on it: so the gain is found with the mean of each voxel's
-six neighbours as instrument, whose noise is another (but where a scanner has interpolated its voxels). And the noise
-of a gradient between voxels, which goes with the noise beside it: that of the unloaded image at its voxels, a
+Three things would pull a mask along its edges. The bias field that its correction leaves: the gain takes it up. Noise
+in I0, which biases a regression on I0: so the gain is estimated with the mean of each voxel's six neighbours as
+instrument, whose noise is independent (unless a scanner has interpolated its voxels). And the noise of a gradient
+between voxels, which correlates with the noise beside it: the gradient of the unloaded image at its voxels, a
 difference of two neighbours, is correlated neither with the voxel between them nor with the neighbours' mean.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import binary_erosion, convolve, map_coordinates, spline_filter
@@ -24,7 +25,7 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.protocol import RigidMotion
 from dvc.errors import InputError, RegistrationError
 from dvc.images.image import Grid, Image, Mask
-from dvc.images.resample import fill_missing, smoothed
+from dvc.images.resample import fill_missing, smoothed, thinned
 
 _BLURS_MM = (4.0, 2.0, 1.0, 0.0)
 _FINE_FROM = 1  # of these, for fits that begin near the end
@@ -48,48 +49,23 @@ _NEIGHBOURS = np.where(np.abs(np.indices((3, 3, 3)) - 1).sum(axis=0) == 1, 1.0 /
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Level:
-    """Both images with one blur: the unloaded one at points of the mask, the loaded one whole.
-
-    Attributes
-    ----------
-    points : (n, 3)
-        LPS mm.
-    values, around : (n,)
-        I0, and the mean of the six neighbours'.
-    places : (n, 10 or 1)
-        Polynomials of place of which the gain is a sum.
-    changes : (n, 6)
-        grad I0 . d for unit steps of the six unknowns.
-    scene, order
-        The loaded image, as coefficients of splines of that order.
-    """
+    """Both images with one blur: the unloaded one at points of the mask, the loaded one whole."""
 
     blur_mm: float
-    points: FloatArray
-    values: FloatArray
-    around: FloatArray
-    places: FloatArray
-    changes: FloatArray
-    scene: Image
-    order: int
+    points: FloatArray  # (n, 3), LPS mm
+    values: FloatArray  # (n,), I0
+    around: FloatArray  # (n,), the mean of the six neighbours'
+    places: FloatArray  # (n, 10 or 1), polynomials of place of which the gain is a sum
+    changes: FloatArray  # (n, 6), grad I0 . d for unit steps of the six unknowns
+    scene: Image  # the loaded image, as coefficients of splines
+    order: int  # of these splines
 
 
 class RigidFit:
-    """Fits of one mask's voxels in one pair of images, from any start.
+    """Fits of one mask's voxels in one pair of images, from any start; the seed is that of the halves of the mask.
 
-    Parameters
-    ----------
-    reference, loaded : Image
-        Of one contrast, but for an offset, and a gain that changes smoothly in place.
-    mask : Mask
-        On the reference grid.
-    seed : int
-        Of the ways in which the mask is divided into halves.
-
-    Raises
-    ------
-    InputError
-        If the unloaded image has values at fewer than 16 of the mask's voxels, or is a single slice.
+    The contrast of the images is one, but for an offset, and a gain that changes smoothly in place. InputError if the
+    unloaded image has values at fewer than 16 of the mask's voxels, or is a single slice.
     """
 
     def __init__(self, reference: Image, loaded: Image, mask: Mask, seed: int) -> None:
@@ -112,34 +88,24 @@ class RigidFit:
         self._levels = [self._level(reference, known, blur, scenes[blur]) for blur in _BLURS_MM]
 
     def whole(self, start: RigidMotion) -> RigidMotion:
-        """The motion found from a start by all of the voxels.
+        """The motion that all of the voxels give from a start.
 
-        Raises
-        ------
-        RegistrationError
-            If half of the voxels leave what the loaded image shows, its contrast there is turned round, or the motion
-            goes off by 15 mm.
+        RegistrationError if half of the voxels leave the loaded image, its contrast is inverted there, or the motion
+        goes off by 15 mm.
         """
         motion = start
         for level in self._levels:
             motion = self._settled(level, motion, np.ones(len(level.points), dtype=bool))
-        points = self._levels[0].points
-        moved_mm = float(np.sqrt(np.mean(np.sum((motion.apply(points) - start.apply(points)) ** 2, axis=1))))
-        if moved_mm > _FARTHEST_MM:
+        if (moved_mm := apart_mm(motion, start, self._levels[0].points)) > _FARTHEST_MM:
             raise RegistrationError(f"The fit went off by {moved_mm:.0f} mm.")
         return motion
 
     def halves(self, near: RigidMotion) -> list[tuple[RigidMotion, RigidMotion]]:
-        """Pairs of motions found by one half of the voxels each, begun to either side of one that is near.
+        """Pairs of motions, each from one half of the voxels, begun to either side of a motion that is near.
 
-        One pair for each way to move on which the images tell something by itself, the axes of the normal equations,
-        and with a division of its own. Along a way of which they tell nothing its pair stays apart, or noise leads the
-        halves to places that agree by chance alone.
-
-        Raises
-        ------
-        RegistrationError
-            If half of a half's voxels leave what the loaded image shows, or its contrast there is turned round.
+        One pair for each axis of the normal equations, with a division into halves of its own. Along an axis of which
+        the images tell nothing the pair stays apart, or noise leads the halves to places that agree by chance alone.
+        RegistrationError as in `whole`, of a half's voxels.
         """
         changes = self._levels[-1].changes
         _, ways = np.linalg.eigh(np.einsum("ni,nj->ij", changes, changes))
@@ -148,8 +114,7 @@ class RigidFit:
             corner = self._random.uniform(0.0, 2.0 * self._block_mm, 3)
             halves = [self._divided(level.points, corner) for level in self._levels[_FINE_FROM:]]
             one = self._part(near.after(self._step(way)), halves)
-            other = self._part(near.after(self._step(-way)), [~half for half in halves])
-            pairs.append((one, other))
+            pairs.append((one, self._part(near.after(self._step(-way)), [~half for half in halves])))
         return pairs
 
     def _divided(self, points: FloatArray, corner: FloatArray) -> BoolArray:
@@ -183,9 +148,8 @@ class RigidFit:
         if self._radius_mm < _SHADED_MM:
             places = places[:, :1]
         around = convolve(fixed, _NEIGHBOURS, mode="nearest")[tuple(at.T)]
-        return _Level(
-            blur_mm, points, values, around, places, np.hstack([gradient, turning]), scene, 1 if blur_mm else 3
-        )
+        changes, order = np.hstack([gradient, turning]), 1 if blur_mm else 3
+        return _Level(blur_mm, points, values, around, places, changes, scene, order)
 
     def _settled(self, level: _Level, motion: RigidMotion, part: BoolArray) -> RigidMotion:
         """Where steps over some of a level's points come to rest."""
@@ -227,6 +191,11 @@ class RigidFit:
         return RigidMotion.about(self._centre, turn, step[:3])
 
 
+def apart_mm(one: RigidMotion, other: RigidMotion, points: FloatArray) -> float:
+    """Root mean square distance, mm, between where two motions take points (n, 3)."""
+    return float(np.sqrt(np.mean(np.sum((one.apply(points) - other.apply(points)) ** 2, axis=1))))
+
+
 def _surrounded(image: Image, mask: Mask) -> Mask:
     """The voxels of a mask that the image shows with all of their six neighbours; if those are few, all that it shows.
 
@@ -247,21 +216,13 @@ def _regressed(columns: FloatArray, on: FloatArray, instruments: FloatArray | No
 
 def _scenes(loaded: Image) -> dict[float, Image]:
     """The loaded image by its blur: cubic coefficients without, and values at fewer voxels the more it is blurred."""
-    scenes, now, blurred = {}, loaded, 0.0
-    for blur in sorted(_BLURS_MM):
-        if not blur:
-            scenes[blur] = Image(loaded.grid, spline_filter(loaded.values, 3, np.float32, "mirror"))
-            continue
-        now, blurred = smoothed(now, float(np.sqrt(blur**2 - blurred**2))), blur
-        every = _every(now.grid, blur)
-        values = now.values[every]
-        spacing = now.grid.spacing_mm * [one.step for one in every]
-        now = Image(Grid(values.shape, spacing, now.grid.origin_mm, now.grid.direction), values)
-        scenes[blur] = now
+    scenes, now = {0.0: Image(loaded.grid, spline_filter(loaded.values, 3, np.float32, "mirror"))}, loaded
+    for before, blur in pairwise(sorted(_BLURS_MM)):
+        now = smoothed(now, float(np.sqrt(blur**2 - before**2)))
+        scenes[blur] = now = thinned(now, _every(now.grid, blur))
     return scenes
 
 
-def _every(grid: Grid, blur_mm: float) -> tuple[slice, slice, slice]:
+def _every(grid: Grid, blur_mm: float) -> tuple[slice, ...]:
     """As many of a grid's voxels as an image needs that is blurred so much."""
-    i, j, k = (slice(None, None, max(1, int(blur_mm / _VOXELS_PER_BLUR / s))) for s in grid.spacing_mm)
-    return i, j, k
+    return tuple(slice(None, None, max(1, int(blur_mm / _VOXELS_PER_BLUR / s))) for s in grid.spacing_mm)

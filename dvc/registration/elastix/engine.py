@@ -15,7 +15,7 @@ import numpy as np
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, ParameterError, RegistrationError
-from dvc.images.image import Grid, Image, Mask
+from dvc.images.image import Grid, Mask
 from dvc.images.resample import fill_missing
 from dvc.io.transforms.elastix_text import parse_parameters
 from dvc.io.transforms.read import bspline_from_elastix
@@ -88,7 +88,7 @@ class Elastix(Engine):
 
     @property
     def seeds(self) -> int:
-        """One for each stage."""
+        """Number of independent seeds: one for each stage."""
         return len(self.presets)
 
     @property
@@ -122,11 +122,12 @@ class Elastix(Engine):
     ) -> Found:
         """Find the displacement between the images of a pair; as in `Engine`."""
         last = None if start is None else _as_bspline(start)
-        moving, moving_mask = _without_gaps(pair.moving)
-        here = replace(pair, fixed=fill_missing(pair.fixed), moving=moving).cut()
+        missing = pair.moving.missing
+        known = Mask(pair.moving.grid, ~missing) if missing.any() else None
+        here = replace(pair, fixed=fill_missing(pair.fixed), moving=fill_missing(pair.moving)).cut()
         for number, (preset, seed) in enumerate(zip(self.presets, seeds, strict=True), start=1):
             stage = "registering" if len(self.presets) == 1 else f"registering, stage {number}"
-            last = _one_stage(preset, here, moving_mask, seed, last, worker, partial(progress, stage))
+            last = _one_stage(preset, here, known, seed, last, worker, partial(progress, stage))
         assert last is not None
         return Found(last)
 
@@ -141,44 +142,25 @@ def _as_bspline(start: Deformation) -> BSpline:
 
 
 def _one_stage(
-    preset: Preset,
-    pair: AlignedPair,
-    moving_mask: Mask | None,
-    seed: int,
-    start: BSpline | None,
-    worker: Worker,
+    preset: Preset, pair: AlignedPair, moving_mask: Mask | None, seed: int, start: BSpline | None, worker: Worker,
     tell: Callable[[float], None],
-) -> BSpline:
+) -> BSpline:  # fmt: skip
     """Displacement by one stage, added to that of the stage or load before it, ``start``."""
+    grid, initial, total = pair.fixed.grid, None, preset.iterations
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
-        initial = None
         if start is not None:
-            initial = str(write_elastix_transform(Path(folder), start, None, pair.fixed.grid)[0])
-        total = preset.iterations
-        run = preset.complete(seed=seed, combine="Add" if start is not None else "Compose")
+            initial = str(write_elastix_transform(Path(folder), start, None, grid)[0])
+        run = _resolvable(preset.complete(seed=seed, combine="Compose" if start is None else "Add"), grid)
         found = worker.run(
-            f"registering with {preset.name}",
-            elastix.register,
-            pair.fixed,
-            pair.moving,
-            _resolvable(run, pair.fixed.grid),
-            pair.compared,
-            moving_mask,
-            initial,
-            folder,
+            f"registering with {preset.name}", elastix.register, pair.fixed, pair.moving, run, pair.compared,
+            moving_mask, initial, folder,
             watch=lambda: tell(min(1.0, elastix.finished_iterations(Path(folder)) / total)),
-        )
+        )  # fmt: skip
     tell(1.0)
-    bspline = bspline_from_elastix(found.transform)
+    bspline = bspline_from_elastix(found)
     if not np.isfinite(bspline.coefficients_mm).all():
         raise RegistrationError(f"{preset.name}: elastix' optimiser diverged (coefficients are not finite).")
     return bspline.plus(start) if start is not None else bspline
-
-
-def _without_gaps(image: Image) -> tuple[Image, Mask | None]:
-    """The image with missing voxels filled in, and the mask of those that are known, where any is missing."""
-    missing = image.missing
-    return fill_missing(image), Mask(image.grid, ~missing) if missing.any() else None
 
 
 def _resolvable(parameters: dict[str, tuple[str, ...]], grid: Grid) -> dict[str, tuple[str, ...]]:

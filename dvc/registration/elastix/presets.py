@@ -18,7 +18,7 @@ from pathlib import Path
 from dvc.errors import InputError, ParameterError
 from dvc.io.transforms.elastix_text import parse_parameters
 
-_FOLDER = "parameters"
+_FOLDER = files("dvc.registration.elastix") / "parameters"
 _LABEL = re.compile(
     r"^(Metric|Transform|Optimizer|Interpolator|ImageSampler|FixedImagePyramid|MovingImagePyramid|Registration)\d*"
 )
@@ -59,18 +59,11 @@ class Preset:
     parameters: dict[str, tuple[str, ...]]
 
     def complete(self, *, seed: int, combine: str = "Compose") -> dict[str, tuple[str, ...]]:
-        """All parameters of a run: the preset's, and those that mrstrain sets for every run.
+        """All parameters of a run: the preset's, those that mrstrain sets for every run, and the seed of elastix.
 
-        Parameters
-        ----------
-        seed : int
-            Seed of elastix' random numbers; without one every run would differ.
-        combine : {"Compose", "Add"}
-            How an initial transform is combined with the one sought.
+        An initial transform is combined with the one sought as `combine` says, "Compose" or "Add".
         """
-        run = {**self.parameters, **_ALWAYS, "HowToCombineTransforms": (combine,)}
-        run["RandomSeed"] = (str(seed),)
-        return run
+        return self.parameters | _ALWAYS | {"HowToCombineTransforms": (combine,), "RandomSeed": (str(seed),)}
 
     @property
     def iterations(self) -> int:
@@ -87,8 +80,7 @@ class Preset:
 
 def preset_names() -> list[str]:
     """Names of the presets that can be asked for."""
-    folder = files("dvc.registration.elastix") / _FOLDER
-    return sorted(f.name.removesuffix(".txt") for f in folder.iterdir() if f.name.endswith(".txt"))
+    return sorted(f.name.removesuffix(".txt") for f in _FOLDER.iterdir() if f.name.endswith(".txt"))
 
 
 def load_preset(name: str) -> Preset:
@@ -106,18 +98,11 @@ def load_preset(name: str) -> Preset:
     """
     if name not in preset_names():
         raise ParameterError(f"No preset '{name}'; there are {', '.join(preset_names())}.")
-    text = (files("dvc.registration.elastix") / _FOLDER / f"{name}.txt").read_text()
-    return _checked(name, text, allow_unknown=False)
+    return _checked(name, (_FOLDER / f"{name}.txt").read_text(), allow_unknown=False)
 
 
 def preset_or_file(name: str) -> Preset:
-    """A preset by its name, or a user's own elastix parameter file by a path that ends in .txt.
-
-    Raises
-    ------
-    ParameterError, InputError
-        As `load_preset` and `read_parameter_file`.
-    """
+    """A preset by its name, or a user's own elastix parameter file by a path that ends in .txt; errors as of both."""
     return read_parameter_file(name) if name.endswith(".txt") else load_preset(name)
 
 
@@ -151,7 +136,7 @@ def _checked(name: str, text: str, *, allow_unknown: bool) -> Preset:
     if not allow_unknown:
         for parameter in parameters:
             _check_name(name, parameter)
-    for kind, components in _known_components().items():
+    for kind, components in _known()[1].items():
         for value in parameters.get(kind, ()):
             if value not in components:
                 raise ParameterError(f'{name}: elastix has no {kind} "{value}"; {_nearest(value, components)}')
@@ -161,13 +146,9 @@ def _checked(name: str, text: str, *, allow_unknown: bool) -> Preset:
 
 
 def _check_name(file: str, parameter: str) -> None:
-    known = _known_parameters()
-    bare = parameter.rstrip("0123456789")
-    without_label = _LABEL.sub("", parameter)
-    if parameter in known or bare in known or without_label in known:
-        return
-    labelled = _LABEL.match(parameter)
-    if labelled and "Metric" + without_label in known:
+    known, without_label = _known()[0], _LABEL.sub("", parameter)
+    spellings = {parameter, parameter.rstrip("0123456789"), without_label}
+    if known & spellings or (_LABEL.match(parameter) and "Metric" + without_label in known):
         return
     raise ParameterError(
         f"{file}: elastix has no parameter '{parameter}' and would ignore it in silence; "
@@ -181,16 +162,7 @@ def _nearest(name: str, known: Sequence[str] | frozenset[str]) -> str:
 
 
 @cache
-def _known() -> dict[str, dict[str, list[str]]]:
-    loaded: dict[str, dict[str, list[str]]] = json.loads(
-        (files("dvc.registration.elastix") / _FOLDER / "known.json").read_text()
-    )
-    return loaded
-
-
-def _known_parameters() -> frozenset[str]:
-    return frozenset(_known()["parameters"])
-
-
-def _known_components() -> dict[str, list[str]]:
-    return _known()["components"]
+def _known() -> tuple[frozenset[str], dict[str, list[str]]]:
+    """Names of elastix' parameters, and of its components by the parameter that names them."""
+    known = json.loads((_FOLDER / "known.json").read_text())
+    return frozenset(known["parameters"]), known["components"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,7 @@ from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.itk_image import to_itk
 
-Parameters = Mapping[str, tuple[str, ...]]
-
-LOG_NAME = "elastix.log"
-_ITERATIONS = "IterationInfo.*.txt"
+_LOG = "elastix.log"
 _SELF_TEST: dict[str, tuple[str, ...]] = {
     "Registration": ("MultiResolutionRegistration",),
     "Metric": ("AdvancedNormalizedCorrelation",),
@@ -39,51 +36,20 @@ _SELF_TEST: dict[str, tuple[str, ...]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Registered:
-    """What elastix found.
-
-    Attributes
-    ----------
-    transform : mapping
-        The transform's parameter map, every value as text.
-    final_metric : float
-        Mean of the metric over the last tenth of the last resolution's iterations; its sign and size are
-        elastix' (normalised correlation: -1 is perfect).
-    """
-
-    transform: dict[str, tuple[str, ...]]
-    final_metric: float
-
-
 def register(
     fixed: Image,
     moving: Image,
-    parameters: Parameters,
+    parameters: Mapping[str, tuple[str, ...]],
     fixed_mask: Mask | None,
     moving_mask: Mask | None,
     initial_transform: str | None,
     folder: str,
-) -> Registered:
-    """Run one elastix registration.
+) -> dict[str, tuple[str, ...]]:
+    """The parameter map, every value as text, of the transform from points of `fixed` (LPS mm) to those of `moving`.
 
-    Parameters
-    ----------
-    fixed, moving : Image
-        The transform found maps points of ``fixed`` (LPS mm) to points of ``moving``. No missing values.
-    parameters : mapping
-        elastix parameters, complete (see `dvc.registration.elastix.presets`).
-    fixed_mask, moving_mask : Mask, optional
-        On the grids of their images; samples are taken inside the fixed mask only.
-    initial_transform : str, optional
-        Path of an elastix transform file to start from; combined as the parameters say.
-    folder : str
-        Existing folder for elastix' log and iteration tables, which tell the progress.
-
-    Raises
-    ------
-    RegistrationError
-        With the reason that elastix wrote to its log.
+    The images have no missing values; samples are taken inside the fixed mask only. The parameters are complete
+    (`Preset.complete`), and say how a transform file to start from is combined. elastix leaves its log and iteration
+    tables, which tell the progress, in the folder; RegistrationError with the reason that it wrote to its log.
     """
     import itk
 
@@ -93,41 +59,36 @@ def register(
     method = itk.ElastixRegistrationMethod[image_type, image_type].New()
     method.SetFixedImage(to_itk(fixed.grid, fixed.values, itk))
     method.SetMovingImage(to_itk(moving.grid, moving.values, itk))
-    if fixed_mask is not None:
-        method.SetFixedMask(to_itk(fixed_mask.grid, fixed_mask.inside.astype(np.uint8), itk))
-    if moving_mask is not None:
-        method.SetMovingMask(to_itk(moving_mask.grid, moving_mask.inside.astype(np.uint8), itk))
+    for mask, set_mask in ((fixed_mask, method.SetFixedMask), (moving_mask, method.SetMovingMask)):
+        if mask is not None:
+            set_mask(to_itk(mask.grid, mask.inside.astype(np.uint8), itk))
     if initial_transform is not None:
         method.SetInitialTransformParameterFileName(initial_transform)
     method.SetParameterObject(parameter_object)
     method.SetOutputDirectory(folder)
-    method.SetLogFileName(LOG_NAME)
+    method.SetLogFileName(_LOG)
     method.SetLogToFile(True)
     method.SetLogToConsole(False)
     try:
         method.UpdateLargestPossibleRegion()
     except RuntimeError as failure:
-        raise RegistrationError(f"elastix failed: {reason_in_log(Path(folder) / LOG_NAME)}") from failure
+        raise RegistrationError(f"elastix failed: {_reason_in(Path(folder) / _LOG)}") from failure
     found = method.GetTransformParameterObject().GetParameterMap(0)
-    transform = {str(name): tuple(str(v) for v in found[name]) for name in found}
-    return Registered(transform, _final_metric(Path(folder)))
+    return {str(name): tuple(str(v) for v in found[name]) for name in found}
 
 
 def self_test() -> str:
     """Register a small pair of known shift; return a sentence on what came out, for `mrstrain doctor`."""
-    from dvc.registration.elastix.presets import Preset
-
-    rng = np.random.default_rng(0)
-    coarse = rng.normal(size=(10, 10, 10)).astype(np.float32)
-    grid = Grid((40, 40, 40), np.ones(3), np.zeros(3))
     from scipy.ndimage import zoom
 
-    values = zoom(coarse, 4.0, order=3)
-    shifted = Grid((40, 40, 40), np.ones(3), np.array([1.5, 0.0, 0.0]))
+    from dvc.registration.elastix.presets import Preset
+
+    values = zoom(np.random.default_rng(0).normal(size=(10, 10, 10)).astype(np.float32), 4.0, order=3)
+    grid, shifted = (Grid((40, 40, 40), np.ones(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.5))
     parameters = Preset("self-test", "", _SELF_TEST).complete(seed=1)
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
         found = register(Image(grid, values), Image(shifted, values), parameters, None, None, None, folder)
-    shift = float(found.transform["TransformParameters"][0])
+    shift = float(found["TransformParameters"][0])
     if abs(shift - 1.5) > 0.05:
         raise RegistrationError(f"elastix found a shift of {shift:.3f} mm where 1.5 mm is true.")
     return f"a shift of 1.5 mm was found as {shift:.3f} mm"
@@ -136,24 +97,13 @@ def self_test() -> str:
 def finished_iterations(folder: Path) -> int:
     """Number of iterations that elastix has written so far into ``folder``, over all resolutions."""
     count = 0
-    for table in folder.glob(_ITERATIONS):
-        try:
+    for table in folder.glob("IterationInfo.*.txt"):
+        with suppress(OSError):
             count += max(0, table.read_bytes().count(b"\n") - 1)
-        except OSError:
-            continue
     return count
 
 
-def _final_metric(folder: Path) -> float:
-    tables = sorted(folder.glob(_ITERATIONS))
-    if not tables:
-        return float("nan")
-    rows = tables[-1].read_text().splitlines()[1:]
-    metric = [float(row.split("\t")[1]) for row in rows if row.strip()]
-    return float(np.mean(metric[-max(1, len(metric) // 10) :])) if metric else float("nan")
-
-
-def reason_in_log(log: Path) -> str:
+def _reason_in(log: Path) -> str:
     """The reason of a failure, as elastix wrote it to its log."""
     try:
         text = log.read_text(errors="replace")

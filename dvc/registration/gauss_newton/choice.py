@@ -4,38 +4,27 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
+from dvc.registration.engine import Regularisation
 from dvc.registration.gauss_newton.level import Weights
 
 _ASKED = 0.04  # the change of volume that a hundredth of the soft tissue exceeds: between loads and swelling
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class Choice(Regularisation):
     """The prior's weights that were used, and why.
 
-    Attributes
-    ----------
-    weights : Weights
-    rule : str
-        In words.
-    tried : tuple of (bending, left-out residual)
-        Mean square residual of the half of the voxels that was left out, over that of the best.
-    tried_in_skin : tuple of (rigidity, left-out residual)
-        Likewise for the weight of strain in the skin, where the tissues are known.
-    at_interfaces : bool
-        Whether strain was let jump at tissue interfaces; the weight "rigidity" is then that of the skin's strain.
-    asked : float or None
-        The change of volume that a hundredth of the soft tissue exceeds if only its gradient is held; None where the
-        weight of the change of volume was fixed beforehand.
-    in_bone : (root mean square displacement in mm, 95th percentile of the maximal shear), optional
-        Within the bone, of the smooth displacement that came before one that holds the bone at rest.
+    Each weight that was tried stands beside the mean square residual of the voxels left out, over that of the best.
+    `asked` is the change of volume that a hundredth of the soft tissue exceeds if only its gradient is held; None where
+    the weight of the change of volume was fixed beforehand. `in_bone` is the displacement (rms, mm) and the 95th
+    percentile of the maximum shear in the bone, of the smooth displacement that came before one with a rigid bone.
     """
 
     weights: Weights
     rule: str
     tried: tuple[tuple[float, float], ...] = ()
     tried_in_skin: tuple[tuple[float, float], ...] = ()
-    at_interfaces: bool = False
+    at_interfaces: bool = False  # if so the weight "rigidity" is that of the skin's strain
     asked: float | None = None
     in_bone: tuple[float, float] | None = None
 
@@ -79,14 +68,14 @@ class Choice:
     def rows(self) -> list[tuple[str, float, str, str | float]]:
         """Each weight: what it penalises, its value, its unit, and "used" or what it left out, % above the least."""
         stiff = f"strain of {self.rigidity_of}"
-        used: list[tuple[str, float, str, str | float]] = [
+        return [
             ("bending", self.weights.bending, "1/mm", "used"),
             ("change of volume in soft tissue", self.weights.volume, "1/mm3", "used"),
             ("gradient of that change", self.weights.volume_gradient, "1/mm", "used"),
             (stiff, self.weights.rigidity, "1/mm3", "used"),
+            *(("bending", weight, "1/mm", 100.0 * (left - 1.0)) for weight, left in self.tried),
+            *((stiff, weight, "1/mm3", 100.0 * (left - 1.0)) for weight, left in self.tried_in_skin),
         ]
-        used += [("bending", weight, "1/mm", 100.0 * (left - 1.0)) for weight, left in self.tried]
-        return used + [(stiff, weight, "1/mm3", 100.0 * (left - 1.0)) for weight, left in self.tried_in_skin]
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""

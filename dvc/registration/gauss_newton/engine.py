@@ -28,8 +28,6 @@ _NOTE = (
     "elastix are not written, since elastix knows no spline with borders."
 )
 
-_Fit = Callable[..., tuple[Displacement, Choice]]
-
 
 @dataclass(frozen=True, slots=True)
 class GaussNewton(Parameters, Engine):
@@ -159,13 +157,9 @@ class GaussNewtonWithInterfaces(Engine):
 
 
 def _run(
-    fitting: _Fit,
-    pair: AlignedPair,
-    given: tuple[object, ...],
-    start: Deformation | None,
-    worker: Worker,
-    tell: Progress,
-) -> tuple[Displacement, Choice]:
+    fitting: Callable[..., tuple[Displacement, Choice]], pair: AlignedPair, given: tuple[object, ...],
+    start: Deformation | None, worker: Worker, tell: Progress,
+) -> tuple[Displacement, Choice]:  # fmt: skip
     """Run a fit in the worker, which leaves the share that is done in a file."""
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
         done = Path(folder) / "share done"
@@ -204,11 +198,9 @@ def _volume_freed(name: str, choice: Choice) -> str:
 def _methods(own: Mapping[str, Any], record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
     bending, volume = own.get("bending"), own.get("volume")
     weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
-    kept = (
-        "300/mm3, or of its gradient alone where the images ask for such a change"
-        if volume is None
-        else f"{volume:g}/mm3"
-    )
+    kept = "300/mm3, or of its gradient alone where the images ask for such a change"
+    if volume is not None:
+        kept = f"{volume:g}/mm3"
     held = (
         f", on change of volume in soft tissue ({kept}) and on strain of the bone ({own.get('rigidity'):g}/mm3)"
         if record.get("align") == "bone"

@@ -1,12 +1,12 @@
 """Gauss-Newton registration: a cubic B-spline displacement, all voxels, and a prior whose weight the images choose.
 
-Minimised is ``1/(2 s^2) sum r^2 + b/2 int c |Δ u|^2 + v/2 int (J - 1)^2 + w/2 int |E|^2``: residuals r over the voxels
-of a mask with their own variance s^2, the bending of the displacement (and, very little, itself:
+The energy is ``1/(2 s^2) sum r^2 + b/2 int c |Δ u|^2 + v/2 int (J - 1)^2 + w/2 int |E|^2``: residuals r over the voxels
+of a mask with their own variance s^2, the bending of the displacement (and, very little, the displacement itself:
 `dvc.registration.gauss_newton.roughness`), the change of volume in soft tissue and the strain of the bone. Bending
-counts alike everywhere (c = 1) at first; in the last steps less where it was found. Four levels from coarse to fine,
-smoothed images first; each step by conjugate gradients that never form the Hessian. Nothing is drawn at random, and
-every sum has a fixed order: the result is the same bit for bit on any number of threads. docs/decisions/0009 has the
-reasons.
+counts alike everywhere (c = 1) at first; in the last steps less where the displacement is curved. Four levels from
+coarse to fine, smoothed images first; each step by conjugate gradients that never form the Hessian. Nothing is random,
+and every sum has a fixed order: the result is the same bit for bit on any number of threads. Reasons:
+docs/decisions/0009.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, ParameterError
-from dvc.images.image import Grid, Image
-from dvc.images.resample import smoothed
+from dvc.images.image import Grid, Image, Mask
+from dvc.images.resample import smoothed, thinned
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.level import Level, Weights
@@ -44,7 +44,6 @@ USUAL_VOLUME = 300.0
 _LOOKING_MM4, _FREED = 1000.0, 100.0
 _RATIO = np.sqrt(10.0)
 _POWERS = -4, 3  # powers of the ratio that are tried at the most: weights of 0.03 to 95
-_CHECK_TOLERANCE, _CHECK_MOST = 0.05, 80
 _MIDDLE = 0.7  # of each edge of the mask's box
 _LAST_STEPS = 2
 
@@ -92,16 +91,10 @@ class Parameters:
         Volume by the rule reads as volume kept, which gives the same result bit for bit unless the rule frees it
         (`Choice.frees_volume`); of a result for which it did, this text alone says too little.
         """
-        rule = {
-            "usual": USUAL_BENDING,
-            "ratio": _RATIO,
-            "powers": _POWERS,
-            "steps": [1, _LAST_STEPS],
-        }
+        rule = {"usual": USUAL_BENDING, "ratio": _RATIO, "powers": _POWERS, "steps": [1, _LAST_STEPS]}
         rims = {"blurred": _BLURRED, "bone_rim_mm": _RIM_MM}
         told = {"engine": "gauss-newton", "levels": LEVELS, "least_voxels": _LEAST_VOXELS, "rims": rims, "rule": rule}
-        told |= {"roughness": NUMBERS}
-        return json.dumps(asdict(self) | {"volume": self.weights.volume} | told)
+        return json.dumps(asdict(self) | {"volume": self.weights.volume} | told | {"roughness": NUMBERS})
 
     @property
     def weights(self) -> Weights:
@@ -116,30 +109,10 @@ def fit(
     start: Deformation | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[BSpline, Choice]:
-    """Find the displacement that carries the fixed image to the moving one.
+    """Find the displacement, LPS mm, that carries the fixed image to the moving one.
 
-    Parameters
-    ----------
-    pair : AlignedPair
-        Images without their bias field; missing voxels are left out.
-    parameters : Parameters
-    start : Deformation, optional
-        First guess, u in mm LPS; where it is not defined its nearest value is taken.
-    progress : callable, optional
-        Gets the share that is done.
-
-    Returns
-    -------
-    bspline : BSpline
-        Displacement, LPS mm.
-    choice : Choice
-
-    Raises
-    ------
-    InputError
-        If the tissue has no contrast.
-    RegistrationError
-        If it diverges.
+    Where the first guess `start` (u in mm LPS) is not defined its nearest value is taken; `progress` gets the share
+    that is done. Errors as in `dvc.Engine.find`.
     """
     fixed, inside = pair.fixed, pair.compared.inside
     pictures = brightness_scaled(pair)
@@ -154,9 +127,9 @@ def fit(
     for number, (sigma_mm, factor, steps, stop_mm) in enumerate(LEVELS):
         guess = start if number == 0 else BSpline(control, turned(axes, coefficients))
         control = control_grid(fixed.grid, factor * spacing)
-        coefficients = (
-            np.zeros((3, *control.shape)) if guess is None else turned(axes.T, spline_through(guess, control))
-        )
+        coefficients = np.zeros((3, *control.shape))
+        if guess is not None:
+            coefficients = turned(axes.T, spline_through(guess, control))
         level = _level(pictures, inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps * weights.patience, stop_mm=stop_mm)
         if parameters.volume is None and number == len(LEVELS) - 2:
@@ -167,7 +140,7 @@ def fit(
     choice = replace(choice, weights=weights)
     level.roughness = level.following(coefficients)
     if parameters.bending is None:
-        part = _middle(inside)
+        part = _middle(pair.compared)
         middle = Level(*pictures, inside & part, soft & part, core & part, control)
         middle.roughness = level.roughness
         choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
@@ -201,10 +174,7 @@ def choose(
     def left_out(power: int) -> float:
         if power not in found:
             tried = replace(weights, **{name: usual * _RATIO**power})
-            fitted = level.descend(
-                coefficients, tried, steps=1, stop_mm=0.0, halves=0, tolerance=_CHECK_TOLERANCE,
-                most=_CHECK_MOST,
-            )  # fmt: skip
+            fitted = level.descend(coefficients, tried, steps=1, stop_mm=0.0, halves=0)
             found[power] = level.at(fitted, halves=1).variance
         return found[power]
 
@@ -237,15 +207,11 @@ def _volume_asked(level: Level, coefficients: FloatArray, weights: Weights) -> f
     return level.swelling(level.descend(coefficients, looking, steps=1, stop_mm=0.0), 99.0)
 
 
-def _middle(inside: BoolArray) -> BoolArray:
+def _middle(mask: Mask) -> BoolArray:
     """The middle of a mask's box, a third of its volume: enough to choose a weight, in a third of the time."""
-    part = np.zeros_like(inside)
-    sides = []
-    for axis in range(3):
-        at = np.flatnonzero(inside.any(axis=tuple(a for a in range(3) if a != axis)))
-        margin = int(0.5 * (1.0 - _MIDDLE) * (at[-1] - at[0] + 1))
-        sides.append(slice(at[0] + margin, at[-1] + 1 - margin))
-    part[tuple(sides)] = True
+    part, box = np.zeros_like(mask.inside), mask.box()
+    margins = [int(0.5 * (1.0 - _MIDDLE) * (edge.stop - edge.start)) for edge in box]
+    part[tuple(slice(e.start + m, e.stop - m) for e, m in zip(box, margins, strict=True))] = True
     return part
 
 
@@ -255,19 +221,13 @@ def _level(
     """Images smoothed, and every so manyth voxel of them: a smooth image needs no more."""
     if sigma_mm == 0.0:
         return Level(*pictures, inside, soft, bone, control)
-    fixed, moving = (_thinned(smoothed(i, sigma_mm), sigma_mm) for i in pictures)
-    every = tuple(slice(None, None, int(n)) for n in _stride(pictures[0].grid, sigma_mm))
+    fixed, moving = (thinned(smoothed(i, sigma_mm), _every(i.grid, sigma_mm)) for i in pictures)
+    every = _every(pictures[0].grid, sigma_mm)
     return Level(fixed, moving, inside[every], soft[every], bone[every], control, _BLURRED * sigma_mm)
 
 
 def brightness_scaled(pair: AlignedPair) -> tuple[Image, Image]:
-    """Both images over the brightness of the tissue in the fixed one.
-
-    Raises
-    ------
-    InputError
-        If that is not above zero.
-    """
+    """Both images over the brightness of the tissue in the fixed one; InputError if that is not above zero."""
     scale = float(np.nanpercentile(pair.fixed.values[pair.body.inside], 75))
     if not scale > 0:
         raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
@@ -279,15 +239,8 @@ def scaled(image: Image, scale: float) -> Image:
     return Image(image.grid, image.values / np.float32(scale))
 
 
-def _stride(grid: Grid, sigma_mm: float) -> FloatArray:
-    return np.maximum(np.floor(sigma_mm / grid.spacing_mm + 1e-6), 1.0)
-
-
-def _thinned(image: Image, sigma_mm: float) -> Image:
-    stride = _stride(image.grid, sigma_mm)
-    values = image.values[tuple(slice(None, None, int(n)) for n in stride)]
-    i, j, k = values.shape
-    return Image(Grid((i, j, k), stride * image.grid.spacing_mm, image.grid.origin_mm, image.grid.direction), values)
+def _every(grid: Grid, sigma_mm: float) -> tuple[slice, ...]:
+    return tuple(slice(None, None, max(1, int(sigma_mm / s + 1e-6))) for s in grid.spacing_mm)
 
 
 def control_grid(grid: Grid, spacing_mm: FloatArray) -> Grid:
@@ -302,22 +255,16 @@ def control_grid(grid: Grid, spacing_mm: FloatArray) -> Grid:
 def spline_through(deformation: Deformation, control: Grid) -> FloatArray:
     """Coefficients (3, mi, mj, mk), LPS mm, of the spline that has a deformation's displacement at the control points.
 
-    Where it is not defined there, its nearest value is taken; the second difference at the ends is zero.
-
-    Raises
-    ------
-    InputError
-        If it is defined nowhere.
+    Where it is not defined there, its nearest value is taken (InputError if it has none); the second difference at the
+    ends is zero.
     """
     u = deformation.displacement(control.points().reshape(-1, 3)).reshape(*control.shape, 3)
     unknown = ~np.isfinite(u).all(axis=-1)
     if unknown.all():
         raise InputError("The deformation to start from is not defined anywhere in the unloaded image.")
     if unknown.any():
-        nearest = distance_transform_edt(
-            unknown, sampling=control.spacing_mm, return_distances=False, return_indices=True
-        )
-        u = u[tuple(nearest)]
+        to = distance_transform_edt(unknown, sampling=control.spacing_mm, return_distances=False, return_indices=True)
+        u = u[tuple(to)]
     c = np.moveaxis(u, -1, 0)
     for axis, n in enumerate(control.shape, start=1):
         bands = np.repeat([[1.0 / 6.0], [4.0 / 6.0], [1.0 / 6.0]], n, axis=1)

@@ -15,58 +15,39 @@ from numba import njit, prange
 from scipy.ndimage import binary_dilation, gaussian_filter, spline_filter
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from dvc.deformation.bspline import spline_basis
+from dvc.deformation.bspline import Table, spline_basis
 from dvc.images.image import Grid, Image
 from dvc.images.resample import fill_missing
-from dvc.registration.gauss_newton.spline_kernels import plane_sums
-from dvc.registration.gauss_newton.spline_sums import SplineSums
+from dvc.registration.gauss_newton.spline_sums import SplineSums, plane_sums
 
 _GAIN_MM = 10.0
 _CUBE = 4  # voxels; finer halves share the noise of neighbours through gradients and interpolation
+
+_Scene = tuple[Float32Array, BoolArray, FloatArray, FloatArray]
+"""The moving image's spline coefficients, its gaps, and its index at s mm along the fixed one's axes, per_mm s + start.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
     """Normal equations of the images at a displacement, for the voxels that were asked for.
 
-    Attributes
-    ----------
-    matrix : (bi, bj, bk, 6)
-        Sums over each block of ``g g^T``, g the derivative of the moving image: xx, xy, xz, yy, yz, zz.
-    force : (3, mi, mj, mk)
-        Sums over the voxels of ``r g B``, by coefficient.
-    square : float
-        Sum of r^2.
-    count : int
-        Voxels that both images show.
+    With g the derivative of the moving image, and B the splines of the coefficients.
     """
 
-    matrix: FloatArray
-    force: FloatArray
-    square: float
-    count: int
+    matrix: FloatArray  # (bi, bj, bk, 6), sums over each block of g g^T: xx, xy, xz, yy, yz, zz
+    force: FloatArray  # (3, mi, mj, mk), sums over the voxels of r g B
+    square: float  # sum of r^2
+    count: int  # voxels that both images show
 
 
 class ImagePair:
-    """Two images, sampled, and the mask and blocks over which they are compared.
+    """Two images, sampled, and the voxels `inside` the fixed one and the blocks over which they are compared.
 
-    Parameters
-    ----------
-    fixed : Image
-        Its axes are those of the displacement's components.
-    moving : Image
-        In the frame that the displacement leads to.
-    inside : (ni, nj, nk) bool
-        Voxels of ``fixed`` to compare.
-    control : Grid
-        Control points, along the axes of ``fixed`` and around all of it.
-    block : three int
-        Voxels of a block along each axis; normal matrices, gain and strain are held by block.
-    rim_mm : float
-        So far from its ends and gaps the moving image is not used: blurred there, it shows what lies beyond.
-    factors : (ni, nj, nk, splines, 4), optional
-        At the voxels, as in `SplineSums`. Strain is then taken at the first voxel of each block, which lies in one
-        tissue; without, at the block's centre.
+    Components of the displacement, and control points, are along the axes of `fixed`. Normal matrices, gain and strain
+    are held by blocks of so many voxels along each axis. Nearer than `rim_mm` to its ends and gaps the moving image is
+    not used: blurred there, it shows what lies beyond. With `factors` at the voxels, as in `SplineSums`, strain is
+    taken at the first voxel of each block, which lies in one tissue; without, at the block's centre.
     """
 
     def __init__(
@@ -84,25 +65,22 @@ class ImagePair:
         self.inside = inside & ~binary_dilation(missing) if missing.any() else inside
         self._fixed = np.ascontiguousarray(fill_missing(fixed).values)
         filled = fill_missing(moving).values
-        self._moving = np.ascontiguousarray(spline_filter(filled, order=3, mode="mirror", output=np.float32))
-        self._gaps = _gaps(moving, rim_mm)
-        # Index of the moving image at s mm along the fixed image's axes: start + per_mm s.
-        self._start = moving.grid.indices_of(self.grid.origin_mm)
+        splines = np.ascontiguousarray(spline_filter(filled, order=3, mode="mirror", output=np.float32))
+        start = moving.grid.indices_of(self.grid.origin_mm)
         ends = moving.grid.indices_of(self.grid.origin_mm + self.grid.direction.T)
-        self._per_mm = np.ascontiguousarray((ends - self._start).T)
+        self._scene: _Scene = (splines, _gaps(moving, rim_mm), np.ascontiguousarray((ends - start).T), start)
         self._step = np.array(self.grid.spacing_mm)
         at = control.indices_of(self.grid.origin_mm)
         per_voxel = self.grid.spacing_mm / control.spacing_mm
         count = -(-np.array(self.grid.shape) // block)
         along = [a + s * np.arange(n) for a, s, n in zip(at, per_voxel, self.grid.shape, strict=True)]
         self.sums = SplineSums(control, along, self.inside, factors)
-        self._first: tuple[slice, ...] | None = None
-        if factors is None:
+        self._first = None if factors is None else tuple(slice(None, None, int(b)) for b in block)
+        compared = self.share(inside) > 0
+        if factors is None or self._first is None:
             middles = [s * ((np.arange(n) + 0.5) * b - 0.5) for s, n, b in zip(per_voxel, count, block, strict=True)]
-            self.blocks = SplineSums(control, [a + m for a, m in zip(at, middles, strict=True)], self.share(inside) > 0)
+            self.blocks = SplineSums(control, [a + m for a, m in zip(at, middles, strict=True)], compared)
         else:
-            compared = self.share(inside) > 0
-            self._first = tuple(slice(None, None, int(b)) for b in block)
             firsts = [a[f] for a, f in zip(along, self._first, strict=True)]
             self.blocks = SplineSums(control, firsts, compared, np.ascontiguousarray(factors[self._first]))
         self._carried = np.zeros(self.grid.shape, dtype=np.float32)
@@ -118,22 +96,17 @@ class ImagePair:
         return np.asarray(counted * self.grid.voxel_volume_mm3)
 
     def normal(self, coefficients: FloatArray, pulled: FloatArray, halves: int = -1) -> Normal:
-        """Normal equations at a displacement.
+        """Normal equations at a displacement with coefficients (3 splines, mi, mj, mk).
 
-        Parameters
-        ----------
-        coefficients : (3, mi, mj, mk)
-        pulled : (bi, bj, bk, 3, 3)
-            F^-T at the blocks' centres, which turns gradients of the fixed image into those of the moving one.
-        halves : int
-            0 or 1: of the voxels only one half, every other cube of 4 x 4 x 4 as on a chessboard; -1: all.
+        `pulled` (bi, bj, bk, 3, 3) is F^-T at the blocks, which turns gradients of the fixed image into those of the
+        moving one. Of the voxels one half (0 or 1) is taken, every other cube of 4 x 4 x 4 as on a chessboard, or
+        all (-1).
         """
         shape = self.blocks.inside.shape
         both, own = np.zeros(shape), np.zeros(shape)
-        first, value, slope = self.sums.table
         _carry(
-            coefficients, self.inside, first, value, slope, self.sums.factors, self._fixed, self._moving, self._gaps,
-            self._per_mm, self._start, self._step, self.block, self._carried, both, own,
+            coefficients, self.inside, self.sums.table, self.sums.factors, self._fixed, self._scene, self._step,
+            self.block, self._carried, both, own,
         )  # fmt: skip
         sigma = _GAIN_MM / (self.block * self.grid.spacing_mm)
         smooth = gaussian_filter(own, sigma, mode="constant")
@@ -141,8 +114,8 @@ class ImagePair:
         matrix, sums = np.zeros((*shape, 6)), np.zeros((shape[0], 2))
         half = np.zeros((self.grid.shape[0], coefficients.shape[0], 2, *self.sums.control.shape[1:]))
         _normal(
-            self._fixed, self._carried, self.inside, halves, gain, pulled, self._step, self.block, first,
-            value, self.sums.factors, matrix, sums, half,
+            self._fixed, self._carried, self.inside, halves, gain, pulled, self._step, self.block, self.sums.table,
+            self.sums.factors, matrix, sums, half,
         )  # fmt: skip
         square, count = sums.sum(axis=0)
         return Normal(matrix, self.sums.closed(half), float(square), int(count))
@@ -180,12 +153,8 @@ def _interpolated(image: Float32Array, gaps: BoolArray, x: float, y: float, z: f
             jq = abs(j - 1 + q)
             jq = jq if jq < nj else 2 * nj - 2 - jq
             if 1 <= k < nk - 2:
-                line = (
-                    c[0] * image[ip, jq, k - 1]
-                    + c[1] * image[ip, jq, k]
-                    + c[2] * image[ip, jq, k + 1]
-                    + c[3] * image[ip, jq, k + 2]
-                )
+                row = image[ip, jq]
+                line = c[0] * row[k - 1] + c[1] * row[k] + c[2] * row[k + 1] + c[3] * row[k + 2]
             else:
                 line = 0.0
                 for r in range(4):
@@ -198,24 +167,12 @@ def _interpolated(image: Float32Array, gaps: BoolArray, x: float, y: float, z: f
 
 @njit(parallel=True, cache=True)
 def _carry(
-    c: FloatArray,
-    inside: BoolArray,
-    first: tuple[IntArray, IntArray, IntArray],
-    value: tuple[FloatArray, FloatArray, FloatArray],
-    slope: tuple[FloatArray, FloatArray, FloatArray],
-    factors: FloatArray,
-    fixed: Float32Array,
-    moving: Float32Array,
-    gaps: BoolArray,
-    per_mm: FloatArray,
-    start: FloatArray,
-    step: FloatArray,
-    block: IntArray,
-    carried: Float32Array,
-    both: FloatArray,
-    own: FloatArray,
-) -> None:
+    c: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, fixed: Float32Array, scene: _Scene,
+    step: FloatArray, block: IntArray, carried: Float32Array, both: FloatArray, own: FloatArray,
+) -> None:  # fmt: skip
     """I1(X + u) at the voxels, and sums of I0 I1 and I0 I0 over each block."""
+    first, second, last = table
+    moving, gaps, per_mm, start = scene
     ni, nj, nk = inside.shape
     alone = factors.shape[3] == 0
     splines = 1 if alone else factors.shape[3]
@@ -225,16 +182,16 @@ def _carry(
         for i in range(bi * block[0], min(ni, (bi + 1) * block[0])):
             if not inside[i].any():
                 continue
-            plane_sums(c, first[0][i], value[0][i], slope[0][i], plane)
+            plane_sums(c, first[0][i], first[1][i], first[2][i], plane)
             for j in range(nj):
                 if not inside[i, j].any():
                     continue
-                at = first[1][j]
+                at = second[0][j]
                 for m in range(row.shape[0]):
                     for k in range(row.shape[1]):
                         total = 0.0
                         for q in range(4):
-                            total += value[1][j, q] * plane[m, 0, at + q, k]
+                            total += second[1][j, q] * plane[m, 0, at + q, k]
                         row[m, k] = total
                 for k in range(nk):
                     if not inside[i, j, k]:
@@ -246,7 +203,7 @@ def _carry(
                         for f in range(splines):
                             a = 1.0 if alone else factors[i, j, k, f, 0]
                             for r in range(4):
-                                place += a * value[2][k, r] * row[3 * f + m, first[2][k] + r]
+                                place += a * last[1][k, r] * row[3 * f + m, last[0][k] + r]
                         x += per_mm[0, m] * place
                         y += per_mm[1, m] * place
                         z += per_mm[2, m] * place
@@ -260,21 +217,12 @@ def _carry(
 
 @njit(parallel=True, cache=True)
 def _normal(
-    fixed: Float32Array,
-    carried: Float32Array,
-    inside: BoolArray,
-    halves: int,
-    gain: FloatArray,
-    pulled: FloatArray,
-    step: FloatArray,
-    block: IntArray,
-    first: tuple[IntArray, IntArray, IntArray],
-    value: tuple[FloatArray, FloatArray, FloatArray],
-    factors: FloatArray,
-    matrix: FloatArray,
-    sums: FloatArray,
+    fixed: Float32Array, carried: Float32Array, inside: BoolArray, halves: int, gain: FloatArray, pulled: FloatArray,
+    step: FloatArray, block: IntArray, table: Table, factors: FloatArray, matrix: FloatArray, sums: FloatArray,
     half: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
+    """Sums of g g^T over each block, of r^2 and of voxels (bi, 2), and of r g B plane by plane, into the last three."""
+    _, second, last = table
     ni, nj, nk = inside.shape
     alone = factors.shape[3] == 0
     splines = 1 if alone else factors.shape[3]
@@ -290,11 +238,9 @@ def _normal(
                 row[:] = 0.0
                 for k in range(nk):
                     found = carried[i, j, k]
-                    if (
-                        not inside[i, j, k]
-                        or np.isnan(found)
-                        or (halves >= 0 and (i // _CUBE + j // _CUBE + k // _CUBE) % 2 != halves)
-                    ):
+                    if not inside[i, j, k] or np.isnan(found):
+                        continue
+                    if halves >= 0 and (i // _CUBE + j // _CUBE + k // _CUBE) % 2 != halves:
                         continue
                     bk = k // block[2]
                     a, T = gain[bi, bj, bk], pulled[bi, bj, bk]
@@ -320,8 +266,8 @@ def _normal(
                         share = r if alone else r * factors[i, j, k, f, 0]
                         for m in range(3):
                             for q in range(4):
-                                row[3 * f + m, first[2][k] + q] += value[2][k, q] * share * g[m]
+                                row[3 * f + m, last[0][k] + q] += last[1][k, q] * share * g[m]
                 for m in range(row.shape[0]):
                     for q in range(4):
                         for k in range(row.shape[1]):
-                            half[i, m, 0, first[1][j] + q, k] += value[1][j, q] * row[m, k]
+                            half[i, m, 0, second[0][j] + q, k] += second[1][j, q] * row[m, k]

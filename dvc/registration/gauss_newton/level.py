@@ -19,7 +19,8 @@ _BLOCKS = 2.5  # blocks between two control points, about
 _LONGEST = 0.45  # of the control spacing: a step of less than that cannot fold by itself
 _HALVINGS = 4
 _SLACK = 1e-3  # the fixed image's gradient is not quite the energy's own: near the end it may rise by as much
-_TOLERANCE, _MOST = 0.1, 60
+_SOLVER = 0.1, 60  # of the conjugate gradients: reduction of the residual, most iterations
+_SOLVER_OF_HALF = 0.05, 80  # half of the voxels are fitted in one step, to choose a weight
 _SMALLEST = 1e-6
 _LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
 _FLATTEST = 0.1  # det F below this is taken as this in F^-T
@@ -27,23 +28,12 @@ _FLATTEST = 0.1  # det F below this is taken as this in F^-T
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Weights of the prior.
+    """Weights of the prior."""
 
-    Attributes
-    ----------
-    bending : float
-        1/mm.
-    volume, rigidity : float
-        Of the change of volume in soft tissue, and of strain in what is stiff, 1/mm3.
-    volume_gradient : float
-        Of the gradient of the change of volume in soft tissue, 1/mm: volume may then change, but from place to place
-        only slowly.
-    """
-
-    bending: float
-    volume: float
-    rigidity: float
-    volume_gradient: float = 0.0
+    bending: float  # 1/mm
+    volume: float  # of the change of volume in soft tissue, 1/mm3
+    rigidity: float  # of strain in stiff tissue, 1/mm3
+    volume_gradient: float = 0.0  # of the gradient of that change, 1/mm: volume may then change, slowly in space
 
     @property
     def patience(self) -> int:
@@ -53,25 +43,13 @@ class Weights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """A displacement and all that a step from it needs.
+    """A displacement and all that a step from it needs."""
 
-    Attributes
-    ----------
-    coefficients : (3 splines, mi, mj, mk)
-    F, cofactor : (bi, bj, bk, 3, 3)
-        Deformation gradient at the blocks' centres, and the derivative of its determinant.
-    J : (bi, bj, bk)
-        det F.
-    bent : (3 splines, mi, mj, mk)
-        Gradient of the bending energy.
-    images : Normal
-    """
-
-    coefficients: FloatArray
-    F: FloatArray
-    cofactor: FloatArray
-    J: FloatArray
-    bent: FloatArray
+    coefficients: FloatArray  # (3 splines, mi, mj, mk), mm
+    F: FloatArray  # (bi, bj, bk, 3, 3), deformation gradient at the blocks
+    cofactor: FloatArray  # (bi, bj, bk, 3, 3), derivative of det F
+    J: FloatArray  # (bi, bj, bk), det F
+    bent: FloatArray  # (3 splines, mi, mj, mk), gradient of the bending energy
     images: Normal
 
     @property
@@ -82,42 +60,21 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Splines:
-    """What a displacement is the sum of, and how each part of it is smoothed.
+    """The splines that a displacement is the sum of, and how each of them is smoothed: one alone by default."""
 
-    Attributes
-    ----------
-    factors : (ni, nj, nk, splines, 4) or None
-        At the voxels, as in `SplineSums`; None for one B-spline alone.
-    rough : sequence of (float, float)
-        Of each spline, how its bending and its square count beside the first one's bending.
-    laplacians : {1, 2}
-        What its bending is, as in `Roughness`.
-    """
-
-    factors: FloatArray | None = None
-    rough: Sequence[tuple[float, float]] = ((1.0, REST),)
-    laplacians: int = 1
+    factors: FloatArray | None = None  # at the voxels, as in `SplineSums`
+    rough: Sequence[tuple[float, float]] = ((1.0, REST),)  # weights of each spline, as in `Roughness`
+    laplacians: int = 1  # as in `Roughness`
 
 
-ONE_SPLINE = Splines()
+_ONE_SPLINE = Splines()
 
 
 class Level:
     """Two images at one resolution, the control points, and the tissue that the prior is about.
 
-    Parameters
-    ----------
-    fixed, moving : Image
-        Components of the displacement are along the axes of ``fixed``; ``moving`` is where it leads.
-    inside : (ni, nj, nk) bool
-        Voxels of ``fixed`` to compare.
-    soft, stiff : (ni, nj, nk) bool
-        Voxels that keep their volume, and voxels that resist strain: bone, if need be skin.
-    control : Grid
-        Control points, around all of ``fixed``.
-    rim_mm : float
-        Along the ends of ``moving``, which is not used there.
-    splines : Splines
+    `soft` voxels of the fixed image keep their volume, `stiff` ones (bone, or the skin) resist strain. Other parameters
+    as in `ImagePair`.
     """
 
     def __init__(
@@ -129,7 +86,7 @@ class Level:
         stiff: BoolArray,
         control: Grid,
         rim_mm: float = 0.0,
-        splines: Splines = ONE_SPLINE,
+        splines: Splines = _ONE_SPLINE,
     ) -> None:
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
         self.control = control
@@ -139,10 +96,13 @@ class Level:
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0
         # between neighbouring blocks of soft tissue: the volume that their difference stands for, over its length^2
-        self._between = [
-            np.minimum(*_neighbours(self._soft, axis)) / length**2
-            for axis, length in enumerate(block * fixed.grid.spacing_mm)
-        ]
+        lengths = enumerate(block * fixed.grid.spacing_mm)
+        self._between = [np.minimum(*_neighbours(self._soft, axis)) / length**2 for axis, length in lengths]
+        self._alone = np.zeros_like(self._soft)  # what a change of volume in one block alone costs by its gradient
+        for axis, between in enumerate(self._between):
+            before, after = _neighbours(self._alone, axis)
+            before += between
+            after += between
 
     def following(self, coefficients: FloatArray) -> Roughness:
         """`roughness`, with less weight where this displacement of the tissue is curved."""
@@ -176,22 +136,17 @@ class Level:
         if weights.volume_gradient:
             pressure += weights.volume_gradient * self._unevenness(state.J)
         stress = pressure[..., None, None] * state.cofactor
-        F = state.F[self._resists]
-        stress[self._resists] += (weights.rigidity * self._stiff[self._resists])[:, None, None] * (
-            F @ _green_lagrange(F)
-        )
+        F, weight = state.F[self._resists], weights.rigidity * self._stiff[self._resists]
+        stress[self._resists] += weight[:, None, None] * (F @ _green_lagrange(F))
         return np.asarray(self.pair.blocks.gathered(stress) + weights.bending * state.bent)
 
-    def step(self, state: State, weights: Weights, variance: float, tolerance: float, most: int) -> FloatArray:
+    def step(self, state: State, weights: Weights, variance: float, solver: tuple[float, int]) -> FloatArray:
         """The Gauss-Newton step, by conjugate gradients, preconditioned by each control point's own 3 x 3 block."""
-        stiffness: Stiffness = (
-            state.images.matrix / variance,
-            state.cofactor,
-            weights.volume * self._soft,
-            weights.rigidity * self._stiff,
-        )
+        volume, shear = weights.volume * self._soft, weights.rigidity * self._stiff
+        stiffness: Stiffness = (state.images.matrix / variance, state.cofactor, volume, shear)
         force = state.images.force / variance - self.prior_gradient(state, weights)
-        diagonal = self.pair.blocks.diagonal(self._stiffness_alone(stiffness, weights))
+        alone = volume + weights.volume_gradient * self._alone
+        diagonal = self.pair.blocks.diagonal((stiffness[0], state.cofactor, alone, shear))
         for spline, rough in enumerate(self.roughness.diagonals):
             for entry in (6 * spline, 6 * spline + 3, 6 * spline + 5):
                 diagonal[entry] += weights.bending * rough
@@ -207,34 +162,14 @@ class Level:
             return np.asarray(out)
 
         inverse = np.concatenate([_inverted(own) for own in np.split(diagonal, len(diagonal) // 6)])
-        return conjugate_gradients(product, force, inverse, tolerance, most)
+        return conjugate_gradients(product, force, inverse, *solver)
 
     def descend(
-        self,
-        coefficients: FloatArray,
-        weights: Weights,
-        *,
-        steps: int,
-        stop_mm: float,
-        halves: int = -1,
-        tolerance: float = _TOLERANCE,
-        most: int = _MOST,
+        self, coefficients: FloatArray, weights: Weights, *, steps: int, stop_mm: float, halves: int = -1
     ) -> FloatArray:
-        """Take steps until they are short, no longer lower the energy, or there were enough.
+        """Take steps until one moves soft tissue by less than `stop_mm` (rms) or none lowers the energy.
 
-        Parameters
-        ----------
-        coefficients : (3 splines, mi, mj, mk)
-            To start from.
-        weights : Weights
-        steps : int
-            Most steps.
-        stop_mm : float
-            A step that moves soft tissue by less, root mean square, is the last.
-        halves : int
-            Voxels used: all (-1), or one half (0, 1).
-        tolerance, most : float, int
-            Of the conjugate gradients: reduction of the residual, and iterations.
+        From coefficients (3 splines, mi, mj, mk), at most so many `steps`; the voxels used are `halves` as in `at`.
         """
         state = self.at(coefficients, halves)
         for _ in range(steps):
@@ -246,7 +181,7 @@ class Level:
                 return 0.5 * count * at.variance / variance + self.prior(at, weights)
 
             before = energy(state)
-            step = self.step(state, weights, variance, tolerance, most)
+            step = self.step(state, weights, variance, _SOLVER if halves < 0 else _SOLVER_OF_HALF)
             if not np.isfinite(step).all():
                 raise RegistrationError("The registration diverged: a step is not finite.")
             step *= min(1.0, _LONGEST / max(self._longest(step), _SMALLEST))
@@ -271,24 +206,11 @@ class Level:
         """How sharply the images see a displacement: median over soft tissue of g^2 / s^2 along an axis, 1/mm5."""
         state = self.at(coefficients)
         seen = state.images.matrix[self._whole_soft][:, [0, 3, 5]].mean(axis=1)
-        variance = max(state.variance, _LEAST_RESIDUAL**2)
-        return float(np.median(seen)) / variance / float(self._soft.max())
+        return float(np.median(seen)) / max(state.variance, _LEAST_RESIDUAL**2) / float(self._soft.max())
 
     @property
     def _whole_soft(self) -> BoolArray:
         return np.asarray(self._soft > 0.99 * self._soft.max())
-
-    def _stiffness_alone(self, stiffness: Stiffness, weights: Weights) -> Stiffness:
-        """With what a change of volume in one block alone would cost: for the preconditioner."""
-        if not weights.volume_gradient:
-            return stiffness
-        image, cofactor, volume, shear = stiffness
-        alone = np.zeros_like(self._soft)
-        for axis, between in enumerate(self._between):
-            before, after = _neighbours(alone, axis)
-            before += between
-            after += between
-        return image, cofactor, volume + weights.volume_gradient * alone, shear
 
     def _unevenness(self, J: FloatArray) -> FloatArray:
         """Derivative by J of half the integral of |grad J|^2 over soft tissue, by differences, mm."""
@@ -333,19 +255,10 @@ def cofactors(F: FloatArray) -> FloatArray:
 def conjugate_gradients(
     product: Callable[[FloatArray], FloatArray], force: FloatArray, inverse: FloatArray, tolerance: float, most: int
 ) -> FloatArray:
-    """Solve A x = force for a positive definite A given by its product.
+    """Solve A x = force (3 n, ...) for a positive definite A given by its product with x.
 
-    Parameters
-    ----------
-    product : callable
-        A x of x (3 n, ...).
-    force : (3 n, ...)
-    inverse : (6 n, ...)
-        Preconditioner, n symmetric 3 x 3 matrices at each place: xx, xy, xz, yy, yz, zz.
-    tolerance : float
-        Reduction of the residual's preconditioned norm.
-    most : int
-        Iterations at the most.
+    The preconditioner `inverse` (6 n, ...) is n symmetric 3 x 3 matrices at each place: xx, xy, xz, yy, yz, zz. Ends
+    once the residual's preconditioned norm is `tolerance` times what it was, or after the `most` iterations.
     """
 
     def preconditioned(v: FloatArray) -> FloatArray:

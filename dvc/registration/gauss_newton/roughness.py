@@ -1,10 +1,10 @@
 """How rough a displacement is: a weight on detail, and less of it where a displacement has been seen to have detail.
 
-Counted is the Laplacian of a cubic B-spline's coefficients, which sees detail of the control points' own size as
-sharply as any, where the spline's own second derivatives let it pass: that detail is noise's. Applied twice, times
-l^4 with l = h / sqrt(2) and h between control points (their mean over the axes), it counts as much as once at a
-wavelength of 4 h, less above and more below; a homogeneous elastic body in equilibrium, whose displacement is
-biharmonic, then costs nothing away from the control grid's faces.
+The measure is the Laplacian of a cubic B-spline's coefficients, which sees detail of the control points' own size, the
+noise's, as sharply as any, where the spline's own second derivatives let it pass. Applied twice, times l^4 with
+l = h / sqrt(2) and h between control points (their mean over the axes), it counts as much as once at a wavelength of
+4 h, less above and more below; a homogeneous elastic body in equilibrium, whose displacement is biharmonic, then costs
+nothing away from the control grid's faces.
 """
 
 from __future__ import annotations
@@ -34,28 +34,14 @@ NUMBERS = {"near_mm": _NEAR_MM, "least": _LEAST, "power": _POWER, "rest": REST}
 class Roughness:
     """Of several splines on one control grid, ``1/2 int (p c |Δ u|^2 + q |u|^2)``, or with ``l^4 |Δ Δ u|^2``.
 
+    `weights` are (p, q) of each spline, `laplacians` 1 or 2, `here` (ni, nj, nk) the weight c at the control points, 1
+    by default. Coefficients are in mm, in any orthonormal frame; |u|^2 is their square, times a control cell's volume.
     The Laplacian is one of differences between coefficients. On the control grid's faces it leaves out the direction
-    along which there is no neighbour; what costs nothing (but q) is then at most linear along each axis, applied once
-    or twice.
-
-    Parameters
-    ----------
-    control : Grid
-        Control points; coefficients are components along its axes, or in any other orthonormal frame, in mm.
-    weights : sequence of (p, q)
-        Of each spline. The square is counted by the coefficients', times a control cell's volume.
-    laplacians : {1, 2}
-        How often it is applied.
-    here : (ni, nj, nk), optional
-        Weight c at the control points; 1 where it is not given.
+    along which there is no neighbour; the fields that cost nothing (but q) are then at most linear along each axis.
     """
 
     def __init__(
-        self,
-        control: Grid,
-        weights: Sequence[tuple[float, float]] = ((1.0, REST),),
-        laplacians: int = 1,
-        here: FloatArray | None = None,
+        self, control: Grid, weights: Sequence[tuple[float, float]], laplacians: int = 1, here: FloatArray | None = None
     ) -> None:
         self._control, self._own, self._times = control, weights, laplacians
         cell_mm3 = float(np.prod(control.spacing_mm))
@@ -63,17 +49,13 @@ class Roughness:
         length_mm = float(control.spacing_mm.mean()) / np.sqrt(2.0)
         scale = cell_mm3 * length_mm ** (4 * (laplacians - 1))
         self._here = np.full(control.shape, scale) if here is None else scale * here
-        matrices = [_second_differences(n, float(h)) for n, h in zip(control.shape, control.spacing_mm, strict=True)]
-        self._laplacian = [_diagonals(each) for each in matrices]
-        self._transposed = [_diagonals(each.T) for each in matrices]
+        self._laplacian = [_second_differences(n, h) for n, h in zip(control.shape, control.spacing_mm, strict=True)]
+        self._transposed = [np.stack([np.roll(high, 1), on, np.roll(low, -1)]) for low, on, high in self._laplacian]
         self._diagonal = self._here * _square_of_one(control.spacing_mm, laplacians)
 
     @property
     def diagonals(self) -> list[FloatArray]:
-        """Of each spline, about what stands on the matrix' diagonal for any component, (ni, nj, nk).
-
-        Exact where c is the same all around and no face is near.
-        """
+        """Each spline's part of the matrix' diagonal, (ni, nj, nk), for any component; exact where c is even."""
         return [p * self._diagonal + q for p, q in self._weights]
 
     def product(self, coefficients: FloatArray) -> FloatArray:
@@ -94,14 +76,8 @@ class Roughness:
 
         c is one over the root of the mean of |Δ u|^2 over the tissue nearby (a Gaussian of 4 mm; in units of the mean
         over all tissue, to which .05 is added); over all tissue its geometric mean is 1. Of several splines the squares
-        are summed with their weights p. Where there is no curvature but rounding's, c is 1.
-
-        Parameters
-        ----------
-        coefficients : (3 splines, ni, nj, nk)
-            Of that displacement.
-        tissue : (ni, nj, nk)
-            Share of tissue at the control points, 0 to 1.
+        are summed with their weights p. Where there is no curvature but rounding's, c is 1. The displacement is given
+        by its coefficients (3 splines, ni, nj, nk), the tissue by its share (ni, nj, nk), 0 to 1, at control points.
         """
         square = (_summed(coefficients, self._laplacian) ** 2).reshape(-1, 3, *tissue.shape).sum(axis=1)
         curved = sum(p * each for (p, _), each in zip(self._own, square, strict=True))
@@ -119,19 +95,10 @@ class Roughness:
 
 
 def _second_differences(count: int, spacing_mm: float) -> FloatArray:
-    """Matrix (count, count) of second differences, 1/mm2; none at the two ends."""
-    found = np.zeros((count, count))
-    row = np.arange(1, count - 1)
-    for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
-        found[row, row + shift] = factor / spacing_mm**2
-    return found
-
-
-def _diagonals(matrix: FloatArray) -> FloatArray:
-    """A tridiagonal matrix (n, n) by its rows' entries below, on and above the diagonal, (3, n)."""
-    found = np.zeros((3, len(matrix)))
-    found[0, 1:], found[1], found[2, :-1] = matrix.diagonal(-1), matrix.diagonal(), matrix.diagonal(1)
-    return found
+    """Second differences, 1/mm2, none at the ends: each row's entries below, on and above the diagonal, (3, count)."""
+    rows = np.repeat([[1.0], [-2.0], [1.0]], count, axis=1) / spacing_mm**2
+    rows[:, [0, -1]] = 0.0
+    return rows
 
 
 def _square_of_one(spacing_mm: FloatArray, laplacians: int) -> float:
@@ -139,7 +106,7 @@ def _square_of_one(spacing_mm: FloatArray, laplacians: int) -> float:
     one = np.zeros((1, 7, 7, 7))
     one[0, 3, 3, 3] = 1.0
     for _ in range(laplacians):
-        one = _summed(one, [_diagonals(_second_differences(7, float(h))) for h in spacing_mm])
+        one = _summed(one, [_second_differences(7, h) for h in spacing_mm])
     return float((one**2).sum())
 
 

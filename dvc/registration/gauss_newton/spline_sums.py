@@ -10,36 +10,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit, prange
 from scipy.sparse import csr_array
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
-from dvc.deformation.bspline import spline_table
+from dvc.deformation.bspline import Axis, Table, spline_table
 from dvc.images.image import Grid
-from dvc.registration.gauss_newton.spline_kernels import close, evaluate, gather, product
 
 _ALONE = np.empty((0, 0, 0, 0, 4))  # factors of a spline that has none
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
-Table = tuple[tuple[IntArray, ...], tuple[FloatArray, ...], tuple[FloatArray, ...]]
+Stiffness = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""At each point: normal matrix N of the images (..., 6: xx, xy, xz, yy, yz, zz), cofactors of F (..., 3, 3), weights v
+and w of volume and shear (...). A step d costs 1/2 (d . N d + v (cof : grad d)^2 + w |sym grad d|^2)."""
 
 
 class SplineSums:
-    """A control grid and points on a tensor grid of the same axes.
+    """A control grid, and points at control indices `along` each of its axes, of which those `inside` count.
 
-    Displacement u and force f are in components along the grid's axes; gradients are per mm along them. A
-    displacement may be a sum of splines, each times a factor that is known at the points, u = a_1 u_1 + a_2 u_2 + ...:
-    coefficients are then those of all splines, (3 splines, mi, mj, mk). Without factors it is one spline.
-
-    Parameters
-    ----------
-    control : Grid
-        Control points of the spline.
-    along : three (n,) arrays
-        Continuous control index of the points along each axis; inside the spline's valid region.
-    inside : (ni, nj, nk) bool
-        Points that count; sums at the others are zero.
-    factors : (ni, nj, nk, splines, 4), optional
-        Of each spline's factor the value, and the gradient along the axes, at the points.
+    Displacement u and force f are in components along the grid's axes; gradients are per mm along them. A displacement
+    may be a sum of splines, each times a factor that is known at the points, u = a_1 u_1 + a_2 u_2 + ...: coefficients
+    are then those of all splines, (3 splines, mi, mj, mk), and `factors` (ni, nj, nk, splines, 4) are the value and the
+    gradient along the axes of each at the points. Without factors it is one spline.
     """
 
     def __init__(
@@ -49,38 +41,35 @@ class SplineSums:
         self.inside = np.ascontiguousarray(inside)
         self.factors = _ALONE if factors is None else factors
         rows = [spline_table(np.ascontiguousarray(t), n) for t, n in zip(along, control.shape, strict=True)]
-        slopes = [np.ascontiguousarray(r[2] / h) for r, h in zip(rows, control.spacing_mm, strict=True)]
-        self.table: Table = (tuple(r[0] for r in rows), tuple(r[1] for r in rows), tuple(slopes))
+        i, j, k = ((first, value, slope / h) for (first, value, slope), h in zip(rows, control.spacing_mm, strict=True))
+        self.table: Table = (i, j, k)
 
     def evaluate(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Give u (ni, nj, nk, 3) mm and grad u (ni, nj, nk, 3, 3) from coefficients (3 splines, mi, mj, mk)."""
         u, H = np.zeros((*self.inside.shape, 3)), np.zeros((*self.inside.shape, 3, 3))
-        evaluate(coefficients, self.inside, *self.table, self.factors, u, H)
+        _evaluate(coefficients, self.inside, self.table, self.factors, u, H)
         return u, H
 
     def gathered(self, stress: FloatArray) -> FloatArray:
         """Put stresses P (ni, nj, nk, 3, 3) onto the coefficients: sum over points of P : grad B."""
         half = self._half()
-        gather(stress, self.inside, *self.table, self.factors, half)
+        _gather(stress, self.inside, self.table, self.factors, half)
         return self.closed(half)
 
     def product(self, coefficients: FloatArray, stiffness: Stiffness) -> FloatArray:
         """Product of the points' part of the Hessian with coefficients (3 splines, mi, mj, mk)."""
         half = self._half()
-        product(coefficients, self.inside, *self.table, self.factors, *stiffness, half)
+        _product(coefficients, self.inside, self.table, self.factors, stiffness, half)
         return self.closed(half)
 
     def diagonal(self, stiffness: Stiffness) -> FloatArray:
-        """Blocks of the points' part of the Hessian on its diagonal, with cofactors taken as those of no strain.
+        """The points' part of the Hessian for each control point's three coefficients with one another.
 
-        Returns
-        -------
-        (6 splines, mi, mj, mk)
-            Of each control point's three coefficients with one another: xx, xy, xz, yy, yz, zz; spline by spline.
+        (6 splines, mi, mj, mk): xx, xy, xz, yy, yz, zz, spline by spline; cofactors are taken as those of no strain.
         """
-        image, _, volume, shear = stiffness
         splines = self.factors.shape[3]
         if splines == 0:
+            image, _, volume, shear = stiffness
             return self._diagonal(image, volume, shear)
         return np.concatenate([self._diagonal(*self._of_one(stiffness, n)) for n in range(splines)])
 
@@ -92,20 +81,18 @@ class SplineSums:
         if slope.any():
             square = np.einsum("...a,...a->...", slope, slope)
             for entry, (m, n) in enumerate(_PAIRS):
-                seen[..., entry] += (volume + 0.5 * shear) * slope[..., m] * slope[..., n] + 0.5 * shear * square * (
-                    m == n
-                )
+                alone = 0.5 * shear * square * (m == n)
+                seen[..., entry] += (volume + 0.5 * shear) * slope[..., m] * slope[..., n] + alone
         return seen, volume * a * a, shear * a * a
 
     def _diagonal(self, image: FloatArray, volume: FloatArray, shear: FloatArray) -> FloatArray:
-        first, value, slope = self.table
         # of each axis, the matrices that sum B B, B' B and B' B'
         spread = [
             [_spread(f, weights, n) for weights in (v * v, s * v, s * s)]
-            for f, v, s, n in zip(first, value, slope, self.control.shape, strict=True)
+            for (f, v, s), n in zip(self.table, self.control.shape, strict=True)
         ]
 
-        def onto(field: FloatArray, slopes: tuple[int, int, int]) -> FloatArray:
+        def onto(field: FloatArray, slopes: Sequence[int]) -> FloatArray:
             for axis in range(3):
                 moved = np.moveaxis(field, axis, 0)
                 summed = spread[axis][slopes[axis]] @ moved.reshape(len(moved), -1)
@@ -116,30 +103,278 @@ class SplineSums:
         out = np.empty((6, *self.control.shape))
         for entry, (m, a) in enumerate(_PAIRS):
             out[entry] = onto(np.where(self.inside, image[..., entry], 0.0), (0, 0, 0))
-            if m == a:
-                for axis in range(3):
-                    weight = volume + shear if axis == m else 0.5 * shear
-                    out[entry] += onto(weight, (2 * (axis == 0), 2 * (axis == 1), 2 * (axis == 2)))
-            else:
-                out[entry] += onto(volume + 0.5 * shear, (int(0 in {m, a}), int(1 in {m, a}), int(2 in {m, a})))
+            if m != a:
+                out[entry] += onto(volume + 0.5 * shear, [int(axis in {m, a}) for axis in range(3)])
+                continue
+            for axis in range(3):
+                out[entry] += onto(volume + shear if axis == m else 0.5 * shear, [2 * (n == axis) for n in range(3)])
         return out
 
     def closed(self, half: FloatArray) -> FloatArray:
         """Sum over the first axis of what was put onto the coefficients of the other two plane by plane."""
         out = np.empty((half.shape[1], *self.control.shape))
-        close(half, self.table[0][0], self.table[1][0], self.table[2][0], out)
+        _close(half, self.table[0], out)
         return out
 
     def _half(self) -> FloatArray:
         return np.empty((self.inside.shape[0], 3 * max(self.factors.shape[3], 1), 2, *self.control.shape[1:]))
 
 
-Stiffness = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""At each point: normal matrix N of the images (..., 6: xx, xy, xz, yy, yz, zz), cofactors of F (..., 3, 3), weights v
-and w of volume and shear (...). A step d costs 1/2 (d . N d + v (cof : grad d)^2 + w |sym grad d|^2)."""
-
-
 def _spread(first: IntArray, weights: FloatArray, count: int) -> csr_array:
     """Matrix (count, n) that puts values at n points onto control points, with four weights for each point."""
     rows, columns = first[:, None] + np.arange(4), np.repeat(np.arange(first.size), 4)
     return csr_array((weights.ravel(), (rows.ravel(), columns)), shape=(count, first.size))
+
+
+# The sweeps: planes, rows and lines of the grid, one axis of B-splines after the other.
+
+
+@njit(cache=True)
+def plane_sums(c: FloatArray, first: int, value: FloatArray, slope: FloatArray, plane: FloatArray) -> None:
+    """Sums over the first axis for a plane of points: plane (3 splines, 2, mj, mk), values and slopes."""
+    for m in range(c.shape[0]):
+        for j in range(c.shape[2]):
+            w, x, y, z = c[m, first, j], c[m, first + 1, j], c[m, first + 2, j], c[m, first + 3, j]
+            sums, slopes = plane[m, 0, j], plane[m, 1, j]
+            for k in range(c.shape[3]):  # written out, so that the compiler takes several k at once
+                sums[k] = value[0] * w[k] + value[1] * x[k] + value[2] * y[k] + value[3] * z[k]
+                slopes[k] = slope[0] * w[k] + slope[1] * x[k] + slope[2] * y[k] + slope[3] * z[k]
+
+
+@njit(cache=True)
+def _row_sums(plane: FloatArray, first: int, value: FloatArray, slope: FloatArray, row: FloatArray) -> None:
+    """Sums over the second axis for a row of points: row (3 splines, 3, mk), values, slopes along two axes."""
+    for m in range(plane.shape[0]):
+        w, x, y, z = plane[m, 0, first], plane[m, 0, first + 1], plane[m, 0, first + 2], plane[m, 0, first + 3]
+        d, e, f, g = plane[m, 1, first], plane[m, 1, first + 1], plane[m, 1, first + 2], plane[m, 1, first + 3]
+        sums, by_i, by_j = row[m, 0], row[m, 1], row[m, 2]
+        for k in range(plane.shape[3]):
+            sums[k] = value[0] * w[k] + value[1] * x[k] + value[2] * y[k] + value[3] * z[k]
+            by_i[k] = value[0] * d[k] + value[1] * e[k] + value[2] * f[k] + value[3] * g[k]
+            by_j[k] = slope[0] * w[k] + slope[1] * x[k] + slope[2] * y[k] + slope[3] * z[k]
+
+
+@njit(cache=True)
+def _add_row_to_plane(row: FloatArray, first: int, value: FloatArray, slope: FloatArray, plane: FloatArray) -> None:
+    for m in range(row.shape[0]):
+        sums, by_i, by_j = row[m, 0], row[m, 1], row[m, 2]
+        for q in range(4):
+            v, s = value[q], slope[q]
+            onto, onto_slopes = plane[m, 0, first + q], plane[m, 1, first + q]
+            for k in range(plane.shape[3]):
+                onto[k] += v * sums[k] + s * by_j[k]
+                onto_slopes[k] += v * by_i[k]
+
+
+@njit(cache=True)
+def _ends(inside: BoolArray) -> tuple[int, int]:
+    """First point of a line that is inside, and the one after its last; equal where none is."""
+    start, stop = 0, inside.size
+    while start < stop and not inside[start]:
+        start += 1
+    while start < stop and not inside[stop - 1]:
+        stop -= 1
+    return start, stop
+
+
+@njit(cache=True)
+def _line_sums(row: FloatArray, last: Axis, ends: tuple[int, int], line: FloatArray) -> None:
+    """Sums over the last axis for a line of points: line (3 splines, 4, nk), of each component value and slopes."""
+    first, value, slope = last
+    for m in range(row.shape[0]):
+        sums, by_i, by_j = row[m, 0], row[m, 1], row[m, 2]
+        u, x, y, z = line[m, 0], line[m, 1], line[m, 2], line[m, 3]
+        for k in range(ends[0], ends[1]):  # written out, so that the compiler takes several k at once
+            at, a, b, c, d = first[k], value[k, 0], value[k, 1], value[k, 2], value[k, 3]
+            u[k] = a * sums[at] + b * sums[at + 1] + c * sums[at + 2] + d * sums[at + 3]
+            x[k] = a * by_i[at] + b * by_i[at + 1] + c * by_i[at + 2] + d * by_i[at + 3]
+            y[k] = a * by_j[at] + b * by_j[at + 1] + c * by_j[at + 2] + d * by_j[at + 3]
+            p, q, r, s = slope[k, 0], slope[k, 1], slope[k, 2], slope[k, 3]
+            z[k] = p * sums[at] + q * sums[at + 1] + r * sums[at + 2] + s * sums[at + 3]
+
+
+@njit(cache=True)
+def _join(line: FloatArray, factors: FloatArray, ends: tuple[int, int], joined: FloatArray) -> None:
+    """Of splines with factors the sums at a line of points: u = sum a u_s, H = sum (a H_s + u_s grad a)."""
+    for m in range(3):
+        u, x, y, z = joined[m, 0], joined[m, 1], joined[m, 2], joined[m, 3]
+        u[:], x[:], y[:], z[:] = 0.0, 0.0, 0.0, 0.0
+        for s in range(factors.shape[1]):
+            each, by_i, by_j, by_k = line[3 * s + m, 0], line[3 * s + m, 1], line[3 * s + m, 2], line[3 * s + m, 3]
+            for k in range(ends[0], ends[1]):
+                a = factors[k, s, 0]
+                u[k] += a * each[k]
+                x[k] += a * by_i[k] + factors[k, s, 1] * each[k]
+                y[k] += a * by_j[k] + factors[k, s, 2] * each[k]
+                z[k] += a * by_k[k] + factors[k, s, 3] * each[k]
+
+
+@njit(cache=True)
+def _split(joined: FloatArray, factors: FloatArray, ends: tuple[int, int], line: FloatArray) -> None:
+    """The transpose of `_join`: each spline gets a f + P grad a, and a P."""
+    for m in range(3):
+        f, x, y, z = joined[m, 0], joined[m, 1], joined[m, 2], joined[m, 3]
+        for s in range(factors.shape[1]):
+            each, by_i, by_j, by_k = line[3 * s + m, 0], line[3 * s + m, 1], line[3 * s + m, 2], line[3 * s + m, 3]
+            for k in range(ends[0], ends[1]):
+                a = factors[k, s, 0]
+                each[k] = a * f[k] + factors[k, s, 1] * x[k] + factors[k, s, 2] * y[k] + factors[k, s, 3] * z[k]
+                by_i[k], by_j[k], by_k[k] = a * x[k], a * y[k], a * z[k]
+
+
+@njit(cache=True)
+def _load(line: FloatArray, stiffness: Stiffness, ends: tuple[int, int]) -> None:
+    """At a line (3, 4, nk) of points, in place: from u and H to the force and the stress that resist them."""
+    image, cofactor, volume, shear = stiffness
+    u, v, w = line[0], line[1], line[2]
+    for k in range(ends[0], ends[1]):
+        N, C, g = image[k], cofactor[k], 0.5 * shear[k]
+        x, y, z = u[0, k], v[0, k], w[0, k]
+        u[0, k] = N[0] * x + N[1] * y + N[2] * z
+        v[0, k] = N[1] * x + N[3] * y + N[4] * z
+        w[0, k] = N[2] * x + N[4] * y + N[5] * z
+        p = volume[k] * (
+            C[0, 0] * u[1, k] + C[0, 1] * u[2, k] + C[0, 2] * u[3, k]
+            + C[1, 0] * v[1, k] + C[1, 1] * v[2, k] + C[1, 2] * v[3, k]
+            + C[2, 0] * w[1, k] + C[2, 1] * w[2, k] + C[2, 2] * w[3, k]
+        )  # fmt: skip
+        xy, xz, yz = g * (u[2, k] + v[1, k]), g * (u[3, k] + w[1, k]), g * (v[3, k] + w[2, k])
+        u[1, k] = p * C[0, 0] + g * (u[1, k] + u[1, k])
+        u[2, k], v[1, k] = p * C[0, 1] + xy, p * C[1, 0] + xy
+        u[3, k], w[1, k] = p * C[0, 2] + xz, p * C[2, 0] + xz
+        v[2, k] = p * C[1, 1] + g * (v[2, k] + v[2, k])
+        v[3, k], w[2, k] = p * C[1, 2] + yz, p * C[2, 1] + yz
+        w[3, k] = p * C[2, 2] + g * (w[3, k] + w[3, k])
+
+
+@njit(cache=True)
+def _add_line_to_row(line: FloatArray, inside: BoolArray, last: Axis, ends: tuple[int, int], row: FloatArray) -> None:
+    """The transpose of `_line_sums`, for the points that are inside."""
+    first, value, slope = last
+    for n in range(0, row.shape[0], 3):
+        a, b, c = row[n], row[n + 1], row[n + 2]
+        for k in range(ends[0], ends[1]):
+            if not inside[k]:
+                continue
+            at = first[k]
+            f, fx, fy, fz = line[n, 0, k], line[n, 1, k], line[n, 2, k], line[n, 3, k]
+            g, gx, gy, gz = line[n + 1, 0, k], line[n + 1, 1, k], line[n + 1, 2, k], line[n + 1, 3, k]
+            h, hx, hy, hz = line[n + 2, 0, k], line[n + 2, 1, k], line[n + 2, 2, k], line[n + 2, 3, k]
+            for r in range(4):
+                v, s = value[k, r], slope[k, r]
+                a[0, at + r] += v * f + s * fz
+                a[1, at + r] += v * fx
+                a[2, at + r] += v * fy
+                b[0, at + r] += v * g + s * gz
+                b[1, at + r] += v * gx
+                b[2, at + r] += v * gy
+                c[0, at + r] += v * h + s * hz
+                c[1, at + r] += v * hx
+                c[2, at + r] += v * hy
+
+
+@njit(parallel=True, cache=True)
+def _evaluate(
+    c: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, u: FloatArray, H: FloatArray
+) -> None:
+    """The displacement u (ni, nj, nk, 3), mm, and its gradient H (ni, nj, nk, 3, 3) at the points that are inside."""
+    first, second, last = table
+    alone = factors.shape[3] == 0
+    for i in prange(inside.shape[0]):
+        if not inside[i].any():
+            continue
+        plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], 3, c.shape[3]))
+        line = np.empty((c.shape[0], 4, inside.shape[2]))
+        joined = line if alone else np.empty((3, 4, inside.shape[2]))
+        plane_sums(c, first[0][i], first[1][i], first[2][i], plane)
+        for j in range(inside.shape[1]):
+            ends = _ends(inside[i, j])
+            if ends[0] == ends[1]:
+                continue
+            _row_sums(plane, second[0][j], second[1][j], second[2][j], row)
+            _line_sums(row, last, ends, line)
+            if not alone:
+                _join(line, factors[i, j], ends, joined)
+            for k in range(ends[0], ends[1]):
+                if inside[i, j, k]:
+                    for m in range(3):
+                        u[i, j, k, m] = joined[m, 0, k]
+                        for a in range(3):
+                            H[i, j, k, m, a] = joined[m, a + 1, k]
+
+
+@njit(parallel=True, cache=True)
+def _gather(stress: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, half: FloatArray) -> None:
+    """Sums of P : grad B over the points that are inside, onto the last two axes' coefficients, plane by plane."""
+    _, second, last = table
+    alone = factors.shape[3] == 0
+    for i in prange(inside.shape[0]):
+        half[i] = 0.0
+        if not inside[i].any():
+            continue
+        row, line = np.empty((half.shape[1], 3, half.shape[4])), np.empty((half.shape[1], 4, inside.shape[2]))
+        joined = line if alone else np.empty((3, 4, inside.shape[2]))
+        for j in range(inside.shape[1]):
+            ends = _ends(inside[i, j])
+            if ends[0] == ends[1]:
+                continue
+            for m in range(3):
+                joined[m, 0] = 0.0
+                for k in range(ends[0], ends[1]):
+                    for a in range(3):
+                        joined[m, a + 1, k] = stress[i, j, k, m, a]
+            if not alone:
+                _split(joined, factors[i, j], ends, line)
+            row[:] = 0.0
+            _add_line_to_row(line, inside[i, j], last, ends, row)
+            _add_row_to_plane(row, second[0][j], second[1][j], second[2][j], half[i])
+
+
+@njit(parallel=True, cache=True)
+def _product(
+    c: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, stiffness: Stiffness, half: FloatArray
+) -> None:
+    """Product of the points' part of the Hessian with coefficients, whole lines of points at once."""
+    first, second, last = table
+    image, cofactor, volume, shear = stiffness
+    alone = factors.shape[3] == 0
+    for i in prange(inside.shape[0]):
+        half[i] = 0.0
+        if not inside[i].any():
+            continue
+        plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], 3, c.shape[3]))
+        back, line = np.empty_like(row), np.empty((c.shape[0], 4, inside.shape[2]))
+        joined = line if alone else np.empty((3, 4, inside.shape[2]))
+        plane_sums(c, first[0][i], first[1][i], first[2][i], plane)
+        for j in range(inside.shape[1]):
+            ends = _ends(inside[i, j])
+            if ends[0] == ends[1]:
+                continue
+            _row_sums(plane, second[0][j], second[1][j], second[2][j], row)
+            _line_sums(row, last, ends, line)
+            if not alone:
+                _join(line, factors[i, j], ends, joined)
+            _load(joined, (image[i, j], cofactor[i, j], volume[i, j], shear[i, j]), ends)
+            if not alone:
+                _split(joined, factors[i, j], ends, line)
+            back[:] = 0.0
+            _add_line_to_row(line, inside[i, j], last, ends, back)
+            _add_row_to_plane(back, second[0][j], second[1][j], second[2][j], half[i])
+
+
+@njit(parallel=True, cache=True)
+def _close(half: FloatArray, axis: Axis, out: FloatArray) -> None:
+    """Sums over the first axis: from planes (ni, m, 2, mj, mk) to coefficients (m, mi, mj, mk)."""
+    first, value, slope = axis
+    for a in prange(out.shape[1]):
+        out[:, a] = 0.0
+        for i in range(first.size):
+            p = np.int64(a) - first[i]
+            if not 0 <= p < 4:
+                continue
+            v, s = value[i, p], slope[i, p]
+            for m in range(out.shape[0]):
+                for j in range(out.shape[2]):
+                    onto, sums, slopes = out[m, a, j], half[i, m, 0, j], half[i, m, 1, j]
+                    for k in range(out.shape[3]):
+                        onto[k] += v * sums[k] + s * slopes[k]

@@ -1,21 +1,21 @@
 """Gauss-Newton registration where the tissues are known: strain may jump at their interfaces, and bone is rigid.
 
 The smooth displacement of `dvc.registration.gauss_newton.fit` is the start of one more stage at full resolution, for a
-`BorderedSpline` u = m v + psi w. Minimised is
+`BorderedSpline` u = m v + psi w. Its energy is
 
     1/(2 s^2) sum r^2 + b/2 int (c l^4 |Δ Δ v|^2 + 3 L^2 c l^4 |Δ Δ w|^2 + q |w|^2) + v/2 int (J - 1)^2
     + k/2 int_skin |E|^2
 
 with L the reach of an interface, q = 0.02 / mm2, and c and l as in `dvc.registration.gauss_newton.roughness`; the bone
-has no strain by construction. Images say little about the inside of a skin as thin as two voxels. How much it resists
-strain, k, is chosen as the bending is, by the residual of voxels that were left out: what the skin does moves the fat
-beside it. docs/decisions/0009 has the reasons.
+has no strain by construction. Images say little about the inside of a skin as thin as two voxels. Its resistance to
+strain, k, is chosen as the bending is, by the residual of left-out voxels: the skin's motion moves the fat beside it.
+Reasons: docs/decisions/0009.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -42,14 +42,9 @@ _LAPLACIANS = 2  # within a tissue; a smooth spline that has to follow jumps doe
 _BENDING, _SQUARE = 3.0, 0.02  # of w beside v: times L^2, and 1/mm2
 _SMOOTH_SHARE = 0.4  # of the time
 STAGE = {
-    "usual_skin": USUAL_SKIN,
-    "powers": _SKIN_POWERS,
-    "margin": _SKIN_MARGIN,
-    "laplacians": _LAPLACIANS,
-    "steps": _STEPS,
-    "of_jumps": [_BENDING, _SQUARE],
-    "distances": NUMBERS,
-}
+    "usual_skin": USUAL_SKIN, "powers": _SKIN_POWERS, "margin": _SKIN_MARGIN, "laplacians": _LAPLACIANS,
+    "steps": _STEPS, "of_jumps": [_BENDING, _SQUARE], "distances": NUMBERS,
+}  # fmt: skip
 """Every number that decides the result of this stage, for a record."""
 
 
@@ -60,37 +55,23 @@ def fit_with_interfaces(
     start: Deformation | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[BorderedSpline, Choice]:
-    """Find the displacement that carries the fixed image to the moving one, its gradient free to jump at interfaces.
+    """Find the displacement, LPS mm, that carries the fixed image to the moving one, its gradient free at interfaces.
 
-    Parameters
-    ----------
-    pair : AlignedPair
-        With labels. A tissue that is named "skin" may resist strain; the bone, if there is one, does not move.
-    skin : float, optional
-        Weight k of strain in the skin, 1/mm3; chosen by cross-validation where not given.
-
-    The other parameters, and errors, are those of `dvc.registration.gauss_newton.fit.fit`.
-
-    Returns
-    -------
-    displacement : BorderedSpline
-        LPS mm.
-    choice : Choice
-        Its weight "rigidity" is the skin's, k; zero where there is no skin.
+    The pair needs labels; a tissue named "skin" may resist strain, and the bone, if there is one, does not move. The
+    weight k of strain in the skin, 1/mm3, is chosen by cross-validation where it is not given; it becomes the choice's
+    weight "rigidity", zero without skin. The rest is as in `dvc.registration.gauss_newton.fit.fit`.
     """
-    smooth, first = fit(
-        pair, replace(parameters, bending=parameters.weights.bending), start,
-        lambda share: progress(_SMOOTH_SHARE * share),
-    )  # fmt: skip
+    usual = replace(parameters, bending=parameters.weights.bending)
+    smooth, first = fit(pair, usual, start, lambda share: progress(_SMOOTH_SHARE * share))
     axes, control = np.array(pair.fixed.grid.direction), smooth.control
-    stage = _Stage.of(pair, control)
+    stage = _Stage(pair, control)
     weights = replace(first.weights, rigidity=(skin or USUAL_SKIN) if stage.has_skin else 0.0)
     steps, stop_mm = _STEPS * weights.patience, LEVELS[-1][-1]
     coefficients: FloatArray = np.concatenate([turned(axes.T, smooth.coefficients_mm), np.zeros((3, *control.shape))])
     coefficients = stage.whole.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
     stage.whole.roughness = stage.slab.roughness = stage.whole.following(coefficients)
     progress(_SMOOTH_SHARE + 0.1)
-    in_skin = stage.skin_chosen(coefficients, weights, skin)
+    in_skin = stage.choose_skin(coefficients, weights, skin)
     progress(_SMOOTH_SHARE + 0.3)
     choice = Choice(in_skin.weights, "bending fixed beforehand")
     if parameters.bending is None:
@@ -110,46 +91,39 @@ def fit_with_interfaces(
     return BorderedSpline(v, w, stage.interfaces), choice
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Stage:
     """The last stage at full resolution: in the whole body, and in a slab of it in which weights are chosen."""
 
-    interfaces: Interfaces
-    whole: Level
-    slab: Level
-    has_skin: bool
-    slab_has_skin: bool
-
-    @classmethod
-    def of(cls, pair: AlignedPair, control: Grid) -> _Stage:
+    def __init__(self, pair: AlignedPair, control: Grid) -> None:
         labels, inside = pair.labels, pair.compared.inside
         if labels is None:
             raise InputError("Strain can jump at tissue interfaces only where a label map tells the tissues.")
-        interfaces = Interfaces.of(labels, pair.bone, float(control.spacing_mm.mean()), pair.body)
-        soft = pair.body.inside & (interfaces.own != interfaces.rest)
+        self.interfaces = Interfaces.of(labels, pair.bone, float(control.spacing_mm.mean()), pair.body)
+        soft = pair.body.inside & (self.interfaces.own != self.interfaces.rest)
         named = [number for number, name in labels.names.items() if name.lower() == _SKIN]
         skin = soft & np.isin(labels.labels, named)
         pictures = brightness_scaled(pair)
-        rough = ((1.0, REST), (_BENDING * interfaces.reach_mm**2, _SQUARE))
-        splines = Splines(interfaces.at_voxels(), rough, _LAPLACIANS)
+        rough = ((1.0, REST), (_BENDING * self.interfaces.reach_mm**2, _SQUARE))
+        splines = Splines(self.interfaces.at_voxels(), rough, _LAPLACIANS)
 
         def level(part: BoolArray) -> Level:
             return Level(*pictures, inside & part, soft & part, skin & part, control, splines=splines)
 
         part = _slab(inside)
-        return cls(interfaces, level(np.ones_like(soft)), level(part), bool(skin.any()), bool((skin & part).any()))
+        self.whole, self.slab = level(np.ones_like(soft)), level(part)
+        self.has_skin, self._slab_has_skin = bool(skin.any()), bool((skin & part).any())
 
-    def skin_chosen(self, coefficients: FloatArray, weights: Weights, fixed: float | None) -> Choice:
+    def choose_skin(self, coefficients: FloatArray, weights: Weights, fixed: float | None) -> Choice:
         """Choose the weight of strain in the skin, unless it is fixed or the slab has no skin."""
         if fixed is not None:
             return Choice(weights, "rigidity fixed beforehand")
-        if not self.slab_has_skin:
+        if not self._slab_has_skin:
             return Choice(weights, "rigidity as usual, as too little of it is in the image")
         return choose(self.slab, coefficients, weights, "rigidity", _SKIN_POWERS, _SKIN_MARGIN)
 
 
 def _moved(smooth: BSpline, bone: Mask) -> tuple[float, float] | None:
-    """Root mean square displacement (mm) and 95th percentile of the maximal shear in the bone."""
+    """Root mean square displacement (mm) and 95th percentile of the maximum shear in the bone."""
     u, H = smooth.evaluate_on_grid(bone.grid, bone.inside)
     known = np.isfinite(u).all(axis=1)
     if not known.any():

@@ -55,7 +55,7 @@ def given(with_labels: bool = True, with_bone: bool = True):
     maps = StrainMaps(GRID, inside, np.zeros((*GRID.shape, 3)), np.zeros((*GRID.shape, 6)), shear, np.ones(GRID.shape))
     settings = Settings.of("heel-mr")
     body = Mask(GRID, inside)
-    found = SimpleNamespace(settings=settings, tissue=body, reference=image, loaded=image, choice=None, unlike_study="")
+    found = SimpleNamespace(settings=settings, tissue=body, reference=image, loaded=image, unlike_study="")
     return found, subject, maps
 
 
