@@ -17,10 +17,7 @@ from dvc.errors import OutputError
 def whole_file(path: Path) -> Iterator[Path]:
     """Give a name of the same ending, in the same folder, to write under; it becomes ``path`` in one step.
 
-    Raises
-    ------
-    OutputError
-        If the file cannot be written; what was begun is removed, and an older file of that name is still there.
+    OutputError if the file cannot be written; what was begun is removed, and an older file of that name is still there.
     """
     part = path.with_name(f".{os.getpid()}.partial.{path.name}")
     try:
@@ -53,12 +50,8 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
 def whole_folder(final: Path) -> Iterator[Path]:
     """Give a folder to fill; it takes its final name when the block ends well, and is removed if not.
 
-    An older folder of that name is replaced only then.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be made or renamed, or the disk is full.
+    An older folder of that name is replaced only then. OutputError if it cannot be made or renamed, or the disk is full
+    now.
     """
     try:
         partial = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))

@@ -148,15 +148,7 @@ def outer_faces(cells: IntArray) -> IntArray:
 
 
 def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
-    """Nodes as an (n, 3) array of finite numbers.
-
-    Raises
-    ------
-    InputError
-        If the shape is another.
-    GeometryError
-        If a coordinate is not finite; with the count and the first index.
-    """
+    """Nodes (n, 3); InputError for another shape, GeometryError for a coordinate that is not finite."""
     points = np.array(points_mm, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(f"Nodes of a mesh must be an (n, 3) array of coordinates; got shape {points.shape}.")
@@ -170,13 +162,7 @@ def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
 
 
 def checked_indices(what: str, index: npt.ArrayLike, count: int, width: int | None = None) -> IntArray:
-    """Integer indices below ``count``, (k,) or (k, width).
-
-    Raises
-    ------
-    InputError
-        If they are not integers, have another shape, or one is out of range.
-    """
+    """Integer indices below ``count``, (k,) or (k, width); InputError for another type, shape or range."""
     array = np.asarray(index)
     if array.size == 0:
         array = array.reshape((0,) if width is None else (0, width)).astype(np.int64)
@@ -197,10 +183,8 @@ def checked_indices(what: str, index: npt.ArrayLike, count: int, width: int | No
 
 
 def box_told(low: FloatArray, high: FloatArray) -> str:
-    """A box by its lower and upper corner (3,), as people read it.
+    """A box by its lower and upper corner (3,), for messages.
 
-    Examples
-    --------
     >>> box_told(np.array([-15.0, 0.0, 0.01]), np.array([5.0, 120.4, 0.06]))
     '-15 to 5 x 0 to 120 x 0.01 to 0.06'
     """
@@ -209,13 +193,7 @@ def box_told(low: FloatArray, high: FloatArray) -> str:
 
 
 def check_extent(points_mm: FloatArray) -> None:
-    """Refuse a mesh that is not the size of a body part in mm.
-
-    Raises
-    ------
-    ExtentError
-        If its longest side is under 1 mm or over 5 m.
-    """
+    """ExtentError for a mesh that is not the size of a body part in mm: its longest side is under 1 mm or over 5 m."""
     extent = float(np.ptp(points_mm, axis=0).max())
     spans = f"It spans {box_told(points_mm.min(axis=0), points_mm.max(axis=0))} (mm as read)."
     if extent < _SMALLEST_EXTENT_MM:

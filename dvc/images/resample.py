@@ -56,17 +56,11 @@ def carry(
     where: BoolArray | None = None,
     order: int = 3,
 ) -> Float32Array:
-    """Values of ``image`` brought onto ``grid``, NaN where any of the eight voxels around is missing or outside.
+    """Values of ``image`` on ``grid``, NaN where any of the eight voxels around is missing or outside.
 
-    Parameters
-    ----------
-    points_of : callable, optional
-        Points (n, 3) LPS mm of ``grid`` to the points of the image whose values they take; the identity by
-        default. NaN points give NaN.
-    where : (ni, nj, nk) bool, optional
-        Voxels wanted; the others are NaN.
-    order : int
-        1 for linear, 3 for cubic spline interpolation.
+    ``points_of`` maps points (n, 3) LPS mm of the grid to those of the image whose values they take (default: the
+    identity; NaN points give NaN); ``where`` (ni, nj, nk) are the voxels wanted; ``order`` is 1 for linear, 3 for cubic
+    spline interpolation.
     """
     gaps = image.missing.astype(np.float32) if image.missing.any() else None
     filled = fill_missing(image)

@@ -1,4 +1,4 @@
-"""Removal of smooth shading: every MR scan has its own receive field, which is not tissue."""
+"""Removal of the bias field: every MR scan has its own receive field, which is not tissue."""
 
 from __future__ import annotations
 
@@ -19,16 +19,12 @@ _ITERATIONS = [50, 50, 50]
 
 
 def without_shading(image: Image) -> Image:
-    """The image, above its lowest value, divided by its smooth multiplicative field, found by N4 on a coarse copy.
+    """The image, above its lowest value, divided by its bias field, estimated by N4 on a coarse copy.
 
-    Normalised correlation over the whole body takes shading for contrast, and a B-spline then bends tissue to
-    follow it: on a phantom with fields of +-20 % that tripled the strain error. N4: N. Tustison et al., 2010,
+    Normalised correlation over the whole body takes a bias field for contrast, and a B-spline then bends tissue to
+    follow it: on a phantom with fields of +-20 % that tripled the strain error. Only the registration sees the
+    corrected image; outputs are made from the image as it was given. N4: N. Tustison et al., 2010,
     doi:10.1109/TMI.2010.2046908.
-
-    Notes
-    -----
-    Only the registration sees the corrected image; outputs are made from the image as it was given. Missing
-    voxels stay missing.
     """
     known = fill_missing(image)
     inside = bright_voxels(known)

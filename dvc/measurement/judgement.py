@@ -24,20 +24,11 @@ from dvc.trust.verdict import Verdict
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarriedImages:
-    """The loaded image on the unloaded one's voxels, and how well they agree.
+    """The loaded image on the unloaded one's voxels, all (ni, nj, nk), and how well they agree."""
 
-    Attributes
-    ----------
-    aligned, registered : (ni, nj, nk)
-        After the rigid part, and after all; NaN where the loaded scan does not show the place.
-    local_rigid, local_after : (ni, nj, nk)
-        Local correlation with the unloaded image, for each of these.
-    similarity : Similarity
-    """
-
-    aligned: Float32Array
-    registered: Float32Array
-    local_rigid: Float32Array
+    aligned: Float32Array  # after the rigid part; NaN where the loaded scan does not show the place
+    registered: Float32Array  # after all
+    local_rigid: Float32Array  # local correlation with the unloaded image, for each of these
     local_after: Float32Array
     similarity: Similarity
 
@@ -70,7 +61,7 @@ def carried_images(found: Registration) -> CarriedImages:
 
 
 def _noise_in_air(found: Registration) -> tuple[float, float] | None:
-    """Of both images; None where there is no such air."""
+    """Noise of both images in the air; None where there is no such air."""
     reference, loaded = found.reference, found.loaded
     try:
         body = Mask(reference.grid, found.tissue.inside | tissue_mask(reference).inside)
@@ -87,15 +78,7 @@ def quality_of(
     landmarks: tuple[FloatArray, FloatArray] | None = None,
     floor: NoiseFloor | None = None,
 ) -> Quality:
-    """Quality and verdict of a registration.
-
-    Parameters
-    ----------
-    landmarks : ((n, 3), (n, 3)), optional
-        Points of the unloaded image and of the loaded one, LPS mm.
-    floor : NoiseFloor, optional
-        Of a repeat scan.
-    """
+    """Quality and verdict of a registration; ``landmarks`` ((n, 3), (n, 3)) of both images, LPS mm."""
     quality = assess(
         maps,
         found.tissue,

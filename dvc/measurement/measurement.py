@@ -20,7 +20,6 @@ from dvc.io import result_folder as files
 from dvc.measurement import notebook, page
 from dvc.measurement.error_bars import ErrorBars, error_bars
 from dvc.measurement.judgement import carried_images, maps_of, quality_of
-from dvc.measurement.notebook import Scalar
 from dvc.measurement.source import Evidence, Source, alignment_of, motion_as_dict, write_images_and_transforms
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
@@ -99,17 +98,9 @@ class Measurement:
         name: str = "load",
         is_repeat: bool = False,
     ) -> Measurement:
-        """Judge a registered pair.
+        """Judge a registered pair by its subject, the unloaded image, and by more evidence.
 
-        Parameters
-        ----------
-        found : Registration
-        subject : Subject
-            Of its unloaded image.
-        evidence : Evidence, optional
-        name : str
-        is_repeat : bool
-            The loaded image is a second scan without load: its own strain is the noise floor that it is judged by.
+        With ``is_repeat`` the loaded image is a second scan without load, judged by its own strain, the noise floor.
         """
         more = evidence or Evidence()
         maps, images = maps_of(found), carried_images(found)
@@ -128,15 +119,13 @@ class Measurement:
 
     @classmethod
     def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Measurement:
-        """Strain of a deformation that was found elsewhere; no images are compared.
+        """Strain of a deformation that was estimated elsewhere; no images are compared.
 
         Parameters
         ----------
         whole : Deformation
             Of points of the unloaded image to points of the loaded one, LPS mm. Of a subject with a bone, the bone's
             rigid motion (least squares over its voxels) is taken out.
-        subject : Subject
-        name : str
 
         Raises
         ------
@@ -162,11 +151,7 @@ class Measurement:
     def read(cls, folder: Path | str, image: Image | None = None) -> Measurement:
         """Read the folder of one load that `write` or ``mrstrain register`` wrote.
 
-        Parameters
-        ----------
-        folder : path
-        image : Image, optional
-            The unloaded image, to show maps over; it is not in the folder, where the registered one stands for it.
+        The unloaded image, to show maps over, is not in the folder; without one, the registered image stands for it.
 
         Raises
         ------
@@ -228,12 +213,12 @@ class Measurement:
     @property
     def strain_line(self) -> str:
         """The maximal shear by region, in a line."""
-        rows = [r for r in self._rows("max_shear") if np.isfinite(r.median)]
+        rows = (r for r in self.regions if r.quantity == "max_shear" and np.isfinite(r.median))
         shear = ", ".join(f"{r.region} {r.median:.3f} / {r.p95:.3f}" for r in rows)
         return f"maximal shear, median / 95th percentile: {shear}"
 
     def summary(self) -> list[str]:
-        """The verdict with its reasons and the strain, for a person."""
+        """The verdict with its reasons and the strain, in lines."""
         return [
             f"{self.name}: {self.verdict.words}.",
             *(f"    {reason}" for reason in self.verdict.reasons),
@@ -274,7 +259,7 @@ class Measurement:
         """
         values = notebook.values_of(quantity, self.maps, self.sigma)
         outline = None if self.source is None else self.source.subject.labels
-        return notebook.figure(self._view(point_mm), self.image, Scalar(quantity, values, outline), planes, largest)
+        return notebook.figure(self._view(point_mm), self.image, quantity, values, outline, planes, largest)
 
     def _repr_html_(self) -> str:
         table = page.short_table(self.regions, self.intervals)
@@ -282,41 +267,19 @@ class Measurement:
 
     def section(self, pictures: Mapping[str, Picture]) -> Section:
         """Its part of a report."""
-        choice = None if (found := self._registration) is None else found.choice
-        note = "" if found is None else found.settings.engine.note
+        found, bars = None if self.source is None else self.source.registration, self.error_bars
+        choice = None if found is None else found.choice
         tables = [page.key_figures(self.quality, self.alignment), page.region_table(self.regions)]
         tables += [] if choice is None else [page.weights_table(choice)]
-        return Section(
-            self.name,
-            self.verdict,
-            (*tables, *page.error_tables(self.error_bars)),
-            tuple(pictures.values()),
-            (
-                *((note,) if note else ()),
-                *((f"No error bars. {self.error_bars.missing}",) if self.error_bars.missing else ()),
-                *((f"Error bars: {self.error_bars.of_twin}",) if self.error_bars.of_twin else ()),
-            ),
-        )
+        tables += page.error_tables(bars)
+        notes = ["" if found is None else found.settings.engine.note]
+        notes += [f"No error bars. {bars.missing}"] * bool(bars.missing)
+        notes += [f"Error bars: {bars.of_twin}"] * bool(bars.of_twin)
+        return Section(self.name, self.verdict, tuple(tables), tuple(pictures.values()), tuple(filter(None, notes)))
 
     def pictures(self) -> dict[str, Picture]:
-        """The figures of a report, by the name of their file.
-
-        Raises
-        ------
-        InputError
-            Of a measurement that was read from a folder: its figures lie there.
-        """
-        made = self._made_from()
-        view, floor = self._view(), self.quality.noise_floor
-        labels = made.subject.regions(made.tissue)
-        agreement = {} if made.images is None else page.agreement_pictures(view, made.subject.reference, made.images)
-        return {
-            **agreement,
-            **page.strain_pictures(
-                view, made.subject, labels, self.maps, made.images, None if floor is None else floor.shear_p95
-            ),
-            **page.sigma_pictures(view, made.subject.reference, self.error_bars.uncertainty),
-        }
+        """The figures of a report, by the name of their file; InputError for one that was read from a folder."""
+        return page.pictures_of(self._view(), self._made_from(), self.maps, self.quality.noise_floor, self.sigma)
 
     def write(self, folder: Path | str, provenance: Mapping[str, object] | None = None) -> Section:
         """Write everything to a folder, whole or not at all; an older folder of that name is replaced.
@@ -324,7 +287,7 @@ class Measurement:
         Parameters
         ----------
         folder : path
-            Its parent is there already.
+            Its parent exists.
         provenance : mapping, optional
             What it was made from, as plain values, kept as ``provenance.json``.
 
@@ -366,10 +329,6 @@ class Measurement:
                 (partial / files.FIGURES / f"{stem}.png").write_bytes(picture.png)
         return self.section(pictures)
 
-    @property
-    def _registration(self) -> Registration | None:
-        return None if self.source is None else self.source.registration
-
     def _made_from(self) -> Source:
         if self.source is None:
             raise InputError(
@@ -377,9 +336,6 @@ class Measurement:
                 "that folder."
             )
         return self.source
-
-    def _rows(self, quantity: str) -> list[RegionRow]:
-        return [row for row in self.regions if row.quantity == quantity]
 
     def _view(self, point_mm: npt.ArrayLike | None = None) -> View:
         """The slices through a point, through the bone's lowest point, or through the tissue's middle."""
@@ -392,7 +348,7 @@ class Measurement:
 
 
 def _deformation_in(folder: Path, maps: StrainMaps) -> Deformation:
-    """The spline that was found, where it is valid; the displacement at voxels where it was found elsewhere."""
+    """The spline, where it is valid; the displacement at voxels where a deformation was given."""
     if any((folder / name).is_file() for name in (files.SPLINE, files.SPLINE_WITH_BORDERS)):
         return Within(files.spline_in(folder), Mask(maps.grid, maps.valid), margin_voxels=0)
     return files.ResultFolder(folder).deformation()

@@ -1,11 +1,9 @@
-"""What a measurement is made from and judged by, and what of it is written beside the maps."""
+"""What a measurement is made from and judged by, and what is written of it beside the maps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import RigidMotion
@@ -18,7 +16,7 @@ from dvc.measurement.judgement import CarriedImages
 from dvc.measurement.subject import Subject
 from dvc.registration.register import Registration
 from dvc.trust.error_model import ErrorModel
-from dvc.trust.quality import NoiseFloor
+from dvc.trust.quality import NoiseFloor, plain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,21 +43,11 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """What a measurement was made from; one that was read from a folder has it no more.
-
-    Attributes
-    ----------
-    subject : Subject
-    tissue : Mask
-        Soft tissue and bone, on the unloaded image's grid.
-    registration : Registration or None
-        None where the deformation was found elsewhere; then there are no images, either.
-    images : CarriedImages or None
-    """
+    """What a measurement was made from; one that was read from a folder has it no more."""
 
     subject: Subject
-    tissue: Mask
-    registration: Registration | None = None
+    tissue: Mask  # soft tissue and bone, on the unloaded image's grid
+    registration: Registration | None = None  # None where the deformation was given; then there are no images, either
     images: CarriedImages | None = None
 
 
@@ -73,7 +61,7 @@ def write_images_and_transforms(folder: Path, found: Registration, images: Carri
 
 
 def motion_as_dict(motion: RigidMotion) -> dict[str, object]:
-    """The bone's rigid motion as plain values; `dvc.io.result_folder.motion_in` turns them back."""
+    """The bone's rigid motion as plain values; `dvc.io.result_folder.motion_in` reads them."""
     return {
         "rotation_deg": motion.angle_deg,
         "rotation": motion.rotation.tolist(),
@@ -84,10 +72,6 @@ def motion_as_dict(motion: RigidMotion) -> dict[str, object]:
 def alignment_of(found: Registration) -> dict[str, object]:
     """The alignment as plain values: motion, how well it is known, and by what the pair was registered."""
     alignment = found.alignment
-
-    def plain(value: float) -> float | None:
-        return value if np.isfinite(value) else None
-
     return {
         "on": alignment.on,
         **motion_as_dict(alignment.motion),

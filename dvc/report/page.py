@@ -28,13 +28,7 @@ METHODS = "Methods text"
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure with what it shows and how to read it.
-
-    Raises
-    ------
-    InputError
-        If ``png`` is not a PNG file.
-    """
+    """A PNG figure (InputError for another) with what it shows and how to read it."""
 
     title: str
     caption: str
@@ -43,6 +37,11 @@ class Picture:
     def __post_init__(self) -> None:
         if not self.png.startswith(_PNG_SIGNATURE):
             raise InputError(f"The figure '{self.title}' is no PNG file; it begins with {self.png[:8]!r}.")
+
+    @classmethod
+    def drawn(cls, title: str, draw: Callable[..., bytes], *shown: object, note: str = "") -> Picture:
+        """A figure by what draws it, whose docstring says how the figure is read: its caption, and a note after it."""
+        return cls(title, " ".join(f"{draw.__doc__ or ''} {note}".split()), draw(*shown))
 
     @property
     def data(self) -> str:
@@ -57,14 +56,9 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows under named columns; numbers are shown to three digits, missing ones as a dash.
+    """Rows under named columns, one cell for each; numbers are shown to three digits, missing ones as a dash.
 
-    Rows ``apart`` stand below a line: what the others are to be seen beside.
-
-    Raises
-    ------
-    InputError
-        If a row has not one cell for each column.
+    Rows ``apart`` stand below a line: the others are to be seen beside them.
     """
 
     title: str
@@ -100,16 +94,9 @@ class Section:
     viewers: tuple[Viewer, ...] = ()
 
 
-def caption_of(draw: Callable[..., bytes]) -> str:
-    """A figure's docstring: it says how the figure is read."""
-    return " ".join((draw.__doc__ or "").split())
-
-
 def shown(value: Cell) -> str:
-    """Return a table cell as people read it.
+    """A table cell as people read it.
 
-    Examples
-    --------
     >>> [shown(v) for v in (0.123456, 1234.5, 12, float("nan"), None, "fat")]
     ['0.123', '1234', '12', '–', '–', 'fat']
     """
@@ -151,12 +138,7 @@ def write_report(
 
     One HTML file without anything to fetch, and without scripts but for a section's viewer; all text is escaped. A list
     of the sections with their verdicts stands at the top where there are two or more; ``notes``, a line each, stand
-    between the verdict and it.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
+    between the verdict and it. OutputError if the file cannot be written.
     """
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -23,15 +24,7 @@ NIIVUE = "0.69.0"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Volume:
-    """A volume as a page holds it: NIfTI, eight bits, compressed, base64.
-
-    Attributes
-    ----------
-    title : str
-    data : str
-    most : float
-        Value at the upper end of the colours.
-    """
+    """A volume as a page holds it: NIfTI, eight bits, compressed, base64; ``most`` is the value of the last colour."""
 
     title: str
     data: str
@@ -44,7 +37,7 @@ class Volume:
         step = most / _STEPS
         image = nibabel.Nifti1Image(np.clip(np.rint(known / step), 0, 255).astype(np.uint8), _TO_RAS @ grid.affine)
         image.header.set_slope_inter(step, 0.0)
-        return cls(title, base64.b64encode(_compressed(image.to_bytes())).decode(), most)
+        return cls(title, base64.b64encode(gzip.compress(image.to_bytes(), mtime=0)).decode(), most)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,9 +57,3 @@ def script() -> str:
     licence = (folder / "niivue-LICENSE.txt").read_text(encoding="utf-8")
     library = (folder / "niivue.umd.js").read_text(encoding="utf-8")
     return f"/* niivue {NIIVUE}\n{licence}*/\n{library}\n{(folder / 'viewer.js').read_text(encoding='utf-8')}"
-
-
-def _compressed(data: bytes) -> bytes:
-    import gzip
-
-    return gzip.compress(data, mtime=0)

@@ -55,8 +55,8 @@ def read_landmarks(
 
     Notes
     -----
-    Two Slicer lists are paired by name where both hold the same names, each once; where no name is in both,
-    they are paired in their order, which is logged. Anything between is refused.
+    Two Slicer lists are paired by name where both hold the same names, each once, and in their order (which is logged)
+    where they share no name. Anything between is refused.
     """
     if frame not in _TO_LPS:
         raise InputError(f"The frame of landmarks is LPS or RAS; got {frame!r}.")
@@ -68,7 +68,7 @@ def read_landmarks(
             f"{file}: landmark pairs are one CSV file, or two point lists of Slicer (.mrk.json, .fcsv) given "
             "together, the unloaded image's first."
         )
-    reference, deformed, names = [], [], []
+    pairs, names = [], []
     rows = csv.DictReader(_text(file).splitlines())
     header = [str(name).strip().casefold() for name in rows.fieldnames or []]
     missing = [name for name in _COLUMNS if name not in header]
@@ -79,14 +79,12 @@ def read_landmarks(
         )
     rows.fieldnames = header
     for count, row in enumerate(rows, start=1):
-        where = f"{file}, line {rows.line_num}"
-        values = [_number(where, name, row[name]) for name in _COLUMNS]
-        reference.append(values[:3])
-        deformed.append(values[3:])
+        pairs.append([_number(f"{file}, line {rows.line_num}", name, row[name]) for name in _COLUMNS])
         names.append((row.get("name") or str(count)).strip())
-    if not reference:
+    if not pairs:
         raise ImageFileError(f"{file} has no landmark below its header.")
-    return np.array(reference) * _TO_LPS[frame], np.array(deformed) * _TO_LPS[frame], tuple(names)
+    reference, deformed = np.split(np.array(pairs), 2, axis=1)
+    return reference * _TO_LPS[frame], deformed * _TO_LPS[frame], tuple(names)
 
 
 def target_registration_error(
@@ -97,8 +95,8 @@ def target_registration_error(
     Parameters
     ----------
     deformation : Deformation
-        The whole motion from the unloaded to the loaded image, the bone's motion included, since the
-        landmarks x lie in the loaded image as it was scanned.
+        The whole motion from the unloaded to the loaded image, the bone's included, since the landmarks x lie in the
+        loaded image as it was scanned.
     reference_mm, deformed_mm : (n, 3)
         Landmarks X in the unloaded and x in the loaded image, LPS mm.
 
@@ -111,7 +109,7 @@ def target_registration_error(
     Raises
     ------
     InputError
-        If the two sets have not the same shape (n, 3).
+        If the two sets do not have the same shape (n, 3).
 
     Examples
     --------
