@@ -21,9 +21,9 @@ from .io.images.write import write_image, write_labels, write_mask, write_vector
 from .io.meshes.read import MeshFile, read_mesh
 from .io.transforms.displacement_image import read_displacement
 from .io.transforms.read import read_transform
+from .measurement.judgement import Evidence
 from .measurement.measure import measure
 from .measurement.measurement import Measurement
-from .measurement.source import Evidence
 from .measurement.subject import Subject
 from .mesh import TetMesh
 from .registration.align import Alignment

@@ -85,10 +85,8 @@ class TetMesh:
             raise InputError("The mesh has no tetrahedron.")
         ids = np.arange(len(points)) if node_ids is None else np.asarray(node_ids)
         if ids.shape != (len(points),) or len(np.unique(ids)) != len(ids):
-            raise InputError(
-                f"node_ids must give each of the {len(points)} nodes a number of its own; got {ids.shape[0]} "
-                f"numbers, {len(np.unique(ids))} of them different."
-            )
+            got = f"got {ids.shape[0]} numbers, {len(np.unique(ids))} of them different"
+            raise InputError(f"node_ids must give each of the {len(points)} nodes a number of its own; {got}.")
         named_cells = {
             name: checked_indices(f"region {name!r}", index, len(tets)) for name, index in (regions or {}).items()
         }
@@ -142,9 +140,12 @@ class TetMesh:
 
 def outer_faces(cells: IntArray) -> IntArray:
     """Faces (k, 3) of tetrahedra (m, 4) that belong to one of them alone, by their nodes in rising order."""
-    faces = np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
-    different, times = np.unique(faces, axis=0, return_counts=True)
+    different, times = np.unique(_faces(cells), axis=0, return_counts=True)
     return np.asarray(different[times == 1])
+
+
+def _faces(cells: IntArray) -> IntArray:
+    return np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
 
 
 def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
@@ -154,10 +155,8 @@ def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
         raise InputError(f"Nodes of a mesh must be an (n, 3) array of coordinates; got shape {points.shape}.")
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
-        raise GeometryError(
-            f"{np.count_nonzero(bad)} of {len(points)} nodes have a coordinate that is not a finite number; "
-            f"the first is at index {np.argmax(bad)}."
-        )
+        what = f"{np.count_nonzero(bad)} of {len(points)} nodes have a coordinate that is not a finite number"
+        raise GeometryError(f"{what}; the first is at index {np.argmax(bad)}.")
     return points
 
 
@@ -175,10 +174,8 @@ def checked_indices(what: str, index: npt.ArrayLike, count: int, width: int | No
     outside = (array < 0) | (array >= count)
     if outside.any():
         first = np.argwhere(outside)[0]
-        raise InputError(
-            f"{what}: {np.count_nonzero(outside)} indices are outside 0 to {count - 1}; the first is "
-            f"{array[tuple(first)]}, in row {first[0]}."
-        )
+        where = f"the first is {array[tuple(first)]}, in row {first[0]}"
+        raise InputError(f"{what}: {np.count_nonzero(outside)} indices are outside 0 to {count - 1}; {where}.")
     return array
 
 
@@ -233,16 +230,13 @@ def _positively_ordered(points: FloatArray, cells: IntArray, node_ids: IntArray)
     negative = volumes < 0
     if not negative.any():
         return cells
-    if not negative.all():
-        overlapping = _overlapping(points, cells)
-        if overlapping.any():
-            first = int(np.argmax(overlapping))
-            raise GeometryError(
-                f"{np.count_nonzero(negative)} of {len(cells)} tetrahedra are inverted (negative volume), "
-                f"and {np.count_nonzero(overlapping)} overlap a neighbour across a common face, the first of "
-                f"them cell {first}, nodes {node_ids[cells[first]].tolist()}: the mesh folds over itself. Mend it "
-                "where it was made."
-            )
+    if not negative.all() and (overlapping := _overlapping(points, cells)).any():
+        first = int(np.argmax(overlapping))
+        raise GeometryError(
+            f"{np.count_nonzero(negative)} of {len(cells)} tetrahedra are inverted (negative volume), and "
+            f"{np.count_nonzero(overlapping)} overlap a neighbour across a common face, the first of them cell "
+            f"{first}, nodes {node_ids[cells[first]].tolist()}: the mesh folds over itself. Mend it where it was made."
+        )
     _log.warning(
         "%d of %d tetrahedra count their nodes the other way round (negative volume); two nodes of each were "
         "swapped. Their shape and place are unchanged, and no cell overlaps its neighbour.",
@@ -255,15 +249,11 @@ def _positively_ordered(points: FloatArray, cells: IntArray, node_ids: IntArray)
 
 def _overlapping(points: FloatArray, cells: IntArray) -> BoolArray:
     """Which cells have a face whose cells do not lie one on either side of it (or that three cells share)."""
-    faces = np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
-    opposite = cells.T.ravel()
-    owner = np.tile(np.arange(len(cells)), 4)
-    _, which = np.unique(faces, axis=0, return_inverse=True)
-    which = which.ravel()
+    faces = _faces(cells)
+    opposite, owner = cells.T.ravel(), np.tile(np.arange(len(cells)), 4)
+    which = np.unique(faces, axis=0, return_inverse=True)[1].ravel()
     side = np.sign(signed_volumes(points[np.column_stack([faces, opposite])]))
     shared_by = np.bincount(which)
     balance = np.bincount(which, weights=side)  # 0 where two cells lie on opposite sides
     wrong = (shared_by > 2) | ((shared_by == 2) & (balance != 0))
-    overlapping = np.zeros(len(cells), dtype=bool)
-    overlapping[owner[wrong[which]]] = True
-    return overlapping
+    return np.isin(np.arange(len(cells)), owner[wrong[which]])

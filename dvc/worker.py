@@ -78,8 +78,7 @@ class Worker:
 
     def kill(self) -> None:
         """End the child process at once, whatever it is doing; a task in it raises `WorkerError`."""
-        executor = self._executor
-        if executor is not None:
+        if (executor := self._executor) is not None:
             executor.shutdown(wait=False, kill_workers=True)
 
     def close(self) -> None:
@@ -144,6 +143,4 @@ def _cause(died: BaseException) -> str:
 
 def usable_cores() -> int:
     """Number of processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -44,9 +44,7 @@ class ErrorBars:
         return told
 
     @classmethod
-    def from_dict(
-        cls, told: Mapping[str, Any], uncertainty: Uncertainty | None = None, model: ErrorModel | None = None
-    ) -> ErrorBars:
+    def from_dict(cls, told: Mapping[str, Any], uncertainty: Uncertainty | None, model: ErrorModel | None) -> ErrorBars:
         """The error bars that `as_dict` gave, with their arrays."""
         twin = tuple(Judged(**row) for row in told.get("twin", ()))
         return cls(uncertainty, str(told.get("source", told.get("reason", ""))), model, twin, told.get("of_twin", ""))

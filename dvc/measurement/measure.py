@@ -8,8 +8,8 @@ from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.io.meshes.read import MeshFile
+from dvc.measurement.judgement import Evidence
 from dvc.measurement.measurement import Measurement
-from dvc.measurement.source import Evidence
 from dvc.measurement.subject import Subject, plate_directions
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Settings, register

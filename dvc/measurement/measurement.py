@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,9 @@ from dvc.deformation.strain_maps import StrainMaps, strain_maps
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
 from dvc.io import result_folder as files
-from dvc.measurement import notebook, page
+from dvc.measurement import judgement, notebook, page
 from dvc.measurement.error_bars import ErrorBars, error_bars
-from dvc.measurement.judgement import carried_images, maps_of, quality_of
-from dvc.measurement.source import Evidence, Source, alignment_of, motion_as_dict, write_images_and_transforms
+from dvc.measurement.judgement import Evidence, Source
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
@@ -102,20 +101,14 @@ class Measurement:
 
         With ``is_repeat`` the loaded image is a second scan without load, judged by its own strain, the noise floor.
         """
-        more = evidence or Evidence()
-        maps, images = maps_of(found), carried_images(found)
-        floor = noise_floor(maps, subject.soft(found.tissue)) if is_repeat else more.noise_floor
-        return cls(
-            name,
-            found.deformation,
-            maps,
-            alignment_of(found),
-            quality_of(found, maps, images.similarity, more.landmarks, floor),
-            tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity)),
-            error_bars(found, subject, maps, more.error_model, more.twin),
-            found.reference,
-            Source(subject, found.tissue, found, images),
-        )
+        more, maps, images = evidence or Evidence(), judgement.maps_of(found), judgement.carried_images(found)
+        if is_repeat:
+            more = replace(more, noise_floor=noise_floor(maps, subject.soft(found.tissue)))
+        quality, alignment = judgement.quality_of(found, maps, images.similarity, more), judgement.alignment_of(found)
+        regions = tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity))
+        bars = error_bars(found, subject, maps, more.error_model, more.twin)
+        source = Source(subject, found.tissue, found, images)
+        return cls(name, found.deformation, maps, alignment, quality, regions, bars, found.reference, source)
 
     @classmethod
     def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Measurement:
@@ -135,17 +128,10 @@ class Measurement:
         relative, motion = without_motion(whole, subject.bone)
         body = subject.body()
         maps = strain_maps(relative, body)
-        return cls(
-            name,
-            relative,
-            maps,
-            {"on": "none" if subject.bone is None else "bone", **motion_as_dict(motion)},
-            assess(maps, body, subject.bone),
-            tuple(region_statistics(subject.regions(body), maps.by_quantity)),
-            ErrorBars(None, ""),
-            subject.reference,
-            Source(subject, body),
-        )
+        alignment = {"on": "none" if subject.bone is None else "bone", **judgement.motion_as_dict(motion)}
+        quality, bars, source = assess(maps, body, subject.bone), ErrorBars(None, ""), Source(subject, body)
+        regions = tuple(region_statistics(subject.regions(body), maps.by_quantity))
+        return cls(name, relative, maps, alignment, quality, regions, bars, subject.reference, source)
 
     @classmethod
     def read(cls, folder: Path | str, image: Image | None = None) -> Measurement:
@@ -172,16 +158,10 @@ class Measurement:
         uncertainty, model = (None, None) if known is None else known
         if image is None and (place / files.REGISTERED).is_file():
             image = files.read_scalar(place / files.REGISTERED, maps.grid)
-        return cls(
-            place.resolve().name,
-            _deformation_in(place, maps),
-            maps,
-            alignment,
-            quality,
-            tuple(read_regions_csv(place / files.REGIONS)),
-            ErrorBars.from_dict(told.get("error_of_max_shear", {}), uncertainty, model),
-            image,
-        )
+        regions = tuple(read_regions_csv(place / files.REGIONS))
+        bars = ErrorBars.from_dict(told.get("error_of_max_shear", {}), uncertainty, model)
+        name, deformation = place.resolve().name, _deformation_in(place, maps)
+        return cls(name, deformation, maps, alignment, quality, regions, bars, image)
 
     @property
     def verdict(self) -> Verdict:
@@ -303,24 +283,22 @@ class Measurement:
         OutputError
             If it cannot be written.
         """
-        made, pictures, verdict = self._made_from(), self.pictures(), self.verdict
+        made, pictures, verdict, bars = self._made_from(), self.pictures(), self.verdict, self.error_bars
         told = self.quality.as_dict() | {"alignment": dict(self.alignment)}
         found = made.registration
         if found is not None:
             if found.choice is not None:
                 told["regularisation"] = found.choice.as_dict()
-            told["error_of_max_shear"] = self.error_bars.as_dict()
+            told["error_of_max_shear"] = bars.as_dict()
         with whole_folder(Path(folder)) as partial:
             files.write_maps(partial, self.maps, made.subject.axes, verdict)
             write_regions_csv(partial / files.REGIONS, self.regions, verdict)
             if made.subject.mesh is not None:
                 told["mesh"] = files.write_mesh_results(partial, made.subject.mesh, self.deformation, verdict)
             if found is not None and made.images is not None:
-                write_images_and_transforms(partial, found, made.images)
-            if self.error_bars.uncertainty is not None:
-                files.write_uncertainty(
-                    partial, self.maps.grid, self.error_bars.uncertainty, self.error_bars.model, verdict
-                )
+                judgement.write_images_and_transforms(partial, found, made.images)
+            if bars.uncertainty is not None:
+                files.write_uncertainty(partial, self.maps.grid, bars.uncertainty, bars.model, verdict)
             write_json(partial / files.QUALITY, told)
             if provenance is not None:
                 write_json(partial / files.PROVENANCE, provenance)

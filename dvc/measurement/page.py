@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from dvc.arrays import Float32Array
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.measurement.error_bars import ErrorBars
-from dvc.measurement.source import Source
+from dvc.measurement.judgement import Source
 from dvc.registration.engine import Regularisation
 from dvc.report import figures
 from dvc.report.page import Cell, Picture, Table, shown
@@ -60,26 +61,22 @@ def pictures_of(
     return drawn
 
 
-def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
+def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
     """What the verdict rests on."""
     rows: list[tuple[str, Cell, str]] = [
-        ("Rotation of the bone between the scans", _number(alignment["rotation_deg"]), "degrees")
+        ("Rotation of the bone between the scans", alignment["rotation_deg"], "degrees")
     ]
     if "bone_shift_lps_mm" in alignment:
-        shift = np.asarray(alignment["bone_shift_lps_mm"], dtype=np.float64)
+        spread = "Spread of the rigid fits of halves of the bone (rms over the bone; largest of six pairs)"
+        spacing = " x ".join(f"{s:.3g}" for s in alignment["control_spacing_mm"])
         rows += [
-            ("Shift of the bone between the scans", float(np.linalg.norm(shift)), "mm"),
-            ("Correlation in and around the bone, before alignment", _number(alignment["similarity_before"]), ""),
-            ("Correlation in and around the bone, after alignment", _number(alignment["similarity"]), ""),
-            (
-                "Spread of the rigid fits of halves of the bone (rms over the bone; largest of six pairs)",
-                _number(alignment["repeatability_rms_mm"]),
-                "mm",
-            ),
+            ("Shift of the bone between the scans", float(np.linalg.norm(alignment["bone_shift_lps_mm"])), "mm"),
+            ("Correlation in and around the bone, before alignment", alignment["similarity_before"], ""),
+            ("Correlation in and around the bone, after alignment", alignment["similarity"], ""),
+            (spread, alignment["repeatability_rms_mm"], "mm"),
+            ("Engine of the non-rigid registration", alignment["engine"], ""),
+            ("Spacing of the B-spline's control points", spacing, "mm"),
         ]
-        spacing = np.asarray(alignment["control_spacing_mm"], dtype=np.float64)
-        rows.append(("Engine of the non-rigid registration", str(alignment["engine"]), ""))
-        rows.append(("Spacing of the B-spline's control points", " x ".join(f"{s:.3g}" for s in spacing), "mm"))
     if quality.similarity is not None:
         for said, value in zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True):
             rows.append((f"Local similarity in the tissue, {said}", float(value), ""))
@@ -92,16 +89,14 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
         ("Lowest det F", quality.lowest_jacobian, ""),
         ("Tissue without a result", 100.0 * quality.undefined_fraction, "%"),
     ]
-    if quality.landmark_errors_mm is not None:
-        errors = quality.landmark_errors_mm
+    if (errors := quality.landmark_errors_mm) is not None:
         known = errors[np.isfinite(errors)]
         rows += [
             ("Landmark error, median", float(np.median(known)) if known.size else None, "mm"),
             ("Landmark error, largest", float(known.max()) if known.size else None, "mm"),
             ("Landmarks without a result", int(errors.size - known.size), f"of {errors.size}"),
         ]
-    if quality.noise_floor is not None:
-        floor = quality.noise_floor
+    if (floor := quality.noise_floor) is not None:
         rows += [
             ("Noise floor (repeat scan): maximal shear, median", floor.shear_p50, ""),
             ("Noise floor (repeat scan): maximal shear, 95th percentile", floor.shear_p95, ""),
@@ -109,10 +104,6 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
             ("Noise floor: SDER", floor.sder, ""),
         ]
     return Table("Key figures", ("figure", "value", "unit"), tuple(rows))
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) else None
 
 
 def weights_table(choice: Regularisation) -> Table:
@@ -142,12 +133,12 @@ def short_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> 
     def own(region: str, figure: str) -> tuple[str, ...]:
         return (known.get((region, figure), "–"),) if known else ()
 
+    interval = ("95 % interval",) * bool(known)
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (r.region, r.volume_ml, r.median, *own(r.region, "median"), r.p95, *own(r.region, "p95"))
         for r in regions
         if r.quantity == "max_shear"
     )
-    interval = ("95 % interval",) * bool(known)
     return Table("Maximal shear", ("region", "volume, mL", "median", *interval, "95th percentile", *interval), rows)
 
 

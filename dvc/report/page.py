@@ -21,7 +21,6 @@ Cell = str | float | int | None
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CSS_PIXELS_PER_DOT = 96 / 120  # figures are drawn at 120 dots per inch: text of 10 pt is then 10 pt on the page
 
-
 METHODS = "Methods text"
 """Title of a report's section with paragraphs for a methods section."""
 
@@ -140,20 +139,11 @@ def write_report(
     of the sections with their verdicts stands at the top where there are two or more; ``notes``, a line each, stand
     between the verdict and it. OutputError if the file cannot be written.
     """
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    strict = jinja2.StrictUndefined
+    environment = jinja2.Environment(autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
     environment.filters["shown"] = shown
-    template = environment.from_string(
-        (files("dvc.report") / "templates" / "report.html.j2").read_text(encoding="utf-8")
-    )
-    page = template.render(
-        title=title,
-        verdict=verdict,
-        sections=list(sections),
-        closing=list(closing),
-        provenance=dict(provenance),
-        notes=list(notes),
-        script=script() if any(section.viewers for section in sections) else "",
-    )
+    template = (files("dvc.report") / "templates" / "report.html.j2").read_text(encoding="utf-8")
+    told = {"title": title, "verdict": verdict, "notes": notes, "provenance": provenance}
+    library = script() if any(section.viewers for section in sections) else ""
+    page = environment.from_string(template).render(**told, sections=sections, closing=closing, script=library)
     write_whole(path, page)

@@ -17,7 +17,6 @@ from dvc.images.image import Grid
 _STEPS = 250  # of a volume's values: one byte for each voxel
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
-
 NIIVUE = "0.69.0"
 """Version of the viewer that comes with the package."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
@@ -38,27 +38,11 @@ _DRAWS = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorTable:
-    """Error of the maximal shear for one voxel size and noise.
+    """Error of the maximal shear for one voxel size and signal-to-noise ratio (`dvc.images.noise.signal_to_noise`).
 
-    Attributes
-    ----------
-    spacing_mm : (3,)
-        Of the voxels.
-    snr : float
-        Signal-to-noise ratio, as `dvc.images.noise.signal_to_noise` estimates it.
-    shear : (m,)
-        Rising measured shears at which bias and deviation are given; linear between, constant beyond.
-    to_bone_mm : (k,)
-        Lower ends of the bins of distance to bone, rising from 0.
-    whole : mapping of tissue to (2, k, m)
-        Mean and standard deviation of measured minus true shear, over all registrations of the study.
-    runs : tuple of mapping of tissue to (2, k, m)
-        The same of each registration alone: how errors differ from image to image.
-    correlation_mm : float
-        Distance at which the error's autocorrelation has fallen to 1/e.
-    widening : float
-        Factor on intervals as they are drawn, by which 95 % of the tissues' figures lay in them when each heel of the
-        study was judged by the others; NaN where there was one heel alone, and intervals stay as drawn.
+    It is given at rising measured shears (m,), linear between and constant beyond, and for bins of distance to bone
+    whose lower ends (k,) rise from 0: mean and standard deviation (2, k, m) of measured minus true shear by tissue,
+    over the whole study and in each of its runs (registrations), since errors differ from image to image.
     """
 
     spacing_mm: FloatArray
@@ -67,7 +51,9 @@ class ErrorTable:
     to_bone_mm: FloatArray
     whole: Mapping[str, FloatArray]
     runs: tuple[Mapping[str, FloatArray], ...]
-    correlation_mm: float
+    correlation_mm: float  # distance at which the error's autocorrelation has fallen to 1/e
+    # Factor on intervals as drawn, by which 95 % of the tissues' figures lay in them when each heel of the study was
+    # judged by the others; NaN where there was one heel alone, and intervals stay as drawn.
     widening: float = float("nan")
 
     @property
@@ -151,9 +137,8 @@ def read_error_model(path: Path | str) -> ErrorModel:
     try:
         return _parsed(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError, KeyError, TypeError) as failure:
-        raise InputError(
-            f"{path}: no error model as `mrstrain accuracy` writes it ({type(failure).__name__}: {failure})."
-        ) from failure
+        what = f"no error model as `mrstrain accuracy` writes it ({type(failure).__name__}: {failure})."
+        raise InputError(f"{path}: {what}") from failure
 
 
 def error_model_of(preset: str) -> ErrorModel | None:
@@ -258,25 +243,12 @@ def uncertainty_of(
     seed: int = 1,
     wider: Mapping[str, float] = MappingProxyType({}),
 ) -> Uncertainty:
-    """Error of a map of maximal shear by an error table.
+    """Error of a map of maximal shear (ni, nj, nk), NaN where not defined, by an error table.
 
-    Parameters
-    ----------
-    max_shear : (ni, nj, nk)
-        NaN where not defined.
-    regions : mapping of name to (ni, nj, nk) bool
-        Soft tissues.
-    to_bone_mm : (ni, nj, nk)
-        Distance to bone.
-    thresholds : sequence of float
-        Strains for which the volume above is wanted.
-    seed : int
-        Of the draws.
-    wider : mapping of name to float
-        Factors on the deviation and the intervals of some regions, beside `ErrorTable.widening`.
+    For each of the soft tissues ``regions``, masks by name, at distances to bone (ni, nj, nk); its volumes are those
+    above ``thresholds``. Beside `ErrorTable.widening`, ``wider`` holds factors on the deviation and the intervals of
+    some regions.
 
-    Notes
-    -----
     The truth is drawn 200 times: measured shear, less the bias of one of the study's registrations, drawn anew each
     time, less a Gaussian field of its standard deviation and of the table's correlation length; not below zero. The
     interval of the draws is widened by a factor from held-out heels (conformal prediction), so that it holds in 95 % of
@@ -284,51 +256,37 @@ def uncertainty_of(
     """
     sigma = np.full(grid.shape, np.nan, dtype=np.float32)
     intervals, random = list[Interval](), np.random.default_rng(seed)
+    names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]
     for name, inside in regions.items():
         where = inside & np.isfinite(max_shear)
         if not where.any():
             continue
-        _, sd = table.expected(name, max_shear[where].astype(np.float64), to_bone_mm[where])
-        factor = wider.get(name, 1.0)
-        sigma[where] = factor * sd
-        own = replace(table, widening=factor * table.factor)
-        intervals += _intervals(name, where, max_shear, to_bone_mm, grid, own, thresholds, random)
+        shear, factor = max_shear[where].astype(np.float64), wider.get(name, 1.0)
+        sigma[where] = factor * table.expected(name, shear, to_bone_mm[where])[1]
+        volume = shear.size * grid.voxel_volume_mm3 / 1000.0
+        lattice, step = _lattice(where)
+        kept = where[lattice]
+        found, distance = max_shear[lattice][kept].astype(np.float64), to_bone_mm[lattice][kept]
+        width = 0.5 * table.correlation_mm / (step * grid.spacing_mm)
+        noise = GaussianField(kept.shape, np.nonzero(kept), width, random)
+        expected = [table.expected(name, found, distance, run) for run in range(len(table.runs))]
+        drawn = []
+        for _ in range(_DRAWS):
+            bias, sd = expected[random.integers(len(expected))]
+            drawn.append(figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds))
+        low, middle, high = widened(np.array(drawn), factor * table.factor)
+        high[3:] = np.minimum(high[3:], volume)
+        each = zip(names, figures_of(shear, volume, thresholds), middle, low, high, strict=True)
+        intervals += [Interval(name, figure, *map(float, numbers)) for figure, *numbers in each]
     return Uncertainty(sigma, tuple(intervals), table)
 
 
-def _intervals(
-    name: str,
-    where: BoolArray,
-    max_shear: Float32Array,
-    to_bone_mm: Float32Array,
-    grid: Grid,
-    table: ErrorTable,
-    thresholds: Sequence[float],
-    random: np.random.Generator,
-) -> list[Interval]:
-    """Intervals of one region, from draws on a lattice coarse enough to be quick."""
+def _lattice(where: BoolArray) -> tuple[tuple[slice, ...], int]:
+    """Every so many voxels of a mask's box, few enough for draws to be quick, or all where these miss the mask."""
     box = tuple(slice(int(a.min()), int(a.max()) + 1) for a in np.nonzero(where))
     step = max(1, int(np.ceil((np.count_nonzero(where) / _LATTICE) ** (1 / 3))))
     lattice = tuple(slice(b.start, b.stop, step) for b in box)
-    kept = where[lattice]
-    if not kept.any():
-        lattice, kept, step = box, where[box], 1
-    found = max_shear[lattice][kept].astype(np.float64)
-    volume = np.count_nonzero(where) * grid.voxel_volume_mm3 / 1000.0
-    noise = GaussianField(kept.shape, np.nonzero(kept), 0.5 * table.correlation_mm / (step * grid.spacing_mm), random)
-    expected = [table.expected(name, found, to_bone_mm[lattice][kept], run) for run in range(len(table.runs))]
-    drawn = np.empty((_DRAWS, 3 + len(thresholds)))
-    for draw in range(_DRAWS):
-        bias, sd = expected[random.integers(len(expected))]
-        drawn[draw] = figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds)
-    low, middle, high = widened(drawn, table.factor)
-    high[3:] = np.minimum(high[3:], volume)
-    measured = figures_of(max_shear[where].astype(np.float64), volume, thresholds)
-    names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]
-    return [
-        Interval(name, figure, float(m), float(e), float(a), float(b))
-        for figure, m, e, a, b in zip(names, measured, middle, low, high, strict=True)
-    ]
+    return (lattice, step) if where[lattice].any() else (box, 1)
 
 
 def figures_of(shear: FloatArray, volume_ml: float, thresholds: Sequence[float]) -> FloatArray:

@@ -103,8 +103,8 @@ def target_registration_error(
     Returns
     -------
     (n,)
-        Error of each landmark, mm; NaN where the deformation is not defined. Count these in any summary: a
-        mean over the others alone looks better than the registration is.
+        mm; NaN where the deformation is not defined. Count these in any summary: a mean over the others alone looks
+        better than the registration is.
 
     Raises
     ------

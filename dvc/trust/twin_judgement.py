@@ -22,29 +22,18 @@ class Judged:
     """How a tissue's maximal shear came back from the twin.
 
     The model's bias need not come back: noise lifts a shear, and the twin's own, having been measured, is lifted
-    already. So bias counts as part of the error that is claimed, whatever its sign.
-
-    Attributes
-    ----------
-    rms_error, bias : float
-        Of the shear measured in the twin less the twin's own, which is that measured in the pair.
-    held : float or None
-        Share of voxels whose error is under 1.96 sqrt(bias^2 + sd^2), with the error model's bias and deviation; None
-        without an error model.
-    expected : float or None
-        Least share at which the error model is believed: of twenty registrations like those it was made from, one has
-        less; and never more than 0.95.
-    factor : float or None
-        By how much deviation and intervals have to be wider: where fewer voxels are held than expected, for 95 % of
-        them; and for the tissue's median, 90th and 95th percentile to come back no farther than the far end of their
-        intervals. At least 1.
+    already. So bias counts as part of the error that is claimed, whatever its sign. Without an error model there are no
+    claims.
     """
 
     region: str
-    rms_error: float
+    rms_error: float  # of the shear measured in the twin less the twin's own, which is that measured in the pair
     bias: float
-    held: float | None = None
+    held: float | None = None  # share of voxels whose error is under 1.96 sqrt(bias^2 + sd^2), as claimed
+    # Least share at which the claims are believed: of twenty registrations of the study, one has less; at most 0.95.
     expected: float | None = None
+    # At least 1: how much wider deviation and intervals have to be for 95 % of the voxels, where fewer are held than
+    # expected, and for median, 90th and 95th percentile to come back no farther than the far end of their intervals.
     factor: float | None = None
 
 
