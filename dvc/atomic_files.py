@@ -58,19 +58,17 @@ def whole_folder(final: Path) -> Iterator[Path]:
         try:
             partial.chmod(0o755)
             yield partial
-            if final.exists():
-                old = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".old", dir=final.parent))
+            if not final.exists():
+                partial.replace(final)
+                return
+            name = f".{final.name}."
+            with tempfile.TemporaryDirectory(".old", name, final.parent, ignore_cleanup_errors=True) as aside:
+                old = final.replace(Path(aside) / final.name)
                 try:
-                    final.replace(old / final.name)
                     partial.replace(final)
                 except OSError:
-                    if not final.exists():
-                        (old / final.name).replace(final)
+                    old.replace(final)
                     raise
-                finally:
-                    shutil.rmtree(old, ignore_errors=True)
-            else:
-                partial.replace(final)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:

@@ -1,13 +1,13 @@
 """The software that a result depends on, as one key for everything that is kept to be used again.
 
 A study's stages, the restart files of simulations and the runs of an accuracy study are kept under this key, and made
-anew when it changes. It covers the package that computes the result and those of ours that it imports: every source
-and data file in them, by place and content, and the versions of mrstrain and of the libraries that figures depend on.
+anew when it changes. It covers the package that computes the result and those of ours that it imports (every source and
+data file in them, by place and content) and the versions of mrstrain and of the libraries that figures depend on.
 
 Why whole packages: a list of file names goes stale without a word. Following imports from file to file loses what is
-read by name (parameter files, material sets), and ends at nearly all files anyway, since a package's front door imports
-the rest. A page template changes the key of an accuracy run, too: between two releases that costs computing time and
-never gives a wrong result. To make error models, measure all presets on one state of the code.
+read by name (parameter files, material sets), and ends at nearly all files anyway, since a front door imports the rest.
+A new page template costs computing time between two releases, and never gives a wrong result. To make error models,
+measure all presets on one state of the code.
 """
 
 from __future__ import annotations

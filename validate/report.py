@@ -10,8 +10,7 @@ import numpy as np
 from dvc import Deformation, LabelMap, Mask, StrainField, Verdict, evaluate_on_grid
 from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
-from dvc.report.page import METHODS, Cell, Picture, Section, Table
-from dvc.report.viewer import Viewer, Volume
+from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from validate import figures
 from validate.curves import Area
 from validate.fe_result import FeResult

@@ -252,8 +252,8 @@ class LabelMap:
 
     Raises
     ------
-    InputError
-        If a label is negative, has no name, or two labels share a name.
+    GeometryError, InputError
+        If labels and grid differ in shape; if a label is negative or has no name, or two labels share a name.
     """
 
     grid: Grid

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import SimpleITK as sitk
 
@@ -41,20 +38,13 @@ def without_shading(image: Image) -> Image:
     n4 = sitk.N4BiasFieldCorrectionImageFilter()
     n4.SetMaximumNumberOfIterations(_ITERATIONS)
     n4.SetNumberOfControlPoints([_CONTROL_POINTS] * 3)
-    with _one_thread():
+    usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
+    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)  # N4 adds up in parts, one for each thread: its bits depend
+    try:
         n4.Execute(sitk.Shrink(scan, shrink), sitk.Shrink(mask, shrink))
         _, log_field = from_sitk(n4.GetLogBiasFieldAsImage(scan))
+    finally:
+        sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
     in_tissue = log_field[inside]  # elsewhere the spline is extrapolated and may be anything
     field = np.exp(np.clip(log_field, in_tissue.min(), in_tissue.max()) - float(np.median(in_tissue)))
     return Image(image.grid, low + (image.values - low) / field.astype(np.float32))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """N4 adds up in parts, one for each thread of ITK's default: in one alone, its bits do not depend on them."""
-    usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
-    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)
-    try:
-        yield
-    finally:
-        sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)

@@ -50,7 +50,7 @@ def pictures_of(
     strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
     through = "Slices through the bone's lowest point along the plate's normal."
     drawn["strain"] = Picture.drawn("Maximal shear", figures.strain_slices, *strain, note=through)
-    curves = maps.max_shear, labels, None if floor is None else floor.shear_p95
+    curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
     drawn["curves"] = Picture.drawn("Volume above a strain", figures.shear_curves, *curves)
     grid = view, below, maps.displacement_mm, None if bone is None else bone.inside
     drawn["deformed_grid"] = Picture.drawn("Deformed grid", figures.deformed_grid, *grid)
@@ -98,8 +98,8 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
         ]
     if (floor := quality.noise_floor) is not None:
         rows += [
-            ("Noise floor (repeat scan): maximal shear, median", floor.shear_p50, ""),
-            ("Noise floor (repeat scan): maximal shear, 95th percentile", floor.shear_p95, ""),
+            ("Noise floor (repeat scan): maximal shear, median", floor.max_shear_p50, ""),
+            ("Noise floor (repeat scan): maximal shear, 95th percentile", floor.max_shear_p95, ""),
             ("Noise floor: MAER", floor.maer, ""),
             ("Noise floor: SDER", floor.sder, ""),
         ]

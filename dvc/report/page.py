@@ -1,19 +1,23 @@
-"""The building blocks of a report page: verdicts, tables and figures in one self-contained HTML file."""
+"""The building blocks of a report page: verdicts, tables, figures and volumes in one self-contained HTML file."""
 
 from __future__ import annotations
 
 import base64
+import gzip
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
 import jinja2
+import nibabel
 import numpy as np
+import numpy.typing as npt
 
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
-from dvc.report.viewer import Viewer, script
+from dvc.images.image import Grid
 from dvc.trust.verdict import Verdict
 
 Cell = str | float | int | None
@@ -21,6 +25,10 @@ Cell = str | float | int | None
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CSS_PIXELS_PER_DOT = 96 / 120  # figures are drawn at 120 dots per inch: text of 10 pt is then 10 pt on the page
 
+_STEPS = 250  # of a volume's values: one byte for each voxel
+_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+NIIVUE = "0.69.0"
+"""Version of the viewer (WebGL 2, niivue.com) that comes with the package; it draws what the page itself holds."""
 METHODS = "Methods text"
 """Title of a report's section with paragraphs for a methods section."""
 
@@ -81,6 +89,34 @@ class Table:
         return tuple(bool(column) and not any(isinstance(c, str) for c in column) for column in columns)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Volume:
+    """A volume as a page holds it: NIfTI, eight bits, compressed, base64; ``most`` is the value of the last colour."""
+
+    title: str
+    data: str
+    most: float
+
+    @classmethod
+    def of(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float) -> Volume:
+        """Values (ni, nj, nk) on a grid, from 0 to ``most``; NaN becomes 0, which an overlay does not show."""
+        known = np.nan_to_num(np.asarray(values, dtype=np.float64), nan=0.0)
+        step = most / _STEPS
+        image = nibabel.Nifti1Image(np.clip(np.rint(known / step), 0, 255).astype(np.uint8), _TO_RAS @ grid.affine)
+        image.header.set_slope_inter(step, 0.0)
+        return cls(title, base64.b64encode(gzip.compress(image.to_bytes(), mtime=0)).decode(), most)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Viewer:
+    """An image, and scalars in colour over it, each on a canvas of its own; they turn and scroll together."""
+
+    title: str
+    caption: str
+    image: Volume
+    overlays: tuple[Volume, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class Section:
     """A part of a report with its own verdict, or without one."""
@@ -121,6 +157,15 @@ def _line(value: object) -> str:
     if isinstance(value, list) and value and isinstance(value[0], Mapping):
         return "\n".join(", ".join(str(v) for v in item.values()) for item in value)
     return str(value)
+
+
+@cache
+def script() -> str:
+    """The library and what starts it, for a page that has a viewer; with the library's licence."""
+    folder = files("dvc.report") / "templates"
+    licence = (folder / "niivue-LICENSE.txt").read_text(encoding="utf-8")
+    library = (folder / "niivue.umd.js").read_text(encoding="utf-8")
+    return f"/* niivue {NIIVUE}\n{licence}*/\n{library}\n{(folder / 'viewer.js').read_text(encoding='utf-8')}"
 
 
 def write_report(

@@ -137,7 +137,7 @@ def assess(
     if landmark_errors_mm is not None and np.isfinite(landmark_errors_mm).any():
         findings += _judged("landmark_error_mm", float(np.nanmedian(landmark_errors_mm)))
     if floor is not None:
-        findings += _judged("floor_shear_p95", floor.shear_p95)
+        findings += _judged("floor_shear_p95", floor.max_shear_p95)
     return replace(quality, verdict=together(findings))
 
 

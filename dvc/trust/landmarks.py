@@ -127,17 +127,16 @@ def target_registration_error(
 def _paired(first: Path, second: Path) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     reference, deformed = _slicer_points(first), _slicer_points(second)
     names, others = [name for name, _ in reference], [name for name, _ in deformed]
-    both = set(names) & set(others)
-    if len(set(names)) == len(names) and len(set(others)) == len(others) and set(names) == set(others):
+    if sorted(names) == sorted(others) and len(set(names)) == len(names):
         by_name = dict(deformed)
         deformed = [(name, by_name[name]) for name in names]
-    elif len(names) != len(others) or both:
+    elif len(names) != len(others) or set(names) & set(others):
         only = sorted(set(names) ^ set(others))
         repeated = sorted({name for some in (names, others) for name in some if some.count(name) > 1})
+        odd = f"in one file only: {', '.join(only) or 'none'}; repeated: {', '.join(repeated) or 'none'}"
         raise InputError(
             f"{first} holds {len(names)} points and {second} {len(others)}, and their names do not match one "
-            f"to one (in one file only: {', '.join(only) or 'none'}; repeated: "
-            f"{', '.join(repeated) or 'none'}). Give both lists the same names, each once."
+            f"to one ({odd}). Give both lists the same names, each once."
         )
     else:
         _log.warning("%s and %s share no name; their points are paired in order.", first, second)
@@ -181,26 +180,21 @@ def _from_markups(path: Path) -> _Points:
 
 
 def _from_fcsv(path: Path) -> _Points:
-    frame: str | None = None
-    columns: list[str] | None = None
+    lines = [(line, text) for line, text in enumerate(_text(path).splitlines(), start=1) if text.strip()]
+    head = [text.removeprefix("#").partition("=") for _, text in lines if text.startswith("#")]
+    header = {key.strip(): value.strip() for key, _, value in head}
+    frame = _FCSV_FRAMES.get(header.get("CoordinateSystem", ""))
+    columns = [name.strip() for name in header.get("columns", "").split(",")]
     points: _Points = []
-    for line, text in enumerate(_text(path).splitlines(), start=1):
-        key, _, value = text.removeprefix("#").partition("=")
+    for line, text in lines:
         if text.startswith("#"):
-            if key.strip() == "CoordinateSystem":
-                frame = _FCSV_FRAMES.get(value.strip())
-            elif key.strip() == "columns":
-                columns = [name.strip() for name in value.split(",")]
-        elif text.strip():
-            if frame is None or columns is None or not {"x", "y", "z"} <= set(columns):
-                raise ImageFileError(
-                    f"{path}: its header does not tell the frame (CoordinateSystem = LPS or RAS) and the "
-                    "columns. Save the list again in Slicer."
-                )
-            row = dict(zip(columns, next(csv.reader([text])), strict=False))
-            where = f"{path}, line {line}"
-            position = np.array([_number(where, axis, row.get(axis)) for axis in ("x", "y", "z")])
-            points.append((row.get("label") or str(len(points) + 1), position * _TO_LPS[frame]))
+            continue
+        if frame is None or not {"x", "y", "z"} <= set(columns):
+            what = "its header does not tell the frame (CoordinateSystem = LPS or RAS) and the columns"
+            raise ImageFileError(f"{path}: {what}. Save the list again in Slicer.")
+        row = dict(zip(columns, next(csv.reader([text])), strict=False))
+        position = np.array([_number(f"{path}, line {line}", axis, row.get(axis)) for axis in "xyz"])
+        points.append((row.get("label") or str(len(points) + 1), position * _TO_LPS[frame]))
     return points
 
 

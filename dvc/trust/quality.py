@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from dvc.errors import InputError
 from dvc.trust.verdict import Verdict
 
 _SIMILARITIES = ("before", "after_rigid", "after_all")
-_FLOOR = ("maer", "sder", "max_shear_p50", "max_shear_p95", "displacement_p95_mm")
 _FIGURES = {  # fields of Quality, and their names in quality.json
     "most_similarity": "local_similarity_that_noise_allows",
     "offset": "offset_between_images_over_brightness",
@@ -40,18 +39,14 @@ class NoiseFloor:
 
     maer: float
     sder: float
-    shear_p50: float  # percentiles of the apparent maximal shear
-    shear_p95: float
+    max_shear_p50: float  # percentiles of the apparent maximal shear
+    max_shear_p95: float
     displacement_p95_mm: float
-
-    def as_dict(self) -> dict[str, float]:
-        """Plain values for JSON."""
-        return dict(zip(_FLOOR, astuple(self), strict=True))
 
     @classmethod
     def from_dict(cls, told: Mapping[str, Any]) -> NoiseFloor:
-        """The noise floor that `as_dict` gave."""
-        return cls(*(float(told[name]) for name in _FLOOR))
+        """The noise floor in ``quality.json``."""
+        return cls(**{name: float(value) for name, value in told.items()})
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +108,7 @@ class Quality:
                 "max_mm": plain(_finite(np.nanmax, errors)),
                 "each_mm": plain(errors.tolist()),
             },
-            "noise_floor": None if floor is None else floor.as_dict(),
+            "noise_floor": None if floor is None else asdict(floor),
         }
 
     @classmethod
