@@ -23,19 +23,7 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Image, LabelMap
 from dvc.report.planes import AXES, PLANES, Plane, Values, View
-from dvc.report.sheet import (
-    FONT,
-    INK,
-    SHADOW,
-    UNSEEN,
-    WIDTH_IN,
-    Sheet,
-    chart,
-    label_axes,
-    levelled,
-    png_bytes,
-    window_of,
-)
+from dvc.report.sheet import FONT, INK, SHADOW, UNSEEN, Sheet, chart, label_axes, levelled, png_bytes, window_of
 from dvc.trust.regions import volume_above
 
 # The palette of Okabe and Ito, told apart by all common kinds of colour vision.
@@ -243,7 +231,7 @@ def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float |
     Both panels show the same curves; the logarithmic axis opens up the small volumes at high strain.
     The legend tells the share of a region that has no result; its curve is a lower bound.
     """
-    figure, panels = chart(2, (WIDTH_IN, 3.8))
+    figure, panels = chart(2, page_wide=True)
     at = np.linspace(0.0, _HIGHEST_SHEAR, 1501)  # finer than a dot of the figure; each ordinate is exact
     voxel_ml = labels.grid.voxel_volume_mm3 / 1000.0
     for number, (label, name) in enumerate(labels.names.items()):

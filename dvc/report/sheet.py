@@ -151,9 +151,9 @@ def scale_length_mm(width_mm: float) -> float:
     return max((n for n in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0) if n <= width_mm / 3), default=1.0)
 
 
-def chart(panels: int = 1, inches: tuple[float, float] | None = None) -> tuple[Figure, tuple[Axes, ...]]:
-    """An empty figure with so many axes side by side, for curves."""
-    size = inches or (0.62 * WIDTH_IN * panels, 3.9)
+def chart(panels: int = 1, page_wide: bool = False) -> tuple[Figure, tuple[Axes, ...]]:
+    """An empty figure with so many axes side by side, for curves; each a part of the page's width, or all that wide."""
+    size = (WIDTH_IN, 3.8) if page_wide else (0.62 * WIDTH_IN * panels, 3.9)
     figure = Figure(figsize=size, dpi=DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure, tuple(np.atleast_1d(figure.subplots(1, panels)))

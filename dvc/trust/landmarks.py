@@ -144,13 +144,10 @@ def _paired(first: Path, second: Path) -> tuple[FloatArray, FloatArray, tuple[st
 
 
 def _slicer_points(path: Path) -> _Points:
-    if path.name.lower().endswith(".json"):
-        points = _from_markups(path)
-    elif path.suffix.lower() == ".fcsv":
-        points = _from_fcsv(path)
-    else:
+    read = {".json": _from_markups, ".fcsv": _from_fcsv}.get(path.suffix.lower())
+    if read is None:
         raise InputError(f"{path}: a point list of Slicer ends in .mrk.json or .fcsv.")
-    if not points:
+    if not (points := read(path)):
         raise ImageFileError(f"{path} holds no point.")
     return points
 
@@ -161,9 +158,8 @@ def _from_markups(path: Path) -> _Points:
         frame, unit = str(markup["coordinateSystem"]), markup.get("coordinateUnits", "mm")
         listed: list[dict[str, Any]] = list(markup["controlPoints"])
     except (ValueError, KeyError, TypeError) as error:
-        raise ImageFileError(
-            f"{path} is not a point list of Slicer with one list of points ({type(error).__name__}: {error})."
-        ) from error
+        what = f"is not a point list of Slicer with one list of points ({type(error).__name__}: {error})"
+        raise ImageFileError(f"{path} {what}.") from error
     if frame not in _TO_LPS or unit not in ("mm", ["mm", "UCUM"]):
         raise ImageFileError(f"{path}: coordinates must be LPS or RAS, in mm; the file says {frame}, {unit}.")
     points: _Points = []

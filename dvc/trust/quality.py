@@ -46,7 +46,7 @@ class NoiseFloor:
     @classmethod
     def from_dict(cls, told: Mapping[str, Any]) -> NoiseFloor:
         """The noise floor in ``quality.json``."""
-        return cls(**{name: float(value) for name, value in told.items()})
+        return cls(**{name: float(told[name]) for name in told})
 
 
 @dataclass(frozen=True, slots=True)
