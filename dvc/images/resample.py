@@ -21,9 +21,8 @@ def fill_missing(image: Image) -> Image:
     missing = image.missing
     if not missing.any():
         return image
-    nearest = distance_transform_edt(
-        missing, sampling=image.grid.spacing_mm, return_distances=False, return_indices=True
-    )
+    spacing = image.grid.spacing_mm
+    nearest = distance_transform_edt(missing, sampling=spacing, return_distances=False, return_indices=True)
     return Image(image.grid, image.values[tuple(nearest)])
 
 
@@ -63,10 +62,9 @@ def carry(
     spline interpolation.
     """
     gaps = image.missing.astype(np.float32) if image.missing.any() else None
-    filled = fill_missing(image)
-    coefficients = (
-        spline_filter(filled.values, order=order, output=np.float32, mode="mirror") if order > 1 else filled.values
-    )
+    coefficients = fill_missing(image).values
+    if order > 1:
+        coefficients = spline_filter(coefficients, order=order, output=np.float32, mode="mirror")
     carried = np.full(grid.shape, np.nan, dtype=np.float32)
     inside = np.ones(grid.shape, dtype=bool) if where is None else where
     step = max(1, _SLAB_VOXELS // (grid.shape[1] * grid.shape[2]))
@@ -78,9 +76,7 @@ def carry(
         indices = np.argwhere(wanted).astype(np.float64)
         indices[:, 0] += start
         points = grid.points_at(indices)
-        if points_of is not None:
-            points = points_of(points)
-        at = image.grid.indices_of(points)
+        at = image.grid.indices_of(points if points_of is None else points_of(points))
         known = np.all((at >= -1e-6) & (at <= last + 1e-6), axis=1)  # False for NaN as well
         values = np.full(len(at), np.nan, dtype=np.float32)
         values[known] = map_coordinates(

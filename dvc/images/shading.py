@@ -31,10 +31,8 @@ def without_shading(image: Image) -> Image:
     box = Grid(image.grid.shape, image.grid.spacing_mm, np.zeros(3))  # N4 works along the image's own axes
     scan = to_sitk(box, known.values - low + 1e-3 * float(np.ptp(known.values)))
     mask = to_sitk(box, inside.astype(np.uint8))
-    shrink = [
-        int(np.clip(round(_COARSE_MM / s), 1, max(1, n // 8)))
-        for s, n in zip(image.grid.spacing_mm, image.grid.shape, strict=True)
-    ]
+    edges = zip(image.grid.spacing_mm, image.grid.shape, strict=True)
+    shrink = [int(np.clip(round(_COARSE_MM / s), 1, max(1, n // 8))) for s, n in edges]
     n4 = sitk.N4BiasFieldCorrectionImageFilter()
     n4.SetMaximumNumberOfIterations(_ITERATIONS)
     n4.SetNumberOfControlPoints([_CONTROL_POINTS] * 3)

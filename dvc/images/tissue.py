@@ -38,10 +38,8 @@ def tissue_mask(image: Image) -> Mask:
     filled = _fill_slices(binary_fill_holes(closed))
     share = float(filled.mean())
     if not 0.01 <= share <= 0.99:
-        raise InputError(
-            f"No tissue mask could be made: the threshold takes {100 * share:.1f} % of the image. "
-            "Give one with --tissue."
-        )
+        taken = f"the threshold takes {100 * share:.1f} % of the image"
+        raise InputError(f"No tissue mask could be made: {taken}. Give one with --tissue.")
     return Mask(image.grid, filled)
 
 

@@ -91,9 +91,8 @@ def carried_images(found: Registration) -> CarriedImages:
     _, as_scanned = local_correlation(reference, before, found.tissue)
     local_rigid, rigid = local_correlation(reference, aligned, both)
     local_after, after = local_correlation(reference, registered, both)
-    noise = _noise_in_air(found)
     similarity = Similarity((as_scanned, rigid, after))
-    if noise is not None:
+    if (noise := _noise_in_air(found)) is not None:
         similarity = replace(similarity, possible=most_similarity(reference, registered, both, noise))
         if found.settings.engine.sees_brightness:
             similarity = replace(similarity, offset=brightness_offset(reference, registered, both, noise[0]))
@@ -113,15 +112,12 @@ def _noise_in_air(found: Registration) -> tuple[float, float] | None:
 
 def quality_of(found: Registration, maps: StrainMaps, similarity: Similarity, evidence: Evidence) -> Quality:
     """Quality and verdict of a registration."""
-    points, choice = evidence.landmarks, found.choice
+    points, floor, choice = evidence.landmarks, evidence.noise_floor, found.choice
+    bone = found.bone if found.alignment.on == "bone" else None
+    errors = None if points is None else target_registration_error(found.total, *points)
+    held = None if choice is None else choice.in_bone
     quality = assess(
-        maps,
-        found.tissue,
-        found.bone if found.alignment.on == "bone" else None,
-        similarity=similarity,
-        landmark_errors_mm=None if points is None else target_registration_error(found.total, *points),
-        floor=evidence.noise_floor,
-        in_bone=None if choice is None else choice.in_bone,
+        maps, found.tissue, bone, similarity=similarity, landmark_errors_mm=errors, floor=floor, in_bone=held
     )
     return replace(quality, verdict=with_caution(quality.verdict, choice))
 

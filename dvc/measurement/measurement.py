@@ -150,12 +150,10 @@ class Measurement:
             quality, alignment = Quality.from_dict(told), dict(told["alignment"])
             files.motion_in(alignment)
         except (KeyError, TypeError, ValueError) as failure:
-            raise InputError(
-                f"{place / files.QUALITY}: not as `write` leaves it ({failure!r}). {files.AGAIN}"
-            ) from failure
+            what = f"not as `write` leaves it ({failure!r})"
+            raise InputError(f"{place / files.QUALITY}: {what}. {files.AGAIN}") from failure
         maps = files.read_maps(place)
-        known = files.read_uncertainty(place, maps.grid)
-        uncertainty, model = (None, None) if known is None else known
+        uncertainty, model = files.read_uncertainty(place, maps.grid) or (None, None)
         if image is None and (place / files.REGISTERED).is_file():
             image = files.read_scalar(place / files.REGISTERED, maps.grid)
         regions = tuple(read_regions_csv(place / files.REGIONS))

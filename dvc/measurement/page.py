@@ -63,9 +63,7 @@ def pictures_of(
 
 def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
     """What the verdict rests on."""
-    rows: list[tuple[str, Cell, str]] = [
-        ("Rotation of the bone between the scans", alignment["rotation_deg"], "degrees")
-    ]
+    rows = [("Rotation of the bone between the scans", alignment["rotation_deg"], "degrees")]
     if "bone_shift_lps_mm" in alignment:
         spread = "Spread of the rigid fits of halves of the bone (rms over the bone; largest of six pairs)"
         spacing = " x ".join(f"{s:.3g}" for s in alignment["control_spacing_mm"])

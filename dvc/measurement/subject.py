@@ -69,12 +69,9 @@ class Subject:
         """The labels; without, the body as "tissue", and the bone."""
         if self.labels is not None:
             return self.labels
-        values = body.inside.astype(np.int64)
-        names = {1: "tissue"}
-        if self.bone is not None:
-            values = np.where(self.bone.inside, 2, values)
-            names[2] = "bone"
-        return LabelMap(body.grid, values, names)
+        if self.bone is None:
+            return LabelMap(body.grid, body.inside.astype(np.int64), {1: "tissue"})
+        return LabelMap(body.grid, np.where(self.bone.inside, 2, body.inside), {1: "tissue", 2: "bone"})
 
 
 def plate_directions(

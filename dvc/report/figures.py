@@ -89,8 +89,7 @@ def strain_slices(
     """
     if not largest > 0:
         raise InputError(f"The end of the colour bar for maximal shear must be positive; got {largest}.")
-    scale = Scale(MAX_SHEAR, "viridis", 0.0, largest)
-    return coloured(view, reference, max_shear, scale, outline=outline).png()
+    return coloured(view, reference, max_shear, Scale(MAX_SHEAR, "viridis", 0.0, largest), outline=outline).png()
 
 
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:

@@ -75,12 +75,11 @@ class Table:
     apart: tuple[tuple[Cell, ...], ...] = ()
 
     def __post_init__(self) -> None:
+        wanted = len(self.columns)
         for number, row in enumerate((*self.rows, *self.apart)):
-            if len(row) != len(self.columns):
-                raise InputError(
-                    f"Row {number} of the table '{self.title}' has {len(row)} cells, its header "
-                    f"{len(self.columns)}; give one for each column."
-                )
+            if len(row) != wanted:
+                what = f"Row {number} of the table '{self.title}' has {len(row)} cells, its header {wanted}"
+                raise InputError(f"{what}; give one for each column.")
 
     @property
     def numeric(self) -> tuple[bool, ...]:

@@ -63,10 +63,8 @@ class View:
         lps = grid.toward_lps()
         point = np.asarray(point_mm, dtype=np.float64)
         if point.shape != (3,) or not bool(lps.contains(point)):
-            raise GeometryError(
-                f"The point to be shown, LPS {point.tolist()} mm, lies outside the grid: {grid}. "
-                "Give a point inside the image."
-            )
+            where = f"LPS {point.tolist()} mm, lies outside the grid: {grid}"
+            raise GeometryError(f"The point to be shown, {where}. Give a point inside the image.")
         nearest = np.clip(np.rint(lps.indices_of(point)), 0, np.array(lps.shape) - 1).astype(int)
         spans = [slice(0, n) for n in lps.shape]
         if around is not None and around.any():

@@ -87,12 +87,11 @@ class Sheet:
         """Draw the borders of masks, given as pages of this plane, as thin lines."""
         left, right, bottom, top = self.view.extent_mm(plane)
         for page in pages:
-            if page.any() and not page.all():
+            if page.any() and not page.all() and min(page.shape) > 1:
                 rows, columns = page.shape
                 x = left + (np.arange(columns) + 0.5) * (right - left) / columns
                 y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
-                if min(page.shape) > 1:
-                    axes.contour(x, y, page.astype(float), levels=[0.5], colors=[colour], linewidths=0.9)
+                axes.contour(x, y, page.astype(float), levels=[0.5], colors=[colour], linewidths=0.9)
 
     def bar(self, shades: Colormap, norm: Normalize, label: str, extend: str = "neither") -> None:
         """Draw the one colour bar of the sheet, below the panels."""

@@ -88,16 +88,12 @@ def assess(
 
     Parameters
     ----------
-    maps, tissue
-        On the reference grid.
     bone : Mask or None
         The bone that was aligned on: motion within it is error.
     similarity : Similarity, optional
         None where there are no images to compare.
     landmark_errors_mm : (n,), optional
         Distance between each registered and each given landmark; NaN where not defined.
-    floor : NoiseFloor, optional
-        Of a repeat scan.
     in_bone : (mm, shear), optional
         Where the maps hold the bone at rest: root mean square displacement and 95th percentile of the maximal shear
         in it before that was imposed.

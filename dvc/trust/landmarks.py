@@ -34,8 +34,10 @@ def read_landmarks(
     Parameters
     ----------
     path : path, or a pair of paths
-        A CSV file with the columns x0, y0, z0 (unloaded image), x1, y1, z1 (loaded image), in mm, and
-        optionally name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first.
+        A CSV file with the columns x0, y0, z0 (unloaded image), x1, y1, z1 (loaded image), in mm, and optionally
+        name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first. These are paired by name where both
+        hold the same names, each once, and in their order (which is logged) where they share none; anything between
+        is refused.
     frame : {"LPS", "RAS"}
         Frame of the CSV's coordinates. Slicer's files tell theirs.
 
@@ -52,11 +54,6 @@ def read_landmarks(
         If the frame or the kind of file is not one of those above, or two point lists do not match.
     ImageFileError
         If a file is missing or damaged, a column or number is missing, or its frame or unit is not known.
-
-    Notes
-    -----
-    Two Slicer lists are paired by name where both hold the same names, each once, and in their order (which is logged)
-    where they share no name. Anything between is refused.
     """
     if frame not in _TO_LPS:
         raise InputError(f"The frame of landmarks is LPS or RAS; got {frame!r}.")

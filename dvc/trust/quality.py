@@ -74,8 +74,6 @@ class Quality:
         Whether these two are from before the bone was held at rest, as it is in the maps.
     landmark_errors_mm : (n,) or None
         Distance between each registered and each given landmark.
-    noise_floor : NoiseFloor or None
-        Of a repeat scan.
     """
 
     similarity: tuple[float, float, float] | None

@@ -111,14 +111,12 @@ def write_regions_csv(path: Path, rows: Sequence[RegionRow], verdict: Verdict | 
     """
     thresholds = sorted({t for row in rows for t in row.volume_above_ml})
     told = [] if verdict is None else [verdict.words]
-    header = ["region", "quantity", "voxels", "volume_ml", "defined_voxels", "defined_fraction", *_NUMBERS]
-    header += [*(_ABOVE.format(t) for t in thresholds), *["verdict"] * len(told)]
+    columns = ("region", "quantity", "voxels", "volume_ml", "defined_voxels", "defined_fraction", *_NUMBERS)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
+    writer.writerow([*columns, *(_ABOVE.format(t) for t in thresholds), *["verdict"] * len(told)])
     for row in rows:
-        cells: list[object] = [row.region, row.quantity, row.voxels, row.volume_ml, row.defined_voxels]
-        cells += [row.defined_fraction, *(getattr(row, name) for name in _NUMBERS)]
+        cells = [getattr(row, name) for name in columns]
         cells += [*(row.volume_above_ml.get(t, "") for t in thresholds), *told]
         writer.writerow([_plain(cell) for cell in cells])
     write_whole(path, text.getvalue())
@@ -130,9 +128,8 @@ def read_regions_csv(path: Path) -> list[RegionRow]:
         with path.open(newline="", encoding="utf-8") as file:
             return [_row_of(cells) for cells in csv.DictReader(file)]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as failure:
-        raise InputError(
-            f"{path}: no statistics by region ({failure!r}). Register this load again, or get a whole copy of the file."
-        ) from failure
+        what = f"no statistics by region ({failure!r}). Register this load again, or get a whole copy of the file"
+        raise InputError(f"{path}: {what}.") from failure
 
 
 def _row_of(cells: Mapping[str, str]) -> RegionRow:
