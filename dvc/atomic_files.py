@@ -50,8 +50,7 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
 def whole_folder(final: Path) -> Iterator[Path]:
     """Give a folder to fill; it takes its final name when the block ends well, and is removed if not.
 
-    An older folder of that name is replaced only then. OutputError if it cannot be made or renamed, or the disk is full
-    now.
+    An older folder of that name is replaced only then. OutputError if it cannot be made or renamed, or a disk is full.
     """
     try:
         partial = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))

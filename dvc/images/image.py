@@ -57,9 +57,8 @@ class Grid:
         shape = tuple(int(n) for n in self.shape)
         if len(shape) != 3 or min(shape) < 1:
             raise GeometryError(f"A grid needs three axes of at least one voxel; got shape {shape}.")
-        spacing, origin, direction = (
-            frozen(given, np.float64) for given in (self.spacing_mm, self.origin_mm, self.direction)
-        )
+        given = self.spacing_mm, self.origin_mm, self.direction
+        spacing, origin, direction = (frozen(each, np.float64) for each in given)
         if spacing.shape != (3,) or not np.all(np.isfinite(spacing)) or np.any(spacing <= 0):
             raise GeometryError(f"Voxel spacing must be three positive lengths in mm; got {spacing.tolist()}.")
         if origin.shape != (3,) or not np.all(np.isfinite(origin)):

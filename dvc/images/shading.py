@@ -37,7 +37,7 @@ def without_shading(image: Image) -> Image:
     n4.SetMaximumNumberOfIterations(_ITERATIONS)
     n4.SetNumberOfControlPoints([_CONTROL_POINTS] * 3)
     usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
-    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)  # N4 adds up in parts, one for each thread: its bits depend
+    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)  # N4's sums, and so its bits, depend on their number
     try:
         n4.Execute(sitk.Shrink(scan, shrink), sitk.Shrink(mask, shrink))
         _, log_field = from_sitk(n4.GetLogBiasFieldAsImage(scan))

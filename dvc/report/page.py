@@ -47,7 +47,7 @@ class Picture:
 
     @classmethod
     def drawn(cls, title: str, draw: Callable[..., bytes], *shown: object, note: str = "") -> Picture:
-        """A figure by what draws it, whose docstring says how the figure is read: its caption, and a note after it."""
+        """The figure that ``draw`` makes of ``shown``; its docstring, which says how to read it, is the caption."""
         return cls(title, " ".join(f"{draw.__doc__ or ''} {note}".split()), draw(*shown))
 
     @property

@@ -36,8 +36,7 @@ def read_landmarks(
     path : path, or a pair of paths
         A CSV file with the columns x0, y0, z0 (unloaded image), x1, y1, z1 (loaded image), in mm, and optionally
         name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first. These are paired by name where both
-        hold the same names, each once, and in their order (which is logged) where they share none; anything between
-        is refused.
+        hold the same names, each once, and in order (logged) where they share none; anything between is refused.
     frame : {"LPS", "RAS"}
         Frame of the CSV's coordinates. Slicer's files tell theirs.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,27 @@ from dvc.errors import InputError
 from dvc.trust.verdict import Verdict
 
 _SIMILARITIES = ("before", "after_rigid", "after_all")
-_FIGURES = {  # fields of Quality, and their names in quality.json
-    "most_similarity": "local_similarity_that_noise_allows",
-    "offset": "offset_between_images_over_brightness",
-    "folded_voxels": "folded_voxels",
-    "lowest_jacobian": "lowest_jacobian",
-    "lowest_jacobian_at_mm": "lowest_jacobian_at_lps_mm",
-    "undefined_fraction": "undefined_fraction_of_tissue",
-    "bone_shift_mm": "bone_shift_rms_mm",
-    "bone_shear_p95": "bone_shear_p95",
-    "bone_held": "bone_figures_before_it_was_held_at_rest",
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _three(values: Sequence[float | None]) -> tuple[float, float, float]:
+    x, y, z = map(_number, values)
+    return x, y, z
+
+
+_FIGURES: dict[str, tuple[str, Callable[[Any], object]]] = {  # fields of Quality: name and reader in quality.json
+    "most_similarity": ("local_similarity_that_noise_allows", _number),
+    "offset": ("offset_between_images_over_brightness", _number),
+    "folded_voxels": ("folded_voxels", int),
+    "lowest_jacobian": ("lowest_jacobian", _number),
+    "lowest_jacobian_at_mm": ("lowest_jacobian_at_lps_mm", _three),
+    "undefined_fraction": ("undefined_fraction_of_tissue", _number),
+    "bone_shift_mm": ("bone_shift_rms_mm", _number),
+    "bone_shear_p95": ("bone_shear_p95", _number),
+    "bone_held": ("bone_figures_before_it_was_held_at_rest", bool),
 }
 
 
@@ -96,7 +107,7 @@ class Quality:
         return {
             "verdict": self.verdict.as_dict(),
             "local_similarity": None if alike is None else dict(zip(_SIMILARITIES, plain(alike), strict=True)),
-            **{stored: plain(getattr(self, name)) for name, stored in _FIGURES.items()},
+            **{stored: plain(getattr(self, name)) for name, (stored, _) in _FIGURES.items()},
             "landmarks": None
             if errors is None
             else {
@@ -112,15 +123,14 @@ class Quality:
     @classmethod
     def from_dict(cls, told: Mapping[str, Any]) -> Quality:
         """The quality that `as_dict` gave; KeyError, TypeError or ValueError where something is missing."""
-        alike, landmarks, floor, verdict = (
-            told[name] for name in ("local_similarity", "landmarks", "noise_floor", "verdict")
-        )
+        alike, landmarks, floor = (told[name] for name in ("local_similarity", "landmarks", "noise_floor"))
+        figures: dict[str, Any] = {name: read(told[stored]) for name, (stored, read) in _FIGURES.items()}
         return cls(
-            similarity=None if alike is None else _read([alike[name] for name in _SIMILARITIES]),
-            landmark_errors_mm=None if landmarks is None else np.array(_read(landmarks["each_mm"])),
+            similarity=None if alike is None else _three([alike[name] for name in _SIMILARITIES]),
+            landmark_errors_mm=None if landmarks is None else np.array([_number(e) for e in landmarks["each_mm"]]),
             noise_floor=None if floor is None else NoiseFloor.from_dict(floor),
-            verdict=Verdict(verdict["level"], tuple(verdict["reasons"])),
-            **{name: _read(told[stored]) for name, stored in _FIGURES.items()},
+            verdict=Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"])),
+            **figures,
         )
 
 
@@ -129,13 +139,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(each) for each in value]
     return value if isinstance(value, int) else float(value) if np.isfinite(value) else None
-
-
-def _read(value: Any) -> Any:
-    """What `plain` was given."""
-    if isinstance(value, list):
-        return tuple(_read(each) for each in value)
-    return float("nan") if value is None else value if isinstance(value, int) else float(value)
 
 
 def _finite(reduce: Callable[[FloatArray], float], values: FloatArray) -> float:
