@@ -52,8 +52,8 @@ def floor_of(found: Registration) -> dict[str, float]:
     return {
         "maer": floor.maer,
         "sder": floor.sder,
-        "max_shear_p50": floor.shear_p50,
-        "max_shear_p95": floor.shear_p95,
+        "max_shear_p50": floor.max_shear_p50,
+        "max_shear_p95": floor.max_shear_p95,
         "in_plane_shear_p50": float(np.percentile(half, 50)),
         "in_plane_shear_p95": float(np.percentile(half, 95)),
         "displacement_p95_mm": floor.displacement_p95_mm,

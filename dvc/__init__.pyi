@@ -20,9 +20,9 @@ from .io.images.read import read_image
 from .io.images.write import write_image, write_labels, write_mask, write_vectors
 from .io.meshes.read import MeshFile, read_mesh
 from .io.transforms.read import read_displacement, read_transform
+from .measurement.judgement import Evidence
 from .measurement.measure import measure
 from .measurement.measurement import Measurement
-from .measurement.source import Evidence
 from .measurement.subject import Subject
 from .mesh import TetMesh
 from .registration.align import Alignment

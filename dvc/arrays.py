@@ -1,4 +1,4 @@
-"""Array types and the one way by which a value object takes an array in."""
+"""Array types, and read-only arrays for value objects."""
 
 from __future__ import annotations
 
@@ -16,10 +16,7 @@ IntArray = npt.NDArray[np.int64]
 
 
 def frozen(values: npt.ArrayLike, dtype: type[_T]) -> npt.NDArray[_T]:
-    """Return ``values`` as a read-only, C-ordered array of ``dtype``; copied only where it must be.
-
-    The caller's own array stays writable: what is returned is a view of it, or a copy.
-    """
+    """``values`` as a read-only, C-ordered array of ``dtype``, copied only if needed; the caller's stays writable."""
     array = np.ascontiguousarray(values, dtype=dtype).view()
     array.flags.writeable = False
     return array

@@ -19,10 +19,7 @@ from dvc.errors import OutputError
 def whole_file(path: Path) -> Iterator[Path]:
     """Give a name of the same ending, in the same folder, to write under; it becomes ``path`` in one step.
 
-    Raises
-    ------
-    OutputError
-        If the file cannot be written; what was begun is removed, and an older file of that name is still there.
+    OutputError if the file cannot be written; what was begun is removed, and an older file of that name is still there.
     """
     part = path.with_name(f".{os.getpid()}.partial.{path.name}")
     try:
@@ -64,31 +61,24 @@ def write_csv(path: Path, head: Iterable[str], rows: Iterable[Iterable[object]])
 def whole_folder(final: Path) -> Iterator[Path]:
     """Give a folder to fill; it takes its final name when the block ends well, and is removed if not.
 
-    An older folder of that name is replaced only then.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be made or renamed, or the disk is full.
+    An older folder of that name is replaced only then. OutputError if it cannot be made or renamed, or a disk is full.
     """
     try:
         partial = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))
         try:
             partial.chmod(0o755)
             yield partial
-            if final.exists():
-                old = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".old", dir=final.parent))
+            if not final.exists():
+                partial.replace(final)
+                return
+            name = f".{final.name}."
+            with tempfile.TemporaryDirectory(".old", name, final.parent, ignore_cleanup_errors=True) as aside:
+                old = final.replace(Path(aside) / final.name)
                 try:
-                    final.replace(old / final.name)
                     partial.replace(final)
                 except OSError:
-                    if not final.exists():
-                        (old / final.name).replace(final)
+                    old.replace(final)
                     raise
-                finally:
-                    shutil.rmtree(old, ignore_errors=True)
-            else:
-                partial.replace(final)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:

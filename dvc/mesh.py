@@ -50,13 +50,11 @@ class TetMesh:
 
     Notes
     -----
-    What is provably safe is mended, and logged (logger ``dvc.mesh``):
-
-    - Nodes that no cell uses are dropped; ``node_ids`` keeps the numbers of the others.
-    - The order of two nodes is swapped in cells of negative volume, which leaves each the same set of points.
-      Where all cells are negative the file merely counts the other way round. Where only some are, it is done
-      only if the two cells on either side of every face lie on opposite sides of it; otherwise a negative
-      volume is a sign of tissue folded over itself, and the mesh is refused.
+    What is provably safe is mended, and logged (logger ``dvc.mesh``): nodes that no cell uses are dropped (``node_ids``
+    keeps the numbers of the others), and two nodes are swapped in cells of negative volume, which leaves each the same
+    set of points. Where all cells are negative the file merely counts the other way round. Where only some are, they
+    are mended only if the two cells on either side of every face lie on opposite sides of it; otherwise a negative
+    volume is a sign of tissue folded over itself, and the mesh is refused.
 
     Examples
     --------
@@ -85,10 +83,8 @@ class TetMesh:
             raise InputError("The mesh has no tetrahedron.")
         ids = np.arange(len(points)) if node_ids is None else np.asarray(node_ids)
         if ids.shape != (len(points),) or len(np.unique(ids)) != len(ids):
-            raise InputError(
-                f"node_ids must give each of the {len(points)} nodes a number of its own; got {ids.shape[0]} "
-                f"numbers, {len(np.unique(ids))} of them different."
-            )
+            got = f"got {ids.shape[0]} numbers, {len(np.unique(ids))} of them different"
+            raise InputError(f"node_ids must give each of the {len(points)} nodes a number of its own; {got}.")
         named_cells = {
             name: checked_indices(f"region {name!r}", index, len(tets)) for name, index in (regions or {}).items()
         }
@@ -142,41 +138,28 @@ class TetMesh:
 
 def outer_faces(cells: IntArray) -> IntArray:
     """Faces (k, 3) of tetrahedra (m, 4) that belong to one of them alone, by their nodes in rising order."""
-    faces = np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
-    different, times = np.unique(faces, axis=0, return_counts=True)
+    different, times = np.unique(_faces(cells), axis=0, return_counts=True)
     return np.asarray(different[times == 1])
 
 
-def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
-    """Nodes as an (n, 3) array of finite numbers.
+def _faces(cells: IntArray) -> IntArray:
+    return np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
 
-    Raises
-    ------
-    InputError
-        If the shape is another.
-    GeometryError
-        If a coordinate is not finite; with the count and the first index.
-    """
+
+def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
+    """Nodes (n, 3); InputError for another shape, GeometryError for a coordinate that is not finite."""
     points = np.array(points_mm, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(f"Nodes of a mesh must be an (n, 3) array of coordinates; got shape {points.shape}.")
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
-        raise GeometryError(
-            f"{np.count_nonzero(bad)} of {len(points)} nodes have a coordinate that is not a finite number; "
-            f"the first is at index {np.argmax(bad)}."
-        )
+        what = f"{np.count_nonzero(bad)} of {len(points)} nodes have a coordinate that is not a finite number"
+        raise GeometryError(f"{what}; the first is at index {np.argmax(bad)}.")
     return points
 
 
 def checked_indices(what: str, index: npt.ArrayLike, count: int, width: int | None = None) -> IntArray:
-    """Integer indices below ``count``, (k,) or (k, width).
-
-    Raises
-    ------
-    InputError
-        If they are not integers, have another shape, or one is out of range.
-    """
+    """Integer indices below ``count``, (k,) or (k, width); InputError for another type, shape or range."""
     array = np.asarray(index)
     if array.size == 0:
         array = array.reshape((0,) if width is None else (0, width)).astype(np.int64)
@@ -189,18 +172,14 @@ def checked_indices(what: str, index: npt.ArrayLike, count: int, width: int | No
     outside = (array < 0) | (array >= count)
     if outside.any():
         first = np.argwhere(outside)[0]
-        raise InputError(
-            f"{what}: {np.count_nonzero(outside)} indices are outside 0 to {count - 1}; the first is "
-            f"{array[tuple(first)]}, in row {first[0]}."
-        )
+        where = f"the first is {array[tuple(first)]}, in row {first[0]}"
+        raise InputError(f"{what}: {np.count_nonzero(outside)} indices are outside 0 to {count - 1}; {where}.")
     return array
 
 
 def box_told(low: FloatArray, high: FloatArray) -> str:
-    """A box by its lower and upper corner (3,), as people read it.
+    """A box by its lower and upper corner (3,), for messages.
 
-    Examples
-    --------
     >>> box_told(np.array([-15.0, 0.0, 0.01]), np.array([5.0, 120.4, 0.06]))
     '-15 to 5 x 0 to 120 x 0.01 to 0.06'
     """
@@ -209,13 +188,7 @@ def box_told(low: FloatArray, high: FloatArray) -> str:
 
 
 def check_extent(points_mm: FloatArray) -> None:
-    """Refuse a mesh that is not the size of a body part in mm.
-
-    Raises
-    ------
-    ExtentError
-        If its longest side is under 1 mm or over 5 m.
-    """
+    """ExtentError for a mesh that is not the size of a body part in mm: its longest side is under 1 mm or over 5 m."""
     extent = float(np.ptp(points_mm, axis=0).max())
     spans = f"It spans {box_told(points_mm.min(axis=0), points_mm.max(axis=0))} (mm as read)."
     if extent < _SMALLEST_EXTENT_MM:
@@ -255,16 +228,13 @@ def _positively_ordered(points: FloatArray, cells: IntArray, node_ids: IntArray)
     negative = volumes < 0
     if not negative.any():
         return cells
-    if not negative.all():
-        overlapping = _overlapping(points, cells)
-        if overlapping.any():
-            first = int(np.argmax(overlapping))
-            raise GeometryError(
-                f"{np.count_nonzero(negative)} of {len(cells)} tetrahedra are inverted (negative volume), "
-                f"and {np.count_nonzero(overlapping)} overlap a neighbour across a common face, the first of "
-                f"them cell {first}, nodes {node_ids[cells[first]].tolist()}: the mesh folds over itself. Mend it "
-                "where it was made."
-            )
+    if not negative.all() and (overlapping := _overlapping(points, cells)).any():
+        first = int(np.argmax(overlapping))
+        raise GeometryError(
+            f"{np.count_nonzero(negative)} of {len(cells)} tetrahedra are inverted (negative volume), and "
+            f"{np.count_nonzero(overlapping)} overlap a neighbour across a common face, the first of them cell "
+            f"{first}, nodes {node_ids[cells[first]].tolist()}: the mesh folds over itself. Mend it where it was made."
+        )
     _log.warning(
         "%d of %d tetrahedra count their nodes the other way round (negative volume); two nodes of each were "
         "swapped. Their shape and place are unchanged, and no cell overlaps its neighbour.",
@@ -277,15 +247,11 @@ def _positively_ordered(points: FloatArray, cells: IntArray, node_ids: IntArray)
 
 def _overlapping(points: FloatArray, cells: IntArray) -> BoolArray:
     """Which cells have a face whose cells do not lie one on either side of it (or that three cells share)."""
-    faces = np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
-    opposite = cells.T.ravel()
-    owner = np.tile(np.arange(len(cells)), 4)
-    _, which = np.unique(faces, axis=0, return_inverse=True)
-    which = which.ravel()
+    faces = _faces(cells)
+    opposite, owner = cells.T.ravel(), np.tile(np.arange(len(cells)), 4)
+    which = np.unique(faces, axis=0, return_inverse=True)[1].ravel()
     side = np.sign(signed_volumes(points[np.column_stack([faces, opposite])]))
     shared_by = np.bincount(which)
     balance = np.bincount(which, weights=side)  # 0 where two cells lie on opposite sides
     wrong = (shared_by > 2) | ((shared_by == 2) & (balance != 0))
-    overlapping = np.zeros(len(cells), dtype=bool)
-    overlapping[owner[wrong[which]]] = True
-    return overlapping
+    return np.isin(np.arange(len(cells)), owner[wrong[which]])

@@ -1,16 +1,13 @@
 """The software that a result depends on, as one key for everything that is kept to be used again.
 
 A study's stages, the restart files of simulations and the runs of an accuracy study are kept under this key, and made
-anew when it is another. It covers the package that computes the result and those of ours that it imports: every source
-file and every data file in them, by its place and content, in whatever folder it lies, and the versions of mrstrain
-and of the libraries that figures depend on.
+anew when it changes. It covers the package that computes the result and those of ours that it imports (every source and
+data file in them, by place and content) and the versions of mrstrain and of the libraries that figures depend on.
 
 Why whole packages: a list of file names goes stale without a word. Following imports from file to file loses what is
-read by name (parameter files, material sets), and ends at nearly all files anyway, since whoever imports from a package
-runs its front door, which imports the rest. So the key of an accuracy run changes with a page template or an error
-model of `dvc`, too, neither of which touches it. Between two releases this costs computing time and never gives a wrong
-result; a user's results are made anew with each release in any case. To make error models, measure all presets on one
-state of the code.
+read by name (parameter files, material sets), and ends at nearly all files anyway, since a front door imports the rest.
+A new page template costs computing time between two releases, and never gives a wrong result. To make error models,
+measure all presets on one state of the code.
 """
 
 from __future__ import annotations
@@ -25,22 +22,9 @@ from pathlib import Path
 _OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
 _IMPORTED = re.compile(rf"\n[ \t]*(?:from|import)[ \t]+({'|'.join(_OURS)})\b".encode())
 _DISTRIBUTIONS = (
-    "mrstrain",
-    "itk-elastix",
-    "SimpleITK",
-    "numpy",
-    "scipy",
-    "scikit-image",
-    "numba",
-    "nibabel",
-    "pydicom",
-    "meshio",
-    "pytetwild",
-    "vtk",
-    "pypardiso",
-    "mkl",
-    "ngsolve",
-)
+    "mrstrain", "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "numba", "nibabel", "pydicom", "meshio",
+    "pytetwild", "vtk", "pypardiso", "mkl", "ngsolve",
+)  # fmt: skip
 
 
 def distribution_versions() -> dict[str, str]:
@@ -56,22 +40,10 @@ def distribution_versions() -> dict[str, str]:
 
 @cache
 def software_key(package: str) -> str:
-    """All software that results of one of our packages depend on.
+    """All software that results of one of our packages ("dvc", "fe", ...) depend on; read once in a process.
 
-    It is read once in a process.
+    Versions, and a hash of our own code, in parts that are divided by ", ".
 
-    Parameters
-    ----------
-    package : str
-        The package that computes the result: "dvc", "fe", "phantoms", "validate" or "mrstrain".
-
-    Returns
-    -------
-    str
-        Versions, and a hash of our own code, in parts that are divided by ", "; two keys differ by the parts that do.
-
-    Examples
-    --------
     >>> software_key("fe").split(", ")[1][:5]
     'code '
     >>> software_key("fe") == software_key("phantoms")

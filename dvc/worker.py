@@ -1,8 +1,8 @@
 """Work in child processes that may crash without taking the caller with them.
 
-elastix is native code: a crash there ends its process. Each worker here is a process of its own, kept alive
-between tasks because the first use of elastix costs many seconds; when one dies, its task raises
-`WorkerError`, the other workers go on, and the next task gets a fresh process.
+elastix is native code: a crash there ends its process. Each worker is a process of its own, kept alive between tasks
+because the first use of elastix costs many seconds; when one dies, its task raises `WorkerError`, the other workers go
+on, and the next task gets a fresh process.
 """
 
 from __future__ import annotations
@@ -33,11 +33,6 @@ class Worker:
     threads : int
         Threads that native code (ITK, numba, BLAS) may use in the child. Results of elastix are equal bit
         for bit only for equal numbers of threads.
-
-    Raises
-    ------
-    WorkerError
-        From `run`, when the child died: the message holds its exit code or signal.
     """
 
     def __init__(self, threads: int) -> None:
@@ -50,12 +45,8 @@ class Worker:
     def run(self, what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None = None) -> _T:
         """Run ``task(*args)`` in the child and return its result; its exceptions are raised here.
 
-        Parameters
-        ----------
-        what : str
-            The task in words, for the error message ("registering Load1").
-        watch : callable, optional
-            Called about twice a second while the task runs.
+        ``what`` is the task in words ("registering Load1") for `WorkerError`, which is raised if the child dies;
+        ``watch`` is called about twice a second while the task runs.
         """
         with self._lock:
             if self._executor is None:
@@ -87,8 +78,7 @@ class Worker:
 
     def kill(self) -> None:
         """End the child process at once, whatever it is doing; a task in it raises `WorkerError`."""
-        executor = self._executor
-        if executor is not None:
+        if (executor := self._executor) is not None:
             executor.shutdown(wait=False, kill_workers=True)
 
     def close(self) -> None:
@@ -109,13 +99,6 @@ def each_in_workers(items: Iterable[_I], task: Callable[[_I, Worker], None], *, 
     """Run ``task(item, worker)`` for every item, ``at_once`` at a time, each thread with a worker of its own.
 
     Whatever ends it, an interrupt too, the workers end with it: now, and not after what they are doing.
-
-    Parameters
-    ----------
-    at_once : int
-        Items at a time.
-    threads : int
-        Of each worker.
     """
     local = threading.local()
     workers: list[Worker] = []
@@ -160,6 +143,4 @@ def _cause(died: BaseException) -> str:
 
 def usable_cores() -> int:
     """Number of processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

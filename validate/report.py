@@ -10,8 +10,7 @@ import numpy as np
 from dvc import Deformation, LabelMap, Mask, StrainField, Verdict, evaluate_on_grid
 from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
-from dvc.report.page import METHODS, Cell, Picture, Section, Table, caption_of
-from dvc.report.viewer import Viewer, Volume
+from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from validate import figures
 from validate.curves import Area
 from validate.fe_result import FeResult
@@ -59,22 +58,20 @@ def _pictures(
     fields, axes, bone = one.fields, one.case.axes, one.bones[0]
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
     tissues = [name for name in (ALL, *fields.tissues) if any(a.tissue == name for a in one.areas)]
-    curves = figures.volume_strain(one, tissues[:_PANELS], colours)
     point = lowest_bone_point(one.labels, bone, axes)
     across = (fields.mesh.points_mm - point) @ axes[:, 2]
     through = f"It goes through the lowest point of {bone}."
     if not across.min() < 0.0 < across.max():
         point = fields.mesh.bounds_mm.mean(axis=0)
         through = f"The lowest point of {bone} lies beside the mesh: the slice goes through the mesh's middle instead."
-    slices, scatter = figures.slices(one, measured, displacements, point), figures.scatter(fields)
-    shear, u = (figures.differences(one, quantity) for quantity in ("max_shear", "u_mm"))
-    differences = caption_of(figures.differences)
+    slices = one, measured, displacements, point
+    shear, u = ((figures.differences, one, quantity) for quantity in ("max_shear", "u_mm"))
     return {
-        "curves": Picture("Volume above a strain", caption_of(figures.volume_strain), curves),
-        "slices": Picture("Where the strain lies", f"{caption_of(figures.slices)} {through}", slices),
-        "agreement": Picture("Maximum shear strain, cell by cell", caption_of(figures.scatter), scatter),
-        "differences_shear": Picture("Differences of maximum shear strain", differences, shear),
-        "differences_u": Picture("Differences of the displacement's magnitude", differences, u),
+        "curves": Picture.drawn("Volume above a strain", figures.volume_strain, one, tissues[:_PANELS], colours),
+        "slices": Picture.drawn("Where the strain lies", figures.slices, *slices, note=through),
+        "agreement": Picture.drawn("Maximum shear strain, cell by cell", figures.scatter, fields),
+        "differences_shear": Picture.drawn("Differences of maximum shear strain", *shear),
+        "differences_u": Picture.drawn("Differences of the displacement's magnitude", *u),
     }
 
 

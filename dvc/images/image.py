@@ -1,8 +1,4 @@
-"""Images on a grid in space: Grid, Image, Mask, LabelMap.
-
-Everything is in one frame, LPS in mm (x to the patient's left, y to posterior, z to superior), whatever
-frame the file used. Arrays are indexed ``values[i, j, k]`` along the grid's own axes.
-"""
+"""Images on a grid in space: Grid, Image, Mask, LabelMap; LPS mm, indexed ``values[i, j, k]`` along the grid's axes."""
 
 from __future__ import annotations
 
@@ -61,9 +57,8 @@ class Grid:
         shape = tuple(int(n) for n in self.shape)
         if len(shape) != 3 or min(shape) < 1:
             raise GeometryError(f"A grid needs three axes of at least one voxel; got shape {shape}.")
-        spacing = frozen(self.spacing_mm, np.float64)
-        origin = frozen(self.origin_mm, np.float64)
-        direction = frozen(self.direction, np.float64)
+        given = self.spacing_mm, self.origin_mm, self.direction
+        spacing, origin, direction = (frozen(each, np.float64) for each in given)
         if spacing.shape != (3,) or not np.all(np.isfinite(spacing)) or np.any(spacing <= 0):
             raise GeometryError(f"Voxel spacing must be three positive lengths in mm; got {spacing.tolist()}.")
         if origin.shape != (3,) or not np.all(np.isfinite(origin)):
@@ -76,10 +71,8 @@ class Grid:
                 f"The grid's axes are not perpendicular unit vectors (largest deviation {skew:.2g}): the "
                 "affine is sheared or its spacing is wrong. Resample the image to a regular grid first."
             )
-        object.__setattr__(self, "shape", shape)
-        object.__setattr__(self, "spacing_mm", spacing)
-        object.__setattr__(self, "origin_mm", origin)
-        object.__setattr__(self, "direction", direction)
+        for name, value in (("shape", shape), ("spacing_mm", spacing), ("origin_mm", origin), ("direction", direction)):
+            object.__setattr__(self, name, value)
 
     @property
     def affine(self) -> FloatArray:
@@ -107,11 +100,9 @@ class Grid:
 
     def points(self, where: BoolArray | None = None) -> FloatArray:
         """Voxel centres in LPS mm: (ni, nj, nk, 3), or (n, 3) for the voxels of the mask ``where``."""
-        if where is None:
-            indices = np.moveaxis(np.indices(self.shape, dtype=np.float64), 0, -1)
-        else:
-            indices = np.argwhere(where).astype(np.float64)
-        return self.points_at(indices)
+        if where is not None:
+            return self.points_at(np.argwhere(where).astype(np.float64))
+        return self.points_at(np.moveaxis(np.indices(self.shape, dtype=np.float64), 0, -1))
 
     def points_at(self, indices: FloatArray) -> FloatArray:
         """LPS mm of continuous voxel indices (..., 3)."""
@@ -148,32 +139,23 @@ class Grid:
         return bool(shift.max() <= tolerance_voxels)
 
     def axes_to_lps(self) -> tuple[tuple[int, int, int], tuple[bool, bool, bool]]:
-        """Order and flips of the grid axes that bring them closest to L, P, S.
-
-        Returns
-        -------
-        order : axis of this grid to be used as first, second, third
-        flips : whether that axis has to be reversed
-        """
+        """Axis of the grid to use as first, second, third, and whether to reverse it, to come closest to L, P, S."""
         closeness = np.abs(self.direction)
         order = [-1, -1, -1]
         for _ in range(3):
             world, axis = np.unravel_index(int(np.argmax(closeness)), (3, 3))
             order[int(world)] = int(axis)
-            closeness[world, :] = -1.0
-            closeness[:, axis] = -1.0
+            closeness[world, :] = closeness[:, axis] = -1.0
         flips = tuple(bool(self.direction[w, a] < 0) for w, a in enumerate(order))
         return (order[0], order[1], order[2]), (flips[0], flips[1], flips[2])
 
     def toward_lps(self) -> Grid:
         """The same voxels with axes ordered and flipped to run closest to L, P, S."""
         order, flips = self.axes_to_lps()
-        first = np.array([self.shape[a] - 1 if f else 0 for a, f in zip(order, flips, strict=True)])
-        start = np.zeros(3)
-        start[list(order)] = first
-        signs = np.where(flips, -1.0, 1.0)
-        shape = (self.shape[order[0]], self.shape[order[1]], self.shape[order[2]])
-        return Grid(shape, self.spacing_mm[list(order)], self.points_at(start), self.direction[:, list(order)] * signs)
+        axes, start, signs = list(order), np.zeros(3), np.where(flips, -1.0, 1.0)
+        ni, nj, nk = (self.shape[axis] for axis in axes)
+        start[axes] = np.where(flips, [ni - 1, nj - 1, nk - 1], 0)
+        return Grid((ni, nj, nk), self.spacing_mm[axes], self.points_at(start), self.direction[:, axes] * signs)
 
     def moved_by(self, rotation: FloatArray, translation_mm: FloatArray) -> Grid:
         """The grid carried by the rigid motion x -> rotation @ x + translation_mm."""
@@ -205,8 +187,8 @@ class Image:
 
     Raises
     ------
-    InputError
-        If values and grid differ in shape or a value is infinite.
+    GeometryError, InputError
+        If values and grid differ in shape, or a value is infinite.
     """
 
     grid: Grid
@@ -269,8 +251,8 @@ class LabelMap:
 
     Raises
     ------
-    InputError
-        If a label is negative, has no name, or two labels share a name.
+    GeometryError, InputError
+        If labels and grid differ in shape; if a label is negative or has no name, or two labels share a name.
     """
 
     grid: Grid
@@ -280,7 +262,7 @@ class LabelMap:
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", frozen(self.labels, np.int64))
         _check_shape("The label map", self.labels.shape, self.grid)
-        present = [int(v) for v in np.unique(self.labels)]
+        present = np.unique(self.labels).tolist()
         if present and present[0] < 0:
             raise InputError(f"Labels must not be negative; found {present[0]}.")
         nameless = [v for v in present if v != 0 and v not in self.names]
@@ -293,20 +275,14 @@ class LabelMap:
         object.__setattr__(self, "names", dict(self.names))
 
     def region(self, name: str) -> Mask:
-        """The mask of one region.
-
-        Raises
-        ------
-        InputError
-            If no label has this name; the message lists the names there are.
-        """
+        """The mask of one region; InputError if no label has this name, with the names there are."""
         for label, known in self.names.items():
             if known == name:
                 return Mask(self.grid, self.labels == label)
         raise self.no_region(name)
 
     def no_region(self, name: str) -> InputError:
-        """What to say where a name is asked for that no label has."""
+        """The error for a name that no label has."""
         unnamed = all(known.startswith("label-") for known in self.names.values())
         hint = " It came without a table of names (--names), so labels go by their numbers." if unnamed else ""
         return InputError(
@@ -319,8 +295,7 @@ class LabelMap:
 
 
 def reordered_to_lps(grid: Grid, values: npt.NDArray[_T]) -> npt.NDArray[_T]:
-    """Values on ``grid`` (leading three axes) reordered to ``grid.toward_lps()``."""
+    """A view of values on ``grid`` (leading three axes) reordered to ``grid.toward_lps()``."""
     order, flips = grid.axes_to_lps()
-    rest = tuple(range(3, values.ndim))
-    reordered = values.transpose((*order, *rest))
-    return np.ascontiguousarray(reordered[tuple(slice(None, None, -1 if f else 1) for f in flips)])
+    turned = values.transpose((*order, *range(3, values.ndim)))
+    return turned[tuple(slice(None, None, -1 if f else 1) for f in flips)]

@@ -18,25 +18,10 @@ def noise_sd(image: Image, tissue: Mask) -> float:
     """Standard deviation of the noise in either channel, in the image's own unit.
 
     From the air, more than 4 mm from the tissue, where a magnitude image of noise alone follows the Rayleigh
-    distribution: its median is sigma sqrt(2 ln 2). Where the scanner has set the air to zero, or none is in view,
-    from the tissue's finest diagonal differences (Haar wavelets; median absolute deviation), which texture raises
-    and a scanner's filter lowers.
-
-    Parameters
-    ----------
-    image : Image
-    tissue : Mask
-        On the image's grid.
-
-    Raises
-    ------
-    InputError
-        If the mask is not on the image's grid or is empty.
-
-    References
-    ----------
-    Gudbjartsson and Patz, Magn Reson Med 1995, doi:10.1002/mrm.1910340618; Donoho and Johnstone, Biometrika 1994,
-    doi:10.1093/biomet/81.3.425 (the wavelet estimate).
+    distribution: its median is sigma sqrt(2 ln 2) (Gudbjartsson and Patz, Magn Reson Med 1995,
+    doi:10.1002/mrm.1910340618). Where the scanner has set the air to zero, or none is in view, from the tissue's finest
+    diagonal differences (Haar wavelets; median absolute deviation; Donoho and Johnstone, Biometrika 1994,
+    doi:10.1093/biomet/81.3.425), which texture raises and a scanner's filter lowers. InputError as `noise_in_air`.
     """
     in_air = noise_in_air(image, tissue)
     if in_air is not None:
@@ -51,10 +36,10 @@ def noise_sd(image: Image, tissue: Mask) -> float:
 
 
 def noise_in_air(image: Image, tissue: Mask) -> float | None:
-    """Standard deviation of the noise in either channel, in the image's own unit, from the air alone.
+    """Standard deviation of the noise in either channel, in the image's own unit, from the air alone, as in `noise_sd`.
 
-    Parameters, errors and source are those of `noise_sd`. None where the scanner has set the air to zero, or under
-    1000 voxels of it are in view. Parallel imaging has more noise in the tissue than this.
+    None where the scanner has set the air to zero, or under 1000 voxels of it are in view; InputError for a mask that
+    is empty or not on the image's grid. Parallel imaging has more noise in the tissue than this.
     """
     if not tissue.grid.same_as(image.grid) or not tissue.inside.any():
         raise InputError("The noise needs a tissue mask that is on the image's grid and not empty.")

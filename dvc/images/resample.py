@@ -21,9 +21,8 @@ def fill_missing(image: Image) -> Image:
     missing = image.missing
     if not missing.any():
         return image
-    nearest = distance_transform_edt(
-        missing, sampling=image.grid.spacing_mm, return_distances=False, return_indices=True
-    )
+    spacing = image.grid.spacing_mm
+    nearest = distance_transform_edt(missing, sampling=spacing, return_distances=False, return_indices=True)
     return Image(image.grid, image.values[tuple(nearest)])
 
 
@@ -63,23 +62,16 @@ def carry(
     where: BoolArray | None = None,
     order: int = 3,
 ) -> Float32Array:
-    """Values of ``image`` brought onto ``grid``, NaN where any of the eight voxels around is missing or outside.
+    """Values of ``image`` on ``grid``, NaN where any of the eight voxels around is missing or outside.
 
-    Parameters
-    ----------
-    points_of : callable, optional
-        Points (n, 3) LPS mm of ``grid`` to the points of the image whose values they take; the identity by
-        default. NaN points give NaN.
-    where : (ni, nj, nk) bool, optional
-        Voxels wanted; the others are NaN.
-    order : int
-        1 for linear, 3 for cubic spline interpolation.
+    ``points_of`` maps points (n, 3) LPS mm of the grid to those of the image whose values they take (default: the
+    identity; NaN points give NaN); ``where`` (ni, nj, nk) are the voxels wanted; ``order`` is 1 for linear, 3 for cubic
+    spline interpolation.
     """
     gaps = image.missing.astype(np.float32) if image.missing.any() else None
-    filled = fill_missing(image)
-    coefficients = (
-        spline_filter(filled.values, order=order, output=np.float32, mode="mirror") if order > 1 else filled.values
-    )
+    coefficients = fill_missing(image).values
+    if order > 1:
+        coefficients = spline_filter(coefficients, order=order, output=np.float32, mode="mirror")
     carried = np.full(grid.shape, np.nan, dtype=np.float32)
     inside = np.ones(grid.shape, dtype=bool) if where is None else where
     step = max(1, _SLAB_VOXELS // (grid.shape[1] * grid.shape[2]))
@@ -91,9 +83,7 @@ def carry(
         indices = np.argwhere(wanted).astype(np.float64)
         indices[:, 0] += start
         points = grid.points_at(indices)
-        if points_of is not None:
-            points = points_of(points)
-        at = image.grid.indices_of(points)
+        at = image.grid.indices_of(points if points_of is None else points_of(points))
         known = np.all((at >= -1e-6) & (at <= last + 1e-6), axis=1)  # False for NaN as well
         values = np.full(len(at), np.nan, dtype=np.float32)
         values[known] = map_coordinates(

@@ -1,9 +1,6 @@
-"""Removal of smooth shading: every MR scan has its own receive field, which is not tissue."""
+"""Removal of the bias field: every MR scan has its own receive field, which is not tissue."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import SimpleITK as sitk
@@ -19,16 +16,12 @@ _ITERATIONS = [50, 50, 50]
 
 
 def without_shading(image: Image) -> Image:
-    """The image, above its lowest value, divided by its smooth multiplicative field, found by N4 on a coarse copy.
+    """The image, above its lowest value, divided by its bias field, estimated by N4 on a coarse copy.
 
-    Normalised correlation over the whole body takes shading for contrast, and a B-spline then bends tissue to
-    follow it: on a phantom with fields of +-20 % that tripled the strain error. N4: N. Tustison et al., 2010,
+    Normalised correlation over the whole body takes a bias field for contrast, and a B-spline then bends tissue to
+    follow it: on a phantom with fields of +-20 % that tripled the strain error. Only the registration sees the
+    corrected image; outputs are made from the image as it was given. N4: N. Tustison et al., 2010,
     doi:10.1109/TMI.2010.2046908.
-
-    Notes
-    -----
-    Only the registration sees the corrected image; outputs are made from the image as it was given. Missing
-    voxels stay missing.
     """
     known = fill_missing(image)
     inside = bright_voxels(known)
@@ -38,27 +31,18 @@ def without_shading(image: Image) -> Image:
     box = Grid(image.grid.shape, image.grid.spacing_mm, np.zeros(3))  # N4 works along the image's own axes
     scan = to_sitk(box, known.values - low + 1e-3 * float(np.ptp(known.values)))
     mask = to_sitk(box, inside.astype(np.uint8))
-    shrink = [
-        int(np.clip(round(_COARSE_MM / s), 1, max(1, n // 8)))
-        for s, n in zip(image.grid.spacing_mm, image.grid.shape, strict=True)
-    ]
+    edges = zip(image.grid.spacing_mm, image.grid.shape, strict=True)
+    shrink = [int(np.clip(round(_COARSE_MM / s), 1, max(1, n // 8))) for s, n in edges]
     n4 = sitk.N4BiasFieldCorrectionImageFilter()
     n4.SetMaximumNumberOfIterations(_ITERATIONS)
     n4.SetNumberOfControlPoints([_CONTROL_POINTS] * 3)
-    with _one_thread():
+    usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
+    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)  # N4's sums, and so its bits, depend on their number
+    try:
         n4.Execute(sitk.Shrink(scan, shrink), sitk.Shrink(mask, shrink))
         _, log_field = from_sitk(n4.GetLogBiasFieldAsImage(scan))
+    finally:
+        sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
     in_tissue = log_field[inside]  # elsewhere the spline is extrapolated and may be anything
     field = np.exp(np.clip(log_field, in_tissue.min(), in_tissue.max()) - float(np.median(in_tissue)))
     return Image(image.grid, low + (image.values - low) / field.astype(np.float32))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """N4 adds up in parts, one for each thread of ITK's default: in one alone, its bits do not depend on them."""
-    usual = sitk.ProcessObject.GetGlobalDefaultNumberOfThreads()
-    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)
-    try:
-        yield
-    finally:
-        sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)

@@ -56,23 +56,9 @@ def most_similarity(
 ) -> Callable[[float], float]:
     """Pooled local correlation of two images of the same tissue that differ in nothing but their noise.
 
-    sqrt((1 - s_a^2 / v_a) (1 - s_b^2 / v_b)), where s is the standard deviation of an image's noise and v the mean
-    local variance in the mask, in the windows of `local_correlation`.
-
-    Parameters
-    ----------
-    a : Image
-    carried : (ni, nj, nk)
-        The other image on its grid, reference configuration; NaN where not known.
-    mask : Mask
-        On that grid too.
-    noise : (s_a, s_b)
-        In the unit of each image (`dvc.images.noise.noise_in_air`).
-
-    Returns
-    -------
-    callable
-        Of a factor on both standard deviations, the correlation that they leave.
+    sqrt((1 - s_a^2 / v_a) (1 - s_b^2 / v_b)), where s is the standard deviation of an image's noise
+    (`dvc.images.noise.noise_in_air`) and v the mean local variance in the mask, in the windows of `local_correlation`:
+    a function of a factor on both standard deviations.
     """
     box = mask.box()
     known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
@@ -90,21 +76,10 @@ def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float)
     """How much of one image's brightness is an offset to the other's, and no factor of it.
 
     Fitted is ``carried = g(X) a + o(X)`` with g quadratic and o linear in X, by least squares in which the noise of
-    ``a``, known beforehand, does not lower g (Fuller, Measurement Error Models, 1987, section 2.2).
-
-    Parameters
-    ----------
-    a, carried, mask
-        As in `local_correlation`.
-    noise : float
-        Standard deviation of the noise of ``a``, in its unit.
-
-    Returns
-    -------
-    callable
-        Of a factor on that noise, the 95th percentile of abs(o) over the mask, as a share of the tissue's brightness
-        (75th percentile of ``carried``); NaN where the mask has too few voxels that both know, or no contrast beyond
-        the noise.
+    ``a`` (its standard deviation, known beforehand) does not lower g (Fuller, Measurement Error Models, 1987, section
+    2.2). The result is a function of a factor on that noise: the 95th percentile of abs(o) over the mask, as a share of
+    the tissue's brightness (75th percentile of ``carried``); NaN where the mask has too few voxels that both know, or
+    no contrast beyond the noise.
     """
     box = mask.box()
     known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]

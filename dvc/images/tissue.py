@@ -19,13 +19,13 @@ _CLOSE_MM = 4.0
 def tissue_mask(image: Image) -> Mask:
     """The body in an MR image: largest bright part, closed over dark bone and septa, holes filled.
 
-    Threshold: half of Otsu's on the image blurred by 1 mm. Otsu's own value parts fat from muscle rather than
+    Threshold: half of Otsu's on the image blurred by 1 mm. Otsu's own value separates fat from muscle rather than
     tissue from air; half of it lies above the noise of the air and below muscle.
 
     Raises
     ------
     InputError
-        If what is found is less than 1 % or more than 99 % of the image: a mask has to be given then.
+        If that is less than 1 % or more than 99 % of the image: a mask has to be given then.
     """
     bright = bright_voxels(image)
     radius = np.maximum(np.rint(_CLOSE_MM / image.grid.spacing_mm / 2.0).astype(int), 0)
@@ -38,10 +38,8 @@ def tissue_mask(image: Image) -> Mask:
     filled = _fill_slices(binary_fill_holes(closed))
     share = float(filled.mean())
     if not 0.01 <= share <= 0.99:
-        raise InputError(
-            f"No tissue mask could be made: the threshold takes {100 * share:.1f} % of the image. "
-            "Give one with --tissue."
-        )
+        taken = f"the threshold takes {100 * share:.1f} % of the image"
+        raise InputError(f"No tissue mask could be made: {taken}. Give one with --tissue.")
     return Mask(image.grid, filled)
 
 

@@ -16,14 +16,7 @@ from dvc.images.noise import signal_to_noise
 from dvc.images.tissue import tissue_mask
 from dvc.measurement.subject import Subject, is_bones_name
 from dvc.registration.register import Registration
-from dvc.trust.error_model import (
-    POOLED,
-    ErrorModel,
-    ErrorTable,
-    Uncertainty,
-    to_surface_mm,
-    uncertainty_of,
-)
+from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, Uncertainty, to_surface_mm, uncertainty_of
 from dvc.trust.twin_judgement import Judged, judged
 
 _MOSTLY = 0.5
@@ -31,88 +24,57 @@ _MOSTLY = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorBars:
-    """Errors of a load's maximal shear, or why they are not known.
-
-    Attributes
-    ----------
-    uncertainty : Uncertainty or None
-    told : str
-        Where the figures come from, or the reason why there are none; empty where no images were registered.
-    model : ErrorModel or None
-        With the one table that was used.
-    twin : tuple of Judged
-        How the shear came back from the pair's twin, by tissue; empty where there is none.
-    of_twin : str
-        What it did to the error bars.
-    """
+    """Errors of a load's maximal shear, or why they are not known."""
 
     uncertainty: Uncertainty | None
-    told: str
-    model: ErrorModel | None = None
-    twin: tuple[Judged, ...] = ()
-    of_twin: str = ""
+    told: str  # where the figures come from, or why there are none; empty where no images were registered
+    model: ErrorModel | None = None  # with the one table that was used
+    twin: tuple[Judged, ...] = ()  # how the shear came back from the pair's twin, by tissue
+    of_twin: str = ""  # what that did to the error bars
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
-        twin = (
-            {"twin": [asdict(row) for row in self.twin], "of_twin": self.of_twin} if self.twin or self.of_twin else {}
-        )
-        if self.uncertainty is None:
-            return {"known": False, "reason": self.told} | twin
-        table = self.uncertainty.table
-        voxel = table.spacing_mm.tolist()
-        return {"known": True, "source": self.told, "voxel_mm": voxel, "snr": round(table.snr, 1)} | twin
+        told: dict[str, object] = {"known": False, "reason": self.told}
+        if self.uncertainty is not None:
+            table = self.uncertainty.table
+            told = {"known": True, "source": self.told, "voxel_mm": table.spacing_mm.tolist()}
+            told["snr"] = round(table.snr, 1)
+        if self.twin or self.of_twin:
+            told |= {"twin": [asdict(row) for row in self.twin], "of_twin": self.of_twin}
+        return told
 
     @classmethod
-    def from_dict(
-        cls, told: Mapping[str, Any], uncertainty: Uncertainty | None = None, model: ErrorModel | None = None
-    ) -> ErrorBars:
-        """The error bars of which `as_dict` told, with their arrays."""
+    def from_dict(cls, told: Mapping[str, Any], uncertainty: Uncertainty | None, model: ErrorModel | None) -> ErrorBars:
+        """The error bars that `as_dict` gave, with their arrays."""
         twin = tuple(Judged(**row) for row in told.get("twin", ()))
         return cls(uncertainty, str(told.get("source", told.get("reason", ""))), model, twin, told.get("of_twin", ""))
 
     @property
     def missing(self) -> str:
-        """Why there are none; empty where there are, or where nothing is to be told."""
+        """Why there are none; empty where there are, or where no images were registered."""
         return self.told if self.uncertainty is None else ""
 
     @property
     def summary(self) -> list[str]:
-        """Why there are none, and what the twin did to them, for a person."""
+        """Why there are none, and what the twin did to them, in lines."""
         lines = [f"no error bars: {self.missing}"] * bool(self.missing)
         return lines + [f"error bars: {self.of_twin}"] * bool(self.of_twin)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwinCheck:
-    """What came back from the pair's twin, or why nothing did.
+    """What came back from the pair's twin, a synthetic warp of the unloaded image, or why nothing did."""
 
-    Attributes
-    ----------
-    max_shear : (ni, nj, nk) or None
-        Found in the twin, on the unloaded image's grid; NaN where not defined.
-    failure : str
-    """
-
-    max_shear: Float32Array | None
+    max_shear: Float32Array | None  # (ni, nj, nk) on the unloaded image's grid; NaN where not defined
     failure: str = ""
 
 
 def error_bars(
-    found: Registration,
-    subject: Subject,
-    maps: StrainMaps,
-    model: ErrorModel | None,
-    twin: TwinCheck | None = None,
+    found: Registration, subject: Subject, maps: StrainMaps, model: ErrorModel | None, twin: TwinCheck | None = None
 ) -> ErrorBars:
-    """Error of a registered load's maximal shear.
+    """Error of a registered load's maximal shear, by an error model: the user's own or the preset's, if there is one.
 
-    Parameters
-    ----------
-    model : ErrorModel or None
-        The user's own or the preset's; None where there is neither.
-    twin : TwinCheck or None
-        The pair's twin: error bars that do not hold there are made wider.
+    Error bars that do not hold in the pair's twin are made wider.
     """
     grid = maps.grid
     bone, regions = _bone_and_tissues(subject, found.tissue.inside, model)
@@ -144,7 +106,7 @@ def error_bars(
 
 
 def _used(chosen: ErrorModel, table: ErrorTable, wider: Mapping[str, float]) -> ErrorModel:
-    """The one table that was used, for what compares models with the maps: as wide as its least sure tissue."""
+    """The error model with the one table that was used, as wide as its least certain tissue, for comparing models."""
     if not wider:
         return replace(chosen, tables=(table,))
     most = max(wider.values())
@@ -175,7 +137,7 @@ def _held(table: ErrorTable) -> str:
 
 
 def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
-    """The error model of what was used; InputError with the reason where there is none."""
+    """The error model of the engine that was used; InputError with the reason where there is none."""
     used = found.settings.engine
     if used.without_error_model:
         raise InputError(used.without_error_model)

@@ -8,8 +8,8 @@ from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.io.meshes.read import MeshFile
+from dvc.measurement.judgement import Evidence
 from dvc.measurement.measurement import Measurement
-from dvc.measurement.source import Evidence
 from dvc.measurement.subject import Subject, plate_directions
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from dvc.registration.register import Settings, register
@@ -45,8 +45,8 @@ def measure(
     reference, loaded : Image
         Unloaded and loaded image, each in the frame of its own file (LPS mm).
     bone, tissue, labels, start
-        As in `dvc.register`: on the reference grid. Labels give statistics by region, and let strain jump at their
-        borders.
+        As in `dvc.register`: on the reference grid. Labels give statistics by region, and strain discontinuities at
+        their borders.
     settings : Settings, optional
         By default the Gauss-Newton engine, with strain discontinuities at tissue interfaces where there are labels; one
         thread.
@@ -67,10 +67,6 @@ def measure(
         Process to compute in; a new one by default.
     progress : callable, optional
         ``progress(stage, fraction)``.
-
-    Returns
-    -------
-    Measurement
 
     Raises
     ------

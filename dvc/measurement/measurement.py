@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +17,9 @@ from dvc.deformation.strain_maps import StrainMaps, strain_maps
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
 from dvc.io import result_folder as files
-from dvc.measurement import notebook, page
+from dvc.measurement import judgement, notebook, page
 from dvc.measurement.error_bars import ErrorBars, error_bars
-from dvc.measurement.judgement import carried_images, maps_of, quality_of
-from dvc.measurement.notebook import Scalar
-from dvc.measurement.source import Evidence, Source, alignment_of, motion_as_dict, write_images_and_transforms
+from dvc.measurement.judgement import Evidence, Source
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
@@ -99,44 +97,28 @@ class Measurement:
         name: str = "load",
         is_repeat: bool = False,
     ) -> Measurement:
-        """Judge a registered pair.
+        """Judge a registered pair by its subject, the unloaded image, and by more evidence.
 
-        Parameters
-        ----------
-        found : Registration
-        subject : Subject
-            Of its unloaded image.
-        evidence : Evidence, optional
-        name : str
-        is_repeat : bool
-            The loaded image is a second scan without load: its own strain is the noise floor that it is judged by.
+        With ``is_repeat`` the loaded image is a second scan without load, judged by its own strain, the noise floor.
         """
-        more = evidence or Evidence()
-        maps, images = maps_of(found), carried_images(found)
-        floor = noise_floor(maps, subject.soft(found.tissue)) if is_repeat else more.noise_floor
-        return cls(
-            name,
-            found.deformation,
-            maps,
-            alignment_of(found),
-            quality_of(found, maps, images.similarity, more.landmarks, floor),
-            tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity)),
-            error_bars(found, subject, maps, more.error_model, more.twin),
-            found.reference,
-            Source(subject, found.tissue, found, images),
-        )
+        more, maps, images = evidence or Evidence(), judgement.maps_of(found), judgement.carried_images(found)
+        if is_repeat:
+            more = replace(more, noise_floor=noise_floor(maps, subject.soft(found.tissue)))
+        quality, alignment = judgement.quality_of(found, maps, images.similarity, more), judgement.alignment_of(found)
+        regions = tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity))
+        bars = error_bars(found, subject, maps, more.error_model, more.twin)
+        source = Source(subject, found.tissue, found, images)
+        return cls(name, found.deformation, maps, alignment, quality, regions, bars, found.reference, source)
 
     @classmethod
     def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Measurement:
-        """Strain of a deformation that was found elsewhere; no images are compared.
+        """Strain of a deformation that was estimated elsewhere; no images are compared.
 
         Parameters
         ----------
         whole : Deformation
             Of points of the unloaded image to points of the loaded one, LPS mm. Of a subject with a bone, the bone's
             rigid motion (least squares over its voxels) is taken out.
-        subject : Subject
-        name : str
 
         Raises
         ------
@@ -146,27 +128,16 @@ class Measurement:
         relative, motion = without_motion(whole, subject.bone)
         body = subject.body()
         maps = strain_maps(relative, body)
-        return cls(
-            name,
-            relative,
-            maps,
-            {"on": "none" if subject.bone is None else "bone", **motion_as_dict(motion)},
-            assess(maps, body, subject.bone),
-            tuple(region_statistics(subject.regions(body), maps.by_quantity)),
-            ErrorBars(None, ""),
-            subject.reference,
-            Source(subject, body),
-        )
+        alignment = {"on": "none" if subject.bone is None else "bone", **judgement.motion_as_dict(motion)}
+        quality, bars, source = assess(maps, body, subject.bone), ErrorBars(None, ""), Source(subject, body)
+        regions = tuple(region_statistics(subject.regions(body), maps.by_quantity))
+        return cls(name, relative, maps, alignment, quality, regions, bars, subject.reference, source)
 
     @classmethod
     def read(cls, folder: Path | str, image: Image | None = None) -> Measurement:
         """Read the folder of one load that `write` or ``mrstrain register`` wrote.
 
-        Parameters
-        ----------
-        folder : path
-        image : Image, optional
-            The unloaded image, to show maps over; it is not in the folder, where the registered one stands for it.
+        The unloaded image, to show maps over, is not in the folder; without one, the registered image stands for it.
 
         Raises
         ------
@@ -179,24 +150,16 @@ class Measurement:
             quality, alignment = Quality.from_dict(told), dict(told["alignment"])
             files.motion_in(alignment)
         except (KeyError, TypeError, ValueError) as failure:
-            raise InputError(
-                f"{place / files.QUALITY}: not as `write` leaves it ({failure!r}). {files.AGAIN}"
-            ) from failure
+            what = f"not as `write` leaves it ({failure!r})"
+            raise InputError(f"{place / files.QUALITY}: {what}. {files.AGAIN}") from failure
         maps = files.read_maps(place)
-        known = files.read_uncertainty(place, maps.grid)
-        uncertainty, model = (None, None) if known is None else known
+        uncertainty, model = files.read_uncertainty(place, maps.grid) or (None, None)
         if image is None and (place / files.REGISTERED).is_file():
             image = files.read_scalar(place / files.REGISTERED, maps.grid)
-        return cls(
-            place.resolve().name,
-            _deformation_in(place, maps),
-            maps,
-            alignment,
-            quality,
-            tuple(read_regions_csv(place / files.REGIONS)),
-            ErrorBars.from_dict(told.get("error_of_max_shear", {}), uncertainty, model),
-            image,
-        )
+        regions = tuple(read_regions_csv(place / files.REGIONS))
+        bars = ErrorBars.from_dict(told.get("error_of_max_shear", {}), uncertainty, model)
+        name, deformation = place.resolve().name, _deformation_in(place, maps)
+        return cls(name, deformation, maps, alignment, quality, regions, bars, image)
 
     @property
     def verdict(self) -> Verdict:
@@ -228,12 +191,12 @@ class Measurement:
     @property
     def strain_line(self) -> str:
         """The maximal shear by region, in a line."""
-        rows = [r for r in self._rows("max_shear") if np.isfinite(r.median)]
+        rows = (r for r in self.regions if r.quantity == "max_shear" and np.isfinite(r.median))
         shear = ", ".join(f"{r.region} {r.median:.3f} / {r.p95:.3f}" for r in rows)
         return f"maximal shear, median / 95th percentile: {shear}"
 
     def summary(self) -> list[str]:
-        """The verdict with its reasons and the strain, for a person."""
+        """The verdict with its reasons and the strain, in lines."""
         return [
             f"{self.name}: {self.verdict.words}.",
             *(f"    {reason}" for reason in self.verdict.reasons),
@@ -274,7 +237,7 @@ class Measurement:
         """
         values = notebook.values_of(quantity, self.maps, self.sigma)
         outline = None if self.source is None else self.source.subject.labels
-        return notebook.figure(self._view(point_mm), self.image, Scalar(quantity, values, outline), planes, largest)
+        return notebook.figure(self._view(point_mm), self.image, quantity, values, outline, planes, largest)
 
     def _repr_html_(self) -> str:
         table = page.short_table(self.regions, self.intervals)
@@ -282,41 +245,18 @@ class Measurement:
 
     def section(self, pictures: Mapping[str, Picture]) -> Section:
         """Its part of a report."""
-        found = self._registration
-        note = "" if found is None else found.settings.engine.note
+        found, bars = None if self.source is None else self.source.registration, self.error_bars
         tables = [page.key_figures(self.quality, self.alignment), page.region_table(self.regions)]
         tables += [] if found is None or not found.choice.rows() else [page.weights_table(found.choice)]
-        return Section(
-            self.name,
-            self.verdict,
-            (*tables, *page.error_tables(self.error_bars)),
-            tuple(pictures.values()),
-            (
-                *((note,) if note else ()),
-                *((f"No error bars. {self.error_bars.missing}",) if self.error_bars.missing else ()),
-                *((f"Error bars: {self.error_bars.of_twin}",) if self.error_bars.of_twin else ()),
-            ),
-        )
+        tables += page.error_tables(bars)
+        notes = ["" if found is None else found.settings.engine.note]
+        notes += [f"No error bars. {bars.missing}"] * bool(bars.missing)
+        notes += [f"Error bars: {bars.of_twin}"] * bool(bars.of_twin)
+        return Section(self.name, self.verdict, tuple(tables), tuple(pictures.values()), tuple(filter(None, notes)))
 
     def pictures(self) -> dict[str, Picture]:
-        """The figures of a report, by the name of their file.
-
-        Raises
-        ------
-        InputError
-            Of a measurement that was read from a folder: its figures lie there.
-        """
-        made = self._made_from()
-        view, floor = self._view(), self.quality.noise_floor
-        labels = made.subject.regions(made.tissue)
-        agreement = {} if made.images is None else page.agreement_pictures(view, made.subject.reference, made.images)
-        return {
-            **agreement,
-            **page.strain_pictures(
-                view, made.subject, labels, self.maps, made.images, None if floor is None else floor.shear_p95
-            ),
-            **page.sigma_pictures(view, made.subject.reference, self.error_bars.uncertainty),
-        }
+        """The figures of a report, by the name of their file; InputError for one that was read from a folder."""
+        return page.pictures_of(self._view(), self._made_from(), self.maps, self.quality.noise_floor, self.sigma)
 
     def write(self, folder: Path | str, provenance: Mapping[str, object] | None = None) -> Section:
         """Write everything to a folder, whole or not at all; an older folder of that name is replaced.
@@ -324,7 +264,7 @@ class Measurement:
         Parameters
         ----------
         folder : path
-            Its parent is there already.
+            Its parent exists.
         provenance : mapping, optional
             What it was made from, as plain values, kept as ``provenance.json``.
 
@@ -340,24 +280,22 @@ class Measurement:
         OutputError
             If it cannot be written.
         """
-        made, pictures, verdict = self._made_from(), self.pictures(), self.verdict
+        made, pictures, verdict, bars = self._made_from(), self.pictures(), self.verdict, self.error_bars
         told = self.quality.as_dict() | {"alignment": dict(self.alignment)}
         found = made.registration
         if found is not None:
             if chosen := found.choice.as_dict():
                 told["regularisation"] = chosen
-            told["error_of_max_shear"] = self.error_bars.as_dict()
+            told["error_of_max_shear"] = bars.as_dict()
         with whole_folder(Path(folder)) as partial:
             files.write_maps(partial, self.maps, made.subject.axes, verdict)
             write_regions_csv(partial / files.REGIONS, self.regions, verdict)
             if made.subject.mesh is not None:
                 told["mesh"] = files.write_mesh_results(partial, made.subject.mesh, self.deformation, verdict)
             if found is not None and made.images is not None:
-                write_images_and_transforms(partial, found, made.images)
-            if self.error_bars.uncertainty is not None:
-                files.write_uncertainty(
-                    partial, self.maps.grid, self.error_bars.uncertainty, self.error_bars.model, verdict
-                )
+                judgement.write_images_and_transforms(partial, found, made.images)
+            if bars.uncertainty is not None:
+                files.write_uncertainty(partial, self.maps.grid, bars.uncertainty, bars.model, verdict)
             write_json(partial / files.QUALITY, told)
             if provenance is not None:
                 write_json(partial / files.PROVENANCE, provenance)
@@ -366,10 +304,6 @@ class Measurement:
                 (partial / files.FIGURES / f"{stem}.png").write_bytes(picture.png)
         return self.section(pictures)
 
-    @property
-    def _registration(self) -> Registration | None:
-        return None if self.source is None else self.source.registration
-
     def _made_from(self) -> Source:
         if self.source is None:
             raise InputError(
@@ -377,9 +311,6 @@ class Measurement:
                 "that folder."
             )
         return self.source
-
-    def _rows(self, quantity: str) -> list[RegionRow]:
-        return [row for row in self.regions if row.quantity == quantity]
 
     def _view(self, point_mm: npt.ArrayLike | None = None) -> View:
         """The slices through a point, through the bone's lowest point, or through the tissue's middle."""
@@ -392,7 +323,7 @@ class Measurement:
 
 
 def _deformation_in(folder: Path, maps: StrainMaps) -> Deformation:
-    """The spline that was found, where it is valid; the displacement at voxels where it was found elsewhere."""
+    """The spline, where it is valid; the displacement at voxels where a deformation was given."""
     if any((folder / name).is_file() for name in (files.SPLINE, files.SPLINE_WITH_BORDERS)):
         return Within(files.spline_in(folder), Mask(maps.grid, maps.valid), margin_voxels=0)
     return files.ResultFolder(folder).deformation()

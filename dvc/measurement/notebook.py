@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 
 import numpy as np
@@ -15,7 +14,7 @@ from dvc.errors import InputError
 from dvc.images.image import Image, LabelMap
 from dvc.report import figures
 from dvc.report.figures import Scale
-from dvc.report.page import Picture, Table, shown
+from dvc.report.page import Cell, Picture, Table, shown
 from dvc.report.planes import PLANES, Plane, View
 from dvc.report.sheet import png_bytes
 from dvc.trust.verdict import Level, Verdict
@@ -35,13 +34,7 @@ _SHOWN_PERCENT = 99.0
 
 
 def values_of(quantity: str, maps: StrainMaps, sigma: Float32Array | None) -> Float32Array:
-    """A scalar (ni, nj, nk) by its name; NaN where not defined.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name, or the standard deviation is not known.
-    """
+    """A scalar (ni, nj, nk) by its name, NaN where not defined; InputError for another name, or an unknown sigma."""
     if quantity == "sigma":
         if sigma is None:
             raise InputError("sigma: the error of this measurement is not known; its `error_bars` tell why.")
@@ -54,36 +47,23 @@ def values_of(quantity: str, maps: StrainMaps, sigma: Float32Array | None) -> Fl
     return known[quantity]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scalar:
-    """Values (ni, nj, nk) of a quantity, and the labels whose borders are drawn with it, if any."""
-
-    quantity: str
-    values: Float32Array
-    outline: LabelMap | None = None
-
-
 def figure(
     view: View,
     image: Image | None,
-    drawn: Scalar,
-    planes: Sequence[Plane] = PLANES,
-    largest: float | None = None,
+    quantity: str,
+    values: Float32Array,
+    outline: LabelMap | None,
+    planes: Sequence[Plane],
+    largest: float | None,
 ) -> Figure:
-    """Draw a scalar in colour over an image, where there is one.
-
-    Raises
-    ------
-    InputError
-        If there is no such plane, or ``largest`` is not above zero.
-    """
+    """Draw a scalar in colour over an image, where there is one, with the borders of labels, if any."""
     chosen: tuple[Plane, ...] = (planes,) if isinstance(planes, str) else tuple(planes)  # type: ignore[assignment]
     if not chosen or any(plane not in PLANES for plane in chosen):
         raise InputError(f"Planes are among {', '.join(PLANES)}; got {', '.join(map(str, chosen)) or 'none'}.")
     if largest is not None and not largest > 0.0:
         raise InputError(f"The end of the colours must be above zero; got {largest}.")
-    scale = _scale(drawn.quantity, view.shown(drawn.values), largest)
-    return figures.coloured(view, image, drawn.values, scale, planes=chosen, outline=drawn.outline).finished()
+    scale = _scale(quantity, view.shown(values), largest)
+    return figures.coloured(view, image, values, scale, planes=chosen, outline=outline).finished()
 
 
 def _scale(quantity: str, values: Float32Array, largest: float | None) -> Scale:
@@ -101,8 +81,6 @@ def _scale(quantity: str, values: Float32Array, largest: float | None) -> Scale:
 def _round_up(value: float) -> float:
     """The next number of one digit or so.
 
-    Examples
-    --------
     >>> [_round_up(v) for v in (0.173, 0.0449, 7.2, 0.0)]
     [0.2, 0.05, 8.0, 1.0]
     """
@@ -119,16 +97,13 @@ def html(name: str, verdict: Verdict, drawn: Figure, table: Table, notes: Sequen
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
     cell = "padding:.2em .8em;border-bottom:1px solid #dde3ea;text-align:"
     sides = ["right" if numeric else "left" for numeric in table.numeric]
-    head = "".join(
-        f'<th style="{cell}{side};font-weight:600">{escape(c)}</th>'
-        for c, side in zip(table.columns, sides, strict=True)
-    )
-    rows = "".join(
-        "<tr>"
-        + "".join(f'<td style="{cell}{side}">{escape(shown(c))}</td>' for c, side in zip(row, sides, strict=True))
-        + "</tr>"
-        for row in table.rows
-    )
+
+    def line(tag: str, style: str, cells: Sequence[Cell]) -> str:
+        sided = zip(cells, sides, strict=True)
+        return "".join(f'<{tag} style="{cell}{side}{style}">{escape(shown(c))}</{tag}>' for c, side in sided)
+
+    head = line("th", ";font-weight:600", table.columns)
+    rows = "".join(f"<tr>{line('td', '', row)}</tr>" for row in table.rows)
     return (
         '<div style="background:#fff;color:#1b2430;padding:.6em;max-width:66rem">'
         f'<div style="border-left:6px solid {tone};background:{wash};padding:.5em .9em;border-radius:4px">'

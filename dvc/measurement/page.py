@@ -1,22 +1,22 @@
-"""What the report says of a measurement: its pictures and tables."""
+"""Pictures and tables of a measurement in a report."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from dvc.arrays import Float32Array
 from dvc.deformation.strain_maps import StrainMaps
-from dvc.images.image import Image, LabelMap
 from dvc.measurement.error_bars import ErrorBars
-from dvc.measurement.judgement import CarriedImages
-from dvc.measurement.subject import Subject
+from dvc.measurement.judgement import Source
 from dvc.registration.engine import Regularisation
 from dvc.report import figures
-from dvc.report.page import Cell, Picture, Table, caption_of, shown
+from dvc.report.page import Cell, Picture, Table, shown
 from dvc.report.planes import View
-from dvc.trust.error_model import Interval, Uncertainty
-from dvc.trust.quality import Quality
+from dvc.trust.error_model import Interval
+from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
 from dvc.trust.twin_judgement import Judged
 
@@ -32,85 +32,49 @@ _TWIN = (
 )
 
 
-def agreement_pictures(view: View, reference: Image, images: CarriedImages) -> dict[str, Picture]:
-    """Draw how well the images agree, after the rigid part and after all."""
-    pair = reference, images.aligned, images.registered
-    return {
-        "overlay": Picture("Before and after", caption_of(figures.overlay), figures.overlay(view, *pair)),
-        "checkerboard": Picture("Checkerboard", caption_of(figures.checkerboard), figures.checkerboard(view, *pair)),
-        "similarity": Picture(
-            "Where the images agree",
-            caption_of(figures.similarity_slices),
-            figures.similarity_slices(view, images.local_rigid, images.local_after),
-        ),
-    }
-
-
-def strain_pictures(
-    view: View, subject: Subject, labels: LabelMap, maps: StrainMaps, images: CarriedImages | None, floor: float | None
+def pictures_of(
+    view: View, made: Source, maps: StrainMaps, floor: NoiseFloor | None, sigma: Float32Array | None
 ) -> dict[str, Picture]:
-    """Draw strain, curves, grid and volume ratio; the grid over the loaded image where there is one.
+    """The figures of a report, by the name of their file: agreement of the images, strain, and its uncertainty.
 
-    ``floor`` is the 95th percentile of a repeat scan's maximal shear.
+    The deformed grid lies over the loaded image where there is one.
     """
-    reference, bone = subject.reference, subject.bone
-    below = reference.values if images is None else images.aligned
-    return {
-        "strain": Picture(
-            "Maximal shear",
-            caption_of(figures.strain_slices) + " Slices through the bone's lowest point along the plate's normal.",
-            figures.strain_slices(view, reference, maps.max_shear, SHEAR_SCALE, labels),
-        ),
-        "curves": Picture(
-            "Volume above a strain",
-            caption_of(figures.shear_curves),
-            figures.shear_curves(maps.max_shear, labels, floor),
-        ),
-        "deformed_grid": Picture(
-            "Deformed grid",
-            caption_of(figures.deformed_grid),
-            figures.deformed_grid(view, below, maps.displacement_mm, None if bone is None else bone.inside),
-        ),
-        "jacobian": Picture(
-            "Volume ratio",
-            caption_of(figures.jacobian_slices),
-            figures.jacobian_slices(view, reference, maps.jacobian),
-        ),
-    }
+    reference, bone, images = made.subject.reference, made.subject.bone, made.images
+    labels, below, drawn = made.subject.regions(made.tissue), reference.values, dict[str, Picture]()
+    if images is not None:
+        pair, below = (view, reference, images.aligned, images.registered), images.aligned
+        local = view, images.local_rigid, images.local_after
+        drawn["overlay"] = Picture.drawn("Before and after", figures.overlay, *pair)
+        drawn["checkerboard"] = Picture.drawn("Checkerboard", figures.checkerboard, *pair)
+        drawn["similarity"] = Picture.drawn("Where the images agree", figures.similarity_slices, *local)
+    strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
+    through = "Slices through the bone's lowest point along the plate's normal."
+    drawn["strain"] = Picture.drawn("Maximal shear", figures.strain_slices, *strain, note=through)
+    curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
+    drawn["curves"] = Picture.drawn("Volume above a strain", figures.shear_curves, *curves)
+    grid = view, below, maps.displacement_mm, None if bone is None else bone.inside
+    drawn["deformed_grid"] = Picture.drawn("Deformed grid", figures.deformed_grid, *grid)
+    drawn["jacobian"] = Picture.drawn("Volume ratio", figures.jacobian_slices, view, reference, maps.jacobian)
+    if sigma is not None:
+        spread = view, reference, sigma, SIGMA_SCALE
+        drawn["sigma"] = Picture.drawn("How sure the maximal shear is", figures.sigma_slices, *spread)
+    return drawn
 
 
-def sigma_pictures(view: View, reference: Image, uncertainty: Uncertainty | None) -> dict[str, Picture]:
-    """Draw the map of the standard deviation, where it is known."""
-    if uncertainty is None:
-        return {}
-    drawn = figures.sigma_slices(view, reference, uncertainty.sigma, SIGMA_SCALE)
-    return {"sigma": Picture("How sure the maximal shear is", caption_of(figures.sigma_slices), drawn)}
-
-
-def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
-    """Tell what the verdict rests on."""
-    rows: list[tuple[str, Cell, str]] = [
-        ("Rotation of the bone between the scans", _number(alignment["rotation_deg"]), "degrees"),
-    ]
+def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
+    """What the verdict rests on."""
+    rows = [("Rotation of the bone between the scans", alignment["rotation_deg"], "degrees")]
     if "bone_shift_lps_mm" in alignment:
-        shift = np.asarray(alignment["bone_shift_lps_mm"], dtype=np.float64)
+        spread = "Spread of the rigid fits of halves of the bone (rms over the bone; largest of six pairs)"
+        spacing = " x ".join(f"{s:.3g}" for s in alignment["control_spacing_mm"])
         rows += [
-            ("Shift of the bone between the scans", float(np.linalg.norm(shift)), "mm"),
-            (
-                "Correlation in and around the bone, before alignment",
-                _number(alignment["similarity_before"]),
-                "",
-            ),
-            ("Correlation in and around the bone, after alignment", _number(alignment["similarity"]), ""),
-            (
-                "Spread of the rigid fits of halves of the bone (rms over the bone; largest of six pairs)",
-                _number(alignment["repeatability_rms_mm"]),
-                "mm",
-            ),
+            ("Shift of the bone between the scans", float(np.linalg.norm(alignment["bone_shift_lps_mm"])), "mm"),
+            ("Correlation in and around the bone, before alignment", alignment["similarity_before"], ""),
+            ("Correlation in and around the bone, after alignment", alignment["similarity"], ""),
+            (spread, alignment["repeatability_rms_mm"], "mm"),
+            ("Engine of the non-rigid registration", alignment["engine"], ""),
+            ("Spacing of the B-spline's control points", spacing, "mm"),
         ]
-        spacing = np.asarray(alignment["control_spacing_mm"], dtype=np.float64)
-        rows.append(("Engine of the non-rigid registration", str(alignment["engine"]), ""))
-        rows.append(("Spacing of the B-spline's control points", " x ".join(f"{s:.3g}" for s in spacing), "mm"))
     if quality.similarity is not None:
         for said, value in zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True):
             rows.append((f"Local similarity in the tissue, {said}", float(value), ""))
@@ -123,79 +87,61 @@ def key_figures(quality: Quality, alignment: Mapping[str, object]) -> Table:
         ("Lowest det F", quality.lowest_jacobian, ""),
         ("Tissue without a result", 100.0 * quality.undefined_fraction, "%"),
     ]
-    if quality.landmark_errors_mm is not None:
-        errors = quality.landmark_errors_mm
+    if (errors := quality.landmark_errors_mm) is not None:
         known = errors[np.isfinite(errors)]
         rows += [
             ("Landmark error, median", float(np.median(known)) if known.size else None, "mm"),
             ("Landmark error, largest", float(known.max()) if known.size else None, "mm"),
             ("Landmarks without a result", int(errors.size - known.size), f"of {errors.size}"),
         ]
-    if quality.noise_floor is not None:
-        floor = quality.noise_floor
+    if (floor := quality.noise_floor) is not None:
         rows += [
-            ("Noise floor (repeat scan): maximal shear, median", floor.shear_p50, ""),
-            ("Noise floor (repeat scan): maximal shear, 95th percentile", floor.shear_p95, ""),
+            ("Noise floor (repeat scan): maximal shear, median", floor.max_shear_p50, ""),
+            ("Noise floor (repeat scan): maximal shear, 95th percentile", floor.max_shear_p95, ""),
             ("Noise floor: MAER", floor.maer, ""),
             ("Noise floor: SDER", floor.sder, ""),
         ]
     return Table("Key figures", ("figure", "value", "unit"), tuple(rows))
 
 
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) else None
-
-
 def weights_table(choice: Regularisation) -> Table:
-    """Tell the weights of the prior, and of those that were tried what they left of half of the voxels."""
+    """The weights of the prior, and what those that were tried left of half of the voxels."""
     columns = ("penalty on", "weight", "unit", "residual left out, % above the least")
     return Table("Weights of the registration", columns, tuple(choice.rows()), choice.caption)
 
 
 def region_table(regions: Sequence[RegionRow]) -> Table:
-    """Tell the maximal shear of every region."""
-    rows = [
-        (
-            r.region,
-            r.volume_ml,
-            100.0 * r.defined_fraction,
-            r.median,
-            r.p90,
-            r.p95,
-            r.p99,
-            *(r.volume_above_ml.get(t) for t in SHEAR_THRESHOLDS),
-        )
-        for r in regions
-        if r.quantity == "max_shear"
-    ]
+    """The maximal shear of every region."""
+
+    def cells(r: RegionRow) -> tuple[Cell, ...]:
+        above = (r.volume_above_ml.get(t) for t in SHEAR_THRESHOLDS)
+        return r.region, r.volume_ml, 100.0 * r.defined_fraction, r.median, r.p90, r.p95, r.p99, *above
+
+    rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
     columns = ("region", "volume, mL", "defined, %", "median", "p90", "p95", "p99")
     above = tuple(f"> {t:g}, mL" for t in SHEAR_THRESHOLDS)
-    return Table(
-        "Maximal shear by region",
-        columns + above,
-        tuple(rows),
-        "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, and volumes above a value.",
-    )
+    note = "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, and volumes above a value."
+    return Table("Maximal shear by region", columns + above, rows, note)
 
 
 def short_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
-    """Tell median and 95th percentile of the maximal shear by region, each with its interval where it is known."""
+    """Median and 95th percentile of the maximal shear by region, each with its interval where it is known."""
     known = {(i.region, i.figure): f"{shown(i.low)} to {shown(i.high)}" for i in intervals}
 
     def own(region: str, figure: str) -> tuple[str, ...]:
         return (known.get((region, figure), "–"),) if known else ()
 
+    interval = ("95 % interval",) * bool(known)
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (r.region, r.volume_ml, r.median, *own(r.region, "median"), r.p95, *own(r.region, "p95"))
         for r in regions
         if r.quantity == "max_shear"
     )
-    interval = ("95 % interval",) * bool(known)
     return Table("Maximal shear", ("region", "volume, mL", "median", *interval, "95th percentile", *interval), rows)
 
 
 def error_tables(bars: ErrorBars) -> list[Table]:
-    """Tell the intervals, and what came back from the twin."""
+    """The intervals, and what came back from the twin."""
     tables = []
     if bars.uncertainty is not None:
         rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in bars.uncertainty.intervals)
@@ -210,7 +156,7 @@ def error_tables(bars: ErrorBars) -> list[Table]:
 
 
 def _against_claims(row: Judged) -> tuple[str | float, ...]:
-    """What the twin says of a tissue's error bars, as a table shows it; nothing where there are none."""
+    """A tissue's error bars beside the twin, as a table shows them; nothing where there are none."""
     if row.held is None or row.expected is None or row.factor is None:
         return ()
     return f"{row.held:.0%}", f"{row.expected:.0%}", row.factor

@@ -30,12 +30,8 @@ class Subject:
 
     Attributes
     ----------
-    reference : Image
-    bone, tissue : Mask or None
+    bone, tissue, labels : Mask, Mask, LabelMap or None
         On the reference grid.
-    labels : LabelMap or None
-        On the reference grid.
-    mesh : MeshFile or None
     plate_normal : (3,)
         The plate's outward unit normal, away from the foot, LPS.
     axes : (3, 3) or None
@@ -62,7 +58,7 @@ class Subject:
         return np.asarray(points[int(np.argmax(points @ self.plate_normal))])
 
     def body(self) -> Mask:
-        """Soft tissue and bone: as given, or found by a threshold."""
+        """Soft tissue and bone: as given, or by a threshold."""
         return self.tissue or tissue_mask(self.reference)
 
     def soft(self, body: Mask) -> BoolArray:
@@ -73,24 +69,15 @@ class Subject:
         """The labels; without, the body as "tissue", and the bone."""
         if self.labels is not None:
             return self.labels
-        values = body.inside.astype(np.int64)
-        names = {1: "tissue"}
-        if self.bone is not None:
-            values = np.where(self.bone.inside, 2, values)
-            names[2] = "bone"
-        return LabelMap(body.grid, values, names)
+        if self.bone is None:
+            return LabelMap(body.grid, body.inside.astype(np.int64), {1: "tissue"})
+        return LabelMap(body.grid, np.where(self.bone.inside, 2, body.inside), {1: "tissue", 2: "bone"})
 
 
 def plate_directions(
     plate_normal: Sequence[float] | None, shear_direction: Sequence[float] | None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """The plate's outward unit normal (inferior where none is given), and its axes where a shear direction is given.
-
-    Raises
-    ------
-    InputError
-        If a direction is not three finite numbers, or zero, or both are one.
-    """
+    """The plate's outward unit normal (inferior where none is given), and its axes where a shear direction is given."""
     normal = _unit("--plate-normal", _INFERIOR if plate_normal is None else plate_normal)
     return normal, None if shear_direction is None else plate_axes(normal, _unit("--shear-direction", shear_direction))
 
@@ -104,10 +91,8 @@ def _unit(name: str, vector: Sequence[float]) -> FloatArray:
 
 
 def is_bones_name(name: str) -> bool:
-    """Whether a label is called as a bone is.
+    """Whether a label is named like a bone.
 
-    Examples
-    --------
     >>> [is_bones_name(name) for name in ("Talus", "tibia_left", "Sacrum", "fat pad", "calcaneus tendon")]
     [True, True, True, False, False]
     """

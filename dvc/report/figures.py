@@ -1,23 +1,21 @@
 """Figures of a registration, each as PNG bytes: slices in three planes through a point, and curves.
 
-All panels of a figure share one scale, so a length is the same everywhere. How slices lie on the page:
-`dvc.report.planes`. Yellow marks at a panel's edge show where the other planes cut. Voxels without a value are never
-drawn as zero: the loaded image is dark blue there, a map leaves the image below it plain.
+All panels of a figure share one scale, so a length is the same everywhere; `dvc.report.planes` tells how slices lie on
+the page. Yellow marks at a panel's edge show where the other planes cut. Voxels without a value are never drawn as
+zero: the loaded image is dark blue there, a map leaves the image below it plain.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter
 from scipy.ndimage import map_coordinates
 
@@ -25,7 +23,7 @@ from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Image, LabelMap
 from dvc.report.planes import AXES, PLANES, Plane, Values, View
-from dvc.report.sheet import DPI, FONT, INK, SHADOW, UNSEEN, WIDTH_IN, Sheet, levelled, png_bytes, window_of
+from dvc.report.sheet import FONT, INK, SHADOW, UNSEEN, Sheet, chart, label_axes, levelled, png_bytes, window_of
 from dvc.trust.regions import volume_above
 
 # The palette of Okabe and Ito, told apart by all common kinds of colour vision.
@@ -47,15 +45,10 @@ def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float
     Dark blue: the loaded scan does not show this place.
     """
     sheet = Sheet(view, _STAGES)
-    window = window_of(view, reference.values)
-    for row, carried in zip(sheet.rows, (rigid, registered), strict=True):
-        own = window_of(view, carried)
-        for plane, axes in row.items():
-            green = levelled(view.cut(reference.values, plane), window)
-            magenta = levelled(view.cut(carried, plane), own)
-            page = np.stack([magenta, green, magenta], axis=-1)
-            page[np.isnan(page).any(axis=-1)] = UNSEEN
-            sheet.paint(plane, axes, page)
+    for plane, axes, green, magenta in _beside(sheet, reference, (rigid, registered)):
+        page = np.stack([magenta, green, magenta], axis=-1)
+        page[np.isnan(page).any(axis=-1)] = UNSEEN
+        sheet.paint(plane, axes, page)
     return sheet.png()
 
 
@@ -64,21 +57,27 @@ def checkerboard(view: View, reference: Image, rigid: Float32Array, registered: 
 
     Where the registration is right, borders run on across the fields without a step.
     """
-    sheet = Sheet(view, _STAGES)
-    window = window_of(view, reference.values)
-    for row, carried in zip(sheet.rows, (rigid, registered), strict=True):
-        own = window_of(view, carried)
-        for plane, axes in row.items():
-            a = levelled(view.cut(reference.values, plane), window)
-            b = levelled(view.cut(carried, plane), own)
-            _, across, along = AXES[plane]
-            spacing = view.grid.toward_lps().spacing_mm
-            down, right = np.indices(a.shape)
-            odd = (down * spacing[along] // _CHECK_MM + right * spacing[across] // _CHECK_MM) % 2 == 1
-            page = np.repeat(np.where(odd, b, a)[..., None], 3, axis=-1)
-            page[np.isnan(page[..., 0])] = UNSEEN
-            sheet.paint(plane, axes, page)
+    sheet, spacing = Sheet(view, _STAGES), view.grid.toward_lps().spacing_mm
+    for plane, axes, a, b in _beside(sheet, reference, (rigid, registered)):
+        _, across, along = AXES[plane]
+        down, right = np.indices(a.shape)
+        odd = (down * spacing[along] // _CHECK_MM + right * spacing[across] // _CHECK_MM) % 2 == 1
+        page = np.repeat(np.where(odd, b, a)[..., None], 3, axis=-1)
+        page[np.isnan(page[..., 0])] = UNSEEN
+        sheet.paint(plane, axes, page)
     return sheet.png()
+
+
+def _beside(
+    sheet: Sheet, reference: Image, carried: Sequence[Float32Array]
+) -> Iterator[tuple[Plane, Axes, FloatArray, FloatArray]]:
+    """Each panel of a sheet that has a row for each carried image: pages of the unloaded image and that one, 0 to 1."""
+    window = window_of(sheet.view, reference.values)
+    for row, values in zip(sheet.rows, carried, strict=True):
+        own = window_of(sheet.view, values)
+        for plane, axes in row.items():
+            page = levelled(sheet.view.cut(reference.values, plane), window)
+            yield plane, axes, page, levelled(sheet.view.cut(values, plane), own)
 
 
 def strain_slices(
@@ -90,8 +89,7 @@ def strain_slices(
     """
     if not largest > 0:
         raise InputError(f"The end of the colour bar for maximal shear must be positive; got {largest}.")
-    scale = Scale(MAX_SHEAR, "viridis", 0.0, largest)
-    return coloured(view, reference, max_shear, scale, outline=outline).png()
+    return coloured(view, reference, max_shear, Scale(MAX_SHEAR, "viridis", 0.0, largest), outline=outline).png()
 
 
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
@@ -133,13 +131,10 @@ def coloured(
             labels = view.cut(outline.labels, plane)
             sheet.outlines(plane, axes, (labels == label for label in outline.names))
     shown = view.shown(values)
-    sheet.bar(colours, norm, scale.told, _ends(bool((shown < scale.low).any()), bool((shown > scale.high).any())))
+    beyond = bool((shown < scale.low).any()), bool((shown > scale.high).any())
+    pointed = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}
+    sheet.bar(colours, norm, scale.told, pointed[beyond])
     return sheet
-
-
-def _ends(below: bool, above: bool) -> str:
-    """Which ends of a colour bar are pointed: values lie beyond."""
-    return {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}[below, above]
 
 
 def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> bytes:
@@ -147,14 +142,9 @@ def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> byt
 
     Red, with the number of voxels, is where the deformation folds (det F <= 0): no result can be trusted there.
     """
-    sheet = Sheet(view, [""], bar=True)
-    window = window_of(view, reference.values)
-    shown = view.shown(jacobian)
-    reach = volume_reach(shown)
-    shades, norm = colormaps["PuOr_r"], Normalize(1.0 - reach, 1.0 + reach)
+    reach = volume_reach(view.shown(jacobian))
+    sheet = coloured(view, reference, jacobian, Scale(VOLUME_RATIO, "PuOr_r", 1.0 - reach, 1.0 + reach))
     for plane, axes in sheet.rows[0].items():
-        sheet.grey(plane, axes, reference.values, window)
-        sheet.colours(plane, axes, jacobian, shades, norm)
         folded = view.cut(jacobian, plane) <= 0.0
         if folded.any():
             red = np.zeros((*folded.shape, 4))
@@ -163,8 +153,6 @@ def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> byt
             told = f"folded: {np.count_nonzero(folded)} voxels"
             style: dict[str, Any] = {"color": "#FF8A80", "weight": "bold", "path_effects": SHADOW}
             axes.text(0.5, 0.08, told, transform=axes.transAxes, ha="center", **style, **FONT)
-    ends = _ends(bool((shown < 1.0 - reach).any()), bool((shown > 1.0 + reach).any()))
-    sheet.bar(shades, norm, VOLUME_RATIO, ends)
     return sheet.png()
 
 
@@ -211,17 +199,9 @@ def deformed_grid(view: View, aligned: Float32Array, displacement_mm: Float32Arr
 
 
 def carried_lines(view: View, plane: Plane, displacement_mm: Values) -> list[FloatArray]:
-    """Lines of a square grid of 5 mm in a slice, where the displacement carries them.
+    """Lines of a square grid of 5 mm in a slice, where the displacement u(X) carries them within it.
 
-    Parameters
-    ----------
-    displacement_mm : (ni, nj, nk, 3)
-        u(X), LPS components; NaN where not defined, which cuts the lines. The component across the slice is left out.
-
-    Returns
-    -------
-    list of (n, 2)
-        Points across and along the page, mm in the frame of `View.extent_mm`.
+    Each (n, 2), across and along the page, mm in the frame of `View.extent_mm`; NaN in u (LPS components) cuts them.
     """
     left, right, bottom, top = view.extent_mm(plane)
     low, high = min(bottom, top), max(bottom, top)
@@ -250,9 +230,7 @@ def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float |
     Both panels show the same curves; the logarithmic axis opens up the small volumes at high strain.
     The legend tells the share of a region that has no result; its curve is a lower bound.
     """
-    figure = Figure(figsize=(WIDTH_IN, 3.8), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    panels: tuple[Axes, Axes] = figure.subplots(1, 2)
+    figure, panels = chart(2, page_wide=True)
     at = np.linspace(0.0, _HIGHEST_SHEAR, 1501)  # finer than a dot of the figure; each ordinate is exact
     voxel_ml = labels.grid.voxel_volume_mm3 / 1000.0
     for number, (label, name) in enumerate(labels.names.items()):
@@ -272,12 +250,7 @@ def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float |
     for axes, scale in zip(panels, ("linear", "logarithmic"), strict=True):
         axes.set_xlim(0.0, _HIGHEST_SHEAR)
         axes.set_title(f"Volume above a strain, {scale} axis", loc="left", color=INK, fontsize=10)
-        axes.set_xlabel(MAX_SHEAR, color=INK, **FONT)
-        axes.set_ylabel("volume above, mL", color=INK, **FONT)
-        axes.grid(True, color="#d9dee4", linewidth=0.6)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=9)
+        label_axes(axes, MAX_SHEAR, "volume above, mL")
         if noise_floor is not None:
             axes.axvspan(0.0, noise_floor, color="#9aa5b1", alpha=0.35, linewidth=0, label="below the noise floor")
     panels[0].set_ylim(bottom=0.0)

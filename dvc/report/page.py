@@ -1,19 +1,23 @@
-"""The building blocks of a report page: verdicts, tables and figures in one self-contained HTML file."""
+"""The building blocks of a report page: verdicts, tables, figures and volumes in one self-contained HTML file."""
 
 from __future__ import annotations
 
 import base64
+import gzip
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
 import jinja2
+import nibabel
 import numpy as np
+import numpy.typing as npt
 
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
-from dvc.report.viewer import Viewer, script
+from dvc.images.image import Grid
 from dvc.trust.verdict import Verdict
 
 Cell = str | float | int | None
@@ -21,20 +25,17 @@ Cell = str | float | int | None
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CSS_PIXELS_PER_DOT = 96 / 120  # figures are drawn at 120 dots per inch: text of 10 pt is then 10 pt on the page
 
-
+_STEPS = 250  # of a volume's values: one byte for each voxel
+_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+NIIVUE = "0.69.0"
+"""Version of the viewer (WebGL 2, niivue.com) that comes with the package; it draws what the page itself holds."""
 METHODS = "Methods text"
 """Title of a report's section with paragraphs for a methods section."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure with what it shows and how to read it.
-
-    Raises
-    ------
-    InputError
-        If ``png`` is not a PNG file.
-    """
+    """A PNG figure (InputError for another) with what it shows and how to read it."""
 
     title: str
     caption: str
@@ -43,6 +44,11 @@ class Picture:
     def __post_init__(self) -> None:
         if not self.png.startswith(_PNG_SIGNATURE):
             raise InputError(f"The figure '{self.title}' is no PNG file; it begins with {self.png[:8]!r}.")
+
+    @classmethod
+    def drawn(cls, title: str, draw: Callable[..., bytes], *shown: object, note: str = "") -> Picture:
+        """The figure that ``draw`` makes of ``shown``; its docstring, which says how to read it, is the caption."""
+        return cls(title, " ".join(f"{draw.__doc__ or ''} {note}".split()), draw(*shown))
 
     @property
     def data(self) -> str:
@@ -57,14 +63,9 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows under named columns; numbers are shown to three digits, missing ones as a dash.
+    """Rows under named columns, one cell for each; numbers are shown to three digits, missing ones as a dash.
 
-    Rows ``apart`` stand below a line: what the others are to be seen beside.
-
-    Raises
-    ------
-    InputError
-        If a row has not one cell for each column.
+    Rows ``apart`` stand below a line: the others are to be seen beside them.
     """
 
     title: str
@@ -74,18 +75,45 @@ class Table:
     apart: tuple[tuple[Cell, ...], ...] = ()
 
     def __post_init__(self) -> None:
+        wanted = len(self.columns)
         for number, row in enumerate((*self.rows, *self.apart)):
-            if len(row) != len(self.columns):
-                raise InputError(
-                    f"Row {number} of the table '{self.title}' has {len(row)} cells, its header "
-                    f"{len(self.columns)}; give one for each column."
-                )
+            if len(row) != wanted:
+                what = f"Row {number} of the table '{self.title}' has {len(row)} cells, its header {wanted}"
+                raise InputError(f"{what}; give one for each column.")
 
     @property
     def numeric(self) -> tuple[bool, ...]:
         """Whether each column holds numbers and missing values alone, and is set flush right."""
         columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(self.columns)
         return tuple(bool(column) and not any(isinstance(c, str) for c in column) for column in columns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Volume:
+    """A volume as a page holds it: NIfTI, eight bits, compressed, base64; ``most`` is the value of the last colour."""
+
+    title: str
+    data: str
+    most: float
+
+    @classmethod
+    def of(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float) -> Volume:
+        """Values (ni, nj, nk) on a grid, from 0 to ``most``; NaN becomes 0, which an overlay does not show."""
+        known = np.nan_to_num(np.asarray(values, dtype=np.float64), nan=0.0)
+        step = most / _STEPS
+        image = nibabel.Nifti1Image(np.clip(np.rint(known / step), 0, 255).astype(np.uint8), _TO_RAS @ grid.affine)
+        image.header.set_slope_inter(step, 0.0)
+        return cls(title, base64.b64encode(gzip.compress(image.to_bytes(), mtime=0)).decode(), most)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Viewer:
+    """An image, and scalars in colour over it, each on a canvas of its own; they turn and scroll together."""
+
+    title: str
+    caption: str
+    image: Volume
+    overlays: tuple[Volume, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,16 +128,9 @@ class Section:
     viewers: tuple[Viewer, ...] = ()
 
 
-def caption_of(draw: Callable[..., bytes]) -> str:
-    """A figure's docstring: it says how the figure is read."""
-    return " ".join((draw.__doc__ or "").split())
-
-
 def shown(value: Cell) -> str:
-    """Return a table cell as people read it.
+    """A table cell as people read it.
 
-    Examples
-    --------
     >>> [shown(v) for v in (0.123456, 1234.5, 12, float("nan"), None, "fat")]
     ['0.123', '1234', '12', '–', '–', 'fat']
     """
@@ -137,6 +158,15 @@ def _line(value: object) -> str:
     return str(value)
 
 
+@cache
+def script() -> str:
+    """The library and what starts it, for a page that has a viewer; with the library's licence."""
+    folder = files("dvc.report") / "templates"
+    licence = (folder / "niivue-LICENSE.txt").read_text(encoding="utf-8")
+    library = (folder / "niivue.umd.js").read_text(encoding="utf-8")
+    return f"/* niivue {NIIVUE}\n{licence}*/\n{library}\n{(folder / 'viewer.js').read_text(encoding='utf-8')}"
+
+
 def write_report(
     path: Path,
     title: str,
@@ -151,27 +181,13 @@ def write_report(
 
     One HTML file without anything to fetch, and without scripts but for a section's viewer; all text is escaped. A list
     of the sections with their verdicts stands at the top where there are two or more; ``notes``, a line each, stand
-    between the verdict and it.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
+    between the verdict and it. OutputError if the file cannot be written.
     """
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    strict = jinja2.StrictUndefined
+    environment = jinja2.Environment(autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
     environment.filters["shown"] = shown
-    template = environment.from_string(
-        (files("dvc.report") / "templates" / "report.html.j2").read_text(encoding="utf-8")
-    )
-    page = template.render(
-        title=title,
-        verdict=verdict,
-        sections=list(sections),
-        closing=list(closing),
-        provenance=dict(provenance),
-        notes=list(notes),
-        script=script() if any(section.viewers for section in sections) else "",
-    )
+    template = (files("dvc.report") / "templates" / "report.html.j2").read_text(encoding="utf-8")
+    told = {"title": title, "verdict": verdict, "notes": notes, "provenance": provenance}
+    library = script() if any(section.viewers for section in sections) else ""
+    page = environment.from_string(template).render(**told, sections=sections, closing=closing, script=library)
     write_whole(path, page)

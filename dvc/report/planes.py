@@ -1,8 +1,8 @@
 """Three planes through a point of a grid, cut out as they lie on the page.
 
-Slices are shown as radiologists read them, whatever the grid's own axes: sagittal seen from the left
-(anterior on the left of the page), coronal from the front and axial from below (the patient's right on the left).
-They are cut along the grid's axes, never resampled; where those are oblique the titles say so.
+Slices are shown as radiologists read them, whatever the grid's own axes: sagittal seen from the left (anterior on the
+left of the page), coronal from the front and axial from below (the patient's right on the left). They are cut along the
+grid's axes, never resampled; where those are oblique the titles say so.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from dvc.arrays import BoolArray
 from dvc.errors import GeometryError
-from dvc.images.image import Grid
+from dvc.images.image import Grid, Mask, reordered_to_lps
 
 Plane = Literal["sagittal", "coronal", "axial"]
 Values = npt.NDArray[Any]
@@ -36,8 +36,6 @@ _LEAST_SHARE = 0.3827  # cosine of 67.5 degrees: half-way between one letter and
 def letters(direction: npt.ArrayLike) -> str:
     """Side of the body to which a direction (3,) LPS points: letters of axes within 67.5 degrees of it, nearest first.
 
-    Examples
-    --------
     >>> letters([0.0, -1.0, 0.0]), letters([0.0, -0.8, 0.6]), letters([0.1, 0.0, 0.99])
     ('A', 'AS', 'S')
     """
@@ -48,70 +46,37 @@ def letters(direction: npt.ArrayLike) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Which slices of a grid are shown, and how much of them.
+    """Which slices of a grid are shown, and how much of them."""
 
-    Attributes
-    ----------
-    grid : Grid
-        Of every array that is drawn through this view; LPS mm.
-    index : (3,) int
-        The three slices, counted along the axes closest to L, P, S.
-    box : three slices
-        The part shown, along the same axes.
-    """
-
-    grid: Grid
-    index: tuple[int, int, int]
-    box: tuple[slice, slice, slice]
+    grid: Grid  # of every array that is drawn through this view
+    index: tuple[int, int, int]  # the three slices, counted along the axes closest to L, P, S
+    box: tuple[slice, slice, slice]  # the part shown, along the same axes
 
     @classmethod
     def through(
         cls, grid: Grid, point_mm: npt.ArrayLike, around: BoolArray | None = None, margin_mm: float = 8.0
     ) -> View:
-        """Return the view of the slices through a point, cropped to a mask and a margin around it.
+        """The slices nearest to a point, LPS mm, cropped to a mask and a margin around it, or the whole of them.
 
-        Parameters
-        ----------
-        grid : Grid
-        point_mm : (3,)
-            LPS mm; the nearest slices are taken.
-        around : (ni, nj, nk) bool, optional
-            What must be in the picture; the whole grid by default.
-        margin_mm : float
-
-        Raises
-        ------
-        GeometryError
-            If the point lies outside the grid, or the mask has another shape.
+        GeometryError if the point lies outside the grid, or the mask has another shape.
         """
         lps = grid.toward_lps()
         point = np.asarray(point_mm, dtype=np.float64)
         if point.shape != (3,) or not bool(lps.contains(point)):
-            raise GeometryError(
-                f"The point to be shown, LPS {point.tolist()} mm, lies outside the grid: {grid}. "
-                "Give a point inside the image."
-            )
+            where = f"LPS {point.tolist()} mm, lies outside the grid: {grid}"
+            raise GeometryError(f"The point to be shown, {where}. Give a point inside the image.")
         nearest = np.clip(np.rint(lps.indices_of(point)), 0, np.array(lps.shape) - 1).astype(int)
         spans = [slice(0, n) for n in lps.shape]
-        if around is not None:
-            shown = _toward_lps(grid, around)
-            for axis in range(3):
-                hit = np.flatnonzero(shown.any(axis=tuple(a for a in range(3) if a != axis)))
-                if hit.size:
-                    edge = round(margin_mm / lps.spacing_mm[axis])
-                    low, high = min(hit[0], nearest[axis]) - edge, max(hit[-1], nearest[axis]) + edge + 1
-                    spans[axis] = slice(max(0, int(low)), min(lps.shape[axis], int(high)))
+        if around is not None and around.any():
+            for axis, held in enumerate(Mask(grid, around).toward_lps().box()):
+                edge = round(margin_mm / lps.spacing_mm[axis])
+                low, high = min(held.start, nearest[axis]) - edge, max(held.stop - 1, nearest[axis]) + edge + 1
+                spans[axis] = slice(max(0, int(low)), min(lps.shape[axis], int(high)))
         i, j, k = (int(n) for n in nearest)
         return cls(grid, (i, j, k), (spans[0], spans[1], spans[2]))
 
     def cut(self, values: Values, plane: Plane) -> Values:
-        """Return the slice of an array on the grid as it lies on the page: rows downward, columns to the right.
-
-        Raises
-        ------
-        GeometryError
-            If the array is not on the view's grid.
-        """
+        """The slice of an array on the grid as it lies on the page: rows downward, columns to the right."""
         cut = AXES[plane][0]
         chosen: list[slice | int] = list(self.box)
         chosen[cut] = self.index[cut]
@@ -119,11 +84,11 @@ class View:
         return page if plane == "axial" else page[::-1]
 
     def shown(self, values: Values) -> Values:
-        """Return the part of an array inside the box, axes closest to L, P, S."""
+        """The part of an array inside the box, axes closest to L, P, S; GeometryError for one of another shape."""
         return _toward_lps(self.grid, values)[self.box]
 
     def extent_mm(self, plane: Plane) -> tuple[float, float, float, float]:
-        """Return left, right, bottom and top of the slice, mm along the grid's axes from its first voxel's centre."""
+        """Left, right, bottom and top of the slice, mm along the grid's axes from its first voxel's centre."""
         _, across, along = AXES[plane]
         spacing = self.grid.toward_lps().spacing_mm
         left, right = ((n - 0.5) * spacing[across] for n in (self.box[across].start, self.box[across].stop))
@@ -131,7 +96,7 @@ class View:
         return (left, right, high, low) if plane == "axial" else (left, right, low, high)
 
     def title(self, plane: Plane) -> str:
-        """Return the name of the plane with the place of the cut, or with a word on oblique axes."""
+        """The plane with the position of the cut, or with the tilt of oblique axes."""
         lps = self.grid.toward_lps()
         cut = AXES[plane][0]
         tilt = float(np.degrees(np.arccos(np.clip(lps.direction[cut, cut], -1.0, 1.0))))
@@ -142,11 +107,9 @@ class View:
 
 
 def _toward_lps(grid: Grid, values: Values) -> Values:
-    """Return a view of values with the leading axes closest to L, P, S; nothing is copied."""
+    """A view of values on a grid with the leading axes closest to L, P, S."""
     if values.shape[:3] != grid.shape:
         raise GeometryError(
             f"An array of shape {values.shape} cannot be shown on a grid of {grid.shape}; bring it there first."
         )
-    order, flips = grid.axes_to_lps()
-    turned = values.transpose((*order, *range(3, values.ndim)))
-    return turned[tuple(slice(None, None, -1 if f else 1) for f in flips)]
+    return reordered_to_lps(grid, values)

@@ -33,19 +33,7 @@ _MARK = "#FFD54A"
 class Sheet:
     """Rows of slices at one scale, with letters, a scale bar, and yellow marks where the other planes cut.
 
-    Parameters
-    ----------
-    view : View
-    titles : sequence of str
-        One for each row; empty for none.
-    planes : sequence of plane names
-        Columns.
-    bar : bool
-        Whether room is kept for a colour bar below.
-
-    Attributes
-    ----------
-    rows : list of dict of plane to Axes
+    A title stands above each row, if it is not empty; the planes are its columns; ``bar`` keeps room for a colour bar.
     """
 
     def __init__(self, view: View, titles: Sequence[str], planes: Sequence[Plane] = PLANES, bar: bool = False) -> None:
@@ -81,7 +69,7 @@ class Sheet:
         self._bar = ((width - length) / 2 / width, 0.42 / height, length / width, 0.13 / height)
 
     def paint(self, plane: Plane, axes: Axes, page: Values, **how: Any) -> None:
-        """Lay a page down; what follows is drawn over it."""
+        """Lay a page down; whatever follows is drawn over it."""
         axes.imshow(page, extent=self.view.extent_mm(plane), origin="upper", aspect="equal", **how)
 
     def grey(self, plane: Plane, axes: Axes, image: Values, window: tuple[float, float]) -> None:
@@ -99,12 +87,11 @@ class Sheet:
         """Draw the borders of masks, given as pages of this plane, as thin lines."""
         left, right, bottom, top = self.view.extent_mm(plane)
         for page in pages:
-            if page.any() and not page.all():
+            if page.any() and not page.all() and min(page.shape) > 1:
                 rows, columns = page.shape
                 x = left + (np.arange(columns) + 0.5) * (right - left) / columns
                 y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows
-                if min(page.shape) > 1:
-                    axes.contour(x, y, page.astype(float), levels=[0.5], colors=[colour], linewidths=0.9)
+                axes.contour(x, y, page.astype(float), levels=[0.5], colors=[colour], linewidths=0.9)
 
     def bar(self, shades: Colormap, norm: Normalize, label: str, extend: str = "neither") -> None:
         """Draw the one colour bar of the sheet, below the panels."""
@@ -150,24 +137,23 @@ class Sheet:
 
 
 def _beside(mark: float) -> float:
-    """Return the middle of a side, 0 to 1, or a place beside it where a mark stands there."""
+    """The middle of a side, 0 to 1, or a place beside it where a mark stands there."""
     return 0.5 if abs(mark - 0.5) > 0.05 else 0.42
 
 
 def scale_length_mm(width_mm: float) -> float:
-    """Return a round length, mm, of at most a third of a panel.
+    """A round length, mm, of at most a third of a panel.
 
-    Examples
-    --------
     >>> [scale_length_mm(w) for w in (14.0, 100.0)]
     [2.0, 20.0]
     """
     return max((n for n in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0) if n <= width_mm / 3), default=1.0)
 
 
-def chart(panels: int = 1) -> tuple[Figure, tuple[Axes, ...]]:
-    """An empty figure with so many axes side by side, for curves."""
-    figure = Figure(figsize=(0.62 * WIDTH_IN * panels, 3.9), dpi=DPI, facecolor="white", layout="constrained")
+def chart(panels: int = 1, page_wide: bool = False) -> tuple[Figure, tuple[Axes, ...]]:
+    """An empty figure with so many axes side by side, for curves; each a part of the page's width, or all that wide."""
+    size = (WIDTH_IN, 3.8) if page_wide else (0.62 * WIDTH_IN * panels, 3.9)
+    figure = Figure(figsize=size, dpi=DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure, tuple(np.atleast_1d(figure.subplots(1, panels)))
 
@@ -183,14 +169,14 @@ def label_axes(axes: Axes, x: str, y: str) -> None:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """Return a figure as a PNG file's bytes; equal figures give equal bytes."""
+    """A figure as a PNG file's bytes; equal figures give equal bytes."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
     return file.getvalue()
 
 
 def window_of(view: View, image: Values) -> tuple[float, float]:
-    """Return the values drawn black and white: the 0.5th and 99.7th percentile of what is shown."""
+    """The values drawn black and white: the 0.5th and 99.7th percentile of what is shown."""
     known = view.shown(image)
     known = known[np.isfinite(known)]
     if not known.size:
@@ -200,5 +186,5 @@ def window_of(view: View, image: Values) -> tuple[float, float]:
 
 
 def levelled(page: Values, window: tuple[float, float]) -> FloatArray:
-    """Return a page scaled to 0 to 1 within a window; NaN stays."""
+    """A page scaled to 0 to 1 within a window; NaN stays."""
     return np.clip((np.asarray(page, dtype=np.float64) - window[0]) / (window[1] - window[0]), 0.0, 1.0)

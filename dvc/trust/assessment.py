@@ -15,29 +15,44 @@ from dvc.trust.verdict import Verdict, together
 
 _MORE_NOISE = 1.5  # times that in the air: parallel imaging and normalised intensities raise it in the tissue
 
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Where a figure turns a verdict; each pair is (use with care, do not trust).
-
-    The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound
-    registrations at SNR 10 to 25 stay above 0.8 and failed ones below 0.6. Those of the voxels come from a
-    knee's moved and noisy twin (slices of 4 mm: apparent maximal shear 0.1) and a leg's repeat scan (6 mm: 0.3).
-    Unlikeness is what the similarity lacks of the most that noise leaves: it tells another person's foot. Offsets
-    that rose to 7, 15 and 30 % across a phantom's foot raised the error in fat by 2, 16 and 130 %, in skin by 27, 93
-    and 380 %.
-    """
-
-    similarity: tuple[float, float] = (0.7, 0.45)
-    unlikeness: tuple[float, float] = (0.05, 0.09)
-    offset: tuple[float, float] = (0.07, 0.12)
-    bone_shift_mm: tuple[float, float] = (0.3, 0.8)
-    bone_shear_p95: tuple[float, float] = (0.1, 0.25)
-    lowest_jacobian: tuple[float, float] = (0.3, 0.0)
-    undefined_fraction: tuple[float, float] = (0.15, 0.4)
-    landmark_error_mm: tuple[float, float] = (1.0, 2.0)
-    floor_shear_p95: tuple[float, float] = (0.06, 0.15)
-    voxel_mm: tuple[float, float] = (2.0, 5.0)
+# Where a figure lowers the verdict: use with care, do not trust; one whose second limit is the lower has to lie above.
+# The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound registrations
+# at SNR 10 to 25 stay above 0.8 and failed ones below 0.6. Those of the voxels come from a warp of a knee with added
+# noise (slices of 4 mm: apparent maximal shear 0.1) and a leg's repeat scan (6 mm: 0.3). Unlikeness is what the
+# similarity lacks of the most that noise leaves: it reveals another person's foot. Offsets that rose to 7, 15 and 30 %
+# across a phantom's foot raised the error in fat by 2, 16 and 130 %, in skin by 27, 93 and 380 %.
+_LIMITS = {
+    "similarity": (0.7, 0.45),
+    "unlikeness": (0.05, 0.09),
+    "offset": (0.07, 0.12),
+    "voxel_mm": (2.0, 5.0),
+    "bone_shift_mm": (0.3, 0.8),
+    "bone_shear_p95": (0.1, 0.25),
+    "lowest_jacobian": (0.3, 0.0),
+    "undefined_fraction": (0.15, 0.4),
+    "landmark_error_mm": (1.0, 2.0),
+    "floor_shear_p95": (0.06, 0.15),
+}
+_REASONS = {
+    "similarity": "After registration the images agree poorly: local similarity {value:.2f} (care below {limit:.2f}).",
+    "unlikeness": "After registration the images are less alike than noise as strong as in the air would leave them: "
+    "local similarity lacks {value:.2f} (care above {limit:.2f}). Is it the same foot, scanned in the same way? "
+    "Parallel imaging and filters change the noise in the tissue.",
+    "offset": "The images' brightness differs by more than a factor: by an offset of {value:.0%} of the tissue's (care "
+    "above {limit:.0%}), which is taken for motion. Scan both in the same way, or take it out of the images.",
+    "voxel_mm": "Slices are {value:.1f} mm apart: strain across them is hardly seen, and strain is found where there "
+    "is none (care above {limit:.0f} mm). A repeat scan without load tells how much.",
+    "bone_shift_mm": "The bone, which is rigid, was deformed: {value:.2f} mm root mean square (care above "
+    "{limit:.2f}).",
+    "bone_shear_p95": "The bone, which is rigid, shows an apparent maximal shear of {value:.3f} (95th percentile; care "
+    "above {limit:.2f}).",
+    "lowest_jacobian": "Somewhere tissue is squeezed to {value:.2f} of its volume (care below {limit:.2f}).",
+    "undefined_fraction": "{value:.0%} of the tissue has no result: it is not shown by the loaded image or not covered "
+    "by the deformation (care above {limit:.0%}).",
+    "landmark_error_mm": "Landmarks are missed by {value:.2f} mm in the median (care above {limit:.2f}).",
+    "floor_shear_p95": "The repeat scan shows an apparent maximal shear of {value:.3f} (95th percentile) where there "
+    "is none (care above {limit:.3f}).",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,14 +62,11 @@ class Similarity:
     Attributes
     ----------
     found : (before, after rigid, after all)
-        Pooled local correlations (`dvc.images.similarity.local_correlation`).
-    possible : callable, optional
-        What noise, and a multiple of it, leaves of the last (`dvc.images.similarity.most_similarity`). What lacks is
-        not trusted where it is too much for half as much noise again.
-    offset : callable, optional
-        Between the registered images, as a share of brightness, at the noise and at a multiple of it
-        (`dvc.images.similarity.brightness_offset`). It is not trusted where it is too much for half as much noise
-        again.
+        Pooled local correlations (`dvc.local_correlation`).
+    possible, offset : callable, optional
+        Of a factor on the noise: what it leaves of the last correlation (`dvc.images.similarity.most_similarity`), and
+        the offset between the registered images as a share of brightness (`dvc.images.similarity.brightness_offset`).
+        A registration is not trusted where either is beyond its limit for half as much noise again, too.
     """
 
     found: tuple[float, float, float]
@@ -71,24 +83,21 @@ def assess(
     landmark_errors_mm: FloatArray | None = None,
     floor: NoiseFloor | None = None,
     in_bone: tuple[float, float] | None = None,
-    limits: Limits | None = None,
 ) -> Quality:
     """Judge a registration by its strain maps and the images' similarity.
 
     Parameters
     ----------
     bone : Mask or None
-        The bone that was aligned on: what moves in it is error. None where none was.
+        The bone that was aligned on: motion within it is error.
     similarity : Similarity, optional
         None where there are no images to compare.
     landmark_errors_mm : (n,), optional
         Distance between each registered and each given landmark; NaN where not defined.
-    floor : NoiseFloor, optional
     in_bone : (mm, shear), optional
         Where the maps hold the bone at rest: root mean square displacement and 95th percentile of the maximal shear
-        in it before that was asked.
+        in it before that was imposed.
     """
-    lines = limits or Limits()
     lowest, at = _lowest(maps.jacobian, maps.grid)
     known = int(np.count_nonzero(maps.valid & tissue.inside))
     bone_shift, bone_shear = _in_bone(maps, bone, in_bone)
@@ -113,10 +122,18 @@ def assess(
     if similarity is None:
         findings.append(Verdict("caution", ("No images were compared: the deformation is taken as it was given.",)))
     if quality.folded_voxels:
-        findings.append(_folding(quality))
+        place = ", ".join(f"{c:.1f}" for c in at)
+        folds = f"The deformation folds: det F <= 0 in {quality.folded_voxels} voxels, lowest {lowest:.2f} at LPS"
+        findings.append(Verdict("distrust", (f"{folds} ({place}) mm.",)))
     if similarity is not None:
-        findings += _unlike(similarity, quality, lines, float(maps.grid.spacing_mm.max()))
-    findings += _in_the_maps(quality, lines) + _beside_the_maps(quality, lines)
+        findings += _unlike(similarity, quality, float(maps.grid.spacing_mm.max()))
+    for figure in ("bone_shift_mm", "bone_shear_p95", "lowest_jacobian", "undefined_fraction"):
+        if np.isfinite(value := getattr(quality, figure)):
+            findings += _judged(figure, value)
+    if landmark_errors_mm is not None and np.isfinite(landmark_errors_mm).any():
+        findings += _judged("landmark_error_mm", float(np.nanmedian(landmark_errors_mm)))
+    if floor is not None:
+        findings += _judged("floor_shear_p95", floor.max_shear_p95)
     return replace(quality, verdict=together(findings))
 
 
@@ -135,6 +152,7 @@ def _in_bone(maps: StrainMaps, bone: Mask | None, told: tuple[float, float] | No
 
 
 def _lowest(jacobian: Float32Array, grid: Grid) -> tuple[float, tuple[float, float, float]]:
+    """Lowest det F, and the centre of its voxel, LPS mm."""
     if not np.isfinite(jacobian).any():
         return float("nan"), (float("nan"),) * 3
     index = np.unravel_index(int(np.nanargmin(jacobian)), jacobian.shape)
@@ -142,110 +160,27 @@ def _lowest(jacobian: Float32Array, grid: Grid) -> tuple[float, tuple[float, flo
     return float(jacobian[index]), (float(x), float(y), float(z))
 
 
-def _folding(quality: Quality) -> Verdict:
-    place = ", ".join(f"{c:.1f}" for c in quality.lowest_jacobian_at_mm)
-    return Verdict(
-        "distrust",
-        (
-            f"The deformation folds: det F <= 0 in {quality.folded_voxels} voxels, lowest "
-            f"{quality.lowest_jacobian:.2f} at LPS ({place}) mm.",
-        ),
-    )
-
-
-def _unlike(similarity: Similarity, quality: Quality, lines: Limits, slice_mm: float) -> list[Verdict]:
-    """What the images tell against the registration."""
+def _unlike(similarity: Similarity, quality: Quality, slice_mm: float) -> list[Verdict]:
+    """Findings from the images: their similarity, their brightness, and the distance of their slices (mm)."""
     _, rigid, after = similarity.found
-    findings = _below(
-        after,
-        lines.similarity,
-        "After registration the images agree poorly: local similarity {value:.2f} (care below {limit:.2f}).",
-    )
+    findings = _judged("similarity", after)
     if similarity.possible is not None:
-        care, distrust = lines.unlikeness
-        surely = similarity.possible(_MORE_NOISE) - after > distrust
-        findings += _above(
-            similarity.possible(1.0) - after,
-            (care, -np.inf if surely else np.inf),
-            "After registration the images are less alike than noise as strong as in the air would leave them: "
-            "local similarity lacks {value:.2f} (care above {limit:.2f}). Is it the same foot, scanned in the same "
-            "way? Parallel imaging and filters change the noise in the tissue.",
-        )
-    surely = _at(similarity.offset, _MORE_NOISE) > lines.offset[1]
-    findings += _above(
-        quality.offset,
-        (lines.offset[0], -np.inf if surely else np.inf),
-        "The images' brightness differs by more than a factor: by an offset of {value:.0%} of the tissue's (care "
-        "above {limit:.0%}), which is taken for motion. Scan both in the same way, or take it out of the images.",
-    )
-    findings += _above(
-        slice_mm,
-        lines.voxel_mm,
-        "Slices are {value:.1f} mm apart: strain across them is hardly seen, and strain is found where there is "
-        "none (care above {limit:.0f} mm). A repeat scan without load tells how much.",
-    )
+        surely = similarity.possible(_MORE_NOISE) - after > _LIMITS["unlikeness"][1]
+        findings += _judged("unlikeness", similarity.possible(1.0) - after, surely)
+    findings += _judged("offset", quality.offset, _at(similarity.offset, _MORE_NOISE) > _LIMITS["offset"][1])
+    findings += _judged("voxel_mm", slice_mm)
     if after < rigid - 0.01:
-        told = (
-            "The non-rigid registration made the images less alike: local similarity went from "
-            f"{rigid:.2f} to {after:.2f}."
-        )
-        findings.append(Verdict("distrust", (told,)))
+        told = "The non-rigid registration made the images less alike: local similarity went from"
+        findings.append(Verdict("distrust", (f"{told} {rigid:.2f} to {after:.2f}.",)))
     return findings
 
 
-def _in_the_maps(quality: Quality, lines: Limits) -> list[Verdict]:
-    """What bone, volume ratio and missing tissue tell against it."""
-    findings = _above(
-        quality.bone_shift_mm,
-        lines.bone_shift_mm,
-        "The bone, which is rigid, was deformed: {value:.2f} mm root mean square (care above {limit:.2f}).",
-    )
-    findings += _above(
-        quality.bone_shear_p95,
-        lines.bone_shear_p95,
-        "The bone, which is rigid, shows an apparent maximal shear of {value:.3f} (95th percentile; care "
-        "above {limit:.2f}).",
-    )
-    if np.isfinite(quality.lowest_jacobian):
-        findings += _below(
-            quality.lowest_jacobian,
-            lines.lowest_jacobian,
-            "Somewhere tissue is squeezed to {value:.2f} of its volume (care below {limit:.2f}).",
-        )
-    return findings + _above(
-        quality.undefined_fraction,
-        lines.undefined_fraction,
-        "{value:.0%} of the tissue has no result: it is not shown by the loaded image or not covered by the "
-        "deformation (care above {limit:.0%}).",
-    )
-
-
-def _beside_the_maps(quality: Quality, lines: Limits) -> list[Verdict]:
-    """What landmarks and a repeat scan tell against it."""
-    errors, floor, findings = quality.landmark_errors_mm, quality.noise_floor, list[Verdict]()
-    if errors is not None and np.isfinite(errors).any():
-        findings += _above(
-            float(np.nanmedian(errors)),
-            lines.landmark_error_mm,
-            "Landmarks are missed by {value:.2f} mm in the median (care above {limit:.2f}).",
-        )
-    if floor is not None:
-        findings += _above(
-            floor.shear_p95,
-            lines.floor_shear_p95,
-            "The repeat scan shows an apparent maximal shear of {value:.3f} (95th percentile) where there "
-            "is none (care above {limit:.3f}).",
-        )
-    return findings
-
-
-def _above(value: float, limits: tuple[float, float], sentence: str) -> list[Verdict]:
-    if not (np.isfinite(value) and value > limits[0]):
+def _judged(figure: str, value: float, distrusted: bool | None = None) -> list[Verdict]:
+    """A figure beside its limits: a finding, or none. ``distrusted``: decided by more than the second limit."""
+    care, distrust = _LIMITS[figure]
+    reason = _REASONS[figure].format(value=value, limit=care)
+    if care > distrust:  # not for NaN: a similarity that is not known counts as none
+        return [] if value >= care else [Verdict("caution" if value >= distrust else "distrust", (reason,))]
+    if not value > care:
         return []
-    return [Verdict("distrust" if value > limits[1] else "caution", (sentence.format(value=value, limit=limits[0]),))]
-
-
-def _below(value: float, limits: tuple[float, float], sentence: str) -> list[Verdict]:
-    if value >= limits[0]:  # NaN is judged too: no similarity could be found
-        return []
-    return [Verdict("caution" if value >= limits[1] else "distrust", (sentence.format(value=value, limit=limits[0]),))]
+    return [Verdict("distrust" if (value > distrust if distrusted is None else distrusted) else "caution", (reason,))]

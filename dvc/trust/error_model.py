@@ -1,6 +1,6 @@
-"""How sure a maximal shear is: bias and standard deviation measured on phantoms, and the intervals that follow.
+"""Uncertainty of a maximal shear: bias and standard deviation measured on phantoms, and the intervals that follow.
 
-An error model is made by an accuracy study of one registration preset: of voxels in which a shear m was found, by
+An error model is made by an accuracy study of one registration preset: of voxels in which a shear m was measured, by
 tissue and distance to bone, how far it lay from the truth on average (bias) and how much that varied (standard
 deviation), for each registration of the study and for all together. Given m, the truth is then about m - bias, with
 that deviation. This holds for tissue that is strained and imaged like the study's phantoms, and for no other.
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
@@ -19,8 +19,10 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.images.image import Grid
+from dvc.trust.quality import plain
 from dvc.trust.random_field import GaussianField
 from dvc.trust.regions import SHEAR_THRESHOLDS
 
@@ -36,27 +38,11 @@ _DRAWS = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorTable:
-    """Error of the maximal shear for one voxel size and noise.
+    """Error of the maximal shear for one voxel size and signal-to-noise ratio (`dvc.images.noise.signal_to_noise`).
 
-    Attributes
-    ----------
-    spacing_mm : (3,)
-        Of the voxels, mm.
-    snr : float
-        As `dvc.images.noise.signal_to_noise` finds it.
-    shear : (m,)
-        Values of the shear found, rising, at which bias and deviation are given; linear between, constant beyond.
-    to_bone_mm : (k,)
-        Lower ends of the bins of distance to bone, mm, rising from 0.
-    whole : mapping of tissue to (2, k, m)
-        Mean and standard deviation of found minus true shear, over all registrations of the study.
-    runs : tuple of mapping of tissue to (2, k, m)
-        The same of each registration alone: how errors differ from image to image.
-    correlation_mm : float
-        Distance at which the error's autocorrelation has fallen to 1/e, mm.
-    widening : float
-        Factor on intervals as they are drawn, by which 95 % of the tissues' figures lay in them when each heel of the
-        study was judged by the others; NaN where there was one heel alone, and intervals stay as drawn.
+    It is given at rising measured shears (m,), linear between and constant beyond, and for bins of distance to bone
+    whose lower ends (k,) rise from 0: mean and standard deviation (2, k, m) of measured minus true shear by tissue,
+    over the whole study and in each of its runs (registrations), since errors differ from image to image.
     """
 
     spacing_mm: FloatArray
@@ -65,7 +51,9 @@ class ErrorTable:
     to_bone_mm: FloatArray
     whole: Mapping[str, FloatArray]
     runs: tuple[Mapping[str, FloatArray], ...]
-    correlation_mm: float
+    correlation_mm: float  # distance at which the error's autocorrelation has fallen to 1/e
+    # Factor on intervals as drawn, by which 95 % of the tissues' figures lay in them when each heel of the study was
+    # judged by the others; NaN where there was one heel alone, and intervals stay as drawn.
     widening: float = float("nan")
 
     @property
@@ -76,47 +64,33 @@ class ErrorTable:
     def expected(
         self, tissue: str, shear: FloatArray, to_bone_mm: Float32Array, run: int | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Bias and standard deviation (n,) of shears (n,) found in a tissue at distances (n,) mm from bone.
+        """Bias and standard deviation (n,) of shears (n,) measured in a tissue at distances (n,) mm from bone.
 
         Over all registrations, or in the one numbered ``run``.
         """
         cells = self.whole if run is None else self.runs[run]
         rows = cells[tissue if tissue in cells else POOLED]
         bins = np.clip(np.searchsorted(self.to_bone_mm, to_bone_mm, side="right") - 1, 0, len(self.to_bone_mm) - 1)
-        bias, sd = np.empty(len(shear)), np.empty(len(shear))
-        for k in range(len(self.to_bone_mm)):
+        found = np.empty((2, len(shear)))
+        for k, (bias, sd) in enumerate(zip(*rows, strict=True)):
             here = bins == k
-            bias[here] = np.interp(shear[here], self.shear, rows[0, k])
-            sd[here] = np.interp(shear[here], self.shear, rows[1, k])
-        return bias, sd
+            found[:, here] = [np.interp(shear[here], self.shear, bias), np.interp(shear[here], self.shear, sd)]
+        return found[0], found[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorModel:
-    """Error tables of one preset, and what they were made from.
-
-    Attributes
-    ----------
-    preset : str
-    parameters_sha256 : str
-        Of the preset's text: other parameters under the same name have another error.
-    tables : tuple of ErrorTable
-    source : str
-        The study in a sentence.
-    """
+    """Error tables of one preset, what they were made from, and the study in a sentence (``source``)."""
 
     preset: str
-    parameters_sha256: str
+    parameters_sha256: str  # of the preset's text: other parameters under the same name have another error
     tables: tuple[ErrorTable, ...]
     source: str
 
     def table_for(self, spacing_mm: FloatArray, snr: float) -> ErrorTable:
-        """The table nearest to a voxel and a signal-to-noise ratio: edges, by size, and ratio within 1.6 times.
+        """The table nearest to a voxel (3,) mm and a signal-to-noise ratio: edges, by size, and ratio within 1.6 times.
 
-        Raises
-        ------
-        InputError
-            If none is that near; the message names those there are.
+        InputError if none is that near; the message names those there are.
         """
         edges = np.sort(spacing_mm)
 
@@ -137,48 +111,34 @@ class ErrorModel:
 
     def write(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""
-        from dvc.atomic_files import write_whole
 
-        def plain(cells: Mapping[str, FloatArray]) -> dict[str, object]:
+        def rounded(cells: Mapping[str, FloatArray]) -> dict[str, object]:
             return {tissue: np.round(rows, 4).tolist() for tissue, rows in cells.items()}
 
+        told = {name: getattr(self, name) for name in ("preset", "parameters_sha256", "source")}
         tables = [
             {
                 "spacing_mm": t.spacing_mm.tolist(),
                 "snr": t.snr,
                 "shear": t.shear.tolist(),
                 "to_bone_mm": t.to_bone_mm.tolist(),
-                "bias_and_sd": plain(t.whole),
-                "bias_and_sd_of_each_run": [plain(run) for run in t.runs],
+                "bias_and_sd": rounded(t.whole),
+                "bias_and_sd_of_each_run": [rounded(run) for run in t.runs],
                 "correlation_mm": t.correlation_mm,
-                "widening": t.widening if np.isfinite(t.widening) else None,
+                "widening": plain(t.widening),
             }
             for t in self.tables
         ]
-        told = {
-            "format": _FORMAT,
-            "preset": self.preset,
-            "parameters_sha256": self.parameters_sha256,
-            "source": self.source,
-            "tables": tables,
-        }
-        write_whole(path, json.dumps(told, allow_nan=False) + "\n")
+        write_whole(path, json.dumps({"format": _FORMAT, **told, "tables": tables}, allow_nan=False) + "\n")
 
 
 def read_error_model(path: Path | str) -> ErrorModel:
-    """Read what `ErrorModel.write` wrote.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is no error model.
-    """
+    """Read what `ErrorModel.write` wrote; InputError if the file cannot be read or is no error model."""
     try:
         return _parsed(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError, KeyError, TypeError) as failure:
-        raise InputError(
-            f"{path}: no error model as `mrstrain accuracy` writes it ({type(failure).__name__}: {failure})."
-        ) from failure
+        what = f"no error model as `mrstrain accuracy` writes it ({type(failure).__name__}: {failure})."
+        raise InputError(f"{path}: {what}") from failure
 
 
 def error_model_of(preset: str) -> ErrorModel | None:
@@ -197,14 +157,12 @@ def _parsed(text: str) -> ErrorModel:
 
     tables = tuple(
         ErrorTable(
-            np.asarray(t["spacing_mm"], dtype=np.float64),
-            float(t["snr"]),
-            np.asarray(t["shear"], dtype=np.float64),
-            np.asarray(t["to_bone_mm"], dtype=np.float64),
-            cells(t["bias_and_sd"]),
-            tuple(cells(run) for run in t["bias_and_sd_of_each_run"]),
-            float(t["correlation_mm"]),
-            float("nan") if t["widening"] is None else float(t["widening"]),
+            snr=float(t["snr"]),
+            whole=cells(t["bias_and_sd"]),
+            runs=tuple(cells(run) for run in t["bias_and_sd_of_each_run"]),
+            correlation_mm=float(t["correlation_mm"]),
+            widening=float("nan") if t["widening"] is None else float(t["widening"]),
+            **{name: np.asarray(t[name], dtype=np.float64) for name in ("spacing_mm", "shear", "to_bone_mm")},
         )
         for t in told["tables"]
     )
@@ -212,10 +170,12 @@ def _parsed(text: str) -> ErrorModel:
         raise ValueError(f"no table, or one without a row '{POOLED}'")
     for t in tables:
         shape = (2, len(t.to_bone_mm), len(t.shear))
-        numbers = [rows for cells_of in (t.whole, *t.runs) for rows in cells_of.values()]
-        if not t.runs or any(
-            rows.shape != shape or not np.isfinite(rows).all() or (rows[1] < 0).any() for rows in numbers
-        ):
+        sound = (
+            rows.shape == shape and np.isfinite(rows).all() and (rows[1] >= 0).all()
+            for cells_of in (t.whole, *t.runs)
+            for rows in cells_of.values()
+        )
+        if not (t.runs and all(sound)):
             raise ValueError(f"a table without runs, or whose figures are not {shape} finite numbers")
         rising = np.all(np.diff(t.shear) > 0) and np.all(np.diff(t.to_bone_mm) > 0)
         if not (rising and t.spacing_mm.shape == (3,) and min(*t.spacing_mm, t.snr, t.correlation_mm) > 0):
@@ -253,39 +213,21 @@ def to_surface_mm(body: BoolArray, spacing_mm: FloatArray) -> Float32Array:
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A figure of one tissue, and the interval in which the study's registrations would put the truth.
-
-    Attributes
-    ----------
-    region, figure : str
-        Such as "fat", "p95" or "volume_above_0.3_ml".
-    found : float
-        As measured.
-    estimate, low, high : float
-        Median of the truths drawn, and their 2.5th and 97.5th percentile moved away from it by `ErrorTable.widening`.
-    """
+    """A figure of one tissue, and the interval in which the study's registrations would put the truth."""
 
     region: str
-    figure: str
-    found: float
-    estimate: float
-    low: float
+    figure: str  # such as "p95" or "volume_above_0.3_ml"
+    found: float  # as measured
+    estimate: float  # median of the truths drawn
+    low: float  # their 2.5th and 97.5th percentile, moved away from the estimate by `ErrorTable.widening`
     high: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """Error of a strain map.
+    """Error of a strain map."""
 
-    Attributes
-    ----------
-    sigma : (ni, nj, nk)
-        Standard deviation of the maximal shear about its bias; NaN where not defined and outside the regions.
-    intervals : tuple of Interval
-    table : ErrorTable
-    """
-
-    sigma: Float32Array
+    sigma: Float32Array  # standard deviation (ni, nj, nk) of the maximal shear about its bias; NaN where not known
     intervals: tuple[Interval, ...]
     table: ErrorTable
 
@@ -301,80 +243,50 @@ def uncertainty_of(
     seed: int = 1,
     wider: Mapping[str, float] = MappingProxyType({}),
 ) -> Uncertainty:
-    """Error of a map of maximal shear by an error table.
+    """Error of a map of maximal shear (ni, nj, nk), NaN where not defined, by an error table.
 
-    Parameters
-    ----------
-    max_shear : (ni, nj, nk)
-        NaN where not defined.
-    grid : Grid
-    regions : mapping of name to (ni, nj, nk) bool
-        Soft tissues, each on the grid.
-    to_bone_mm : (ni, nj, nk)
-        Distance to bone, mm.
-    table : ErrorTable
-    thresholds : sequence of float
-        Strains for which the volume above is wanted.
-    seed : int
-        Of the draws.
-    wider : mapping of name to float
-        Factors on the deviation and the intervals of some regions, beside `ErrorTable.widening`.
+    For each of the soft tissues ``regions``, masks by name, at distances to bone (ni, nj, nk); its volumes are those
+    above ``thresholds``. Beside `ErrorTable.widening`, ``wider`` holds factors on the deviation and the intervals of
+    some regions.
 
-    Notes
-    -----
-    The truth is drawn 200 times: found shear, less the bias of one of the study's registrations, drawn anew each time,
-    less a Gaussian field of its standard deviation and of the table's correlation length; not below zero. The interval
-    of the draws is widened by a factor found on held-out heels (conformal prediction), so that it holds in 95 % of
+    The truth is drawn 200 times: measured shear, less the bias of one of the study's registrations, drawn anew each
+    time, less a Gaussian field of its standard deviation and of the table's correlation length; not below zero. The
+    interval of the draws is widened by a factor from held-out heels (conformal prediction), so that it holds in 95 % of
     cases like those of the study.
     """
     sigma = np.full(grid.shape, np.nan, dtype=np.float32)
-    intervals: list[Interval] = []
-    random = np.random.default_rng(seed)
+    intervals, random = list[Interval](), np.random.default_rng(seed)
+    names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]
     for name, inside in regions.items():
         where = inside & np.isfinite(max_shear)
         if not where.any():
             continue
-        _, sd = table.expected(name, max_shear[where].astype(np.float64), to_bone_mm[where])
-        factor = wider.get(name, 1.0)
-        sigma[where] = factor * sd
-        own = replace(table, widening=factor * table.factor)
-        intervals += _intervals(name, where, max_shear, to_bone_mm, grid, own, thresholds, random)
+        shear, factor = max_shear[where].astype(np.float64), wider.get(name, 1.0)
+        sigma[where] = factor * table.expected(name, shear, to_bone_mm[where])[1]
+        volume = shear.size * grid.voxel_volume_mm3 / 1000.0
+        lattice, step = _lattice(where)
+        kept = where[lattice]
+        found, distance = max_shear[lattice][kept].astype(np.float64), to_bone_mm[lattice][kept]
+        width = 0.5 * table.correlation_mm / (step * grid.spacing_mm)
+        noise = GaussianField(kept.shape, np.nonzero(kept), width, random)
+        expected = [table.expected(name, found, distance, run) for run in range(len(table.runs))]
+        drawn = []
+        for _ in range(_DRAWS):
+            bias, sd = expected[random.integers(len(expected))]
+            drawn.append(figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds))
+        low, middle, high = widened(np.array(drawn), factor * table.factor)
+        high[3:] = np.minimum(high[3:], volume)
+        each = zip(names, figures_of(shear, volume, thresholds), middle, low, high, strict=True)
+        intervals += [Interval(name, figure, *map(float, numbers)) for figure, *numbers in each]
     return Uncertainty(sigma, tuple(intervals), table)
 
 
-def _intervals(
-    name: str,
-    where: BoolArray,
-    max_shear: Float32Array,
-    to_bone_mm: Float32Array,
-    grid: Grid,
-    table: ErrorTable,
-    thresholds: Sequence[float],
-    random: np.random.Generator,
-) -> list[Interval]:
-    """Of one region, from draws on a lattice coarse enough to be quick."""
+def _lattice(where: BoolArray) -> tuple[tuple[slice, ...], int]:
+    """Every so many voxels of a mask's box, few enough for draws to be quick, or all where these miss the mask."""
     box = tuple(slice(int(a.min()), int(a.max()) + 1) for a in np.nonzero(where))
     step = max(1, int(np.ceil((np.count_nonzero(where) / _LATTICE) ** (1 / 3))))
     lattice = tuple(slice(b.start, b.stop, step) for b in box)
-    kept = where[lattice]
-    if not kept.any():
-        lattice, kept, step = box, where[box], 1
-    found = max_shear[lattice][kept].astype(np.float64)
-    volume = np.count_nonzero(where) * grid.voxel_volume_mm3 / 1000.0
-    noise = GaussianField(kept.shape, np.nonzero(kept), 0.5 * table.correlation_mm / (step * grid.spacing_mm), random)
-    expected = [table.expected(name, found, to_bone_mm[lattice][kept], run) for run in range(len(table.runs))]
-    drawn = np.empty((_DRAWS, 3 + len(thresholds)))
-    for draw in range(_DRAWS):
-        bias, sd = expected[random.integers(len(expected))]
-        drawn[draw] = figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds)
-    low, middle, high = widened(drawn, table.factor)
-    high[3:] = np.minimum(high[3:], volume)
-    measured = figures_of(max_shear[where].astype(np.float64), volume, thresholds)
-    names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]
-    return [
-        Interval(name, figure, float(m), float(e), float(a), float(b))
-        for figure, m, e, a, b in zip(names, measured, middle, low, high, strict=True)
-    ]
+    return (lattice, step) if where[lattice].any() else (box, 1)
 
 
 def figures_of(shear: FloatArray, volume_ml: float, thresholds: Sequence[float]) -> FloatArray:

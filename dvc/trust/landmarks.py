@@ -34,8 +34,9 @@ def read_landmarks(
     Parameters
     ----------
     path : path, or a pair of paths
-        A CSV file with the columns x0, y0, z0 (unloaded image), x1, y1, z1 (loaded image), in mm, and
-        optionally name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first.
+        A CSV file with the columns x0, y0, z0 (unloaded image), x1, y1, z1 (loaded image), in mm, and optionally
+        name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first. These are paired by name where both
+        hold the same names, each once, and in order (logged) where they share none; anything between is refused.
     frame : {"LPS", "RAS"}
         Frame of the CSV's coordinates. Slicer's files tell theirs.
 
@@ -52,11 +53,6 @@ def read_landmarks(
         If the frame or the kind of file is not one of those above, or two point lists do not match.
     ImageFileError
         If a file is missing or damaged, a column or number is missing, or its frame or unit is not known.
-
-    Notes
-    -----
-    Two Slicer lists are paired by name where both hold the same names, each once; where no name is in both,
-    they are paired in their order, which is logged. Anything between is refused.
     """
     if frame not in _TO_LPS:
         raise InputError(f"The frame of landmarks is LPS or RAS; got {frame!r}.")
@@ -68,7 +64,7 @@ def read_landmarks(
             f"{file}: landmark pairs are one CSV file, or two point lists of Slicer (.mrk.json, .fcsv) given "
             "together, the unloaded image's first."
         )
-    reference, deformed, names = [], [], []
+    pairs, names = [], []
     rows = csv.DictReader(_text(file).splitlines())
     header = [str(name).strip().casefold() for name in rows.fieldnames or []]
     missing = [name for name in _COLUMNS if name not in header]
@@ -79,14 +75,12 @@ def read_landmarks(
         )
     rows.fieldnames = header
     for count, row in enumerate(rows, start=1):
-        where = f"{file}, line {rows.line_num}"
-        values = [_number(where, name, row[name]) for name in _COLUMNS]
-        reference.append(values[:3])
-        deformed.append(values[3:])
+        pairs.append([_number(f"{file}, line {rows.line_num}", name, row[name]) for name in _COLUMNS])
         names.append((row.get("name") or str(count)).strip())
-    if not reference:
+    if not pairs:
         raise ImageFileError(f"{file} has no landmark below its header.")
-    return np.array(reference) * _TO_LPS[frame], np.array(deformed) * _TO_LPS[frame], tuple(names)
+    reference, deformed = np.split(np.array(pairs), 2, axis=1)
+    return reference * _TO_LPS[frame], deformed * _TO_LPS[frame], tuple(names)
 
 
 def target_registration_error(
@@ -97,21 +91,21 @@ def target_registration_error(
     Parameters
     ----------
     deformation : Deformation
-        The whole motion from the unloaded to the loaded image, the bone's motion included, since the
-        landmarks x lie in the loaded image as it was scanned.
+        The whole motion from the unloaded to the loaded image, the bone's included, since the landmarks x lie in the
+        loaded image as it was scanned.
     reference_mm, deformed_mm : (n, 3)
         Landmarks X in the unloaded and x in the loaded image, LPS mm.
 
     Returns
     -------
     (n,)
-        Error of each landmark, mm; NaN where the deformation is not defined. Count these in any summary: a
-        mean over the others alone looks better than the registration is.
+        mm; NaN where the deformation is not defined. Count these in any summary: a mean over the others alone looks
+        better than the registration is.
 
     Raises
     ------
     InputError
-        If the two sets have not the same shape (n, 3).
+        If the two sets do not have the same shape (n, 3).
 
     Examples
     --------
@@ -129,17 +123,16 @@ def target_registration_error(
 def _paired(first: Path, second: Path) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     reference, deformed = _slicer_points(first), _slicer_points(second)
     names, others = [name for name, _ in reference], [name for name, _ in deformed]
-    both = set(names) & set(others)
-    if len(set(names)) == len(names) and len(set(others)) == len(others) and set(names) == set(others):
+    if sorted(names) == sorted(others) and len(set(names)) == len(names):
         by_name = dict(deformed)
         deformed = [(name, by_name[name]) for name in names]
-    elif len(names) != len(others) or both:
+    elif len(names) != len(others) or set(names) & set(others):
         only = sorted(set(names) ^ set(others))
         repeated = sorted({name for some in (names, others) for name in some if some.count(name) > 1})
+        odd = f"in one file only: {', '.join(only) or 'none'}; repeated: {', '.join(repeated) or 'none'}"
         raise InputError(
             f"{first} holds {len(names)} points and {second} {len(others)}, and their names do not match one "
-            f"to one (in one file only: {', '.join(only) or 'none'}; repeated: "
-            f"{', '.join(repeated) or 'none'}). Give both lists the same names, each once."
+            f"to one ({odd}). Give both lists the same names, each once."
         )
     else:
         _log.warning("%s and %s share no name; their points are paired in order.", first, second)
@@ -147,13 +140,10 @@ def _paired(first: Path, second: Path) -> tuple[FloatArray, FloatArray, tuple[st
 
 
 def _slicer_points(path: Path) -> _Points:
-    if path.name.lower().endswith(".json"):
-        points = _from_markups(path)
-    elif path.suffix.lower() == ".fcsv":
-        points = _from_fcsv(path)
-    else:
+    read = {".json": _from_markups, ".fcsv": _from_fcsv}.get(path.suffix.lower())
+    if read is None:
         raise InputError(f"{path}: a point list of Slicer ends in .mrk.json or .fcsv.")
-    if not points:
+    if not (points := read(path)):
         raise ImageFileError(f"{path} holds no point.")
     return points
 
@@ -164,9 +154,8 @@ def _from_markups(path: Path) -> _Points:
         frame, unit = str(markup["coordinateSystem"]), markup.get("coordinateUnits", "mm")
         listed: list[dict[str, Any]] = list(markup["controlPoints"])
     except (ValueError, KeyError, TypeError) as error:
-        raise ImageFileError(
-            f"{path} is not a point list of Slicer with one list of points ({type(error).__name__}: {error})."
-        ) from error
+        what = f"is not a point list of Slicer with one list of points ({type(error).__name__}: {error})"
+        raise ImageFileError(f"{path} {what}.") from error
     if frame not in _TO_LPS or unit not in ("mm", ["mm", "UCUM"]):
         raise ImageFileError(f"{path}: coordinates must be LPS or RAS, in mm; the file says {frame}, {unit}.")
     points: _Points = []
@@ -183,26 +172,21 @@ def _from_markups(path: Path) -> _Points:
 
 
 def _from_fcsv(path: Path) -> _Points:
-    frame: str | None = None
-    columns: list[str] | None = None
+    lines = [(line, text) for line, text in enumerate(_text(path).splitlines(), start=1) if text.strip()]
+    head = [text.removeprefix("#").partition("=") for _, text in lines if text.startswith("#")]
+    header = {key.strip(): value.strip() for key, _, value in head}
+    frame = _FCSV_FRAMES.get(header.get("CoordinateSystem", ""))
+    columns = [name.strip() for name in header.get("columns", "").split(",")]
     points: _Points = []
-    for line, text in enumerate(_text(path).splitlines(), start=1):
-        key, _, value = text.removeprefix("#").partition("=")
+    for line, text in lines:
         if text.startswith("#"):
-            if key.strip() == "CoordinateSystem":
-                frame = _FCSV_FRAMES.get(value.strip())
-            elif key.strip() == "columns":
-                columns = [name.strip() for name in value.split(",")]
-        elif text.strip():
-            if frame is None or columns is None or not {"x", "y", "z"} <= set(columns):
-                raise ImageFileError(
-                    f"{path}: its header does not tell the frame (CoordinateSystem = LPS or RAS) and the "
-                    "columns. Save the list again in Slicer."
-                )
-            row = dict(zip(columns, next(csv.reader([text])), strict=False))
-            where = f"{path}, line {line}"
-            position = np.array([_number(where, axis, row.get(axis)) for axis in ("x", "y", "z")])
-            points.append((row.get("label") or str(len(points) + 1), position * _TO_LPS[frame]))
+            continue
+        if frame is None or not {"x", "y", "z"} <= set(columns):
+            what = "its header does not tell the frame (CoordinateSystem = LPS or RAS) and the columns"
+            raise ImageFileError(f"{path}: {what}. Save the list again in Slicer.")
+        row = dict(zip(columns, next(csv.reader([text])), strict=False))
+        position = np.array([_number(f"{path}, line {line}", axis, row.get(axis)) for axis in "xyz"])
+        points.append((row.get("label") or str(len(points) + 1), position * _TO_LPS[frame]))
     return points
 
 

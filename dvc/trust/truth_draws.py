@@ -1,4 +1,4 @@
-"""Truths that could lie behind a strain found at scattered points, such as the cells of a mesh."""
+"""Draws of the truth behind a strain measured at scattered points, such as the cells of a mesh."""
 
 from __future__ import annotations
 
@@ -16,17 +16,7 @@ _STEPS = 4  # of the lattice that noise is drawn on, within a correlation length
 class TruthDraws:
     """Draws of the truth, as `dvc.trust.error_model.uncertainty_of` makes them on a grid.
 
-    Parameters
-    ----------
-    points_mm : (n, 3)
-        Reference configuration, LPS mm.
-    shear : (n,)
-        Maximal shear found there.
-    tissue : (n,) str
-    to_bone_mm : (n,)
-        Distance to the surface of bone.
-    table : ErrorTable
-    seed : int
+    At points (n, 3) of the reference configuration, LPS mm: maximal shear (n,), tissue (n,), and distance to bone (n,).
     """
 
     def __init__(
@@ -43,7 +33,7 @@ class TruthDraws:
         names = self._names = np.asarray(tissue)
         self._expected = []
         for run in range(len(table.runs)):
-            bias, sd = np.empty(len(shear)), np.empty(len(shear))
+            bias, sd = np.empty((2, len(shear)))
             for name in np.unique(names):
                 here = names == name
                 bias[here], sd[here] = table.expected(str(name), shear[here], to_bone_mm[here], run)
@@ -54,15 +44,15 @@ class TruthDraws:
         self._noise = GaussianField(tuple(int(n) + 1 for n in index.max(axis=0)), tuple(index.T), width, self._random)
 
     def drawn(self) -> FloatArray:
-        """A truth (n,): shear found less a registration's bias, less a Gaussian field of its deviation; not below 0."""
+        """A truth (n,): the shear less a registration's bias, less a Gaussian field of its deviation; not below 0."""
         bias, sd = self._expected[self._random.integers(len(self._expected))]
         return np.maximum(self._shear - bias - sd * self._noise.drawn(), 0.0)
 
     def narrowed(self, truth: FloatArray) -> FloatArray:
-        """A truth drawn (n,) whose spread in each tissue is that of the found shear less the noise, not plus it.
+        """A truth drawn (n,) whose spread in each tissue is that of the measured shear less the noise, not plus it.
 
         About the tissue's mean m: m + (x - m) (1 - 2 s^2 / v)^(1/2), with v the variance of x and s^2 the mean square
-        of the noise's deviation, which is in x once as found and once as drawn; uniform where the noise could have made
+        of the noise's deviation, which is in x once as measured and once as drawn; uniform where noise could have made
         all of the spread.
         """
         noise = np.mean([sd**2 for _, sd in self._expected], axis=0)

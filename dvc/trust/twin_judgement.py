@@ -1,4 +1,4 @@
-"""Error bars judged by a pair whose strain is known: the twin of the very pair that they stand on."""
+"""Error bars judged by a pair whose strain is known: a synthetic warp of the very pair that they are for, its twin."""
 
 from __future__ import annotations
 
@@ -21,33 +21,19 @@ _FEW = 50
 class Judged:
     """How a tissue's maximal shear came back from the twin.
 
-    Attributes
-    ----------
-    region : str
-    rms_error, bias : float
-        Of the shear found in the twin less the twin's own, which is that measured.
-    held : float or None
-        Share of voxels whose error is under 1.96 sqrt(bias^2 + sd^2), of the bias and deviation that the error model
-        tells; None without an error model.
-    expected : float or None
-        Least share at which the error model is believed: of twenty registrations like those it was made from, one has
-        less; and never more than 0.95.
-    factor : float or None
-        By how much deviation and intervals have to be wider: where fewer voxels are held than expected, for 95 % of
-        them; and for the tissue's median, 90th and 95th percentile to come back no farther than the far end of their
-        intervals. At least 1.
-
-    Notes
-    -----
     The model's bias need not come back: noise lifts a shear, and the twin's own, having been measured, is lifted
-    already. So bias counts as part of the error that is claimed, whatever its sign.
+    already. So bias counts as part of the error that is claimed, whatever its sign. Without an error model there are no
+    claims.
     """
 
     region: str
-    rms_error: float
+    rms_error: float  # of the shear measured in the twin less the twin's own, which is that measured in the pair
     bias: float
-    held: float | None = None
+    held: float | None = None  # share of voxels whose error is under 1.96 sqrt(bias^2 + sd^2), as claimed
+    # Least share at which the claims are believed: of twenty registrations of the study, one has less; at most 0.95.
     expected: float | None = None
+    # At least 1: how much wider deviation and intervals have to be for 95 % of the voxels, where fewer are held than
+    # expected, and for median, 90th and 95th percentile to come back no farther than the far end of their intervals.
     factor: float | None = None
 
 
@@ -59,20 +45,11 @@ def judged(
     of_twin: Uncertainty | None = None,
     voxel_mm3: float = 1.0,
 ) -> tuple[Judged, ...]:
-    """Judge error bars by the maximal shear found in a pair whose true one is known.
+    """Judge error bars by the maximal shear measured ``again`` in a pair whose true one is known, (ni, nj, nk) or NaN.
 
-    Parameters
-    ----------
-    measured, again : (ni, nj, nk)
-        The true maximal shear, and that found; NaN where not defined.
-    regions : mapping of name to (ni, nj, nk) bool
-        Those with fewer than 50 voxels are not judged.
-    to_bone_mm : (ni, nj, nk), optional
-        Distance to bone, mm.
-    of_twin : Uncertainty, optional
-        What the error model says of the shear found, at the voxels where both are defined; neither where there is none.
-    voxel_mm3 : float
-        Volume of a voxel.
+    Regions (masks by name) of fewer than 50 voxels are not judged. ``of_twin`` is what the error model says of the
+    shear measured again, at the voxels where both are defined, with the distance to bone; without these two, or either,
+    errors alone are given.
     """
     rows = []
     for name, inside in regions.items():
@@ -96,12 +73,7 @@ def judged(
 
 
 def _believed(
-    name: str,
-    found: FloatArray,
-    to_bone_mm: Float32Array,
-    of_twin: Uncertainty,
-    claimed: FloatArray,
-    voxel_mm3: float,
+    name: str, found: FloatArray, to_bone_mm: Float32Array, of_twin: Uncertainty, claimed: FloatArray, voxel_mm3: float
 ) -> float:
     """The share of voxels that one in twenty registrations of the study would not reach."""
     table, shares = of_twin.table, []

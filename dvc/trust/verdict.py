@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -23,7 +23,7 @@ class Verdict:
     ----------
     level : {"trust", "caution", "distrust"}
     reasons : tuple of str
-        Full sentences; a "trust" may have none.
+        Full sentences; at least one below "trust".
 
     Raises
     ------
@@ -56,15 +56,10 @@ class Verdict:
 
 
 def worst(verdicts: Iterable[Verdict]) -> Verdict:
-    """Return the lowest level among verdicts, with the reasons of all at that level, each told once.
+    """The lowest level among verdicts, with the reasons of all at that level, each once.
 
-    Raises
-    ------
-    InputError
-        If there is no verdict: nothing judged is not the same as nothing wrong.
+    InputError where there is no verdict: nothing judged is not the same as nothing wrong.
 
-    Examples
-    --------
     >>> worst([Verdict("trust"), Verdict("distrust", ("It folds.",))])
     Verdict(level='distrust', reasons=('It folds.',))
     """
@@ -72,36 +67,15 @@ def worst(verdicts: Iterable[Verdict]) -> Verdict:
     if not given:
         raise InputError("There is no verdict to choose the worst of; judge at least one result first.")
     level = max((v.level for v in given), key=LEVELS.index)
-    reasons = dict.fromkeys(r for v in given if v.level == level for r in v.reasons)
-    return Verdict(level, tuple(reasons))
+    return Verdict(level, tuple(dict.fromkeys(r for v in given if v.level == level for r in v.reasons)))
 
 
 def together(findings: Iterable[Verdict]) -> Verdict:
-    """Return the lowest level among findings with the reasons of all, in their order; trust where there is none.
+    """The lowest level among findings with the reasons of all, in their order; trust where there is none.
 
-    Examples
-    --------
     >>> together([Verdict("distrust", ("It folds.",)), Verdict("caution", ("Slices are 4 mm apart.",))]).reasons
     ('It folds.', 'Slices are 4 mm apart.')
     """
     given = [Verdict("trust"), *findings]
     level = max((v.level for v in given), key=LEVELS.index)
     return Verdict(level, tuple(reason for v in given for reason in v.reasons))
-
-
-def verdict_on_loads(by_load: Mapping[str, Verdict], strange: Sequence[str] = ()) -> Verdict | None:
-    """The verdict on a comparison with measured loads: the worst of theirs, and of what is ``strange`` about models.
-
-    All reasons for less than trust are told, the worst first; trust is said to be in the measurement, and not in the
-    models. None where no load has a verdict and nothing is strange.
-    """
-    given = [Verdict("caution", tuple(strange))] if strange else []
-    for load, verdict in by_load.items():
-        what = "is not to be trusted" if verdict.level == "distrust" else "is to be used with care"
-        told = tuple(f"{load}: its registration {what}: {reason}" for reason in verdict.reasons)
-        given.append(Verdict(verdict.level, () if verdict.level == "trust" else told))
-    if not given:
-        return None
-    reasons = {level: [r for v in given if v.level == level for r in v.reasons] for level in ("distrust", "caution")}
-    sound = f"The measurement: {len(given)} registrations are sound. The models are judged below."
-    return Verdict(worst(given).level, (*reasons["distrust"], *reasons["caution"]) or (sound,))

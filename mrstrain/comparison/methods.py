@@ -10,7 +10,7 @@ from typing import Any
 from dvc.io.images.read import format_of
 from dvc.io.result_folder import PROVENANCE, QUALITY
 from dvc.registration.engines import methods_of
-from dvc.report.viewer import NIIVUE
+from dvc.report.page import NIIVUE
 from fe import LoadStep
 from mrstrain.records.provenance import versions
 from validate import Comparison, Criteria

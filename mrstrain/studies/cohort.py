@@ -12,7 +12,7 @@ import numpy as np
 from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError
 from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
-from dvc.report.page import Picture, Section, Table, caption_of, record_lines, write_report
+from dvc.report.page import Picture, Section, Table, record_lines, write_report
 from dvc.trust.verdict import worst
 from mrstrain.records.inputs import make_output
 from mrstrain.records.progress import OnProgress
@@ -228,7 +228,7 @@ def _write_page(
         ("subject", *order),
         tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in names),
     )
-    drawn = Picture("Distribution over subjects", caption_of(over_subjects), over_subjects(shares, order))
+    drawn = Picture.drawn("Distribution over subjects", over_subjects, shares, order)
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for one in ran:
         failed = [f"{o.stage}: {o.status}. {o.reason}" for o in one.outcomes.values() if o.record is None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from dvc.report.page import Picture, Section, Table, caption_of, record_lines, write_report
+from dvc.report.page import Picture, Section, Table, record_lines, write_report
 from dvc.trust.error_model import POOLED
 from phantoms import CoverageRow, ErrorRow, FloorRow, ResolutionRow, figures, wavelength_recovered
 
@@ -87,9 +87,7 @@ def _condition_section(
             )
         )
     pictures = tuple(
-        Picture(
-            f"Error by {by.split(',')[0]}", caption_of(figures.errors_by_place), figures.errors_by_place(errors, by)
-        )
+        Picture.drawn(f"Error by {by.split(',')[0]}", figures.errors_by_place, errors, by)
         for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
     )
     return Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tuple(tables), pictures=pictures)
@@ -127,10 +125,8 @@ def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow
         preset, voxel, snr = condition
         table_rows.append((preset, f"{voxel} mm", snr, *wavelengths, *noise))
     columns = ("preset", "voxel", "SNR", "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
-    pictures = [Picture("Spatial resolution", caption_of(figures.resolution), figures.resolution(rows))]
+    pictures = [Picture.drawn("Spatial resolution", figures.resolution, rows)]
     if floors:
-        pictures.append(
-            Picture("Noise against resolution", caption_of(figures.trade_off), figures.trade_off(floors, rows, POOLED))
-        )
+        pictures.append(Picture.drawn("Noise against resolution", figures.trade_off, floors, rows, POOLED))
     table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows))
     return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))

@@ -72,7 +72,7 @@ def test_arrays_in_and_arrays_out(measured, tiny_pair):
     assert np.corrcoef(measured.max_shear[fat], truth[fat])[0, 1] > 0.7
     moved = measured.bone_motion.displacement(tiny_pair.bone.points())
     np.testing.assert_allclose(moved, tiny_pair.foot_motion.displacement(tiny_pair.bone.points()), atol=0.6)
-    assert measured.quality.noise_floor.shear_p95 > 0.0
+    assert measured.quality.noise_floor.max_shear_p95 > 0.0
     assert measured.sigma is not None
     assert {i.region for i in measured.intervals} >= {"fat", "muscle"}
     assert str(measured).startswith(f"Load1: {measured.verdict.words}.\n")

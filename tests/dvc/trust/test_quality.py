@@ -189,7 +189,7 @@ def test_noise_floor_is_the_mean_and_spread_of_the_mean_absolute_component():
     floor = noise_floor(maps, core().inside)
     assert floor.maer == pytest.approx((1.2**2 - 1) / 2 / 6, rel=1e-6)
     assert floor.sder == pytest.approx(0.0, abs=1e-7)
-    assert floor.shear_p95 == pytest.approx((1.2**2 - 1) / 4, rel=1e-6)
+    assert floor.max_shear_p95 == pytest.approx((1.2**2 - 1) / 4, rel=1e-6)
 
 
 def test_local_correlation_of_an_image_with_itself_is_one_and_is_blind_to_gain():
