@@ -1,24 +1,23 @@
 """Tetrahedra for nearly incompressible tissue: displacement and pressure are two fields (mixed elements).
 
-The weak form, with W(F) the isochoric part of the law, K the bulk modulus and p the pressure (positive in tension), is
-stationary at the solution of
+The weak form, with W(F) the isochoric part of the material law, K the bulk modulus and p the pressure (positive in
+tension), is stationary at the solution of
 
     integral W(F) + p (J - 1) - p^2 / (2 K) dX  -  work of the forces,
 
-which for p = K (J - 1) is the law itself. Pressure is linear in each tetrahedron and continuous within a tissue, and
-may jump from one tissue to the next. Three choices of displacement:
+which for p = K (J - 1) is the material law itself. Pressure is linear in each tetrahedron and continuous within a
+tissue, and may jump from one tissue to the next. Three choices of displacement:
 
 - ``P1``: linear. Alone it is unstable; S = tau / mu0 (M - Mbar) is subtracted, in which M is the pressure's mass matrix
   and Mbar that of its mean in the cell (Bochev, Dohrmann, Gunzburger 2006, doi:10.1137/S0036142905444482). A small part
-  of the bulk modulus, c mu0, acts in each cell on its own, and only the rest through the pressure: the law is the same,
-  and single cells scatter less.
+  of the bulk modulus, c mu0, acts in each cell on its own, and only the rest through the pressure: the material law is
+  the same, and single cells scatter less.
 - ``MINI``: linear and a quartic bubble (Arnold, Brezzi, Fortin 1984, doi:10.1007/BF02576171); stable.
-- ``P2``: quadratic (Taylor, Hood 1973); stable, second order in the strain, and dear.
+- ``P2``: quadratic (Taylor, Hood 1973); stable, second order in the strain, and expensive.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -31,7 +30,6 @@ DESCRIPTIONS = {
     "MINI": "linear tetrahedra with a bubble, displacement and pressure",
     "P2": "quadratic tetrahedra with straight edges, linear pressure (Taylor-Hood)",
 }
-"""What each element is, in words."""
 
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 """Corners of a quadratic tetrahedron's edges, in the order of its nodes 4 to 9."""
@@ -39,53 +37,24 @@ EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Element:
-    """A mixed tetrahedron, tabulated at its quadrature points.
-
-    Attributes
-    ----------
-    name : str
-    weights : (q,)
-        Share of the cell's volume that each quadrature point stands for; their sum is 1.
-    gradients : (q, a, 3)
-        Of the a displacement functions, with respect to the reference coordinates (those of nodes 1, 2 and 3).
-    pressure : (q, 4)
-        The pressure's functions.
-    stabilisation : float
-        tau, no unit; 0 where the element needs none.
-    own_volume : float
-        c, no unit.
-    """
+    """A mixed tetrahedron, tabulated at its q quadrature points, with a displacement functions."""
 
     name: str
-    weights: FloatArray
-    gradients: FloatArray
-    pressure: FloatArray
-    stabilisation: float = 0.0
-    own_volume: float = 0.0
-
-    @property
-    def nodes(self) -> int:
-        """Displacement functions in a cell."""
-        return int(self.gradients.shape[1])
+    weights: FloatArray  # (q,) shares of the cell's volume
+    gradients: FloatArray  # (q, a, 3) of the displacement functions, by the reference coordinates (nodes 1, 2 and 3)
+    pressure: FloatArray  # (q, 4) pressure functions
+    stabilisation: float = 0.0  # tau, no unit; 0 where the element needs none
+    own_volume: float = 0.0  # c, no unit
 
 
 def element(name: str, stabilisation: float = 0.5, own_volume: float = 1.0) -> Element:
-    """An element by its name: P1, MINI or P2.
-
-    Parameters
-    ----------
-    stabilisation : float
-        tau of P1.
-    own_volume : float
-        c of P1.
-    """
+    """An element by its name, P1, MINI or P2; ``stabilisation`` and ``own_volume`` are tau and c of P1."""
     if name not in _MADE:
         raise InputError(f"No element '{name}'; there are {', '.join(_MADE)}.")
     barycentric, weights = _MADE[name][1]
     gradients = np.array([_MADE[name][0](b) for b in barycentric])
-    return Element(
-        name, weights, gradients, barycentric, *((stabilisation, own_volume) if name == "P1" else (0.0, 0.0))
-    )
+    of_p1 = (stabilisation, own_volume) if name == "P1" else ()
+    return Element(name, weights, gradients, barycentric, *of_p1)
 
 
 _LINEAR = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -139,27 +108,15 @@ _MADE = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Space:
-    """Where the unknowns of a mesh lie.
+    """Where the unknowns of a mesh lie."""
 
-    Attributes
-    ----------
-    nodes_mm : (n, 3)
-        Reference position of each displacement node; a bubble's is its cell's centroid.
-    cells : (m, a)
-        Displacement nodes of each cell, the mesh's own four first.
-    pressure_cells : (m, 4)
-        Pressure unknowns at the corners of each cell.
-    pressures : int
-        Their number.
-    """
-
-    nodes_mm: FloatArray
-    cells: IntArray
-    pressure_cells: IntArray
-    pressures: int
+    nodes_mm: FloatArray  # (n, 3) reference positions of the displacement nodes; a bubble's is its cell's centroid
+    cells: IntArray  # (m, a) displacement nodes, the mesh's own four first
+    pressure_cells: IntArray  # (m, 4) pressure unknowns at the corners
+    pressures: int  # their number
 
     @classmethod
-    def on(cls, mesh: TetMesh, kind: str, tissue: IntArray) -> Space:
+    def on(cls, mesh: TetMesh, kind: str, tissue: IntArray) -> Self:
         """The space of an element on a mesh; ``tissue`` (m,) numbers the cells between which pressure may jump."""
         points, cells = mesh.points_mm, mesh.cells
         if kind == "P2":

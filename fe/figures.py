@@ -1,7 +1,5 @@
 """Figures of the finite-element side; what a figure's docstring says is its caption."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,9 +40,9 @@ def write_figure(path: Path, figure: Figure) -> None:
 
 
 def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> Figure:
-    """Measured nominal stress (points) and the fitted law (lines), by kind of test.
+    """Measured nominal stress (points) and the fitted material law (lines), by kind of test.
 
-    The line is dashed where Drucker's condition fails: a simulation that gets there is not to be trusted.
+    The line is dashed where Drucker's condition fails: simulations that reach this range are unreliable.
     """
     figure, (axes,) = chart()
     for number, curve in enumerate(curves):
@@ -68,19 +66,17 @@ def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> Figure:
 def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
     """Maximum shear strain on the slice through the bone's lowest point, along the plate's normal and the shear.
 
-    Those of the first load, where loads have directions of their own. Cells are cut in the unloaded configuration and
-    drawn where they are under load; the dashed line is the plate. The colours end where a hundredth of the volume is
-    above, over all loads.
+    The directions are those of the first load, where loads have their own. Cells are cut in the unloaded configuration
+    and drawn where they are under load; the dashed line is the plate. The colour scale ends at the 99th percentile of
+    the volume, over all loads.
     """
     axes = states[0].plate_axes
     assert axes is not None
     panels, middle = [], _lowest_bone_point(mesh, axes)
     for state in states:
-        load = state.load
         part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%})"
-        title = f"{load.name}: {load}{part}"
-        along = _along_plate(mesh, state, axes, middle)
-        panels.append(Slice(title, state.u_mm, state.strain.max_shear, along))
+        title = f"{state.load.name}: {state.load}{part}"
+        panels.append(Slice(title, state.u_mm, state.strain.max_shear, _along_plate(mesh, state, axes, middle)))
     return slice_sheet(mesh, panels, axes, middle)
 
 
@@ -100,36 +96,20 @@ def _along_plate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slice:
-    """A field on a mesh, to be drawn on a slice.
-
-    Attributes
-    ----------
-    title : str
-    u_mm : (n, 3)
-        Displacement of the mesh's nodes, LPS mm: cells are drawn where it puts them.
-    max_shear : (m,)
-        Of the cells; where it is NaN, a cell is drawn grey.
-    face : tuple of float, optional
-        A plate, drawn as a dashed line: height along the normal force where the shear's coordinate is 0, and slope.
-    """
+    """A field on a mesh, to be drawn on a slice; a plate's ``face`` is a dashed line."""
 
     title: str
-    u_mm: FloatArray
-    max_shear: FloatArray
-    face: tuple[float, float] | None = None
+    u_mm: FloatArray  # (n, 3) displacement of the mesh's nodes, LPS: cells are drawn where it puts them
+    max_shear: FloatArray  # (m,) of the cells; one with NaN is drawn grey
+    face: tuple[float, float] | None = None  # height along the normal force where the shear's coordinate is 0; slope
 
 
 def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> Figure:
-    """Fields on one slice, in one colour scale that ends where a hundredth of the volume is above.
+    """Fields on one slice, in one colour scale that ends at the 99th percentile of the volume.
 
-    Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
-
-    Parameters
-    ----------
-    axes : (3, 3)
-        The plate's: columns are the directions of the normal force, of shear, and their cross product, LPS.
-    point_mm : (3,)
-        On the slice, reference configuration, LPS mm.
+    Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left. ``axes`` (3,
+    3) are the plate's: columns are the directions of the normal force, of shear, and their cross product, LPS.
+    ``point_mm`` (3,) lies on the slice, reference configuration, LPS mm.
     """
     cuts = [cut(mesh, panel.u_mm, axes, point_mm) for panel in panels]
     corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
@@ -177,22 +157,10 @@ def _lowest_bone_point(mesh: TetMesh, axes: FloatArray) -> FloatArray:
 
 
 def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray) -> tuple[IntArray, list[FloatArray]]:
-    """Cells that the plane of the plate's first two axes cuts, and each one's polygon where it is under load.
+    """Cells (k,) cut by the plane of the plate's first two axes, and each one's polygon (3 or 4, 2) under load.
 
-    Parameters
-    ----------
-    u_mm : (n, 3)
-        Displacement of the mesh's nodes, LPS mm.
-    axes : (3, 3)
-        The plate's, columns, LPS.
-    point_mm : (3,)
-        On the plane, reference configuration, LPS mm.
-
-    Returns
-    -------
-    cells : (k,)
-    polygons : list of (3 or 4, 2)
-        Along shear and normal force, mm.
+    Polygons are along shear and normal force, mm; ``u_mm`` (n, 3) is the displacement of the mesh's nodes, LPS; the
+    rest as in `slice_sheet`.
     """
     height = (mesh.points_mm - point_mm) @ axes[:, 2]
     height = np.where(height == 0.0, 1e-9, height)
@@ -243,9 +211,9 @@ def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
 
 
 def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[float], Limit]]) -> Figure:
-    """Figures relative to what they tend to, over the size of the cells (cube root of their mean volume).
+    """Quantities relative to their limits, over the size of the cells (cube root of their mean volume).
 
-    A figure that does not depend on the mesh any more lies on the grey line.
+    One that no longer depends on the mesh lies on the grey line.
     """
     figure, (axes,) = chart()
     for number, (name, (values, limit)) in enumerate(curves.items()):

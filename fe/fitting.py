@@ -1,6 +1,4 @@
-"""Parameters of a law from stretch-stress curves, with confidence intervals."""
-
-from __future__ import annotations
+"""Parameters of a material law from stretch-stress curves, with confidence intervals."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -18,35 +16,28 @@ from fe.stress_curves import Curve
 
 _EXPONENTS = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # starts of an Ogden fit
 _MOSTLY = 0.8
-_MOST = 60.0  # an exponent beyond this is not one that a curve can tell
-_SOFTEST = 1e-3  # least C10 of a polynomial law, of that of the neo-Hookean law that suits the same curves best
-_ABSURD = 1e-4  # curves of a law with a positive modulus are refused less often than this
+_MOST = 60.0  # no curve determines an exponent beyond this
+_SOFTEST = 1e-3  # least C10 of a polynomial, relative to that of the neo-Hookean model that fits the curves best
+_ABSURD = 1e-4  # curves of a material with a positive modulus are refused less often than this
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A fitted number and the interval that holds it with 95 % confidence.
-
-    Attributes
-    ----------
-    at_bound : bool
-        Whether the curves alone would have it lower than a law may have it, so that ``value`` is the bound.
-    """
+    """A fitted number and its 95 % confidence interval."""
 
     name: str
     value: float
     low: float
     high: float
-    at_bound: bool = False
+    at_bound: bool = False  # the curves alone would have it below what a material law may have: ``value`` is the bound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A law fitted to curves.
+    """A material law fitted to curves.
 
     Attributes
     ----------
-    material : Material
     parameters : tuple of Parameter
         Moduli in MPa; an Ogden term's ``mu`` is its initial shear modulus.
     r2 : mapping of mode to float
@@ -54,9 +45,9 @@ class Fit:
     rmse_mpa : float
         Of the nominal stress over all points.
     others : tuple of Material
-        Laws of the same form that these curves cannot tell from this one.
+        Material laws of the same form that fit these curves equally well.
     stable : mapping of mode to (float, float)
-        Stretches between which the law is stable, of 1/5 to 5 (`Material.stable_range`).
+        Stretches between which the material law is stable, of 1/5 to 5 (`Material.stable_range`).
     reached : mapping of mode to (float, float)
         Least and greatest stretch of the curves.
     """
@@ -71,13 +62,13 @@ class Fit:
 
     @property
     def stable_where_measured(self) -> bool:
-        """Whether the law is stable at every stretch of the curves."""
+        """Whether the material law is stable at every stretch of the curves."""
         return all(self.stable[m][0] <= low and high <= self.stable[m][1] for m, (low, high) in self.reached.items())
 
 
 @dataclass(frozen=True, slots=True)
 class _Law:
-    """A law as the fit sees it: names of its parameters, their vector, the material, and first guesses."""
+    """A material law as the fit sees it: names of its parameters, their vector, and the material."""
 
     names: tuple[str, ...]
     vector: Callable[[FloatArray], FloatArray]
@@ -117,7 +108,7 @@ LAWS: Mapping[str, _Law] = {
     "Ogden-3": _ogden(3),
     "Hencky": _Law(("mu",), lambda v: v[0] * np.eye(1, OGDEN, HENCKY)[0], lambda v, nu: Hencky.of(float(v[0]), nu)),
 }
-"""Laws that can be fitted. Isihara's is Yeoh's without C30."""
+"""Material laws that can be fitted. Isihara's is Yeoh's without C30."""
 
 
 def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
@@ -202,7 +193,7 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
 
 
 def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[Curve]]:
-    """The law of that name, and the curves, one for each kind of test; or why they cannot be used."""
+    """The material law of that name, and one curve for each kind of test; or why they cannot be used."""
     named = {name.lower(): name for name in LAWS}
     if law.lower() not in named:
         raise InputError(f"No law '{law}' to fit; there are {', '.join(LAWS)}.")
@@ -210,8 +201,9 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
         raise InputError(f"Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {nu:g}.")
     sought, curves = LAWS[named[law.lower()]], _by_mode(curves)
     count = len(sought.names)
-    stress = np.concatenate([c.stress_mpa for c in curves]) if curves else np.empty(0)
-    stretch = np.concatenate([c.stretch for c in curves]) if curves else np.empty(0)
+    stress, stretch = (
+        np.concatenate([np.empty(0), *(getattr(c, part) for c in curves)]) for part in ("stress_mpa", "stretch")
+    )
     apart = len(np.unique(np.round(stretch[np.abs(stretch - 1.0) > 1e-6], 9)))
     if len(stress) < count + 2 or apart < count:
         raise InputError(
@@ -239,7 +231,9 @@ def _with_intervals(
         absurd = values[0] + student.isf(_ABSURD, freedom) * deviations[0] <= 0.0
         if values[0] <= widths[0] and not absurd:  # zero is in its interval: the curves leave it open
             size = float(np.sqrt(np.mean(stress**2)))
-            values = _not_softer(values, _softest(curves), best.jac * size, stress)
+            unit = np.concatenate([nominal_stress(np.eye(OGDEN)[0], c.stretch, c.mode) for c in curves])
+            softest = _SOFTEST * float(unit @ stress / (unit @ unit))  # not above 0 where no positive modulus fits
+            values = _not_softer(values, softest, best.jac * size, stress)
         least[0] = 0.0
     low, high = np.maximum(np.minimum(values, best.x) - widths, least), np.maximum(values, best.x) + widths
     at_bound = (least > -np.inf) & (values > best.x)
@@ -250,7 +244,7 @@ def _with_intervals(
 
 
 def _r2(curves: Sequence[Curve], residual: FloatArray) -> dict[str, float]:
-    """Share of the stress' variance that the law explains, by kind of test."""
+    """Share of the stress' variance that the material law explains, by kind of test."""
     r2, ends = {}, np.cumsum([0, *(len(c.stress_mpa) for c in curves)])
     for curve, first, last in zip(curves, ends, ends[1:], strict=False):
         spread = float(((curve.stress_mpa - curve.stress_mpa.mean()) ** 2).sum())
@@ -284,7 +278,7 @@ def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: Flo
 def _chosen(
     law: _Law, optima: Sequence[OptimizeResult], points: int
 ) -> tuple[OptimizeResult, tuple[OptimizeResult, ...]]:
-    """The optimum to report, and those that the data do not tell from it."""
+    """The optimum to report, and those that the data do not distinguish from it."""
     ranked = sorted(optima, key=lambda o: o.cost)
     freedom = points - len(law.names)
     limit = ranked[0].cost * (1.0 + fisher.ppf(0.95, 1, freedom) / freedom)
@@ -299,12 +293,6 @@ def _chosen(
     return different[0], tuple(different[1:])
 
 
-def _softest(curves: Sequence[Curve]) -> float:
-    """The least C10 of a fit to these curves, MPa; not above 0 where they give no positive modulus at all."""
-    unit = np.concatenate([nominal_stress(np.array([1.0, 0.0, 0.0, 0.0]), c.stretch, c.mode) for c in curves])
-    return _SOFTEST * float(unit @ np.concatenate([c.stress_mpa for c in curves]) / (unit @ unit))
-
-
 def _not_softer(values: FloatArray, least: float, columns: FloatArray, stress: FloatArray) -> FloatArray:
     """The best values with the first ``least`` or more; ``columns`` times the values is the stress."""
     if values[0] >= least:
@@ -314,7 +302,7 @@ def _not_softer(values: FloatArray, least: float, columns: FloatArray, stress: F
 
 
 def _deviations(values: FloatArray, jacobian: FloatArray, residual: FloatArray) -> FloatArray | None:
-    """Standard deviations of the values; None where the parameters cannot be told apart."""
+    """Standard deviations of the values; None where the curves do not determine them."""
     scaled = jacobian * np.maximum(np.abs(values), 1e-300)
     lengths = np.linalg.norm(scaled, axis=0)
     if not (lengths > 0.0).all():

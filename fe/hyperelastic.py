@@ -16,8 +16,6 @@ frame only the components (R. W. Ogden, Non-Linear Elastic Deformations, 1984, s
     A_ijij + A_ijji = (W_i - W_j) / (s_i - s_j),   A_ijij - A_ijji = (W_i + W_j) / (s_i + s_j),   i != j.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 
@@ -26,18 +24,13 @@ from dvc.arrays import FloatArray
 POLYNOMIAL, HENCKY, OGDEN = 0, 3, 4
 """Where a law's vector holds C10; mu_H; and its first Ogden pair."""
 
-_EQUAL = (
-    1e-5  # principal stretches nearer than this, relatively: the quotient is replaced by its limit, in error by 1e-10
-)
+_EQUAL = 1e-5  # relative distance of principal stretches below which the quotient's limit is used, in error by 1e-10
 _SWEEPS = 30
 
 
 @njit(cache=True, error_model="numpy")
 def isochoric(law: FloatArray, e: FloatArray, slope: FloatArray, curvature: FloatArray) -> float:
-    """Wbar (MPa) at logarithmic stretches ``e`` (3,), with its derivatives by e.
-
-    Written: ``slope`` (3,), the deviatoric principal Kirchhoff stresses, and ``curvature`` (3, 3).
-    """
+    """Wbar (MPa) at logarithmic stretches ``e`` (3,); its derivatives go to ``slope`` (3,), ``curvature`` (3, 3)."""
     mean = (e[0] + e[1] + e[2]) / 3.0
     energy, invariant = 0.0, 0.0
     curvature[:, :] = 0.0
@@ -148,21 +141,13 @@ def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) 
 
 @njit(cache=True, error_model="numpy")
 def principal_response(
-    law: FloatArray,
-    s: FloatArray,
-    J: float,
-    p: float,
-    bulk: float,
-    stress: FloatArray,
-    direct: FloatArray,
-    swapped: FloatArray,
-) -> float:
+    law: FloatArray, s: FloatArray, J: float, p: float, bulk: float,
+    stress: FloatArray, direct: FloatArray, swapped: FloatArray,
+) -> float:  # fmt: skip
     """W(F, p) in MPa at principal stretches ``s`` (3,), with its stress and tangent in the principal frame.
 
-    ``bulk`` is dp/dJ (MPa), 0 for a pressure that is a field of its own.
-
-    Written: ``stress`` (3,) = W_i; ``direct`` (3, 3) with A_ijij, A_iiii on its diagonal; ``swapped`` (3, 3, 2) with
-    A_iijj first and A_ijji second, i != j.
+    ``bulk`` is dp/dJ (MPa), 0 for a pressure that is a field of its own. Written: ``stress`` (3,) = W_i; ``direct`` (3,
+    3) with A_ijij, A_iiii on its diagonal; ``swapped`` (3, 3, 2) with A_iijj first and A_ijji second, i != j.
     """
     e, slope, curvature = np.empty(3), np.empty(3), np.empty((3, 3))
     for i in range(3):

@@ -1,7 +1,5 @@
 """A plate pressed against tissue: from one converged increment to the next, in steps as large as converge."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -16,7 +14,7 @@ from fe.elements import edges_of
 from fe.linear import Solver
 from fe.load_step import PlateTarget
 from fe.model import Model
-from fe.newton import Converged, Imposed, Tolerance, equilibrium
+from fe.newton import Imposed, Tolerance, equilibrium
 from fe.plate import Contact, ContactStatus
 from fe.plate_rotation import Parallel, Turning
 from fe.problem import Problem
@@ -24,7 +22,7 @@ from fe.surface_sets import SKIN
 
 _FIRST_STEP = 0.25
 _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
-_TIPPING = 0.5  # of how far a plate was in when it was level: it sinks in when it is let go
+_TIPPING = 0.5  # of a level plate's indentation: one that is released sinks in further
 _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
@@ -65,44 +63,19 @@ class PlateState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Increment:
-    """A converged increment, with all that it takes to go on from it.
+    """A converged increment, with all that it takes to go on from it."""
 
-    Attributes
-    ----------
-    unknowns : (unknowns,)
-        Displacements, along the plate's axes, and pressures.
-    plate : PlateState
-    contact : ContactStatus
-    """
-
-    unknowns: FloatArray
+    unknowns: FloatArray  # displacements along the plate's axes, and pressures
     plate: PlateState
     contact: ContactStatus
 
 
 class LoadPath:
-    """The body under a load that grows, increment by increment; vectors along the plate's axes.
+    """The body under a growing load, increment by increment; vectors along the plate's axes, ``mesh`` too.
 
-    Parameters
-    ----------
-    model : Model
-    mesh : TetMesh
-        That of the model, along the plate's axes.
-    problem : Problem
-        Its plate and what is fixed.
-    threads, tolerance
-        As in `fe.solution.SolverOptions`.
-
-    Attributes
-    ----------
-    state : (unknowns,)
-    plate : PlateState
-    curve : list of PlateState
-        The plate at every converged increment so far.
-    iterations : int
-        Newton steps so far.
-    log, is_over, on_converged : callable
-        Gets a line for each step; says whether to stop where it is; called at each increment that can be resumed from.
+    ``curve`` is the plate at every converged increment so far, ``iterations`` counts Newton steps. ``log`` gets a line
+    for each step, ``is_over`` says whether to stop, ``on_converged`` is called at each increment that can be resumed
+    from.
     """
 
     def __init__(self, model: Model, mesh: TetMesh, problem: Problem, threads: int, tolerance: Tolerance) -> None:
@@ -124,14 +97,14 @@ class LoadPath:
         self.iterations = 0
 
     def reached(self, target: PlateTarget) -> FloatArray:
-        """What is reached (3,) of what a target asks for."""
+        """What is reached (3,) of the quantities that a target prescribes."""
         return np.where(target.displaced, self.plate.displacement_mm, self.plate.force_n)
 
     def approach(self, target: PlateTarget) -> bool:
-        """Touch, move on to a part of the normal load asked for, and let a plate go that turns.
+        """Touch, press on to a part of the normal load, and release a plate that turns; whether going on makes sense.
 
-        Until then it stays level, as a plate on a node or two would tip over; and if it cannot be let go there, it is
-        pressed further and tried again. Returns whether going on makes sense.
+        Until then it stays level, as a plate on a node or two would tip over; if it cannot be released there, it is
+        pressed further first.
         """
         if not len(self.contact.held):
             self.contact.touch_first(self.state)
@@ -151,7 +124,7 @@ class LoadPath:
         return False
 
     def _let_go(self) -> bool:
-        """Take the moment away that kept the plate level, under the force that it has.
+        """Remove the moment that kept the plate level, under its present force; whether that succeeded.
 
         A plate that is held less sinks in further; one that comes back out instead tips over on too few nodes.
         """
@@ -167,7 +140,7 @@ class LoadPath:
                 if self.plate.displacement_mm[0] < least_mm:
                     break
                 left, step = least, step * _GROWTH
-                self._log(f"{1.0 - left:.0%} let go")
+                self._log(f"{1.0 - left:.0%} released")
             else:
                 self._back(last)
                 step *= _SHRINK
@@ -176,10 +149,10 @@ class LoadPath:
         return left == 0.0
 
     def raise_to(self, target: PlateTarget) -> bool:
-        """Go on from what is to the target, in steps as large as converge; whether it is there.
+        """Go on to the target, in steps as large as converge; whether it is reached.
 
-        Where Newton's method does not get on under forces, it goes on downhill (`fe.descent`), with a plate on
-        tape that does not turn. A displacement goes on in steps so small that nodes touch in their order.
+        Where Newton's method fails under forces, viscous descent takes over (`fe.descent`), with a taped plate that
+        does not turn. A displacement goes on in steps so small that nodes touch in their order.
         """
         before = self.reached(target)
         way = target.values - before
@@ -233,7 +206,10 @@ class LoadPath:
         outside[equations] = np.where(displaced, 0.0, aim)
         self.assembler.share(contact.followers)
         if downhill:
-            converged = self._descended(outside)
+            converged = descend(
+                self.assembler, self.solver, self.state, outside, self.tolerance, self._changed_on_the_way, self.log,
+                self.is_over,
+            )  # fmt: skip
         else:
             rotation = Parallel()
             if contact.status.turns:
@@ -251,29 +227,15 @@ class LoadPath:
         self.state = converged.state
         self.iterations += converged.iterations
         self.plate = PlateState(
-            moved,
-            contact.force_n(converged.forces),
+            moved, contact.force_n(converged.forces),
             np.degrees(Rotation.from_matrix(contact.status.rotation).as_rotvec()),
-            contact.moment_nmm(converged.state, converged.forces),
-            self._area_mm2(),
-        )
+            contact.moment_nmm(converged.state, converged.forces), self._area_mm2(),
+        )  # fmt: skip
         self.curve.append(self.plate)
         return True
 
-    def _descended(self, outside: FloatArray) -> Converged | None:
-        """Equilibrium under forces; what touches on the way does so from where it was the step before."""
-
-        def changed(state: FloatArray, forces: FloatArray) -> bool:
-            touched = self._changed(state, forces)
-            self.contact.begin(state)
-            return touched
-
-        return descend(
-            self.assembler, self.solver, self.state, outside, self.tolerance, changed, self.log, self.is_over
-        )
-
     def _area_mm2(self) -> float:
-        """Area of the faces of which every corner holds to the plate, as they are now."""
+        """Present area of the faces with every corner on the plate."""
         u = self.state[: 3 * len(self.model.space.nodes_mm)].reshape(-1, 3)
         faces = self._faces[np.isin(self._faces, self.contact.held).all(axis=1)]
         a, b, c = np.moveaxis((self.model.space.nodes_mm + u)[faces], 1, 0)
@@ -285,9 +247,15 @@ class LoadPath:
         self.assembler.share(self.contact.followers)
         return True
 
+    def _changed_on_the_way(self, state: FloatArray, forces: FloatArray) -> bool:
+        """As `_changed`; what touches next does so from where it is now."""
+        touched = self._changed(state, forces)
+        self.contact.begin(state)
+        return touched
+
     @property
     def increment(self) -> Increment:
-        """The increment that it is at."""
+        """The current increment."""
         return Increment(self.state, self.plate, self.contact.status)
 
     def resume(self, where: Increment) -> None:
@@ -295,7 +263,7 @@ class LoadPath:
         self.state, self.plate, self.contact.status = where.unknowns, where.plate, where.contact
 
     def _back(self, where: Increment) -> None:
-        """Take steps back that were made since."""
+        """Undo the steps since an increment."""
         while self.curve[-1] is not where.plate:
             self.curve.pop()
         self.resume(where)
@@ -306,9 +274,8 @@ class LoadPath:
             ", ".join(f"{v:.3f}" for v in x) for x in (plate.displacement_mm, plate.force_n, plate.turn_deg)
         )
         turned = f", turned {turn} degrees" if self.contact.status.turns else ""
-        self.log(
-            f"{what}: displacement {moved} mm, force {force} N, {len(self.contact.held)} nodes on the plate{turned}"
-        )
+        nodes = len(self.contact.held)
+        self.log(f"{what}: displacement {moved} mm, force {force} N, {nodes} nodes on the plate{turned}")
 
 
 def _nodes_on(model: Model, mesh: TetMesh, facets: str) -> IntArray:

@@ -1,7 +1,5 @@
 """One load of a path, from the one before it: its stages, how far it came, and what it takes to resume from there."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,10 +28,8 @@ class Checkpoint:
         The plate at every converged increment from that of the load before it to this one.
     iterations : int
         Newton steps since the load before it, those of increments that failed not counted.
-    seconds : float
     unknowns : (unknowns,)
         Displacements, along the plate's axes, and pressures.
-    contact : ContactStatus
     """
 
     reached: float
@@ -46,29 +42,16 @@ class Checkpoint:
 
 
 class Loading:
-    """A load on its way.
+    """A load in progress on a path that is where the load before it ended.
 
-    Parameters
-    ----------
-    path : LoadPath
-        Which is where the load before it ended.
-    target : PlateTarget
-    before : PlateTarget, optional
-        Of the load before it; None for the first, which has to touch.
-    earlier : Checkpoint, optional
-        Where this load came to in an earlier solution.
-    on_converged : callable
-        Gets what it takes to resume, and the share that is done, at each converged increment.
+    ``before`` is that load's target, None for the first, which has to touch; ``earlier`` is where this load came to in
+    an earlier solution. ``on_converged`` gets a checkpoint and the share that is done, at each converged increment.
     """
 
     def __init__(
-        self,
-        path: LoadPath,
-        target: PlateTarget,
-        before: PlateTarget | None,
-        earlier: Checkpoint | None,
+        self, path: LoadPath, target: PlateTarget, before: PlateTarget | None, earlier: Checkpoint | None,
         on_converged: Callable[[Checkpoint, float], None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._path, self._target, self._first = path, target, before is None
         self._before = path.reached(target)
         if before is not None:  # what was asked for, not what was reached to the tolerance
@@ -101,18 +84,14 @@ class Loading:
     def checkpoint(self) -> Checkpoint:
         """Where it is now."""
         path = self._path
+        reached = 1.0 if self._complete else max(0.0, float(self._shares().min(initial=1.0)))
         return Checkpoint(
-            1.0 if self._complete else max(0.0, float(self._shares().min(initial=1.0))),
-            self._stages,
-            tuple(path.curve),
-            path.iterations - self._counted,
-            time.monotonic() - self._began,
-            path.state,
-            path.contact.status,
-        )
+            reached, self._stages, tuple(path.curve), path.iterations - self._counted,
+            time.monotonic() - self._began, path.state, path.contact.status,
+        )  # fmt: skip
 
     def _shares(self) -> FloatArray:
-        """Of each of the plate's axes along which the load adds something, the share of it that is reached."""
+        """Share reached of what the load adds, along each of the plate's axes where it adds something."""
         way = self._target.values - self._before
         adds = way != 0.0
         if not adds.any():

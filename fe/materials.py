@@ -7,11 +7,9 @@ What a number means depends on the program that it was made for; the constructor
 `Ogden.from_abaqus`, `Ogden.from_febio`. The same mu and alpha give initial shear moduli that differ by alpha / 2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -175,7 +173,7 @@ class NeoHooke(Material):
     law: ClassVar[str] = "neo-Hooke"
 
     @classmethod
-    def of(cls, mu_mpa: float, nu: float = 0.4999) -> NeoHooke:
+    def of(cls, mu_mpa: float, nu: float = 0.4999) -> Self:
         """From the initial shear modulus, MPa."""
         return cls(np.array([0.5 * mu_mpa, 0.0, 0.0, 0.0]), nu, f"neo-Hooke, mu {_kpa(mu_mpa)}, nu {nu:g}")
 
@@ -187,7 +185,7 @@ class Yeoh(Material):
     law: ClassVar[str] = "Yeoh"
 
     @classmethod
-    def of(cls, c10_mpa: float, c20_mpa: float, c30_mpa: float = 0.0, nu: float = 0.4999) -> Yeoh:
+    def of(cls, c10_mpa: float, c20_mpa: float, c30_mpa: float = 0.0, nu: float = 0.4999) -> Self:
         """From the coefficients of the polynomial, MPa."""
         description = f"Yeoh, C10 {_kpa(c10_mpa)}, C20 {_kpa(c20_mpa)}, C30 {_kpa(c30_mpa)}, nu {nu:g}"
         return cls(np.array([c10_mpa, c20_mpa, c30_mpa, 0.0]), nu, description)
@@ -204,7 +202,7 @@ class Hencky(Material):
     law: ClassVar[str] = "linear elastic (Hencky)"
 
     @classmethod
-    def of(cls, mu_mpa: float, nu: float = 0.4999) -> Hencky:
+    def of(cls, mu_mpa: float, nu: float = 0.4999) -> Self:
         """From the shear modulus, MPa: Young's modulus is 2 mu (1 + nu)."""
         return cls(np.array([0.0, 0.0, 0.0, mu_mpa]), nu, f"linear elastic (Hencky), mu {_kpa(mu_mpa)}, nu {nu:g}")
 
@@ -230,7 +228,7 @@ class Ogden(Material):
     law: ClassVar[str] = "Ogden"
 
     @classmethod
-    def of(cls, shear_modulus_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+    def of(cls, shear_modulus_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Self:
         """From each term's initial shear modulus (MPa) and exponent.
 
         Raises
@@ -247,19 +245,19 @@ class Ogden(Material):
         return cls(vector, nu, f"Ogden, {pairs}, nu {nu:g}")
 
     @classmethod
-    def from_ansys(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+    def from_ansys(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Self:
         """W = sum mu / alpha (sum l^alpha - 3), so mu0 = mu alpha / 2."""
         numbers, exponents = np.atleast_1d(mu_mpa).astype(float), np.atleast_1d(alpha).astype(float)
         _check_terms(numbers, exponents)
         return cls.of(0.5 * numbers * exponents, exponents, nu)
 
     @classmethod
-    def from_abaqus(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+    def from_abaqus(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Self:
         """W = sum 2 mu / alpha^2 (sum l^alpha - 3), so mu0 = mu; CalculiX writes it so as well."""
         return cls.of(mu_mpa, alpha, nu)
 
     @classmethod
-    def from_febio(cls, c_mpa: npt.ArrayLike, m: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+    def from_febio(cls, c_mpa: npt.ArrayLike, m: npt.ArrayLike, nu: float = 0.4999) -> Self:
         """W = sum c / m^2 (sum l^m - 3), so mu0 = c / 2."""
         return cls.of(0.5 * np.asarray(c_mpa), m, nu)
 

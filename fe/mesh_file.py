@@ -1,7 +1,5 @@
 """Meshes made here, kept as files that ParaView opens and that are read back with every name."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -42,9 +40,9 @@ def write_tet_mesh(path: Path, mesh: TetMesh, about: dict[str, object]) -> None:
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:
     """Read a mesh of tetrahedra with its named regions and facets, made here or elsewhere.
 
-    Where a JSON file of the same name tells the names of the numbers in the array ``region``, they are used. A set of
-    all cells is left out where others divide them, and so are the materials of ANSYS where components do. The facets
-    "bone", "skin" and "cut" are called so in whatever case the file has them: ANSYS knows capitals only.
+    A JSON file of the same name may give the names of the numbers in the array ``region``. A set of all cells is left
+    out where others divide them, and so are the materials of ANSYS where components do. The facets "bone", "skin" and
+    "cut" are recognised in any case: ANSYS has capitals only.
 
     Raises
     ------
@@ -64,8 +62,7 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
         except (ValueError, KeyError, AttributeError, TypeError) as damaged:
             raise InputError(f"{_names_of(place)}: no table of regions in it ({damaged}).") from damaged
     mesh = read.tets
-    regions = {names.get(name, name): cells for name, cells in mesh.regions.items()}
-    count = len(mesh.cells)
+    regions, count = {names.get(name, name): cells for name, cells in mesh.regions.items()}, len(mesh.cells)
     regions = _without(regions, {name for name, cells in regions.items() if len(cells) == count}, count)
     regions = _without(regions, {name for name in regions if _MATERIAL.fullmatch(name)}, count)
     facets: dict[str, IntArray] = {}

@@ -1,9 +1,8 @@
-"""A mesh with its materials, cut into elements: what is assembled, and what its states mean."""
-
-from __future__ import annotations
+"""A mesh with its materials, discretised by an element: what is assembled, and what its states mean."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -18,35 +17,20 @@ CROWDED = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """A mesh with its materials, cut into elements.
-
-    Attributes
-    ----------
-    element : Element
-    space : Space
-    volumes_mm3 : (m,)
-    inverse : (m, 3, 3)
-        Reference coordinates by position, 1/mm.
-    vectors : (k, v)
-        Laws, as `fe.hyperelastic` takes them.
-    shear_mpa, bulk_mpa : (k,)
-        Initial moduli of the materials.
-    law : (m,)
-        Number of each cell's law.
-    """
+    """A mesh of m cells with its k materials, discretised by an element."""
 
     element: Element
     space: Space
-    volumes_mm3: FloatArray
-    inverse: FloatArray
-    vectors: FloatArray
-    shear_mpa: FloatArray
-    bulk_mpa: FloatArray
-    law: IntArray
+    volumes_mm3: FloatArray  # (m,)
+    inverse: FloatArray  # (m, 3, 3) reference coordinates by position, 1/mm
+    vectors: FloatArray  # (k, v) of the material laws, see `fe.hyperelastic`
+    shear_mpa: FloatArray  # (k,) initial
+    bulk_mpa: FloatArray  # (k,)
+    law: IntArray  # (m,) number of each cell's material law
 
     @classmethod
-    def of(cls, mesh: TetMesh, materials: Mapping[str, Material], element: Element) -> Model:
-        """The model of a mesh whose regions are those of ``materials``; each cell is in one of them."""
+    def of(cls, mesh: TetMesh, materials: Mapping[str, Material], element: Element) -> Self:
+        """The model of a mesh; each cell is in one of the regions of ``materials``."""
         law = np.full(len(mesh.cells), -1)
         for number, region in enumerate(materials):
             law[mesh.regions[region]] = number
@@ -55,20 +39,14 @@ class Model:
         jacobian = np.stack([corners[:, i] - corners[:, 0] for i in (1, 2, 3)], axis=2)
         length = max(len(material.vector) for material in materials.values())
         vectors = np.array([np.pad(m.vector, (0, length - len(m.vector))) for m in materials.values()])
-        return cls(
-            element,
-            Space.on(mesh, element.name, law),
-            mesh.volumes_mm3,
-            np.asarray(np.linalg.inv(jacobian), dtype=np.float64),
-            vectors,
-            np.array([m.shear_modulus_mpa for m in materials.values()]),
-            np.array([m.bulk_modulus_mpa for m in materials.values()]),
-            law,
-        )
+        inverse = np.asarray(np.linalg.inv(jacobian), dtype=np.float64)
+        shear = np.array([m.shear_modulus_mpa for m in materials.values()])
+        bulk = np.array([m.bulk_modulus_mpa for m in materials.values()])
+        return cls(element, Space.on(mesh, element.name, law), mesh.volumes_mm3, inverse, vectors, shear, bulk, law)
 
     @property
     def own_bulk_mpa(self) -> FloatArray:
-        """The part of each law's bulk modulus (k,) that acts in each cell on its own; at most half of it."""
+        """The part of each material's bulk modulus (k,) that acts in each cell on its own; at most half of it."""
         return np.minimum(self.element.own_volume * self.shear_mpa, 0.5 * self.bulk_mpa)
 
     @property
@@ -78,7 +56,7 @@ class Model:
 
     @property
     def node_volumes_mm3(self) -> FloatArray:
-        """Each cell's volume in equal parts to its displacement nodes, (n,)."""
+        """Volumes (n,) of the displacement nodes: each cell's, in equal parts."""
         cells = self.space.cells
         each = np.repeat(self.volumes_mm3 / cells.shape[1], cells.shape[1])
         return np.bincount(cells.ravel(), weights=each, minlength=len(self.space.nodes_mm)).astype(np.float64)

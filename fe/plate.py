@@ -1,7 +1,5 @@
 """A rigid plate that tissue touches: taped to it from the first touch on, or free to slide along it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -64,41 +62,19 @@ class Plate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactStatus:
-    """Which nodes are in contact with the plate, where on it, and how it is turned.
+    """Which nodes are in contact with the plate, where on it, and how it is turned."""
 
-    Attributes
-    ----------
-    nodes : (s,) bool
-        Of those that may touch.
-    places_mm : (s, 3)
-        From the pivot, along axes that turn with the plate; NaN where a node does not hold.
-    rotation : (3, 3)
-        Of those axes against the plate's axes at the start.
-    turns : bool
-        Whether the plate turns freely now.
-    """
-
-    nodes: BoolArray
-    places_mm: FloatArray
-    rotation: FloatArray
-    turns: bool
+    nodes: BoolArray  # (s,) of those that may touch
+    places_mm: FloatArray  # (s, 3) from the pivot, along axes that turn with the plate; NaN without contact
+    rotation: FloatArray  # (3, 3) of those axes against the plate's axes at the start
+    turns: bool  # whether the plate turns freely now
 
 
 class Contact:
     """The nodes on the plate, in the plate's axes at the start (the first is that of the normal force).
 
-    Parameters
-    ----------
-    plate : Plate
-    nodes_mm : (n, 3)
-        Reference positions of all nodes, plate's axes.
-    surface : (s,) int
-        Nodes that may touch.
-
-    Raises
-    ------
-    InputError
-        If tissue that may not touch lies nearer to the plate than all that may: the plate comes from the wrong side.
+    ``nodes_mm`` (n, 3) are the reference positions of all nodes, ``surface`` (s,) those that may touch. InputError if
+    other tissue lies nearer to the plate: the plate comes from the wrong side.
     """
 
     def __init__(self, plate: Plate, nodes_mm: FloatArray, surface: IntArray) -> None:
@@ -123,12 +99,12 @@ class Contact:
 
     @property
     def held(self) -> IntArray:
-        """Nodes that hold to the plate."""
+        """Nodes on the plate."""
         return self.nodes[self.status.nodes]
 
     @property
     def stays(self) -> bool:
-        """Whether what touches stays where it does, on a plate that does not turn now."""
+        """Whether nodes stay where they touched, on a plate that does not turn now."""
         return self.plate.taped and not self.status.turns
 
     @property
@@ -142,12 +118,9 @@ class Contact:
         return {axis: 3 * self.nodes + axis for axis in range(3)}
 
     def touch_first(self, state: FloatArray) -> None:
-        """Move the plate to the surface: its lowest node holds, or its lowest nodes."""
-        self.status = replace(
-            self.status,
-            nodes=self._first,
-            places_mm=np.where(self._first[:, None], (self._start - self._pivot) * [0.0, 1.0, 1.0], np.nan),
-        )
+        """Move the plate to the surface, onto its lowest node or nodes."""
+        places = np.where(self._first[:, None], (self._start - self._pivot) * [0.0, 1.0, 1.0], np.nan)
+        self.status = replace(self.status, nodes=self._first, places_mm=places)
         state[3 * self.held] = self._pivot[0] - self._start[self._first, 0]
 
     def begin(self, state: FloatArray) -> None:
@@ -155,11 +128,10 @@ class Contact:
         self._before = self._seen_from_plate(state)
 
     def centre_mm(self, state: FloatArray) -> FloatArray:
-        """Where the pivot is, (3,) mm."""
+        """Position of the pivot, (3,) mm."""
         status = self.status
-        centre = (self._positions(state)[status.nodes] - status.places_mm[status.nodes] @ status.rotation.T).mean(
-            axis=0
-        )
+        centres = self._positions(state)[status.nodes] - status.places_mm[status.nodes] @ status.rotation.T
+        centre = centres.mean(axis=0)
         if not self.plate.taped:
             centre[1:] = self._pivot[1:]
         return np.asarray(centre)
@@ -169,7 +141,7 @@ class Contact:
         return np.asarray(self.centre_mm(state) - self._pivot + [self.plate.gap_mm, 0.0, 0.0])
 
     def arms_mm(self, state: FloatArray) -> FloatArray:
-        """From the pivot to each node that holds (k, 3), mm."""
+        """From the pivot to each node on the plate (k, 3), mm."""
         return self._positions(state)[self.status.nodes] - self.centre_mm(state)
 
     def force_n(self, forces: FloatArray) -> FloatArray:
@@ -181,20 +153,11 @@ class Contact:
         return np.asarray(np.cross(self.arms_mm(state), forces[_unknowns(self.held)]).sum(axis=0))
 
     def update(self, state: FloatArray, forces: FloatArray) -> bool:
-        """Let nodes that are past the plate hold to it, and, without tape, those go that it would have to pull.
+        """Take up nodes past the plate and, without tape, release those that it would pull; whether any changed.
 
-        Parameters
-        ----------
-        state : (unknowns,)
-            Nodes that touch are put on the plate, in place: along its normal onto its face, and, on tape, across it to
-            where they crossed the face on a straight way from the state before, as seen from the plate.
-        forces : (unknowns,)
-            Internal forces, N.
-
-        Returns
-        -------
-        bool
-            Whether any node was taken or let go.
+        ``state`` is changed in place: nodes that touch are put onto the plate's face, along its normal and, on tape,
+        across it to where they crossed the face on a straight way from the state before, as seen from the plate.
+        ``forces`` (unknowns,) are internal, N.
         """
         status, now, before = self.status, self._seen_from_plate(state), self._before
         new = (now[:, 0] <= 0.0) & ~status.nodes

@@ -1,16 +1,14 @@
 """A plate's rotation: three unknowns beside the sparse system of all others, and a turn that stays rigid.
 
-The nodes on a plate that turns by a small vector t about its pivot c move by t x r, r = x - c. With f their internal
-forces, the moment is sum r x f, and the second variation of the energy has beside w_k . K w_l (w_k = e_k x r, K the
-tangent) the part of the curved way
+Nodes on a plate that turns by a small vector t about its pivot c move by t x r, r = x - c. With f their internal
+forces, the moment is sum r x f, and the second variation of the energy has, beside w_k . K w_l (w_k = e_k x r, K the
+tangent), the part of the curved path
 
     sum  (r f^T + f r^T) / 2 - (r . f) I,
 
 which is symmetric. The system [K B; B^T C] [x; t] = [right; moment] is solved by elimination of x, so that K, its
 pattern and its factorisation are those of a plate that does not turn.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 
@@ -23,23 +21,18 @@ from fe.linear import SingularError, Solver
 from fe.plate import Contact
 
 _LEAST_ARM_MM = 1e-3
+_ACCURACY = 1e-3  # of the linear solutions
 
 
 class Parallel:
     """A plate that stays parallel: it has no unknowns of rotation."""
 
     def missing_n(self, state: FloatArray, forces: FloatArray) -> float:
-        """What its moment is off, N; nothing, as it takes up any."""
+        """Imbalance of the moment, N; none, as it takes up any."""
         return 0.0
 
     def solved(
-        self,
-        state: FloatArray,
-        forces: FloatArray,
-        data: FloatArray,
-        level: FloatArray,
-        held: IntArray,
-        accuracy: float,
+        self, state: FloatArray, forces: FloatArray, data: FloatArray, level: FloatArray, held: IntArray
     ) -> tuple[FloatArray, FloatArray]:
         """Change of every equation, ``level`` as it is, and the turn (3,), none."""
         return level, np.zeros(3)
@@ -50,17 +43,7 @@ class Parallel:
 
 
 class Turning(Parallel):
-    """A plate that turns until its moment about the pivot is the one given.
-
-    Parameters
-    ----------
-    contact : Contact
-        Whose rotation is changed in place.
-    assembler, solver
-        Of everything else.
-    moment_nmm : (3,)
-        On the tissue, N mm.
-    """
+    """A plate that turns until its moment about the pivot is ``moment_nmm`` (3,); it turns ``contact`` in place."""
 
     def __init__(self, contact: Contact, assembler: Assembler, solver: Solver, moment_nmm: FloatArray) -> None:
         self._contact, self._assembler, self._solver = contact, assembler, solver
@@ -69,36 +52,18 @@ class Turning(Parallel):
         self._arms, self._on_plate = np.empty((0, 3)), np.empty((0, 3), dtype=int)
 
     def missing_n(self, state: FloatArray, forces: FloatArray) -> float:
-        """What the moment is off, N: over the root mean square arm of the nodes on the plate."""
+        """Imbalance of the moment, N: over the root mean square arm of the nodes on the plate."""
         arm = float(np.sqrt((self._contact.arms_mm(state) ** 2).sum(axis=1).mean()))
         missing = self._moment - self._contact.moment_nmm(state, forces)
         return float(np.linalg.norm(missing)) / max(arm, _LEAST_ARM_MM)
 
     def solved(
-        self,
-        state: FloatArray,
-        forces: FloatArray,
-        data: FloatArray,
-        level: FloatArray,
-        held: IntArray,
-        accuracy: float,
+        self, state: FloatArray, forces: FloatArray, data: FloatArray, level: FloatArray, held: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Change of every equation and the turn (3,), from the change that would be if the plate stayed level.
+        """Change of every equation and the turn (3,), from ``level``, the change (equations,) of a level plate.
 
-        Parameters
-        ----------
-        state, forces : (unknowns,)
-        data
-            Values of the tangent, with ``held`` equations prescribed.
-        level : (equations,)
-            Change without a turn.
-        accuracy : float
-            Of the linear solutions.
-
-        Raises
-        ------
-        SingularError
-            If what is on the plate does not hold it.
+        ``data`` are the tangent's values, with ``held`` equations prescribed. SingularError if the tissue does not hold
+        the plate against turning.
         """
         self._rotation = self._contact.status.rotation
         self._arms = self._contact.arms_mm(state)
@@ -110,7 +75,7 @@ class Turning(Parallel):
         coupled = np.column_stack([self._assembler.by_equation(acted[:, axis]) for axis in range(3)])
         right = coupled.copy()
         right[held] = 0.0
-        answers = np.column_stack([self._solver.solve(data, right[:, axis], accuracy) for axis in range(3)])
+        answers = np.column_stack([self._solver.solve(data, right[:, axis], _ACCURACY) for axis in range(3)])
         r, f = self._arms, forces[self._on_plate]
         curved = r.T @ f
         own = ways.T @ acted + 0.5 * (curved + curved.T) - (r * f).sum() * np.eye(3)

@@ -1,7 +1,5 @@
 """The boundary value problem: tissue under a rigid plate, with what it is made of and where it is held."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -29,7 +27,6 @@ class Problem:
         LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed; every cell in one
         region.
     materials : mapping of region to Material
-    plate : Plate
     loads : sequence of LoadStep
         Reached one from the other. The first must press.
     fixed : sequence of str
@@ -120,7 +117,7 @@ def check_materials(mesh: TetMesh, materials: Mapping[str, Material]) -> None:
 
 
 def _check_bonded(mesh: TetMesh, held: IntArray, fixed: Sequence[str]) -> None:
-    """Refuse tissue that hangs on nothing: cells whose nodes are joined to no fixed one."""
+    """Refuse tissue that nothing holds: cells whose nodes are joined to no fixed one."""
     ends = np.repeat(mesh.cells[:, 0], 3), mesh.cells[:, 1:].ravel()
     count = len(mesh.points_mm)
     joined = sparse.csr_matrix((np.ones(len(ends[0]), dtype=np.int8), ends), shape=(count, count))

@@ -1,7 +1,5 @@
 """Material parameter sets, tissue by tissue: seven published ones, and the user's own in the same form."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import re
@@ -18,14 +16,14 @@ from fe.hyperelastic import OGDEN
 from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
 
 WHOLE = "all"
-"""Name of the tissue in a set that has one law for everything."""
+"""Name of the tissue in a set that has one material law for everything."""
 
 _INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
 
 @dataclass(frozen=True, slots=True)
 class _Form:
-    """How a law is written in a file: what makes it, and which of its numbers are stresses."""
+    """How a material law is written in a file: its constructor, and which of its numbers are stresses."""
 
     made: Callable[..., Material]
     stresses: tuple[str, ...]
@@ -82,11 +80,10 @@ class MaterialSet:
         """
         by_region: dict[str, Material] = {}
         notes = []
+        if WHOLE in self.materials:
+            return dict.fromkeys(regions, self.materials[WHOLE]), ()
         known = {tissue.casefold(): law for tissue, law in self.materials.items()}
         for region in regions:
-            if WHOLE in self.materials:
-                by_region[region] = self.materials[WHOLE]
-                continue
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
             name = next((t for t in tried if t.casefold() in known), None)
             if name is None:
@@ -163,30 +160,27 @@ def as_toml(name: str, title: str, materials: Mapping[str, Material]) -> str:
     alpha = [6.2]
     nu = 0.4999
     """
-    key = json.dumps(name) if not re.fullmatch(r"[\w-]+", name, re.ASCII) else name
+    key = _key(name)
     lines = [f"[{key}]", f"title = {json.dumps(title)}"]
     for tissue, law in materials.items():
-        at = json.dumps(tissue) if not re.fullmatch(r"[\w-]+", tissue, re.ASCII) else tissue
-        lines += ["", f"[{key}.{at}]", f'law = "{_NAMES[type(law)]}"']
+        lines += ["", f"[{key}.{_key(tissue)}]"]
         lines += [f"{k} = {v}" for k, v in _numbers_of(law).items()]
     return "\n".join(lines) + "\n"
 
 
-_NAMES: Mapping[type[Material], str] = {NeoHooke: "neo-Hooke", Yeoh: "Yeoh", Hencky: "linear elastic", Ogden: "Ogden"}
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else json.dumps(name)
 
 
 def _numbers_of(law: Material) -> dict[str, object]:
-    """The numbers of a law as a file has them."""
+    """The name and numbers of a material law as a file has them."""
     c10, c20, c30, hencky = law.vector[:OGDEN].tolist()
+    mu, alpha = law.vector[OGDEN::2].tolist(), law.vector[OGDEN + 1 :: 2].tolist()
     given: dict[type[Material], dict[str, object]] = {
-        NeoHooke: {"mu_mpa": 2.0 * c10},
-        Yeoh: {"c10_mpa": c10, "c20_mpa": c20, "c30_mpa": c30},
-        Hencky: {"mu_mpa": hencky},
-        Ogden: {
-            "convention": '"abaqus"',
-            "mu_mpa": law.vector[OGDEN::2].tolist(),
-            "alpha": law.vector[OGDEN + 1 :: 2].tolist(),
-        },
+        NeoHooke: {"law": '"neo-Hooke"', "mu_mpa": 2.0 * c10},
+        Yeoh: {"law": '"Yeoh"', "c10_mpa": c10, "c20_mpa": c20, "c30_mpa": c30},
+        Hencky: {"law": '"linear elastic"', "mu_mpa": hencky},
+        Ogden: {"law": '"Ogden"', "convention": '"abaqus"', "mu_mpa": mu, "alpha": alpha},
     }
     return given[type(law)] | {"nu": law.nu}
 
@@ -204,9 +198,7 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
     sets = {}
     for name, content in tables.items():
         if not isinstance(content, dict):
-            raise InputError(
-                f"{where}: '{name}' stands outside any set; a file starts with the set's name in brackets."
-            )
+            raise InputError(f"{where}: '{name}' is outside any set; a file starts with the set's name in brackets.")
         head = {key: content.get(key, "") for key in ("title", "source")}
         tissues = {key: value for key, value in content.items() if key not in head}
         if not tissues:
@@ -248,12 +240,12 @@ def _law(where: str, given: object) -> Material:
 
 
 def _form(where: str, law: object, convention: object) -> _Form:
+    if law == "Ogden" and convention not in _OGDEN:
+        raise InputError(
+            f"{where}: an Ogden law needs convention = {' or '.join(map(repr, _OGDEN))}, the program that its numbers "
+            f"are for: the same numbers differ by a factor of alpha / 2 in stiffness; got {convention!r}."
+        )
     if law == "Ogden":
-        if convention not in _OGDEN:
-            raise InputError(
-                f"{where}: an Ogden law needs convention = {' or '.join(map(repr, _OGDEN))}, the program that its "
-                f"numbers are for: the same numbers differ by a factor of alpha / 2 in stiffness; got {convention!r}."
-            )
         return _OGDEN[str(convention)]
     if law not in _LAWS:
         raise InputError(f"{where}: law must be one of {', '.join((*_LAWS, 'Ogden'))}; got {law!r}.")

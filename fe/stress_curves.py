@@ -1,7 +1,5 @@
 """Stretch-stress curves of mechanical tests, read from CSV files."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path

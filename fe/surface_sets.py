@@ -1,7 +1,5 @@
 """Names of a mesh's surfaces, which are sets of facets; case does not count in them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from dvc import TetMesh

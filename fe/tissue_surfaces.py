@@ -1,7 +1,5 @@
 """Smooth surfaces between the tissues of a label map, which keep the tissues' volumes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,20 +14,11 @@ _PASSES = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Borders:
-    """Triangles between tissues, and between tissue and outside.
+    """Triangles between tissues, and between tissue and outside."""
 
-    Attributes
-    ----------
-    points_mm : (n, 3)
-        LPS mm.
-    triangles : (m, 3) int
-    sides : (m, 2) int
-        Labels on either side; 0 is outside.
-    """
-
-    points_mm: FloatArray
-    triangles: IntArray
-    sides: IntArray
+    points_mm: FloatArray  # (n, 3) LPS
+    triangles: IntArray  # (m, 3)
+    sides: IntArray  # (m, 2) labels on either side; 0 is outside
 
     def volume_ml(self, label: int) -> float:
         """Volume that the borders of a label enclose, mL."""
@@ -51,25 +40,16 @@ def borders_of(labels: LabelMap) -> Borders:
     grid = labels.grid
     padded = np.pad(labels.labels.astype(np.int32), 1)  # closed at the image's edge
     present = [int(v) for v in np.unique(padded) if v > 0]
-    image = vtkImageData()
-    image.SetDimensions(*padded.shape)
-    image.SetSpacing(*grid.spacing_mm)
-    image.SetOrigin(*(-grid.spacing_mm))
+    image = vtkImageData(dimensions=padded.shape, spacing=grid.spacing_mm, origin=-grid.spacing_mm)
     image.GetPointData().SetScalars(numpy_to_vtk(padded.ravel(order="F"), deep=True))
-    nets = vtkSurfaceNets3D()
-    nets.SetInputData(image)
-    nets.SetNumberOfLabels(len(present))
+    nets = vtkSurfaceNets3D(input_data=image, number_of_labels=len(present), smoothing=False)
     for number, label in enumerate(present):
         nets.SetLabel(number, label)
-    nets.SmoothingOff()
     nets.SetOutputMeshTypeToTriangles()
-    smooth = vtkWindowedSincPolyDataFilter()
-    smooth.SetInputConnection(nets.GetOutputPort())
-    smooth.SetNumberOfIterations(_PASSES)
-    smooth.SetPassBand(_PASS_BAND)
-    smooth.NonManifoldSmoothingOn()
-    smooth.BoundarySmoothingOn()
-    smooth.NormalizeCoordinatesOn()
+    smooth = vtkWindowedSincPolyDataFilter(
+        input_connection=nets.output_port, number_of_iterations=_PASSES, pass_band=_PASS_BAND,
+        non_manifold_smoothing=True, boundary_smoothing=True, normalize_coordinates=True,
+    )  # fmt: skip
     smooth.Update()
     net, made = nets.GetOutput(), smooth.GetOutput()
     if not made.GetNumberOfPolys():
@@ -84,11 +64,10 @@ def borders_of(labels: LabelMap) -> Borders:
 
 def labels_at(borders: Borders, points_mm: FloatArray) -> IntArray:
     """Label of the tissue that encloses each point (n, 3) LPS mm; 0 outside all."""
-    found = np.zeros(len(points_mm), dtype=np.int64)
-    for label in np.unique(borders.sides):
-        if label > 0:
-            found[_inside(borders, int(label), points_mm)] = label
-    return found
+    enclosing = np.zeros(len(points_mm), dtype=np.int64)
+    for label in np.unique(borders.sides[borders.sides > 0]):
+        enclosing[_inside(borders, int(label), points_mm)] = label
+    return enclosing
 
 
 def _inside(borders: Borders, label: int, points_mm: FloatArray) -> BoolArray:
@@ -108,9 +87,6 @@ def _inside(borders: Borders, label: int, points_mm: FloatArray) -> BoolArray:
     starts = np.arange(0, 3 * len(triangles) + 1, 3)
     cells.SetData(numpy_to_vtkIdTypeArray(starts, deep=True), numpy_to_vtkIdTypeArray(triangles.ravel(), deep=True))
     surface.SetPolys(cells)
-    enclosed = vtkSelectEnclosedPoints()
-    enclosed.SetInputData(points_of(points_mm))
-    enclosed.SetSurfaceData(surface)
-    enclosed.SetTolerance(1e-9)
+    enclosed = vtkSelectEnclosedPoints(input_data=points_of(points_mm), surface_data=surface, tolerance=1e-9)
     enclosed.Update()
     return np.asarray(vtk_to_numpy(enclosed.GetOutput().GetPointData().GetArray("SelectedPoints")).astype(bool))

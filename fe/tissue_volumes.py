@@ -1,7 +1,5 @@
 """Tissues of a mesh given the volumes that they should have, by the least motion of their borders."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dvc.arrays import FloatArray, IntArray
@@ -15,32 +13,14 @@ _HALVINGS = 6
 def with_volumes(
     points_mm: FloatArray, cells: IntArray, tissue: IntArray, volumes_mm3: dict[int, float], farthest_mm: float
 ) -> FloatArray:
-    """Nodes on the borders moved until each tissue encloses its volume.
+    """Nodes (n, 3) on the borders moved until each tissue encloses its volume, by label; mm, in any frame.
 
-    Parameters
-    ----------
-    points_mm : (n, 3)
-        Nodes, mm, in any frame.
-    cells : (m, 4) int
-        Tetrahedra that fill a box.
-    tissue : (m,) int
-        Label of each cell.
-    volumes_mm3 : dict
-        Volume wanted by label; labels left out, such as that of air, get what is left.
-    farthest_mm : float
-        A node moves no farther than this in each of three steps, whatever is missing then.
-
-    Returns
-    -------
-    points_mm : (n, 3)
-        The same but on the borders.
-
-    Notes
-    -----
-    A step moves nodes along the gradients of the volumes, by one factor for each label: the least sum over the nodes
-    of the distance squared, times the area of all tissues' borders around the node, that changes the volumes as wanted,
-    to first order. A smoothed thin cord gets wider by the same distance all around. Where a cell would lose four fifths
-    of its volume in a step, or turn over, its nodes move by half as much, and so on.
+    ``cells`` (m, 4) fill a box and ``tissue`` (m,) labels them; labels without a volume, such as that of air, get the
+    rest. A step moves nodes along the gradients of the volumes, by one factor for each label: the least sum over the
+    nodes of the distance squared, times the area of all tissues' borders around the node, that changes the volumes as
+    wanted, to first order. A smoothed thin cord gets wider by the same distance all around. Where a cell would lose
+    four fifths of its volume in a step, or turn over, its nodes move by half as much, and so on. A node moves no
+    farther than ``farthest_mm`` in each of three steps, even if volumes are still off then.
     """
     points = points_mm.copy()
     labels = list(volumes_mm3)
