@@ -5,19 +5,19 @@ nodes on the plate are moved to their final positions has our state as its solut
 forces: contact need not be solved again. CalculiX reads one (Abaqus knows the same keywords), FEBio 4 the other.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from dvc import TetMesh
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from fe.elements import Space, edges_of
 from fe.hyperelastic import OGDEN
-from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
+from fe.materials import Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
 from fe.solution import LoadState
 from fe.surface_sets import BONE
 
@@ -41,7 +41,7 @@ _FEBIO_OUTPUT = """<Output><plotfile type="febio">
 def write_calculix(
     path: Path,
     mesh: TetMesh,
-    materials: Mapping[str, Material],
+    materials: Materials,
     state: LoadState,
     *,
     fixed: Sequence[str] = (BONE,),
@@ -70,7 +70,7 @@ def write_calculix(
 
 
 def _deck(
-    mesh: TetMesh, materials: Mapping[str, Material], state: LoadState, fixed: Sequence[str], quadratic: bool
+    mesh: TetMesh, materials: Materials, state: LoadState, fixed: Sequence[str], quadratic: bool
 ) -> Iterator[str]:
     space = _space(mesh, quadratic)
     yield from (f"** {line}" for line in _about(state))
@@ -102,26 +102,19 @@ def _supports(
     mesh: TetMesh, space: Space, state: LoadState, fixed: Sequence[str]
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Nodes that are fixed, nodes on the plate, and how far those move; middles of edges go with their ends."""
-    count = len(mesh.points_mm)
-    bone = np.zeros(count, dtype=bool)
     held = np.concatenate([mesh.facets[name] for name in fixed])
-    bone[held] = True
-    plate = np.zeros(count, dtype=bool)
-    plate[state.on_plate] = True
+    bone, plate = (np.isin(np.arange(len(mesh.points_mm)), nodes) for nodes in (held, state.on_plate))
     still, on_plate, moved = [np.flatnonzero(bone)], [np.flatnonzero(plate)], [state.u_mm[plate]]
     if space.cells.shape[1] > 4:
-        for facets, both, nodes in ((held, bone, still), (_faces_on(mesh, plate, fixed), plate, on_plate)):
+        others = np.concatenate([rows for name, rows in mesh.facets.items() if name not in fixed])
+        faces = others[plate[others].all(axis=1)]
+        for facets, both, nodes in ((held, bone, still), (faces, plate, on_plate)):
             ends = edges_of(facets)
             ends = ends[both[ends].all(axis=1)]
             nodes.append(space.middles(ends))
             if nodes is on_plate:
                 moved.append(state.u_mm[ends].mean(axis=1))
     return np.concatenate(still), np.concatenate(on_plate), np.concatenate(moved)
-
-
-def _faces_on(mesh: TetMesh, plate: BoolArray, fixed: Sequence[str]) -> IntArray:
-    every = np.concatenate([rows for name, rows in mesh.facets.items() if name not in fixed])
-    return np.asarray(every[plate[every].all(axis=1)])
 
 
 def _law(region: str, law: Material) -> Iterator[str]:
@@ -151,7 +144,7 @@ def _law(region: str, law: Material) -> Iterator[str]:
 def write_febio(
     path: Path,
     mesh: TetMesh,
-    materials: Mapping[str, Material],
+    materials: Materials,
     state: LoadState,
     *,
     fixed: Sequence[str] = (BONE,),
@@ -245,6 +238,6 @@ def _space(mesh: TetMesh, quadratic: bool) -> Space:
     return Space.on(mesh, "P2" if quadratic else "P1", np.zeros(len(mesh.cells), dtype=np.int64))
 
 
-def _short(prefix: str, region: str, materials: Mapping[str, Material]) -> str:
+def _short(prefix: str, region: str, materials: Materials) -> str:
     """A name of its own that CalculiX takes: letters and digits, under 20 characters."""
     return f"{prefix}{list(materials).index(region) + 1}" + "".join(c for c in region.upper() if c.isalnum())[:15]

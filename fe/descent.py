@@ -70,7 +70,9 @@ def descend(
     """
     model = assembler.model
     now, damping, thickness = state.copy(), _FIRST, np.ones(len(model.space.nodes_mm))
-    growth, balanced = _MOST_GROWTH[0], 0
+    cells, growth, balanced = model.space.cells, _MOST_GROWTH[0], 0
+    each = np.repeat(model.volumes_mm3 / cells.shape[1], cells.shape[1])
+    volumes_mm3 = np.bincount(cells.ravel(), weights=each, minlength=len(thickness))
     largest_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
     forces, residual, lowest = assembler.residual(now)
     if not lowest > 0.0:
@@ -80,7 +82,7 @@ def descend(
         if is_over():
             return None
         before_n = max(out_of_balance(outside - residual, assembler), 1e-300)
-        by_node = np.repeat(damping * thickness * model.node_volumes_mm3, 3)
+        by_node = np.repeat(damping * thickness * volumes_mm3, 3)
         medium = assembler.by_equation(np.concatenate([by_node, np.zeros(model.space.pressures)]))
         step = _tried(assembler, solver, now, tangent, outside, residual, medium)
         if step is None or step.after_n > growth * before_n:

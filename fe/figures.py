@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -45,8 +46,7 @@ def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> Figure:
     The line is dashed where Drucker's condition fails: simulations that reach this range are unreliable.
     """
     figure, (axes,) = chart()
-    for number, curve in enumerate(curves):
-        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+    for curve, colour in zip(curves, cycle(REGION_COLOURS), strict=False):
         low, high = fitted.reached[curve.mode]
         margin = 0.05 * (high - low)
         stretch = np.linspace(low - margin, high + margin, _POINTS)
@@ -137,13 +137,12 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
             spot.axline((0.0, panel.face[0]), slope=panel.face[1], color=INK, linewidth=1.0, linestyle="--")
         spot.set_title(panel.title, color=INK, **FONT)
         label_axes(spot, "along the shear, mm", "along the normal force, mm")
-        sides = ((0.01, 0.5, -axes[:, 1]), (0.99, 0.5, axes[:, 1]), (0.5, 0.01, -axes[:, 0]), (0.5, 0.99, axes[:, 0]))
-        for x, y, direction in sides:
-            spot.text(
-                x, y, letters(direction), transform=spot.transAxes, weight="bold", color=INK,
-                ha={0.01: "left", 0.99: "right"}.get(x, "center"), va={0.01: "bottom", 0.99: "top"}.get(y, "center"),
-                **FONT,
-            )  # fmt: skip
+        for x, y, ha, va, direction in (
+            (0.01, 0.5, "left", "center", -axes[:, 1]), (0.99, 0.5, "right", "center", axes[:, 1]),
+            (0.5, 0.01, "center", "bottom", -axes[:, 0]), (0.5, 0.99, "center", "top", axes[:, 0]),
+        ):  # fmt: skip
+            how = {"transform": spot.transAxes, "weight": "bold", "color": INK, "ha": ha, "va": va} | FONT
+            spot.text(x, y, letters(direction), **how)
     bar = figure.colorbar(drawn, ax=list(spots[: len(panels)]), shrink=0.8, extend="max")
     bar.set_label("max. shear strain", color=INK, **FONT)
     return figure
@@ -184,12 +183,9 @@ def force_displacement(states: Sequence[LoadState]) -> Figure:
     """Force of the plate over its displacement from the first touch on, along normal (left) and shear (right)."""
     figure, panels = chart(2)
     for axes, axis, name in zip(panels, (0, 1), ("normal", "shear"), strict=True):
-        for number, state in enumerate(states):
+        for state, colour in zip(states, cycle(REGION_COLOURS), strict=False):
             moved, force = ([getattr(at, what)[axis] for at in state.curve] for what in ("displacement_mm", "force_n"))
-            axes.plot(
-                moved, force, marker=".", label=state.load.name, linewidth=1.8,
-                color=REGION_COLOURS[number % len(REGION_COLOURS)],
-            )  # fmt: skip
+            axes.plot(moved, force, marker=".", label=state.load.name, linewidth=1.8, color=colour)
         label_axes(axes, f"{name} displacement, mm", f"{name} force, N")
     panels[0].legend(fontsize=9, frameon=False)
     return figure
@@ -199,9 +195,8 @@ def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
     """The mesh on a slice through the bone's lowest point, coloured by tissue."""
     figure, (panel,) = chart()
     cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, _lowest_bone_point(mesh, plate.axes))
-    for number, (name, members) in enumerate(mesh.regions.items()):
+    for (name, members), colour in zip(mesh.regions.items(), cycle(REGION_COLOURS), strict=False):
         mine = [c for c, inside in zip(corners, np.isin(cells, members), strict=True) if inside]
-        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
         panel.add_collection(PolyCollection(mine, facecolors=colour, edgecolors="white", linewidths=0.3, label=name))
     panel.autoscale_view()
     panel.set_aspect("equal")
@@ -216,8 +211,7 @@ def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[f
     One that no longer depends on the mesh lies on the grey line.
     """
     figure, (axes,) = chart()
-    for number, (name, (values, limit)) in enumerate(curves.items()):
-        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+    for (name, (values, limit)), colour in zip(curves.items(), cycle(REGION_COLOURS), strict=False):
         style = "-" if "travel" in name else "--"
         axes.plot(sizes_mm, np.array(values) / limit.limit, style, marker="o", color=colour, linewidth=1.6, label=name)
         h = np.linspace(0.0, min(sizes_mm), _POINTS)

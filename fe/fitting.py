@@ -112,7 +112,7 @@ LAWS: Mapping[str, _Law] = {
 
 
 def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
-    """Fit a law to curves of an incompressible solid by least squares of the nominal stress.
+    """Fit a material law to curves of an incompressible solid by least squares of the nominal stress.
 
     Parameters
     ----------
@@ -126,26 +126,26 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     Raises
     ------
     InputError
-        If there are too few points, or none away from a stretch of 1; if no parameters can be told from these
-        curves; or if they say that the initial shear modulus is not positive.
+        If points are too few, or none lies away from a stretch of 1; if the curves do not determine the parameters, or
+        imply an initial shear modulus that is not positive.
 
     Notes
     -----
     A curve of one test may leave two exponents open: in uniaxial compression, alpha and about -alpha / 2 give nearly
-    the same stress. Of optima that an F test at 5 % does not tell apart, one whose exponents are all positive is
+    the same stress. Of optima that an F test at 5 % does not distinguish, one whose exponents are all positive is
     taken, and the rest are named.
 
-    Intervals are those of linearised regression with Student's t: they assume independent errors of the same
-    standard deviation at every point, and claim nothing of errors that a curve shares, such as a wrong area.
-    Parameters in which the stress is linear start at their best; an Ogden law's exponents from the four best of the
-    combinations of eight values.
+    Intervals are those of linearised regression with Student's t: they assume independent errors of the same standard
+    deviation at every point, and do not cover errors that a curve shares, such as a wrong area. Parameters in which
+    the stress is linear start at their best; Ogden exponents from the four best of the combinations of eight values.
 
-    C10, half the initial shear modulus, is positive in any law; a curve that is steep only at its end may leave it
-    open, and the best fit then has it below 0 as often as not. It is kept at a thousandth or more of that of the
-    neo-Hookean law which suits the same curves best. An interval reaches w below the lower, and w above the higher, of
-    the values with and without that bound, w being the half width without it; C10's ends at 0. So it contains all of
-    the usual interval that a law can have, and holds the truth as often or more often. Curves are refused that would
-    have C10 so far below 0 that chance does it to less than one in 10,000 of the curves of a true law.
+    C10, half the initial shear modulus, is positive in any material law; a curve that is steep only at its end may
+    leave it open, and the best fit then has it below 0 as often as not. It is kept at a thousandth or more of that of
+    the neo-Hookean model which fits the same curves best. An interval reaches w below the lower, and w above the
+    higher, of the values with and without that bound, w being the half width without it; C10's ends at 0. So it
+    contains all of the usual interval that a material law can have, and covers the truth as often or more often.
+    Curves are refused that would have C10 so far below 0 that chance does it to less than one in 10,000 of the curves
+    of a true material law.
     """
     sought, curves = _checked(curves, law, nu)
     count = len(sought.names)
@@ -166,19 +166,19 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         optima.append(optimum)
     best, others = _chosen(sought, optima, len(stress))
     if sought.exponents and np.abs(best.x[-sought.exponents :]).max() > _MOST:
-        raise InputError(f"{law}: the best exponent is beyond {_MOST:g}; these curves cannot tell it. Use fewer terms.")
+        raise InputError(
+            f"{law}: the best exponent is beyond {_MOST:g}; these curves do not determine it. Use fewer terms."
+        )
     deviations = _deviations(best.x, best.jac, best.fun)
     if deviations is None:
-        raise InputError(
-            f"{law}: its parameters cannot be told apart from these curves (singular); use a law with fewer."
-        )
+        raise InputError(f"{law}: these curves do not determine its parameters (singular); use a model with fewer.")
     values, parameters = _with_intervals(sought, best, deviations, curves, stress)
     try:
         material = sought.material(values, nu)
     except InputError as unusable:
         raise InputError(
-            f"The best fit is no law to compute with ({unusable}) Give points nearer to a stretch of 1, or use a law "
-            "with fewer parameters."
+            f"The best fit is no usable material law ({unusable}) Give points nearer to a stretch of 1, or fit one with "
+            "fewer parameters."
         ) from unusable
     residual = modelled(values) - stress
     return Fit(
@@ -196,10 +196,10 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
     """The material law of that name, and one curve for each kind of test; or why they cannot be used."""
     named = {name.lower(): name for name in LAWS}
     if law.lower() not in named:
-        raise InputError(f"No law '{law}' to fit; there are {', '.join(LAWS)}.")
+        raise InputError(f"No material law '{law}' to fit; there are {', '.join(LAWS)}.")
     if not 0.0 <= nu <= HIGHEST_NU:
         raise InputError(f"Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {nu:g}.")
-    sought, curves = LAWS[named[law.lower()]], _by_mode(curves)
+    sought, curves = LAWS[named[law.lower()]], [_joined(mode, curves) for mode in dict.fromkeys(c.mode for c in curves)]
     count = len(sought.names)
     stress, stretch = (
         np.concatenate([np.empty(0), *(getattr(c, part) for c in curves)]) for part in ("stress_mpa", "stretch")
@@ -223,7 +223,7 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
 def _with_intervals(
     law: _Law, best: OptimizeResult, deviations: FloatArray, curves: Sequence[Curve], stress: FloatArray
 ) -> tuple[FloatArray, tuple[Parameter, ...]]:
-    """The best values, the first kept positive where the law is bounded, and their 95 % confidence intervals."""
+    """The best values, the first kept positive where it has to be, and their 95 % confidence intervals."""
     values, least = best.x, np.full(len(best.x), -np.inf)
     freedom = len(stress) - len(values)
     widths = student.ppf(0.975, freedom) * deviations
@@ -233,7 +233,10 @@ def _with_intervals(
             size = float(np.sqrt(np.mean(stress**2)))
             unit = np.concatenate([nominal_stress(np.eye(OGDEN)[0], c.stretch, c.mode) for c in curves])
             softest = _SOFTEST * float(unit @ stress / (unit @ unit))  # not above 0 where no positive modulus fits
-            values = _not_softer(values, softest, best.jac * size, stress)
+            columns = best.jac * size  # times the values they are the stress
+            if values[0] < softest:
+                rest, *_ = np.linalg.lstsq(columns[:, 1:], stress - columns[:, 0] * softest, rcond=None)
+                values = np.array([softest, *rest])
         least[0] = 0.0
     low, high = np.maximum(np.minimum(values, best.x) - widths, least), np.maximum(values, best.x) + widths
     at_bound = (least > -np.inf) & (values > best.x)
@@ -252,14 +255,10 @@ def _r2(curves: Sequence[Curve], residual: FloatArray) -> dict[str, float]:
     return r2
 
 
-def _by_mode(curves: Sequence[Curve]) -> list[Curve]:
-    """All points of one kind of test in one curve."""
-    joined = []
-    for mode in dict.fromkeys(c.mode for c in curves):
-        mine = [c for c in curves if c.mode == mode]
-        stretch, stress = (np.concatenate([getattr(c, part) for c in mine]) for part in ("stretch", "stress_mpa"))
-        joined.append(Curve(mode, stretch, stress))
-    return joined
+def _joined(mode: str, curves: Sequence[Curve]) -> Curve:
+    """All points of one kind of test."""
+    mine = [c for c in curves if c.mode == mode]
+    return Curve(mode, *(np.concatenate([getattr(c, part) for c in mine]) for part in ("stretch", "stress_mpa")))
 
 
 def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: FloatArray) -> list[FloatArray]:
@@ -291,14 +290,6 @@ def _chosen(
     exponents = slice(len(law.names) - law.exponents, None)
     different.sort(key=lambda o: not (o.x[exponents] > 0.0).all())
     return different[0], tuple(different[1:])
-
-
-def _not_softer(values: FloatArray, least: float, columns: FloatArray, stress: FloatArray) -> FloatArray:
-    """The best values with the first ``least`` or more; ``columns`` times the values is the stress."""
-    if values[0] >= least:
-        return values
-    rest, *_ = np.linalg.lstsq(columns[:, 1:], stress - columns[:, 0] * least, rcond=None)
-    return np.concatenate([[least], rest])
 
 
 def _deviations(values: FloatArray, jacobian: FloatArray, residual: FloatArray) -> FloatArray | None:

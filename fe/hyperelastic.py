@@ -5,9 +5,10 @@ With F = U diag(s) V^T, logarithmic stretches e_i = ln s_i and their isochoric p
     W(F, p) = Wbar(ebar) + p (J - 1),
     Wbar = sum_k C_k0 (I1bar - 3)^k + mu_H sum_i ebar_i^2 + sum_q 2 mu_q / alpha_q^2 (sum_i exp(alpha_q ebar_i) - 3),
 
-I1bar = sum_i exp(2 ebar_i): Yeoh's polynomial, Hencky's quadratic, Ogden's terms. One sum holds every law, so there is
-one kernel. A law is a vector (C10, C20, C30, mu_H, mu_1, alpha_1, mu_2, alpha_2, ...), MPa but for the alphas, in which
-mu_q is the term's initial shear modulus. p is the pressure-like multiplier of the volume, MPa, positive in tension.
+I1bar = sum_i exp(2 ebar_i): Yeoh's polynomial, Hencky's quadratic, Ogden's terms. One sum holds every material law, so
+there is one kernel. A law is a vector (C10, C20, C30, mu_H, mu_1, alpha_1, mu_2, alpha_2, ...), MPa but for the alphas,
+in which mu_q is the term's initial shear modulus. p is the pressure-like multiplier of the volume, MPa, positive in
+tension.
 
 The first Piola-Kirchhoff stress of an isotropic solid is P = U diag(dW/ds) V^T, and its derivative has in the principal
 frame only the components (R. W. Ogden, Non-Linear Elastic Deformations, 1984, section 6.1.4)
@@ -22,7 +23,7 @@ from numba import njit
 from dvc.arrays import FloatArray
 
 POLYNOMIAL, HENCKY, OGDEN = 0, 3, 4
-"""Where a law's vector holds C10; mu_H; and its first Ogden pair."""
+"""Where a material law's vector holds C10; mu_H; and its first Ogden pair."""
 
 _EQUAL = 1e-5  # relative distance of principal stretches below which the quotient's limit is used, in error by 1e-10
 _SWEEPS = 30

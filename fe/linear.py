@@ -9,7 +9,7 @@ import platform
 from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -27,56 +27,6 @@ _IN_SINGLE = {1: 1, 2: 2, 8: 0, 10: 8, 11: 0, 13: 0, 21: 1, 28: 1}
 
 class SingularError(MrstrainError, RuntimeError):
     """A matrix that cannot be factorised: a part of the model is free to move, or memory is short."""
-
-
-class Factors(Protocol):
-    """A symmetric matrix of fixed pattern, factorised again whenever its values change."""
-
-    rough: bool  # factorised in single precision
-
-    def factorise(self, data: FloatArray) -> None:
-        """Take new values of the upper triangle, in the order of the pattern."""
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solve with the last values."""
-        ...
-
-    def close(self) -> None:
-        """Free the memory."""
-
-
-def factors(
-    indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None, rough: bool = False
-) -> Factors:
-    """A solver for symmetric matrices whose upper triangle has this pattern (CSR, sorted, with its whole diagonal).
-
-    ``threads`` are PARDISO's; ``library`` is pardiso, ngsolve or superlu, by default the fastest on this machine;
-    ``rough`` asks for single precision, where the library can.
-    """
-    chosen = library or _fastest()
-    if chosen == "pardiso":
-        return _Pardiso(indptr, indices, threads, rough)
-    return _NGSolve(indptr, indices) if chosen == "ngsolve" else _SuperLU(indptr, indices)
-
-
-def _fastest() -> str:
-    if platform.machine().lower() in ("x86_64", "amd64"):
-        return "pardiso"
-    return "ngsolve" if find_spec("ngsolve") is not None else "superlu"
-
-
-def self_test() -> str:
-    """Solve a small system; return a sentence on what came out, for `mrstrain doctor`."""
-    A = sparse.diags([4.0, -1.0], [0, 1], shape=(100, 100), format="csr")
-    A.sort_indices()
-    solver = factors(A.indptr.astype(np.int64), A.indices.astype(np.int64))
-    solver.factorise(A.data)
-    x = solver.solve(np.ones(100))
-    solver.close()
-    whole = A + sparse.triu(A, 1).T
-    if np.abs(whole @ x - 1.0).max() > _FINE:
-        raise MrstrainError(f"{_fastest()} solved a hundred equations wrongly.")
-    return f"{_fastest()} solved a hundred equations"
 
 
 def _ones(indptr: IntArray, indices: IntArray) -> sparse.csr_matrix:
@@ -180,6 +130,44 @@ class _SuperLU:
 
     def close(self) -> None:
         self._factors = None
+
+
+Factors = _Pardiso | _NGSolve | _SuperLU
+"""A symmetric matrix of fixed pattern: `factorise` takes new values of its upper triangle, in the pattern's order."""
+
+
+def factors(
+    indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None, rough: bool = False
+) -> Factors:
+    """A solver for symmetric matrices whose upper triangle has this pattern (CSR, sorted, with its whole diagonal).
+
+    ``threads`` are PARDISO's; ``library`` is pardiso, ngsolve or superlu, by default the fastest on this machine;
+    ``rough`` asks for single precision, where the library can.
+    """
+    chosen = library or _fastest()
+    if chosen == "pardiso":
+        return _Pardiso(indptr, indices, threads, rough)
+    return _NGSolve(indptr, indices) if chosen == "ngsolve" else _SuperLU(indptr, indices)
+
+
+def _fastest() -> str:
+    if platform.machine().lower() in ("x86_64", "amd64"):
+        return "pardiso"
+    return "ngsolve" if find_spec("ngsolve") is not None else "superlu"
+
+
+def self_test() -> str:
+    """Solve a small system; return a sentence on what came out, for `mrstrain doctor`."""
+    A = sparse.diags([4.0, -1.0], [0, 1], shape=(100, 100), format="csr")
+    A.sort_indices()
+    solver = factors(A.indptr.astype(np.int64), A.indices.astype(np.int64))
+    solver.factorise(A.data)
+    x = solver.solve(np.ones(100))
+    solver.close()
+    whole = A + sparse.triu(A, 1).T
+    if np.abs(whole @ x - 1.0).max() > _FINE:
+        raise MrstrainError(f"{_fastest()} solved a hundred equations wrongly.")
+    return f"{_fastest()} solved a hundred equations"
 
 
 class Solver:

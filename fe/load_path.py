@@ -15,8 +15,7 @@ from fe.linear import Solver
 from fe.load_step import PlateTarget
 from fe.model import Model
 from fe.newton import Imposed, Tolerance, equilibrium
-from fe.plate import Contact, ContactStatus
-from fe.plate_rotation import Parallel, Turning
+from fe.plate import Contact, ContactStatus, Parallel, Turning
 from fe.problem import Problem
 from fe.surface_sets import SKIN
 
@@ -86,7 +85,8 @@ class LoadPath:
         held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in problem.fixed]))
         touching = np.setdiff1d(_nodes_on(model, mesh, SKIN), held)
         self.contact = Contact(problem.plate, model.space.nodes_mm, touching)
-        self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), self.contact.may_follow)
+        may_follow = {axis: 3 * touching + axis for axis in range(3)}
+        self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), may_follow)
         self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
         self.extent_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
         self.state = np.zeros(model.unknowns)
@@ -170,7 +170,8 @@ class LoadPath:
                 continue
             self._back(last)
             step *= _SHRINK
-            if step < _SOFT_STEP and not (downhill or target.displaced.any()) and self.contact.stays:
+            stays = self.contact.plate.taped and not self.contact.status.turns
+            if step < _SOFT_STEP and stays and not (downhill or target.displaced.any()):
                 downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0
 

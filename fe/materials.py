@@ -1,7 +1,7 @@
-"""Laws of nearly incompressible, isotropic soft tissue: neo-Hooke, Yeoh, Ogden, Hencky.
+"""Material laws of nearly incompressible, isotropic soft tissue: neo-Hooke, Yeoh, Ogden, Hencky.
 
-Every law is W(F) = Wbar(F J^(-1/3)) + K / 2 (J - 1)^2 with J = det F. The bulk modulus K comes from the initial shear
-modulus mu0 and Poisson's ratio, K = 2 mu0 (1 + nu) / (3 (1 - 2 nu)). Units: MPa; stretches have none.
+Every material law is W(F) = Wbar(F J^(-1/3)) + K / 2 (J - 1)^2 with J = det F. K, the bulk modulus, comes from the initial
+shear modulus mu0 and Poisson's ratio, K = 2 mu0 (1 + nu) / (3 (1 - 2 nu)). Units: MPa; stretches have none.
 
 What a number means depends on the program that it was made for; the constructors say which: `Ogden.from_ansys`,
 `Ogden.from_abaqus`, `Ogden.from_febio`. The same mu and alpha give initial shear moduli that differ by alpha / 2.
@@ -33,7 +33,7 @@ _SEARCHED = float(np.log(5.0))  # stretches of 1/5 to 5 are searched for a loss 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Material:
-    """A hyperelastic law with its numbers; made by `NeoHooke`, `Yeoh`, `Ogden` and `Hencky`.
+    """A material law (hyperelastic) with its parameters; made by `NeoHooke`, `Yeoh`, `Ogden` and `Hencky`.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Material:
         vector = frozen(self.vector, np.float64)
         object.__setattr__(self, "vector", vector)
         if not (np.isfinite(vector).all() and np.isfinite(self.nu)):
-            raise InputError(f"{self.description}: every number of a law must be finite.")
+            raise InputError(f"{self.description}: every parameter of a material law must be finite.")
         if not 0.0 <= self.nu <= HIGHEST_NU:
             raise InputError(
                 f"{self.description}: Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {self.nu:g}. For "
@@ -125,7 +125,7 @@ class Material:
         return np.asarray(~folded & (least_stiffness(self.vector, strains) > 0.0))
 
     def stable_range(self, mode: str) -> tuple[float, float]:
-        """Least and greatest stretch of a test, between 1/5 and 5, between which the law is stable (Drucker).
+        """Least and greatest stretch of a test, between 1/5 and 5, between which the material law is stable (Drucker).
 
         Examples
         --------
@@ -142,8 +142,12 @@ class Material:
         return round(ends[0], 6), round(ends[1], 6)
 
 
+Materials = Mapping[str, Material]
+"""Materials by region."""
+
+
 def nominal_stress(vector: FloatArray, stretch: FloatArray, mode: str) -> FloatArray:
-    """As `Material.nominal_stress`, for a law's vector alone."""
+    """As `Material.nominal_stress`, for a material law's vector alone."""
     _check_mode(mode)
     if not (stretch > 0.0).all():
         raise InputError("Stretches must be positive.")
@@ -195,8 +199,8 @@ class Yeoh(Material):
 class Hencky(Material):
     """Wbar = mu sum_i ebar_i^2: linear elastic in logarithmic strain.
 
-    It is what a linear elastic material amounts to in a run with large displacements; Saint Venant-Kirchhoff's law,
-    which is linear in the Green-Lagrange strain, collapses in compression.
+    It is what a linear elastic material amounts to under large displacements; Saint Venant-Kirchhoff's law, which is
+    linear in the Green-Lagrange strain, collapses in compression.
     """
 
     law: ClassVar[str] = "linear elastic (Hencky)"

@@ -9,9 +9,9 @@ import numpy as np
 
 from dvc import TetMesh, read_mesh
 from dvc.arrays import IntArray
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
-from fe.surface_sets import known_name
+from fe.surface_sets import BONE, CUT, SKIN
 
 _FIRST_FACET = 101  # numbers of facets in the array "region"; those of tissues begin at 1
 _MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, beside its components
@@ -34,7 +34,7 @@ def write_tet_mesh(path: Path, mesh: TetMesh, about: dict[str, object]) -> None:
     with whole_file(path) as part:
         meshio.vtu.write(part, meshio.Mesh(mesh.points_mm, blocks, cell_data={"region": numbers}), binary=True)
     names = {str(number): name for named in (tissues, facets) for name, number in named.items()}
-    write_whole(_names_of(path), json.dumps({"regions": names} | about, indent=2) + "\n")
+    write_json(_names_of(path), {"regions": names} | about)
 
 
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:
@@ -67,7 +67,8 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
     regions = _without(regions, {name for name in regions if _MATERIAL.fullmatch(name)}, count)
     facets: dict[str, IntArray] = {}
     for name, rows in mesh.facets.items():
-        known = known_name(names.get(name, name))
+        known = names.get(name, name)
+        known = known.casefold() if known.casefold() in (BONE, SKIN, CUT) else known
         if known in facets:
             raise InputError(f"{place}: two sets of facets are called '{known}'; case does not count. Rename one.")
         facets[known] = rows

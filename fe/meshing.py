@@ -15,8 +15,7 @@ from dvc.mesh import FACES, signed_volumes
 from dvc.worker import Worker
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.surface_sets import BONE, CUT, SKIN
-from fe.tissue_surfaces import Borders, borders_of, labels_at
-from fe.tissue_volumes import with_volumes
+from fe.tissue_surfaces import Borders, borders_of, labels_at, with_volumes
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
 _FARTHEST = 0.1  # of the smallest voxel edge: how far a node may move at once to keep the tissues' volumes
@@ -122,7 +121,7 @@ def mesh_labels(
     Notes
     -----
     The tetrahedra are fTetWild's (Hu and others 2020, doi:10.1145/3386569.3392385). Borders are then moved, by three
-    tenths of a voxel at the most, until each region has the volume of its voxels (`fe.tissue_volumes`); where a cell
+    tenths of a voxel at the most, until each region has the volume of its voxels (`fe.tissue_surfaces`); where a cell
     has an angle under 12 degrees, nodes are moved until there is none or no move helps. Meshes differ slightly from run
     to run: keep a mesh, and its hash, with what was computed on it.
     """
@@ -252,7 +251,8 @@ def _named(
     outer = first[count == 1]
     triangles, owner = faces[outer], np.tile(tissue, 4)[outer]
     bone_faces = np.sort(np.concatenate([cells[np.isin(cell_labels, bones)][:, face] for face in FACES]), axis=1)
-    at_bone = _rows_in(triangles, bone_faces)
+    which = np.unique(np.concatenate([bone_faces, triangles]), axis=0, return_inverse=True)[1].ravel()
+    at_bone = np.isin(which[len(bone_faces) :], which[: len(bone_faces)])
     free: BoolArray = np.logical_not(at_bone)
     cut = np.zeros(len(triangles), dtype=bool)
     if skins := [number for name, number in soft.items() if name.casefold() == SKIN]:
@@ -261,12 +261,6 @@ def _named(
     facets = {BONE: triangles[at_bone], SKIN: triangles[free & ~cut], CUT: triangles[cut]}
     regions = {name: np.flatnonzero(tissue == number) for name, number in soft.items()}
     return TetMesh(points, body, regions, {name: rows for name, rows in facets.items() if len(rows)})
-
-
-def _rows_in(rows: IntArray, others: IntArray) -> IntArray:
-    """Which rows are among others, all sorted."""
-    which = np.unique(np.concatenate([others, rows]), axis=0, return_inverse=True)[1].ravel()
-    return np.asarray(np.isin(which[len(others) :], which[: len(others)]))
 
 
 def _rim(points: FloatArray, triangles: IntArray, asked: BoolArray, cut: BoolArray, labels: LabelMap) -> BoolArray:

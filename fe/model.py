@@ -1,6 +1,5 @@
 """A mesh with its materials, discretised by an element: what is assembled, and what its states mean."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Self
 
@@ -9,7 +8,7 @@ import numpy as np
 from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
 from fe.elements import Element, Space
-from fe.materials import Material
+from fe.materials import Materials
 
 CROWDED = 0.4
 """det F below which a cell resists with an energy of its own, K / 3 ln(CROWDED / J)^3, so that it does not fold."""
@@ -29,7 +28,7 @@ class Model:
     law: IntArray  # (m,) number of each cell's material law
 
     @classmethod
-    def of(cls, mesh: TetMesh, materials: Mapping[str, Material], element: Element) -> Self:
+    def of(cls, mesh: TetMesh, materials: Materials, element: Element) -> Self:
         """The model of a mesh; each cell is in one of the regions of ``materials``."""
         law = np.full(len(mesh.cells), -1)
         for number, region in enumerate(materials):
@@ -53,13 +52,6 @@ class Model:
     def unknowns(self) -> int:
         """Displacements and pressures."""
         return 3 * len(self.space.nodes_mm) + self.space.pressures
-
-    @property
-    def node_volumes_mm3(self) -> FloatArray:
-        """Volumes (n,) of the displacement nodes: each cell's, in equal parts."""
-        cells = self.space.cells
-        each = np.repeat(self.volumes_mm3 / cells.shape[1], cells.shape[1])
-        return np.bincount(cells.ravel(), weights=each, minlength=len(self.space.nodes_mm)).astype(np.float64)
 
     def unknowns_of_cells(self) -> IntArray:
         """Unknowns of each cell (m, 3 a + 4): its nodes' x, y, z one node after the other, then its pressures."""

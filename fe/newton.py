@@ -8,7 +8,7 @@ import numpy as np
 from dvc.arrays import FloatArray, IntArray
 from fe.assembly import Assembler
 from fe.linear import SingularError, Solver
-from fe.plate_rotation import Parallel
+from fe.plate import Parallel
 
 _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at

@@ -12,7 +12,7 @@ from dvc.arrays import IntArray
 from dvc.errors import InputError
 from fe.elements import element as formulation
 from fe.load_step import LoadStep, paths_of
-from fe.materials import Material
+from fe.materials import Materials
 from fe.plate import Contact, Plate
 from fe.surface_sets import BONE, SKIN
 
@@ -42,7 +42,7 @@ class Problem:
     """
 
     mesh: TetMesh
-    materials: Mapping[str, Material]
+    materials: Materials
     plate: Plate
     loads: Sequence[LoadStep]
     fixed: Sequence[str] = (BONE,)
@@ -71,7 +71,7 @@ class Problem:
 
 def problems_of(
     mesh: TetMesh,
-    materials: Mapping[str, Material],
+    materials: Materials,
     plate: Plate | Mapping[str, Plate],
     loads: Sequence[LoadStep],
     fixed: Sequence[str] = (BONE,),
@@ -100,7 +100,7 @@ def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
             raise InputError(f"{load.name}: a plate without friction carries no shear; got {load}.")
 
 
-def check_materials(mesh: TetMesh, materials: Mapping[str, Material]) -> None:
+def check_materials(mesh: TetMesh, materials: Materials) -> None:
     """Refuse a mesh of which a cell has no material, or more than one, with an `InputError`."""
     times = np.zeros(len(mesh.cells), dtype=int)
     for region in materials:
@@ -111,7 +111,7 @@ def check_materials(mesh: TetMesh, materials: Mapping[str, Material]) -> None:
         bare, twice = int((times == 0).sum()), int((times > 1).sum())
         without = ", ".join(name for name in mesh.regions if name not in materials)
         raise InputError(
-            f"Every cell needs one law: {bare} have none and {twice} more than one. Regions without a law: "
+            f"Every cell needs one material law: {bare} have none and {twice} more than one. Regions without one: "
             f"{without or 'none'}."
         )
 

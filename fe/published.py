@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 from dvc.errors import InputError
 from fe.hyperelastic import OGDEN
-from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
+from fe.materials import Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
 
 WHOLE = "all"
 """Name of the tissue in a set that has one material law for everything."""
@@ -59,24 +59,24 @@ class MaterialSet:
     name: str
     title: str
     source: str
-    materials: Mapping[str, Material]
+    materials: Materials
 
     def for_regions(self, regions: Iterable[str]) -> tuple[dict[str, Material], tuple[str, ...]]:
-        """The law of each region of a mesh, and a sentence for each region that has none of its own.
+        """The material law of each region of a mesh, and a sentence for each region that has none of its own.
 
-        Tendon and aponeurosis without a law take muscle's, or else fat's; muscle takes fat's. No other region takes
+        Tendon and aponeurosis without one take muscle's, or else fat's; muscle takes fat's. No other region takes
         another's.
 
         Raises
         ------
         InputError
-            If a region has no law and the set none to put in its place.
+            If a region has no material law and the set none to put in its place.
 
         Examples
         --------
         >>> materials, notes = material_set("friedman").for_regions(["fat", "skin", "muscle"])
         >>> materials["muscle"] is materials["fat"], notes
-        (True, ("friedman has no law for muscle; fat's is used.",))
+        (True, ("friedman has no material law for muscle; fat's is used.",))
         """
         by_region: dict[str, Material] = {}
         notes = []
@@ -89,12 +89,12 @@ class MaterialSet:
             if name is None:
                 instead = f", nor one for {' or '.join(tried[1:])} to put in its place" if tried[1:] else ""
                 raise InputError(
-                    f"The set {self.name} has no law for the region '{region}'{instead}; it has "
+                    f"The set {self.name} has no material law for the region '{region}'{instead}; it has "
                     f"{', '.join(self.materials)}. Add it to the set in a file of your own, or rename the region."
                 )
             by_region[region] = known[name.casefold()]
             if name != region:
-                notes.append(f"{self.name} has no law for {region}; {name}'s is used.")
+                notes.append(f"{self.name} has no material law for {region}; {name}'s is used.")
         return by_region, tuple(notes)
 
 
@@ -144,7 +144,7 @@ def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
     return _parsed(str(path), text)
 
 
-def as_toml(name: str, title: str, materials: Mapping[str, Material]) -> str:
+def as_toml(name: str, title: str, materials: Materials) -> str:
     """A set as text in the form that `read_material_sets` takes; Ogden's numbers in the convention of Abaqus.
 
     Examples
@@ -202,7 +202,7 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
         head = {key: content.get(key, "") for key in ("title", "source")}
         tissues = {key: value for key, value in content.items() if key not in head}
         if not tissues:
-            raise InputError(f"{where}: the set '{name}' has no tissue; add [{name}.fat] with a law.")
+            raise InputError(f"{where}: the set '{name}' has no tissue; add [{name}.fat] with a material law.")
         materials = {tissue: _law(f"{where}, {name}.{tissue}", given) for tissue, given in tissues.items()}
         sets[name] = MaterialSet(name, str(head["title"]), str(head["source"]), MappingProxyType(materials))
     if not sets:
@@ -212,7 +212,7 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
 
 def _law(where: str, given: object) -> Material:
     if not isinstance(given, dict):
-        raise InputError(f"{where}: a tissue is a table with a law and its numbers; got {given!r}.")
+        raise InputError(f"{where}: a tissue is a table with a material law and its numbers; got {given!r}.")
     law = given.get("law")
     form = _form(where, law, given.get("convention"))
     values: dict[str, float | list[float]] = {}

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
 from dvc.trust.regions import SHEAR_THRESHOLDS, volume_above
 from fe.load_path import PlateState
-from fe.materials import Material
+from fe.materials import Materials
 from fe.model import CROWDED
 from fe.solution import LoadState
 
@@ -28,7 +28,7 @@ _VECTORS = {
 }  # vectors of a plate's state, and the columns of their components
 
 
-def cauchy_stress(state: LoadState, mesh: TetMesh, materials: Mapping[str, Material]) -> FloatArray:
+def cauchy_stress(state: LoadState, mesh: TetMesh, materials: Materials) -> FloatArray:
     """Cauchy stress of each cell (m, 3, 3), MPa, LPS: the material law's deviator, and the cell's mean pressure."""
     F = np.eye(3) + state.gradients
     stress = np.empty_like(F)
@@ -60,7 +60,7 @@ def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
     return np.asarray(np.bincount(nodes, np.repeat(mesh.volumes_mm3 * jacobian, 4)) / before)
 
 
-def volume_share_off(mesh: TetMesh, state: LoadState, materials: Mapping[str, Material], by: float) -> float:
+def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials, by: float) -> float:
     """Share of the volume where det F of nodal patches differs by more than ``by`` from the material law's, 1 + p / K.
 
     Mean over a cell's nodes. A material of low bulk modulus K may well give way; only the mesh's error is counted.
@@ -114,7 +114,7 @@ class RegionFigures:
     crowded_share: float
 
 
-def region_figures(mesh: TetMesh, state: LoadState, materials: Mapping[str, Material]) -> list[RegionFigures]:
+def region_figures(mesh: TetMesh, state: LoadState, materials: Materials) -> list[RegionFigures]:
     """Figures of each region under a load."""
     strain = state.strain
     stress = equivalent_stress(cauchy_stress(state, mesh, materials))
@@ -194,7 +194,7 @@ def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
     return curves
 
 
-def write_state(path: Path, mesh: TetMesh, state: LoadState, materials: Mapping[str, Material]) -> None:
+def write_state(path: Path, mesh: TetMesh, state: LoadState, materials: Materials) -> None:
     """Write a load's results as VTU: LPS mm and MPa, on the undeformed mesh (warp by ``displacement_mm``).
 
     At nodes: displacement, and det F of the patch around each. In cells: number of the region, F, Green-Lagrange

@@ -1,8 +1,6 @@
 """A simulation: what a material parameter set gave under its loads, as arrays, as files, as a picture."""
 
-import base64
 import html
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -10,14 +8,14 @@ from typing import TYPE_CHECKING, Self
 
 from dvc import TetMesh
 from dvc.arrays import FloatArray
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_json
 from dvc.deformation.nodal import OnMesh
 from dvc.errors import InputError
 from fe import result
 from fe.decks import write_calculix, write_febio
 from fe.elements import DESCRIPTIONS
 from fe.load_step import LoadStep
-from fe.materials import MODES, Material
+from fe.materials import MODES, Materials
 from fe.model import CROWDED
 from fe.plate import Plate
 from fe.problem import Problem, problems_of
@@ -193,9 +191,10 @@ class Simulation:
         return sagittal_slice(self.mesh, self.states if loads is None else [self.state(name) for name in loads])
 
     def _repr_html_(self) -> str:
+        from dvc.report.page import Picture
         from dvc.report.sheet import png_bytes
 
-        picture = base64.b64encode(png_bytes(self.plot())).decode("ascii")
+        picture = Picture(self.name, "", png_bytes(self.plot())).data
         ended = sum(state.reached == 1.0 for state in self.states)
         title = f"{self.name}: {ended} of {len(self.loads)} loads reached"
         columns = ["load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N"]
@@ -210,7 +209,7 @@ class Simulation:
         notes = "".join(f"<li>{html.escape(note)}</li>" for note in self.notes)
         return (
             f"<div><strong>{html.escape(title)}</strong><table>{table}</table><ul>{notes}</ul>"
-            f'<img style="max-width: 100%" alt="Maximum shear strain" src="data:image/png;base64,{picture}"></div>'
+            f'<img style="max-width: 100%" alt="Maximum shear strain" src="{picture}"></div>'
         )
 
     def parameters(self) -> dict[str, object]:
@@ -264,8 +263,7 @@ class Simulation:
         result.write_curve_csv(place / "curve.csv", self.states)
         parameters = {"fixed": list(self.fixed), "turns": self.turns} | self.parameters()
         content = {"outcome": {s.load.name: self._outcome(s) for s in self.states}, "notes": list(self.notes)}
-        text = json.dumps(content | dict(record or {"parameters": parameters}), indent=2, allow_nan=False)
-        write_whole(place / RECORD, text + "\n")
+        write_json(place / RECORD, content | dict(record or {"parameters": parameters}))
         figures.write_figure(place / "slices.png", self.plot())
         figures.write_figure(place / "force_travel.png", figures.force_displacement(self.states))
 
@@ -326,7 +324,7 @@ class Simulation:
 
 def simulate(
     mesh: TetMesh,
-    materials: MaterialSet | Mapping[str, Material],
+    materials: MaterialSet | Materials,
     plate: Plate | Mapping[str, Plate],
     loads: Sequence[LoadStep],
     *,

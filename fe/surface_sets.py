@@ -8,11 +8,6 @@ BONE, SKIN, CUT = "bone", "skin", "cut"
 """The interface with bone, which is fixed; the outer surface, which the plate may touch; and where a label map ends."""
 
 
-def known_name(name: str) -> str:
-    """One of the three names where this is one in another case; else the name as it is."""
-    return name.casefold() if name.casefold() in (BONE, SKIN, CUT) else name
-
-
 def fixed_facets(mesh: TetMesh, beside: Sequence[str]) -> tuple[str, ...]:
     """The bone's facets and others beside them, as the mesh spells them."""
     spelt = {name.casefold(): name for name in mesh.facets} | {name: name for name in mesh.facets}
