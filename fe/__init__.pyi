@@ -2,9 +2,8 @@ from .convergence import Limit, cell_size_mm, extrapolate
 from .decks import write_calculix, write_febio
 from .fitting import LAWS, Fit, fit
 from .from_dvc import InputError, MrstrainError, OutputError, TetMesh, WorkerError
-from .load_path import PlateState
+from .load_path import Checkpoint, PlateState
 from .load_step import LoadStep, paths_of
-from .loading import Checkpoint
 from .materials import MODES, Hencky, Material, NeoHooke, Ogden, Yeoh
 from .mesh_file import read_tet_mesh, write_tet_mesh
 from .meshing import MeshQuality, check_meshing, mesh_labels

@@ -78,35 +78,31 @@ class _Law:
 
 
 def _polynomial(*names: str) -> _Law:
-    def vector(values: FloatArray) -> FloatArray:
-        return np.concatenate([values, np.zeros(4 - len(values))])
-
     def material(values: FloatArray, nu: float) -> Material:
         c10, c20, c30 = (*values.tolist(), 0.0)[:3]
         return Yeoh.of(c10, c20, c30, nu)
 
-    return _Law(names, vector, material, bounded=True)
+    return _Law(names, lambda values: np.append(values, np.zeros(OGDEN - len(values))), material, bounded=True)
 
 
 def _ogden(terms: int) -> _Law:
-    def vector(values: FloatArray) -> FloatArray:
-        return np.concatenate([np.zeros(OGDEN), np.column_stack([values[:terms], values[terms:]]).ravel()])
-
     numbers = [""] if terms == 1 else [str(q + 1) for q in range(terms)]
-    names = (*(f"mu{n}" for n in numbers), *(f"alpha{n}" for n in numbers))
-    return _Law(names, vector, lambda values, nu: Ogden.of(values[:terms], values[terms:], nu), terms)
+    return _Law(
+        (*(f"mu{n}" for n in numbers), *(f"alpha{n}" for n in numbers)),
+        lambda values: np.append(np.zeros(OGDEN), np.column_stack([values[:terms], values[terms:]])),
+        lambda values, nu: Ogden.of(values[:terms], values[terms:], nu),
+        terms,
+    )
 
 
 LAWS: Mapping[str, _Law] = {
-    "neo-Hooke": _Law(
-        ("mu",), lambda v: np.array([0.5 * v[0], 0.0, 0.0, 0.0]), lambda v, nu: NeoHooke.of(float(v[0]), nu)
-    ),
+    "neo-Hooke": _Law(("mu",), lambda v: 0.5 * v[0] * np.eye(OGDEN)[0], lambda v, nu: NeoHooke.of(float(v[0]), nu)),
     "Isihara": _polynomial("C10", "C20"),
     "Yeoh": _polynomial("C10", "C20", "C30"),
     "Ogden": _ogden(1),
     "Ogden-2": _ogden(2),
     "Ogden-3": _ogden(3),
-    "Hencky": _Law(("mu",), lambda v: v[0] * np.eye(1, OGDEN, HENCKY)[0], lambda v, nu: Hencky.of(float(v[0]), nu)),
+    "Hencky": _Law(("mu",), lambda v: v[0] * np.eye(OGDEN)[HENCKY], lambda v, nu: Hencky.of(float(v[0]), nu)),
 }
 """Material laws that can be fitted. Isihara's is Yeoh's without C30."""
 
@@ -177,8 +173,8 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         material = sought.material(values, nu)
     except InputError as unusable:
         raise InputError(
-            f"The best fit is no usable material law ({unusable}) Give points nearer to a stretch of 1, or fit one with "
-            "fewer parameters."
+            f"The best fit is no usable material law ({unusable}) Give points nearer to a stretch of 1, or fit one "
+            "with fewer parameters."
         ) from unusable
     residual = modelled(values) - stress
     return Fit(

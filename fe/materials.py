@@ -1,6 +1,6 @@
 """Material laws of nearly incompressible, isotropic soft tissue: neo-Hooke, Yeoh, Ogden, Hencky.
 
-Every material law is W(F) = Wbar(F J^(-1/3)) + K / 2 (J - 1)^2 with J = det F. K, the bulk modulus, comes from the initial
+Every material law is W(F) = Wbar(F J^(-1/3)) + K / 2 (J - 1)^2 with J = det F; its bulk modulus comes from the initial
 shear modulus mu0 and Poisson's ratio, K = 2 mu0 (1 + nu) / (3 (1 - 2 nu)). Units: MPa; stretches have none.
 
 What a number means depends on the program that it was made for; the constructors say which: `Ogden.from_ansys`,

@@ -11,8 +11,7 @@ import numpy as np
 
 from dvc.atomic_files import whole_file
 from dvc.software import software_key
-from fe.load_path import PlateState
-from fe.loading import Checkpoint
+from fe.load_path import Checkpoint, PlateState
 from fe.plate import ContactStatus
 from fe.problem import Problem
 

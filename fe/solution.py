@@ -9,9 +9,8 @@ import numpy as np
 from dvc import StrainField, TetMesh
 from dvc.arrays import FloatArray, IntArray
 from fe.elements import element
-from fe.load_path import LoadPath, PlateState
+from fe.load_path import Checkpoint, Loading, LoadPath, PlateState
 from fe.load_step import LoadStep
-from fe.loading import Checkpoint, Loading
 from fe.model import Model
 from fe.newton import Tolerance
 from fe.problem import Problem
@@ -60,7 +59,7 @@ class LoadState:
     Attributes
     ----------
     reached, curve, iterations, seconds
-        As in `fe.loading.Checkpoint`; the curve is empty where there is no plate.
+        As in `fe.Checkpoint`; the curve is empty where there is no plate.
     u_mm : (n, 3)
         Displacement of the mesh's nodes, mm.
     pressure_mpa : (m,)
