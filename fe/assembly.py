@@ -12,8 +12,8 @@ from numba import njit, prange
 from scipy import sparse
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
+from fe.elements import CROWDED, Model
 from fe.hyperelastic import principal_response, singular_values
-from fe.model import CROWDED, Model
 
 _CHUNK = 16384  # cells whose matrices are in memory at once
 FIXED = -1

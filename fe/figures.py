@@ -20,11 +20,10 @@ from dvc.report.figures import REGION_COLOURS
 from dvc.report.planes import letters
 from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.convergence import Limit
-from fe.fitting import Fit
+from fe.fitting import Curve, Fit
 from fe.plate import Plate
 from fe.result import volume_percentiles
 from fe.solution import LoadState
-from fe.stress_curves import Curve
 from fe.surface_sets import BONE
 
 _POINTS = 200

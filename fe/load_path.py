@@ -12,10 +12,9 @@ from dvc import TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from fe.assembly import Assembler
 from fe.descent import descend
-from fe.elements import edges_of
+from fe.elements import Model, edges_of
 from fe.linear import Solver
 from fe.load_step import PlateTarget
-from fe.model import Model
 from fe.newton import Imposed, Tolerance, equilibrium
 from fe.plate import Contact, ContactStatus, Parallel, Turning
 from fe.problem import Problem

@@ -10,8 +10,6 @@ import numpy as np
 from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
 
-_SAME_DIRECTIONS: Mapping[str, Hashable] = MappingProxyType({})
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateTarget:
@@ -83,7 +81,7 @@ class LoadStep:
 
 
 def paths_of(
-    loads: Sequence[LoadStep], directions: Mapping[str, Hashable] = _SAME_DIRECTIONS
+    loads: Sequence[LoadStep], directions: Mapping[str, Hashable] = MappingProxyType({})
 ) -> list[tuple[LoadStep, ...]]:
     """Loads by path: pressed alike and sheared to the same side, by force or by displacement, in the order of shear.
 

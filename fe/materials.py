@@ -19,7 +19,7 @@ from dvc.errors import InputError
 from fe.hyperelastic import HENCKY, OGDEN, POLYNOMIAL, along, least_stiffness, stress_and_tangent
 
 HIGHEST_NU = 0.49999
-"""Above it the bulk modulus is over 50,000 times the shear modulus: no measurement tells that from incompressible."""
+"""Above it the bulk modulus is over 50,000 times the shear modulus, which no measurement distinguishes from infinite."""
 
 MODES: Mapping[str, tuple[float, float, float]] = {
     "uniaxial": (1.0, -0.5, -0.5),
@@ -267,7 +267,7 @@ class Ogden(Material):
 
 
 def from_vector(description: str, vector_mpa: FloatArray, bulk_modulus_mpa: float) -> Material:
-    """A material from what `Material` tells of itself; Poisson's ratio, to ten digits, from the bulk modulus."""
+    """A material from its description and numbers; Poisson's ratio, to ten digits, from the bulk modulus."""
     (made,) = (one for one in (NeoHooke, Yeoh, Hencky, Ogden) if description.startswith(f"{one.law},"))
     mu, K = Material(vector_mpa, 0.0, description).shear_modulus_mpa, bulk_modulus_mpa
     return made(vector_mpa, round((3.0 * K - 2.0 * mu) / (6.0 * K + 2.0 * mu), 10), description)

@@ -37,7 +37,7 @@ class Problem:
     Raises
     ------
     InputError
-        If a region has no material or a cell no region, a surface set is missing, tissue hangs on nothing that is
+        If a region has no material or a cell no region, a surface set is missing, tissue is joined to nothing that is
         fixed, the plate comes from the wrong side, or a load cannot be brought onto tissue.
     """
 

@@ -13,9 +13,9 @@ from dvc import TetMesh
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
 from dvc.trust.regions import SHEAR_THRESHOLDS, volume_above
+from fe.elements import CROWDED
 from fe.load_path import PlateState
 from fe.materials import Materials
-from fe.model import CROWDED
 from fe.solution import LoadState
 
 _SHARES = (0.5, 0.9, 0.99)
@@ -95,7 +95,7 @@ class RegionFigures:
     stable_share : float
         Share of the volume in which the material law is stable (Drucker) at the strain reached.
     crowded_share : float
-        Share of the volume with det F below `fe.model.CROWDED`, where the solver adds resistance to the material law's.
+        Share of the volume with det F below `fe.elements.CROWDED`, where the solver adds resistance of its own.
     """
 
     load: str

@@ -13,10 +13,9 @@ from dvc.deformation.nodal import OnMesh
 from dvc.errors import InputError
 from fe import result
 from fe.decks import write_calculix, write_febio
-from fe.elements import DESCRIPTIONS
+from fe.elements import CROWDED, DESCRIPTIONS
 from fe.load_step import LoadStep
 from fe.materials import MODES, Materials
-from fe.model import CROWDED
 from fe.plate import Plate
 from fe.problem import Problem, problems_of
 from fe.published import MaterialSet
@@ -348,7 +347,7 @@ def simulate(
     element : {"P1", "MINI", "P2"}
         As in `fe.elements`.
     observer : Observer, optional
-        Hears how each path gets on.
+        Receives the progress of each path.
 
     Raises
     ------

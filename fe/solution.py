@@ -8,10 +8,9 @@ import numpy as np
 
 from dvc import StrainField, TetMesh
 from dvc.arrays import FloatArray, IntArray
-from fe.elements import element
+from fe.elements import Model, element
 from fe.load_path import Checkpoint, Loading, LoadPath, PlateState
 from fe.load_step import LoadStep
-from fe.model import Model
 from fe.newton import Tolerance
 from fe.problem import Problem
 

@@ -51,7 +51,7 @@ def borders_of(labels: LabelMap) -> Borders:
     smooth.Update()
     net, made = nets.GetOutput(), smooth.GetOutput()
     if not made.GetNumberOfPolys():
-        raise MrstrainError("No border between tissues was found in the label map.")
+        raise MrstrainError("There is no border between tissues in the label map.")
     own = vtk_to_numpy(made.GetPoints().GetData()).astype(np.float64)
     return Borders(
         own @ grid.direction.T + grid.origin_mm,

@@ -25,7 +25,7 @@ from fe import (
     write_calculix,
     write_febio,
 )
-from fe.model import Model
+from fe.elements import Model
 from tests.blocks import block
 from tests.fe.solving import solved
 
