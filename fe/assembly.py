@@ -16,7 +16,6 @@ from fe.elements import CROWDED, Model
 from fe.hyperelastic import principal_response, singular_values
 
 _CHUNK = 16384  # cells whose matrices are in memory at once
-FIXED = -1
 
 
 class Assembler:
@@ -31,7 +30,7 @@ class Assembler:
         self._cells = model.unknowns_of_cells()
         free = np.ones(model.unknowns, dtype=bool)
         free[fixed] = False
-        self._own = np.where(free, np.cumsum(free) - 1, FIXED)
+        self._own = np.where(free, np.cumsum(free) - 1, -1)  # -1 where fixed
         self.own_equations = int(free.sum())
         self.size = self.own_equations + len(shared)
         self._may_share = np.zeros(model.unknowns, dtype=bool)

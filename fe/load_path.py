@@ -46,7 +46,7 @@ class PlateState:
     moment_nmm : (3,)
         On the tissue, about its pivot.
     area_mm2 : float
-        Of the surface that holds to it, as it is now: of faces with all their corners on the plate.
+        Of the deformed surface on it: of faces with all their corners on the plate.
     """
 
     displacement_mm: FloatArray

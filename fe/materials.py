@@ -19,7 +19,7 @@ from dvc.errors import InputError
 from fe.hyperelastic import HENCKY, OGDEN, POLYNOMIAL, along, least_stiffness, stress_and_tangent
 
 HIGHEST_NU = 0.49999
-"""Above it the bulk modulus is over 50,000 times the shear modulus, which no measurement distinguishes from infinite."""
+"""Above it the bulk modulus is over 50,000 times the shear modulus: measurements cannot tell it from infinite."""
 
 MODES: Mapping[str, tuple[float, float, float]] = {
     "uniaxial": (1.0, -0.5, -0.5),

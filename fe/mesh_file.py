@@ -34,7 +34,7 @@ def write_tet_mesh(path: Path, mesh: TetMesh, about: dict[str, object]) -> None:
     with whole_file(path) as part:
         meshio.vtu.write(part, meshio.Mesh(mesh.points_mm, blocks, cell_data={"region": numbers}), binary=True)
     names = {str(number): name for named in (tissues, facets) for name, number in named.items()}
-    write_json(_names_of(path), {"regions": names} | about)
+    write_json(path.with_suffix(".json"), {"regions": names} | about)
 
 
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:
@@ -55,12 +55,13 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
     if read.tets is None:
         raise InputError(f"{place}: the simulation takes tetrahedra; this mesh has cells of other shapes.")
     names: dict[str, str] = {}
-    if _names_of(place).is_file():
+    names_file = place.with_suffix(".json")
+    if names_file.is_file():
         try:
-            table = json.loads(_names_of(place).read_text(encoding="utf-8"))["regions"]
+            table = json.loads(names_file.read_text(encoding="utf-8"))["regions"]
             names = {f"region {number}": str(name) for number, name in table.items()}
         except (ValueError, KeyError, AttributeError, TypeError) as damaged:
-            raise InputError(f"{_names_of(place)}: no table of regions in it ({damaged}).") from damaged
+            raise InputError(f"{names_file}: no table of regions in it ({damaged}).") from damaged
     mesh = read.tets
     regions, count = {names.get(name, name): cells for name, cells in mesh.regions.items()}, len(mesh.cells)
     regions = _without(regions, {name for name, cells in regions.items() if len(cells) == count}, count)
@@ -80,7 +81,3 @@ def _without(regions: dict[str, IntArray], names: set[str], cell_count: int) -> 
     others = {name: cells for name, cells in regions.items() if name not in names}
     held = np.unique(np.concatenate([*others.values(), np.empty(0, dtype=np.int64)]))
     return others if len(held) == cell_count else regions
-
-
-def _names_of(path: Path) -> Path:
-    return path.with_suffix(".json")
