@@ -25,9 +25,8 @@ from dvc import TetMesh
 from dvc.arrays import IntArray
 from fe import LoadState, LoadStep, PlateState, Tolerance, material_set, read_tet_mesh, write_calculix
 from fe.assembly import Assembler
-from fe.elements import edges_of, element
+from fe.elements import Model, edges_of, element
 from fe.linear import Solver
-from fe.model import Model
 from fe.newton import Imposed, equilibrium
 from mrstrain.records.provenance import versions
 

@@ -21,9 +21,8 @@ import numpy as np
 from dvc import StrainField, TetMesh
 from fe import LoadState, LoadStep, NeoHooke, Ogden, Plate, Problem, Tolerance, material_set, read_tet_mesh, solve
 from fe.assembly import Assembler
-from fe.elements import element
+from fe.elements import Model, element
 from fe.linear import Solver
-from fe.model import Model
 from fe.newton import Imposed, equilibrium
 from fe.result import patch_volumes, volume_percentiles
 from mrstrain.records.provenance import versions

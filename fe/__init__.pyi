@@ -1,10 +1,9 @@
 from .convergence import Limit, cell_size_mm, extrapolate
 from .decks import write_calculix, write_febio
-from .fitting import LAWS, Fit, fit
+from .fitting import LAWS, Curve, Fit, fit, read_curves
 from .from_dvc import InputError, MrstrainError, OutputError, TetMesh, WorkerError
-from .load_path import PlateState
+from .load_path import Checkpoint, PlateState
 from .load_step import LoadStep, paths_of
-from .loading import Checkpoint
 from .materials import MODES, Hencky, Material, NeoHooke, Ogden, Yeoh
 from .mesh_file import read_tet_mesh, write_tet_mesh
 from .meshing import MeshQuality, check_meshing, mesh_labels
@@ -16,7 +15,6 @@ from .result import RegionFigures, cauchy_stress, equivalent_stress, region_figu
 from .simulation import Simulation, simulate
 from .simulation_files import clear_simulation
 from .solution import LoadState, Observer, SolverOptions, solve
-from .stress_curves import Curve, read_curves
 from .surface_sets import BONE, CUT, SKIN, fixed_facets
 
 __all__ = [

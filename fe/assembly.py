@@ -1,11 +1,9 @@
 """Residual and tangent of a mixed finite-element model, assembled into one symmetric sparse matrix (numba kernels).
 
-Unknowns are the displacements of the nodes (three for each, mm) and then the pressures (MPa). Each stands in an
-equation of its own, in none where it is fixed, or in one that it shares with others, as do nodes that are taped to a
-rigid plate. The pattern of the matrix is made once, for all nodes that may ever be taped.
+Unknowns are the displacements of the nodes (three each, mm), then the pressures (MPa). An unknown has its own equation,
+none where it is fixed, or shares one with others, as nodes taped to a rigid plate do. The sparsity pattern is computed
+once, for all nodes that may ever be taped.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
@@ -14,25 +12,17 @@ from numba import njit, prange
 from scipy import sparse
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
+from fe.elements import CROWDED, Model
 from fe.hyperelastic import principal_response, singular_values
-from fe.model import CROWDED, Model
 
-_CHUNK = 16384  # cells whose matrices are held at once
-
-
-FIXED = -1
+_CHUNK = 16384  # cells whose matrices are in memory at once
 
 
 class Assembler:
     """The sparse system of a model under changing constraints.
 
-    Parameters
-    ----------
-    model : Model
-    fixed : (f,) int
-        Unknowns whose value never changes.
-    shared : mapping of int to (s,) int
-        For each shared equation, numbered from 0, the unknowns that may ever follow it.
+    ``fixed`` (f,) are unknowns whose value never changes; ``shared`` maps each shared equation, numbered from 0, to the
+    unknowns that may ever follow it.
     """
 
     def __init__(self, model: Model, fixed: IntArray, shared: Mapping[int, IntArray]) -> None:
@@ -40,7 +30,7 @@ class Assembler:
         self._cells = model.unknowns_of_cells()
         free = np.ones(model.unknowns, dtype=bool)
         free[fixed] = False
-        self._own = np.where(free, np.cumsum(free) - 1, FIXED)
+        self._own = np.where(free, np.cumsum(free) - 1, -1)  # -1 where fixed
         self.own_equations = int(free.sum())
         self.size = self.own_equations + len(shared)
         self._may_share = np.zeros(model.unknowns, dtype=bool)
@@ -57,7 +47,7 @@ class Assembler:
         _locate(self._cells, self.equation, self.indptr, self.indices, np.arange(len(self._cells)), self._places)
 
     def share(self, followers: Mapping[int, IntArray]) -> None:
-        """Let unknowns follow a shared equation, given for each; all others stand in their own."""
+        """Let unknowns follow shared equations, numbered as at the start; all others keep their own."""
         equation = self._own.copy()
         for number, unknowns in followers.items():
             equation[unknowns] = self.own_equations + number
@@ -68,7 +58,7 @@ class Assembler:
 
     @property
     def force_equations(self) -> BoolArray:
-        """Which equations are a balance of forces, (size,); the others say that volume follows pressure."""
+        """Which equations balance forces, (size,); the others relate volume to pressure."""
         forces = np.ones(self.size, dtype=bool)
         pressures = self.equation[3 * len(self.model.space.nodes_mm) :]
         forces[pressures[pressures >= 0]] = False
@@ -76,7 +66,7 @@ class Assembler:
 
     @property
     def idle(self) -> IntArray:
-        """Equations that no unknown stands in now; their diagonal is 1 and their residual 0."""
+        """Equations without an unknown at present; their diagonal is 1 and their residual 0."""
         used = np.zeros(self.size, dtype=bool)
         used[self.equation[self.equation >= 0]] = True
         return np.flatnonzero(~used)
@@ -84,7 +74,7 @@ class Assembler:
     def residual(self, state: FloatArray) -> tuple[FloatArray, FloatArray, float]:
         """Internal forces by unknown and by equation, and the least det F, at a state.
 
-        Forces are in N for displacements, volume defects in mm3 for pressures. Where det F <= 0 forces are NaN.
+        N for displacements, volume defects in mm3 for pressures; NaN where det F <= 0.
         """
         by_unknown = np.zeros(self.model.unknowns)
         lowest = self._run(state, by_unknown, None)
@@ -98,7 +88,7 @@ class Assembler:
         return data
 
     def held(self, data: FloatArray, right: FloatArray, equations: IntArray, moves: FloatArray) -> FloatArray:
-        """Prescribe how far the unknowns of shared equations move: ``right`` is changed in place, and values returned.
+        """Prescribe the moves of shared equations: return the changed values, and change ``right`` in place.
 
         Their columns go to the right-hand side, their diagonal becomes 1.
         """
@@ -114,18 +104,17 @@ class Assembler:
         return kept
 
     def spread(self, change: FloatArray) -> FloatArray:
-        """Change of every unknown from that of every equation; fixed ones do not change."""
+        """Change of every unknown from that of every equation; 0 where fixed."""
         return np.where(self.equation >= 0, change[self.equation], 0.0)
 
     def by_equation(self, by_unknown: FloatArray) -> FloatArray:
-        """Sums of a quantity of unknowns over those of each equation."""
+        """Sum of a quantity of the unknowns over each equation."""
         inside = self.equation >= 0
-        return np.asarray(
-            np.bincount(self.equation[inside], weights=by_unknown[inside], minlength=self.size), dtype=np.float64
-        )
+        sums = np.bincount(self.equation[inside], weights=by_unknown[inside], minlength=self.size)
+        return sums.astype(np.float64)
 
     def acting(self, state: FloatArray, directions: FloatArray) -> FloatArray:
-        """The tangent times directions (unknowns, k), by unknown, as if each stood in an equation of its own."""
+        """The tangent times directions (unknowns, k), by unknown, as if each had its own equation."""
         product = np.zeros_like(directions)
         cells = np.flatnonzero((directions != 0.0).any(axis=1)[self._cells].any(axis=1))
         for part, _, local, _ in self._in_chunks(state, cells, with_tangent=True):
@@ -144,10 +133,12 @@ class Assembler:
     def _in_chunks(
         self, state: FloatArray, cells: IntArray | None, *, with_tangent: bool
     ) -> Iterator[tuple[slice | IntArray, FloatArray, FloatArray, FloatArray]]:
-        """Forces, tangents (upper triangles) and least det F of cells, all by default, some thousands at a time."""
+        """Forces, tangents (upper triangles) and least det F of cells, all by default, `_CHUNK` at a time."""
         m, space, element = self.model, self.model.space, self.model.element
-        u = np.ascontiguousarray(state[: 3 * len(space.nodes_mm)].reshape(-1, 3))
-        p = np.ascontiguousarray(state[3 * len(space.nodes_mm) :])
+        count = 3 * len(space.nodes_mm)
+        count = 3 * len(space.nodes_mm)
+        u = np.ascontiguousarray(state[:count].reshape(-1, 3))
+        p = np.ascontiguousarray(state[count:])
         forces = np.empty((_CHUNK, self._cells.shape[1]))
         tangents = np.empty((_CHUNK if with_tangent else 1, self._places.shape[1]))
         volumes = np.empty(_CHUNK)
@@ -157,14 +148,13 @@ class Assembler:
             part = slice(start, stop) if cells is None else cells[start:stop]
             _elements(
                 space.cells[part], space.pressure_cells[part], m.volumes_mm3[part], m.inverse[part], m.law[part],
-                m.vectors, m.shear_mpa, m.bulk_mpa, self.model.own_bulk_mpa,
-                element.weights, element.gradients, element.pressure,
-                element.stabilisation, u, p, with_tangent, forces, tangents, volumes,
+                m.vectors, m.shear_mpa, m.bulk_mpa, m.own_bulk_mpa, element.weights, element.gradients,
+                element.pressure, element.stabilisation, u, p, with_tangent, forces, tangents, volumes,
             )  # fmt: skip
             yield part, forces, tangents, volumes[: stop - start]
 
     def _pattern(self, shared: Mapping[int, IntArray]) -> tuple[IntArray, IntArray]:
-        """Upper triangle: equations of unknowns that meet in a cell, and shared ones with all that may follow them."""
+        """Upper triangle: equations of unknowns that share a cell, and shared ones with all that may follow them."""
         count, width = self._cells.shape
         cell = np.repeat(np.arange(count), width)
         meets = sparse.csr_matrix((np.ones(cell.size, dtype=np.int32), (cell, self._cells.ravel())))
@@ -187,7 +177,7 @@ class Assembler:
 def _locate(
     cells: IntArray, equation: IntArray, indptr: IntArray, indices: IntArray, which: IntArray, places: IntArray
 ) -> None:
-    """For each pair of a cell's unknowns the place of its entry in the upper triangle.
+    """Place of the entry of each pair of a cell's unknowns in the upper triangle.
 
     -1 where one is fixed; -2 - place where the entry counts twice.
     """
@@ -208,7 +198,7 @@ def _locate(
                             low = middle + 1
                         else:
                             high = middle
-                    # Two unknowns of one equation: both halves of the symmetric pair come to its diagonal.
+                    # Two unknowns of one equation: both halves of the symmetric pair fall on its diagonal.
                     place = low if row < column or i == j else -2 - low
                 places[cell, pair] = place
                 pair += 1
@@ -248,26 +238,11 @@ def _add_products(cells: IntArray, local: FloatArray, directions: FloatArray, pr
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _elements(
-    cells: IntArray,
-    pressure_cells: IntArray,
-    volumes: FloatArray,
-    inverse: FloatArray,
-    law: IntArray,
-    vectors: FloatArray,
-    shear: FloatArray,
-    bulk: FloatArray,
-    own: FloatArray,
-    weights: FloatArray,
-    tables: FloatArray,
-    pressure: FloatArray,
-    tau: float,
-    u: FloatArray,
-    p: FloatArray,
-    with_tangent: bool,
-    forces: FloatArray,
-    tangents: FloatArray,
-    lowest: FloatArray,
-) -> None:
+    cells: IntArray, pressure_cells: IntArray, volumes: FloatArray, inverse: FloatArray, law: IntArray,
+    vectors: FloatArray, shear: FloatArray, bulk: FloatArray, own: FloatArray,
+    weights: FloatArray, tables: FloatArray, pressure: FloatArray, tau: float, u: FloatArray, p: FloatArray,
+    with_tangent: bool, forces: FloatArray, tangents: FloatArray, lowest: FloatArray,
+) -> None:  # fmt: skip
     """Forces and tangents of cells, and the least det F at the quadrature points of each."""
     nodes, points = tables.shape[1], tables.shape[0]
     width = 3 * nodes + 4

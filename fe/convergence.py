@@ -1,7 +1,5 @@
 """What a figure would be on an endlessly fine mesh, from meshes of several sizes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,36 +1,47 @@
 """A state of load written for another solver: same mesh, materials, supports, and plate nodes.
 
-A hyperelastic state depends on where its supports are, and not on the way there. So a deck in which bone is fixed and
-the nodes on the plate are moved to where they ended has our state for its solution, and its reactions are the plate's
-forces: contact has not to be found again. CalculiX reads the one (Abaqus knows the same keywords), FEBio 4 the other.
+A hyperelastic state depends on where its supports are, not on the way there. So a deck in which bone is fixed and the
+nodes on the plate are moved to their final positions has our state as its solution, and its reactions are the plate's
+forces: contact need not be solved again. CalculiX reads one (Abaqus knows the same keywords), FEBio 4 the other.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from dvc import TetMesh
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from fe.elements import Space, edges_of
 from fe.hyperelastic import OGDEN
-from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
+from fe.materials import Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
 from fe.solution import LoadState
 from fe.surface_sets import BONE
 
 _UNUSED = 1e30  # D of a volumetric term that is not wanted: its stiffness is 1 / D
 _PER_LINE = 12
+_FEBIO_CONTROL = """<Control>
+  <analysis>STATIC</analysis><time_steps>20</time_steps><step_size>0.05</step_size>
+  <time_stepper type="default">
+    <max_retries>10</max_retries><opt_iter>12</opt_iter><dtmin>1e-4</dtmin><dtmax>0.1</dtmax>
+  </time_stepper>
+  <solver type="solid"><symmetric_stiffness>symmetric</symmetric_stiffness></solver>
+</Control>"""
+_FEBIO_LOADS = """<LoadData><load_controller id="1" type="loadcurve">
+  <interpolate>LINEAR</interpolate><points><pt>0,0</pt><pt>1,1</pt></points>
+</load_controller></LoadData>"""
+_FEBIO_OUTPUT = """<Output><plotfile type="febio">
+  <var type="displacement" /><var type="stress" /><var type="Lagrange strain" /><var type="reaction forces" />
+</plotfile></Output>"""
 
 
 def write_calculix(
     path: Path,
     mesh: TetMesh,
-    materials: Mapping[str, Material],
+    materials: Materials,
     state: LoadState,
     *,
     fixed: Sequence[str] = (BONE,),
@@ -44,7 +55,6 @@ def write_calculix(
         Ending in .inp. CalculiX prints displacements of all nodes and the plate's total force to the .dat file.
     materials : mapping of region to Material
         Neo-Hooke, Yeoh and Ogden; volume as in `fe.materials`, which is CalculiX' own (D1 = 2 / K).
-    state : LoadState
     fixed : sequence of str
         Facets that do not move.
     quadratic : bool
@@ -60,7 +70,7 @@ def write_calculix(
 
 
 def _deck(
-    mesh: TetMesh, materials: Mapping[str, Material], state: LoadState, fixed: Sequence[str], quadratic: bool
+    mesh: TetMesh, materials: Materials, state: LoadState, fixed: Sequence[str], quadratic: bool
 ) -> Iterator[str]:
     space = _space(mesh, quadratic)
     yield from (f"** {line}" for line in _about(state))
@@ -80,50 +90,31 @@ def _deck(
         yield f"*NSET, NSET={name}"
         for start in range(0, len(nodes), _PER_LINE):
             yield ", ".join(str(n + 1) for n in nodes[start : start + _PER_LINE]) + ","
-    yield "*BOUNDARY"
-    yield "NBONE, 1, 3, 0."
-    yield "*STEP, NLGEOM, INC=200"
-    yield "*STATIC"
-    yield "0.1, 1., 1e-5, 0.25"
-    yield "*BOUNDARY"
+    yield from ("*BOUNDARY", "NBONE, 1, 3, 0.")
+    yield from ("*STEP, NLGEOM, INC=200", "*STATIC", "0.1, 1., 1e-5, 0.25", "*BOUNDARY")
     for node, u in zip(on_plate, moved, strict=True):
-        for axis in range(3):
-            yield f"{node + 1}, {axis + 1}, {axis + 1}, {u[axis]:.12g}"
-    yield "*NODE PRINT, NSET=NALL"
-    yield "U"
-    yield "*NODE PRINT, NSET=NPLATE, TOTALS=ONLY"
-    yield "RF"
-    yield "*NODE FILE"
-    yield "U"
-    yield "*EL FILE"
-    yield "S, E"
-    yield "*END STEP"
+        yield from (f"{node + 1}, {axis + 1}, {axis + 1}, {u[axis]:.12g}" for axis in range(3))
+    yield from ("*NODE PRINT, NSET=NALL", "U", "*NODE PRINT, NSET=NPLATE, TOTALS=ONLY", "RF")
+    yield from ("*NODE FILE", "U", "*EL FILE", "S, E", "*END STEP")
 
 
 def _supports(
     mesh: TetMesh, space: Space, state: LoadState, fixed: Sequence[str]
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Nodes that are fixed, nodes on the plate, and how far those move; middles of edges go with their ends."""
-    count = len(mesh.points_mm)
-    bone = np.zeros(count, dtype=bool)
     held = np.concatenate([mesh.facets[name] for name in fixed])
-    bone[held] = True
-    plate = np.zeros(count, dtype=bool)
-    plate[state.on_plate] = True
+    bone, plate = (np.isin(np.arange(len(mesh.points_mm)), nodes) for nodes in (held, state.on_plate))
     still, on_plate, moved = [np.flatnonzero(bone)], [np.flatnonzero(plate)], [state.u_mm[plate]]
     if space.cells.shape[1] > 4:
-        for facets, both, nodes in ((held, bone, still), (_faces_on(mesh, plate, fixed), plate, on_plate)):
+        others = np.concatenate([rows for name, rows in mesh.facets.items() if name not in fixed])
+        faces = others[plate[others].all(axis=1)]
+        for facets, both, nodes in ((held, bone, still), (faces, plate, on_plate)):
             ends = edges_of(facets)
             ends = ends[both[ends].all(axis=1)]
             nodes.append(space.middles(ends))
             if nodes is on_plate:
                 moved.append(state.u_mm[ends].mean(axis=1))
     return np.concatenate(still), np.concatenate(on_plate), np.concatenate(moved)
-
-
-def _faces_on(mesh: TetMesh, plate: BoolArray, fixed: Sequence[str]) -> IntArray:
-    every = np.concatenate([rows for name, rows in mesh.facets.items() if name not in fixed])
-    return np.asarray(every[plate[every].all(axis=1)])
 
 
 def _law(region: str, law: Material) -> Iterator[str]:
@@ -140,24 +131,20 @@ def _law(region: str, law: Material) -> Iterator[str]:
         if len(pairs) > 3:
             raise InputError(f"{region}: CalculiX takes Ogden models of up to three terms; this has {len(pairs)}.")
         yield f"*HYPERELASTIC, OGDEN, N={len(pairs)}"
-        numbers = [
-            *(f"{mu:.12g}, {alpha:.12g}" for mu, alpha in pairs),
-            f"{d1:.12g}",
-            *[f"{_UNUSED:g}"] * (len(pairs) - 1),
-        ]
-        yield ", ".join(numbers)
+        numbers = [*pairs.ravel(), d1, *[_UNUSED] * (len(pairs) - 1)]
+        yield ", ".join(f"{number:.12g}" for number in numbers)
     else:
         assert isinstance(law, Hencky)
         raise InputError(
-            f"{region}: CalculiX has no law that is linear in logarithmic strain (its *ELASTIC is Saint Venant-"
-            "Kirchhoff's, which collapses in compression); choose another set for a deck."
+            f"{region}: CalculiX has no material law that is linear in logarithmic strain (its *ELASTIC is Saint "
+            "Venant-Kirchhoff's, which collapses in compression); choose another set for a deck."
         )
 
 
 def write_febio(
     path: Path,
     mesh: TetMesh,
-    materials: Mapping[str, Material],
+    materials: Materials,
     state: LoadState,
     *,
     fixed: Sequence[str] = (BONE,),
@@ -178,14 +165,7 @@ def write_febio(
     root = ElementTree.Element("febio_spec", version="4.0")
     root.append(ElementTree.Comment(" " + "\n    ".join(_about(state)) + " "))
     _child(root, "Module", type="solid")
-    control = _child(root, "Control")
-    for name, value in (("analysis", "STATIC"), ("time_steps", "20"), ("step_size", "0.05")):
-        _child(control, name, value)
-    stepper = _child(control, "time_stepper", type="default")
-    for name, value in (("max_retries", "10"), ("opt_iter", "12"), ("dtmin", "1e-4"), ("dtmax", "0.1")):
-        _child(stepper, name, value)
-    solver = _child(control, "solver", type="solid")
-    _child(solver, "symmetric_stiffness", "symmetric")
+    root.append(ElementTree.fromstring(_FEBIO_CONTROL))
     listed = _child(root, "Material")
     for number, (region, law) in enumerate(materials.items(), start=1):
         kind, numbers = _febio_law(region, law)
@@ -219,18 +199,10 @@ def write_febio(
         _child(bc, "dof", axis)
         _child(bc, "value", f"u{axis}", lc="1", type="map")
         _child(bc, "relative", "0")
-    curve = _child(_child(root, "LoadData"), "load_controller", id="1", type="loadcurve")
-    _child(curve, "interpolate", "LINEAR")
-    points = _child(curve, "points")
-    for point in ("0,0", "1,1"):
-        _child(points, "pt", point)
-    plot = _child(_child(root, "Output"), "plotfile", type="febio")
-    for name in ("displacement", "stress", "Lagrange strain", "reaction forces"):
-        _child(plot, "var", type=name)
+    root.extend(map(ElementTree.fromstring, (_FEBIO_LOADS, _FEBIO_OUTPUT)))
     ElementTree.indent(root)
-    write_whole(
-        path, '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
-    )
+    text = ElementTree.tostring(root, encoding="unicode")
+    write_whole(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')
 
 
 def _child(parent: ElementTree.Element, tag: str, text: str | None = None, /, **attributes: str) -> ElementTree.Element:
@@ -258,7 +230,7 @@ def _about(state: LoadState) -> tuple[str, ...]:
         f"Written by mrstrain: the state under {state.load.name}, {state.reached:.0%} of it reached. mm, N, MPa; LPS.",
         "Bone is fixed; nodes on the plate are moved to where they ended; no contact and no force is in this deck.",
         f"Force on the plate to expect, along the normal force, the shear and their cross product: {force} N,",
-        "less what this element differs from the stabilised linear one that found the state.",
+        "apart from the difference between this element and the one of the simulation.",
     )
 
 
@@ -266,6 +238,6 @@ def _space(mesh: TetMesh, quadratic: bool) -> Space:
     return Space.on(mesh, "P2" if quadratic else "P1", np.zeros(len(mesh.cells), dtype=np.int64))
 
 
-def _short(prefix: str, region: str, materials: Mapping[str, Material]) -> str:
+def _short(prefix: str, region: str, materials: Materials) -> str:
     """A name of its own that CalculiX takes: letters and digits, under 20 characters."""
     return f"{prefix}{list(materials).index(region) + 1}" + "".join(c for c in region.upper() if c.isalnum())[:15]

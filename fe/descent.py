@@ -1,14 +1,12 @@
-"""Downhill to equilibrium, where Newton's method loses its way: a stiff skin that buckles over soft fat.
+"""Viscous descent to equilibrium, where Newton's method fails: a stiff skin that buckles over soft fat.
 
-At such a load the next equilibrium is far, and in between the tangent has directions along which a step of Newton's
-goes against the forces. A body without inertia in a viscous medium goes with them: c V du/dt = forces out of balance,
-V the nodes' volumes. Implicit steps of it, (K + d V) du = forces with d = c / dt, are Newton's as d -> 0
-(pseudo-transient continuation; Kelley and Keyes 1998, doi:10.1137/S0036142996304796). d rises where a step would go
-against the forces, or the tangent foretells badly what is left of them, and falls where it foretells well. A few nodes,
-those of nearly flat cells, are foretold badly for long: the medium is thicker there, and they do not hold up the rest.
+At such a load the next equilibrium is far, and on the way the tangent has directions along which Newton's step goes
+against the forces. A body without inertia in a viscous medium follows them: c V du/dt = forces out of balance, V the
+nodes' volumes. Its implicit steps, (K + d V) du = forces with d = c / dt, become Newton's as d -> 0 (pseudo-transient
+continuation; Kelley and Keyes 1998, doi:10.1137/S0036142996304796). d rises where a step would go against the forces or
+the tangent predicts the remaining forces badly, and falls where it predicts them well. A few nodes, those of nearly
+flat cells, are predicted badly for long: the medium is thicker there, so that they do not slow down the rest.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,14 +24,14 @@ _MOST_STEPS = 400
 _LARGEST_MM, _TOO_FAR_MM = 1.0, 3.0  # a longer step is shortened to that; a step that long is damped more
 _MOST_GROWTH = 3.0, 1.5  # of the forces out of balance in one step: far from balance, and near it
 _NEAR = 10.0  # times what is asked
-# Of d after a step, by the share of those forces that was not foretold: no node counts more than _CLIPPED, those on the
-# plate not at all.
+# Change of d after a step, by the share of those forces that the tangent did not predict: no node counts more than
+# _CLIPPED, those on the plate not at all.
 _CHANGES = ((0.1, 0.2), (0.5, 1.0 / 3.0), (1.0, 0.5), (np.inf, 1.0))
 _CLIPPED = 0.1
 _RISE = 4.0  # of d for a step that goes uphill, too far, or folds a cell
-# For one after which forces are far larger, of d, and of the medium's thickness at the nodes that did most of it.
+# After a step that leaves far larger forces: of d, and of the medium's thickness at the nodes that caused most of it.
 _RISE_OVER, _THICKENED, _MOST_OF_IT = 1.5, 4.0, 0.1
-# How the medium's thickness at a node changes after a step, by the share of the forces that was not foretold there.
+# Change of the medium's thickness at a node after a step, by the share of the forces that was not predicted there.
 _THICKNESSES = ((0.1, 0.5), (0.3, 1.0), (np.inf, 4.0))
 _THICKEST = 1e3
 _BORNE = 0.5  # share of the forces that the medium may still take in the last step
@@ -42,24 +40,16 @@ _ACCURACY = 1e-3  # of linear solutions
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
-    """A step that was tried: where it leads, with which forces, and by how much its tangent was wrong.
-
-    Attributes
-    ----------
-    unforeseen_n : (n,)
-        Forces at nodes that the tangent did not foretell, N; zero for nodes that hold to the plate.
-    borne_n, after_n : float
-        Forces that the medium takes, and forces out of balance there, N.
-    """
+    """A step that was tried: where it leads, with which forces, and how wrong its tangent was."""
 
     state: FloatArray
     forces: FloatArray
     residual: FloatArray
     lowest: float
     largest_mm: float
-    unforeseen_n: FloatArray
-    borne_n: float
-    after_n: float
+    unforeseen_n: FloatArray  # (n,) forces at nodes that the tangent did not predict; 0 for nodes on the plate
+    borne_n: float  # forces that the medium takes
+    after_n: float  # forces out of balance after the step
 
 
 def descend(
@@ -72,28 +62,17 @@ def descend(
     log: Callable[[str], None] = lambda _: None,
     is_over: Callable[[], bool] = lambda: False,
 ) -> Converged | None:
-    """Find the state in balance with forces from outside to which a body in a viscous medium comes.
+    """Find the equilibrium to which a body in a viscous medium moves under forces from ``outside`` (equations,), N.
 
-    Parameters
-    ----------
-    assembler, solver, state, tolerance, log
-        As in `fe.newton.equilibrium`; no unknown is prescribed.
-    outside : (equations,)
-        External forces, N.
-    changed : callable
-        As there; asked after every step.
-    is_over : callable
-        Asked before every step; given up where it is true.
-
-    Returns
-    -------
-    Converged or None
-        None if it is not found in 400 steps, or a node moves farther than the body is large. As in
-        `fe.newton.Tolerance`, steps that stay in balance are enough.
+    The rest as in `fe.newton.equilibrium`, but no unknown is prescribed; ``changed`` is called after every step, and
+    ``is_over`` before it, to stop. None if equilibrium is not reached in 400 steps, or a node moves farther than the
+    body is large. As in `fe.newton.Tolerance`, several steps that stay in balance are enough.
     """
     model = assembler.model
     now, damping, thickness = state.copy(), _FIRST, np.ones(len(model.space.nodes_mm))
-    growth, balanced = _MOST_GROWTH[0], 0
+    cells, growth, balanced = model.space.cells, _MOST_GROWTH[0], 0
+    each = np.repeat(model.volumes_mm3 / cells.shape[1], cells.shape[1])
+    volumes_mm3 = np.bincount(cells.ravel(), weights=each, minlength=len(thickness))
     largest_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
     forces, residual, lowest = assembler.residual(now)
     if not lowest > 0.0:
@@ -103,7 +82,7 @@ def descend(
         if is_over():
             return None
         before_n = max(out_of_balance(outside - residual, assembler), 1e-300)
-        by_node = np.repeat(damping * thickness * model.node_volumes_mm3, 3)
+        by_node = np.repeat(damping * thickness * volumes_mm3, 3)
         medium = assembler.by_equation(np.concatenate([by_node, np.zeros(model.space.pressures)]))
         step = _tried(assembler, solver, now, tangent, outside, residual, medium)
         if step is None or step.after_n > growth * before_n:
@@ -140,24 +119,16 @@ def descend(
 
 
 def _by(table: Sequence[tuple[float, float]], values: npt.ArrayLike) -> FloatArray:
-    """Of each value the factor beside the first limit that it does not exceed."""
+    """The factor of each value: the one beside the first limit that it does not exceed."""
     limits, factors = np.array(table).T
     return np.asarray(factors[np.searchsorted(limits, values)])
 
 
 def _tried(
-    assembler: Assembler,
-    solver: Solver,
-    now: FloatArray,
-    tangent: FloatArray,
-    outside: FloatArray,
-    residual: FloatArray,
-    medium: FloatArray,
-) -> _Step | None:
-    """A damped step from a state with that tangent and residual; None where it goes against the forces, or folds.
-
-    ``medium`` (equations,) is d V, N/mm.
-    """
+    assembler: Assembler, solver: Solver, now: FloatArray, tangent: FloatArray, outside: FloatArray,
+    residual: FloatArray, medium: FloatArray,
+) -> _Step | None:  # fmt: skip
+    """A damped step from a state; None where it goes against the forces or folds a cell. ``medium`` is d V, N/mm."""
     right = outside - residual
     right[assembler.idle] = 0.0
     data = tangent.copy()
@@ -181,12 +152,6 @@ def _tried(
     unforeseen[assembler.own_equations :] = 0.0
     at_nodes = assembler.spread(unforeseen)[: -assembler.model.space.pressures].reshape(-1, 3)
     return _Step(
-        now + share * moves,
-        forces,
-        left,
-        lowest,
-        share * longest_mm,
-        np.linalg.norm(at_nodes, axis=1),
-        out_of_balance(borne, assembler),
-        out_of_balance(outside - left, assembler),
-    )
+        now + share * moves, forces, left, lowest, share * longest_mm, np.linalg.norm(at_nodes, axis=1),
+        out_of_balance(borne, assembler), out_of_balance(outside - left, assembler),
+    )  # fmt: skip

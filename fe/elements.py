@@ -1,37 +1,40 @@
 """Tetrahedra for nearly incompressible tissue: displacement and pressure are two fields (mixed elements).
 
-The weak form, with W(F) the isochoric part of the law, K the bulk modulus and p the pressure (positive in tension), is
-stationary at the solution of
+The weak form, with W(F) the isochoric part of the material law, K the bulk modulus and p the pressure (positive in
+tension), is stationary at the solution of
 
     integral W(F) + p (J - 1) - p^2 / (2 K) dX  -  work of the forces,
 
-which for p = K (J - 1) is the law itself. Pressure is linear in each tetrahedron and continuous within a tissue, and
-may jump from one tissue to the next. Three choices of displacement:
+which for p = K (J - 1) is the material law itself. Pressure is linear in each tetrahedron and continuous within a
+tissue, and may jump from one tissue to the next. Three choices of displacement:
 
 - ``P1``: linear. Alone it is unstable; S = tau / mu0 (M - Mbar) is subtracted, in which M is the pressure's mass matrix
   and Mbar that of its mean in the cell (Bochev, Dohrmann, Gunzburger 2006, doi:10.1137/S0036142905444482). A small part
-  of the bulk modulus, c mu0, acts in each cell on its own, and only the rest through the pressure: the law is the same,
-  and single cells scatter less.
+  of the bulk modulus, c mu0, acts in each cell on its own, and only the rest through the pressure: the material law is
+  the same, and single cells scatter less.
 - ``MINI``: linear and a quartic bubble (Arnold, Brezzi, Fortin 1984, doi:10.1007/BF02576171); stable.
-- ``P2``: quadratic (Taylor, Hood 1973); stable, second order in the strain, and dear.
+- ``P2``: quadratic (Taylor, Hood 1973); stable, second order in the strain, and expensive.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from itertools import permutations
+from typing import Self
 
 import numpy as np
 
 from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
+from fe.materials import Materials
 
 DESCRIPTIONS = {
     "P1": "stabilised linear tetrahedra, displacement and pressure",
     "MINI": "linear tetrahedra with a bubble, displacement and pressure",
     "P2": "quadratic tetrahedra with straight edges, linear pressure (Taylor-Hood)",
 }
-"""What each element is, in words."""
+
+CROWDED = 0.4
+"""det F below which a cell resists with an energy of its own, K / 3 ln(CROWDED / J)^3, so that it does not fold."""
 
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 """Corners of a quadratic tetrahedron's edges, in the order of its nodes 4 to 9."""
@@ -39,53 +42,24 @@ EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Element:
-    """A mixed tetrahedron, tabulated at its quadrature points.
-
-    Attributes
-    ----------
-    name : str
-    weights : (q,)
-        Share of the cell's volume that each quadrature point stands for; their sum is 1.
-    gradients : (q, a, 3)
-        Of the a displacement functions, with respect to the reference coordinates (those of nodes 1, 2 and 3).
-    pressure : (q, 4)
-        The pressure's functions.
-    stabilisation : float
-        tau, no unit; 0 where the element needs none.
-    own_volume : float
-        c, no unit.
-    """
+    """A mixed tetrahedron, tabulated at its q quadrature points, with a displacement functions."""
 
     name: str
-    weights: FloatArray
-    gradients: FloatArray
-    pressure: FloatArray
-    stabilisation: float = 0.0
-    own_volume: float = 0.0
-
-    @property
-    def nodes(self) -> int:
-        """Displacement functions in a cell."""
-        return int(self.gradients.shape[1])
+    weights: FloatArray  # (q,) shares of the cell's volume
+    gradients: FloatArray  # (q, a, 3) of the displacement functions, by the reference coordinates (nodes 1, 2 and 3)
+    pressure: FloatArray  # (q, 4) pressure functions
+    stabilisation: float = 0.0  # tau, no unit; 0 where the element needs none
+    own_volume: float = 0.0  # c, no unit
 
 
 def element(name: str, stabilisation: float = 0.5, own_volume: float = 1.0) -> Element:
-    """An element by its name: P1, MINI or P2.
-
-    Parameters
-    ----------
-    stabilisation : float
-        tau of P1.
-    own_volume : float
-        c of P1.
-    """
+    """An element by its name, P1, MINI or P2; ``stabilisation`` and ``own_volume`` are tau and c of P1."""
     if name not in _MADE:
         raise InputError(f"No element '{name}'; there are {', '.join(_MADE)}.")
     barycentric, weights = _MADE[name][1]
     gradients = np.array([_MADE[name][0](b) for b in barycentric])
-    return Element(
-        name, weights, gradients, barycentric, *((stabilisation, own_volume) if name == "P1" else (0.0, 0.0))
-    )
+    of_p1 = (stabilisation, own_volume) if name == "P1" else ()
+    return Element(name, weights, gradients, barycentric, *of_p1)
 
 
 _LINEAR = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -109,13 +83,12 @@ def _points(*orbits: tuple[float, tuple[float, ...]]) -> tuple[FloatArray, Float
     """Barycentric points and weights from one point of each orbit and the weight of each of its points."""
     points, weights = [], []
     for weight, first in orbits:
-        different = sorted({tuple(np.array(first)[list(order)]) for order in _ORDERS})
+        different = sorted(set(permutations(first)))
         points += different
         weights += [weight] * len(different)
     return np.array(points), np.array(weights)
 
 
-_ORDERS = [(i, j, k, 6 - i - j - k) for i in range(4) for j in range(4) for k in range(4) if len({i, j, k}) == 3]
 _CENTRE = (0.25, 0.25, 0.25, 0.25)
 _A = 0.1381966011250105  # (5 - sqrt 5) / 20
 _B, _C, _D = 1.0 / 3.0, 1.0 / 11.0, 0.0665501535736643
@@ -139,27 +112,15 @@ _MADE = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Space:
-    """Where the unknowns of a mesh lie.
+    """Where the unknowns of a mesh lie."""
 
-    Attributes
-    ----------
-    nodes_mm : (n, 3)
-        Reference position of each displacement node; a bubble's is its cell's centroid.
-    cells : (m, a)
-        Displacement nodes of each cell, the mesh's own four first.
-    pressure_cells : (m, 4)
-        Pressure unknowns at the corners of each cell.
-    pressures : int
-        Their number.
-    """
-
-    nodes_mm: FloatArray
-    cells: IntArray
-    pressure_cells: IntArray
-    pressures: int
+    nodes_mm: FloatArray  # (n, 3) reference positions of the displacement nodes; a bubble's is its cell's centroid
+    cells: IntArray  # (m, a) displacement nodes, the mesh's own four first
+    pressure_cells: IntArray  # (m, 4) pressure unknowns at the corners
+    pressures: int  # their number
 
     @classmethod
-    def on(cls, mesh: TetMesh, kind: str, tissue: IntArray) -> Space:
+    def on(cls, mesh: TetMesh, kind: str, tissue: IntArray) -> Self:
         """The space of an element on a mesh; ``tissue`` (m,) numbers the cells between which pressure may jump."""
         points, cells = mesh.points_mm, mesh.cells
         if kind == "P2":
@@ -190,3 +151,62 @@ class Space:
 def edges_of(faces: IntArray) -> IntArray:
     """The edges (k, 2) of triangles (n, 3), each once."""
     return np.unique(np.sort(np.concatenate([faces[:, e] for e in ([0, 1], [1, 2], [0, 2])]), axis=1), axis=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """A mesh of m cells with its k materials, discretised by an element."""
+
+    element: Element
+    space: Space
+    volumes_mm3: FloatArray  # (m,)
+    inverse: FloatArray  # (m, 3, 3) reference coordinates by position, 1/mm
+    vectors: FloatArray  # (k, v) of the material laws, see `fe.hyperelastic`
+    shear_mpa: FloatArray  # (k,) initial
+    bulk_mpa: FloatArray  # (k,)
+    law: IntArray  # (m,) number of each cell's material law
+
+    @classmethod
+    def of(cls, mesh: TetMesh, materials: Materials, element: Element) -> Self:
+        """The model of a mesh; each cell is in one of the regions of ``materials``."""
+        law = np.full(len(mesh.cells), -1)
+        for number, region in enumerate(materials):
+            law[mesh.regions[region]] = number
+        assert (law >= 0).all()
+        corners = mesh.points_mm[mesh.cells]
+        jacobian = np.stack([corners[:, i] - corners[:, 0] for i in (1, 2, 3)], axis=2)
+        length = max(len(material.vector) for material in materials.values())
+        vectors = np.array([np.pad(m.vector, (0, length - len(m.vector))) for m in materials.values()])
+        inverse = np.asarray(np.linalg.inv(jacobian), dtype=np.float64)
+        shear = np.array([m.shear_modulus_mpa for m in materials.values()])
+        bulk = np.array([m.bulk_modulus_mpa for m in materials.values()])
+        return cls(element, Space.on(mesh, element.name, law), mesh.volumes_mm3, inverse, vectors, shear, bulk, law)
+
+    @property
+    def own_bulk_mpa(self) -> FloatArray:
+        """The part of each material's bulk modulus (k,) that acts in each cell on its own; at most half of it."""
+        return np.minimum(self.element.own_volume * self.shear_mpa, 0.5 * self.bulk_mpa)
+
+    @property
+    def unknowns(self) -> int:
+        """Displacements and pressures."""
+        return 3 * len(self.space.nodes_mm) + self.space.pressures
+
+    def unknowns_of_cells(self) -> IntArray:
+        """Unknowns of each cell (m, 3 a + 4): its nodes' x, y, z one node after the other, then its pressures."""
+        nodes = self.space.cells
+        displacement = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
+        return np.hstack([displacement, 3 * len(self.space.nodes_mm) + self.space.pressure_cells])
+
+    def gradients(self, state: FloatArray) -> FloatArray:
+        """H = du/dX of each cell (m, 3, 3), mean over its quadrature points, at a state of all unknowns."""
+        table = np.einsum("q,qaj->aj", self.element.weights, self.element.gradients)
+        u = state[: 3 * len(self.space.nodes_mm)].reshape(-1, 3)[self.space.cells]
+        return np.asarray(np.einsum("mai,aj,mjk->mik", u, table, self.inverse))
+
+    def pressures(self, state: FloatArray) -> FloatArray:
+        """Pressure at each cell's corners (m, 4), MPa: the field's, and the part that acts in the cell on its own."""
+        volume = np.linalg.det(np.eye(3) + self.gradients(state))
+        crowded = np.log(CROWDED / np.clip(volume, 1e-12, CROWDED)) ** 2 / volume
+        own = self.own_bulk_mpa[self.law] * (volume - 1.0) - self.bulk_mpa[self.law] * crowded
+        return np.asarray(state[3 * len(self.space.nodes_mm) :][self.space.pressure_cells] + own[:, None])

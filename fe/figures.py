@@ -1,9 +1,8 @@
 """Figures of the finite-element side; what a figure's docstring says is its caption."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +20,10 @@ from dvc.report.figures import REGION_COLOURS
 from dvc.report.planes import letters
 from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
 from fe.convergence import Limit
-from fe.fitting import Fit
+from fe.fitting import Curve, Fit
 from fe.plate import Plate
 from fe.result import volume_percentiles
 from fe.solution import LoadState
-from fe.stress_curves import Curve
 from fe.surface_sets import BONE
 
 _POINTS = 200
@@ -42,13 +40,12 @@ def write_figure(path: Path, figure: Figure) -> None:
 
 
 def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> Figure:
-    """Measured nominal stress (points) and the fitted law (lines), by kind of test.
+    """Measured nominal stress (points) and the fitted material law (lines), by kind of test.
 
-    The line is dashed where Drucker's condition fails: a simulation that gets there is not to be trusted.
+    The line is dashed where Drucker's condition fails: simulations that reach this range are unreliable.
     """
     figure, (axes,) = chart()
-    for number, curve in enumerate(curves):
-        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+    for curve, colour in zip(curves, cycle(REGION_COLOURS), strict=False):
         low, high = fitted.reached[curve.mode]
         margin = 0.05 * (high - low)
         stretch = np.linspace(low - margin, high + margin, _POINTS)
@@ -68,19 +65,17 @@ def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> Figure:
 def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
     """Maximum shear strain on the slice through the bone's lowest point, along the plate's normal and the shear.
 
-    Those of the first load, where loads have directions of their own. Cells are cut in the unloaded configuration and
-    drawn where they are under load; the dashed line is the plate. The colours end where a hundredth of the volume is
-    above, over all loads.
+    The directions are those of the first load, where loads have their own. Cells are cut in the unloaded configuration
+    and drawn where they are under load; the dashed line is the plate. The colour scale ends at the 99th percentile of
+    the volume, over all loads.
     """
     axes = states[0].plate_axes
     assert axes is not None
     panels, middle = [], _lowest_bone_point(mesh, axes)
     for state in states:
-        load = state.load
         part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%})"
-        title = f"{load.name}: {load}{part}"
-        along = _along_plate(mesh, state, axes, middle)
-        panels.append(Slice(title, state.u_mm, state.strain.max_shear, along))
+        title = f"{state.load.name}: {state.load}{part}"
+        panels.append(Slice(title, state.u_mm, state.strain.max_shear, _along_plate(mesh, state, axes, middle)))
     return slice_sheet(mesh, panels, axes, middle)
 
 
@@ -100,36 +95,20 @@ def _along_plate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slice:
-    """A field on a mesh, to be drawn on a slice.
-
-    Attributes
-    ----------
-    title : str
-    u_mm : (n, 3)
-        Displacement of the mesh's nodes, LPS mm: cells are drawn where it puts them.
-    max_shear : (m,)
-        Of the cells; where it is NaN, a cell is drawn grey.
-    face : tuple of float, optional
-        A plate, drawn as a dashed line: height along the normal force where the shear's coordinate is 0, and slope.
-    """
+    """A field on a mesh, to be drawn on a slice; a plate's ``face`` is a dashed line."""
 
     title: str
-    u_mm: FloatArray
-    max_shear: FloatArray
-    face: tuple[float, float] | None = None
+    u_mm: FloatArray  # (n, 3) displacement of the mesh's nodes, LPS: cells are drawn where it puts them
+    max_shear: FloatArray  # (m,) of the cells; one with NaN is drawn grey
+    face: tuple[float, float] | None = None  # height along the normal force where the shear's coordinate is 0; slope
 
 
 def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> Figure:
-    """Fields on one slice, in one colour scale that ends where a hundredth of the volume is above.
+    """Fields on one slice, in one colour scale that ends at the 99th percentile of the volume.
 
-    Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
-
-    Parameters
-    ----------
-    axes : (3, 3)
-        The plate's: columns are the directions of the normal force, of shear, and their cross product, LPS.
-    point_mm : (3,)
-        On the slice, reference configuration, LPS mm.
+    Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left. ``axes`` (3,
+    3) are the plate's: columns are the directions of the normal force, of shear, and their cross product, LPS.
+    ``point_mm`` (3,) lies on the slice, reference configuration, LPS mm.
     """
     cuts = [cut(mesh, panel.u_mm, axes, point_mm) for panel in panels]
     corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
@@ -157,13 +136,12 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
             spot.axline((0.0, panel.face[0]), slope=panel.face[1], color=INK, linewidth=1.0, linestyle="--")
         spot.set_title(panel.title, color=INK, **FONT)
         label_axes(spot, "along the shear, mm", "along the normal force, mm")
-        sides = ((0.01, 0.5, -axes[:, 1]), (0.99, 0.5, axes[:, 1]), (0.5, 0.01, -axes[:, 0]), (0.5, 0.99, axes[:, 0]))
-        for x, y, direction in sides:
-            spot.text(
-                x, y, letters(direction), transform=spot.transAxes, weight="bold", color=INK,
-                ha={0.01: "left", 0.99: "right"}.get(x, "center"), va={0.01: "bottom", 0.99: "top"}.get(y, "center"),
-                **FONT,
-            )  # fmt: skip
+        for x, y, ha, va, direction in (
+            (0.01, 0.5, "left", "center", -axes[:, 1]), (0.99, 0.5, "right", "center", axes[:, 1]),
+            (0.5, 0.01, "center", "bottom", -axes[:, 0]), (0.5, 0.99, "center", "top", axes[:, 0]),
+        ):  # fmt: skip
+            how = {"transform": spot.transAxes, "weight": "bold", "color": INK, "ha": ha, "va": va} | FONT
+            spot.text(x, y, letters(direction), **how)
     bar = figure.colorbar(drawn, ax=list(spots[: len(panels)]), shrink=0.8, extend="max")
     bar.set_label("max. shear strain", color=INK, **FONT)
     return figure
@@ -177,22 +155,10 @@ def _lowest_bone_point(mesh: TetMesh, axes: FloatArray) -> FloatArray:
 
 
 def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray) -> tuple[IntArray, list[FloatArray]]:
-    """Cells that the plane of the plate's first two axes cuts, and each one's polygon where it is under load.
+    """Cells (k,) cut by the plane of the plate's first two axes, and each one's polygon (3 or 4, 2) under load.
 
-    Parameters
-    ----------
-    u_mm : (n, 3)
-        Displacement of the mesh's nodes, LPS mm.
-    axes : (3, 3)
-        The plate's, columns, LPS.
-    point_mm : (3,)
-        On the plane, reference configuration, LPS mm.
-
-    Returns
-    -------
-    cells : (k,)
-    polygons : list of (3 or 4, 2)
-        Along shear and normal force, mm.
+    Polygons are along shear and normal force, mm; ``u_mm`` (n, 3) is the displacement of the mesh's nodes, LPS; the
+    rest as in `slice_sheet`.
     """
     height = (mesh.points_mm - point_mm) @ axes[:, 2]
     height = np.where(height == 0.0, 1e-9, height)
@@ -216,12 +182,9 @@ def force_displacement(states: Sequence[LoadState]) -> Figure:
     """Force of the plate over its displacement from the first touch on, along normal (left) and shear (right)."""
     figure, panels = chart(2)
     for axes, axis, name in zip(panels, (0, 1), ("normal", "shear"), strict=True):
-        for number, state in enumerate(states):
+        for state, colour in zip(states, cycle(REGION_COLOURS), strict=False):
             moved, force = ([getattr(at, what)[axis] for at in state.curve] for what in ("displacement_mm", "force_n"))
-            axes.plot(
-                moved, force, marker=".", label=state.load.name, linewidth=1.8,
-                color=REGION_COLOURS[number % len(REGION_COLOURS)],
-            )  # fmt: skip
+            axes.plot(moved, force, marker=".", label=state.load.name, linewidth=1.8, color=colour)
         label_axes(axes, f"{name} displacement, mm", f"{name} force, N")
     panels[0].legend(fontsize=9, frameon=False)
     return figure
@@ -231,9 +194,8 @@ def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
     """The mesh on a slice through the bone's lowest point, coloured by tissue."""
     figure, (panel,) = chart()
     cells, corners = cut(mesh, np.zeros_like(mesh.points_mm), plate.axes, _lowest_bone_point(mesh, plate.axes))
-    for number, (name, members) in enumerate(mesh.regions.items()):
+    for (name, members), colour in zip(mesh.regions.items(), cycle(REGION_COLOURS), strict=False):
         mine = [c for c, inside in zip(corners, np.isin(cells, members), strict=True) if inside]
-        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
         panel.add_collection(PolyCollection(mine, facecolors=colour, edgecolors="white", linewidths=0.3, label=name))
     panel.autoscale_view()
     panel.set_aspect("equal")
@@ -243,13 +205,12 @@ def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
 
 
 def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[float], Limit]]) -> Figure:
-    """Figures relative to what they tend to, over the size of the cells (cube root of their mean volume).
+    """Quantities relative to their limits, over the size of the cells (cube root of their mean volume).
 
-    A figure that does not depend on the mesh any more lies on the grey line.
+    One that no longer depends on the mesh lies on the grey line.
     """
     figure, (axes,) = chart()
-    for number, (name, (values, limit)) in enumerate(curves.items()):
-        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+    for (name, (values, limit)), colour in zip(curves.items(), cycle(REGION_COLOURS), strict=False):
         style = "-" if "travel" in name else "--"
         axes.plot(sizes_mm, np.array(values) / limit.limit, style, marker="o", color=colour, linewidth=1.6, label=name)
         h = np.linspace(0.0, min(sizes_mm), _POINTS)

@@ -1,10 +1,10 @@
-"""Parameters of a law from stretch-stress curves, with confidence intervals."""
+"""Stretch-stress curves of mechanical tests, and a material law's parameters from them, with confidence intervals."""
 
-from __future__ import annotations
-
+import csv
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -14,39 +14,105 @@ from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from fe.hyperelastic import HENCKY, OGDEN
 from fe.materials import HIGHEST_NU, MODES, Hencky, Material, NeoHooke, Ogden, Yeoh, nominal_stress
-from fe.stress_curves import Curve
 
 _EXPONENTS = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # starts of an Ogden fit
 _MOSTLY = 0.8
-_MOST = 60.0  # an exponent beyond this is not one that a curve can tell
-_SOFTEST = 1e-3  # least C10 of a polynomial law, of that of the neo-Hookean law that suits the same curves best
-_ABSURD = 1e-4  # curves of a law with a positive modulus are refused less often than this
+_MOST = 60.0  # no curve determines an exponent beyond this
+_SOFTEST = 1e-3  # least C10 of a polynomial, relative to that of the neo-Hookean model that fits the curves best
+_ABSURD = 1e-4  # curves of a material with a positive modulus are refused less often than this
+_STRESS = {
+    "nominal_stress_kpa": (1e-3, False),
+    "nominal_stress_mpa": (1.0, False),
+    "true_stress_kpa": (1e-3, True),
+    "true_stress_mpa": (1.0, True),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """A test of an incompressible solid.
+
+    Attributes
+    ----------
+    mode : str
+        One of `fe.materials.MODES`: uniaxial, equibiaxial, pure shear.
+    stretch : (n,)
+        Length over undeformed length along the loading axis; below 1 in compression.
+    stress_mpa : (n,)
+        Force over undeformed area, MPa; below 0 in compression.
+    """
+
+    mode: str
+    stretch: FloatArray
+    stress_mpa: FloatArray
+
+
+def read_curves(path: Path | str, mode: str | None = None) -> list[Curve]:
+    """Curves of a CSV file, one for each kind of test.
+
+    Columns: ``stretch``; one of ``nominal_stress_kpa``, ``nominal_stress_mpa``, ``true_stress_kpa``,
+    ``true_stress_mpa`` (nominal: force over undeformed area; true: over deformed); and ``test``, a name of
+    `fe.materials.MODES`, unless ``mode`` gives it for the whole file. In other columns nothing is read.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a column is missing or ambiguous, or a value is no number; with its line.
+    """
+    try:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+            columns = [c.strip().lower() for c in reader.fieldnames or []]
+    except (OSError, UnicodeDecodeError, csv.Error) as failure:
+        raise InputError(f"Cannot read the curve {path}: {failure}.") from failure
+    stress = [c for c in columns if c in _STRESS]
+    if len(columns) == 1 and ";" in columns[0]:
+        raise InputError(f"{path}: columns are divided by semicolons; write it with commas (and points in numbers).")
+    if "stretch" not in columns or len(stress) != 1:
+        raise InputError(
+            f"{path}: a curve needs a column 'stretch' and one of {', '.join(_STRESS)}, so that unit and kind of "
+            f"stress are said (stretch = 1 + strain); its columns are {', '.join(columns) or 'none'}."
+        )
+    mode = None if mode is None else mode.strip().lower()
+    if mode is None and "test" not in columns:
+        raise InputError(f"{path}: say which test it is: {', '.join(MODES)} (--test, or a column 'test').")
+    scale, true = _STRESS[stress[0]]
+    tests: dict[str, list[tuple[float, float]]] = {}
+    for line, row in enumerate(rows, start=2):
+        cells = {(k or "").strip().lower(): (v or "").strip() for k, v in row.items() if not isinstance(v, list)}
+        try:
+            stretch, value = float(cells["stretch"]), scale * float(cells[stress[0]])
+        except ValueError as failure:
+            raise InputError(f"{path}, line {line}: {failure}.") from failure
+        if not (np.isfinite([stretch, value]).all() and stretch > 0.0):
+            raise InputError(f"{path}, line {line}: a stretch is positive, and both numbers finite; got {cells}.")
+        name = mode or cells["test"].lower()
+        if name not in MODES:
+            raise InputError(f"{path}, line {line}: no test '{name}'; there are {', '.join(MODES)}.")
+        tests.setdefault(name, []).append((stretch, value / stretch if true else value))
+    if not tests:
+        raise InputError(f"{path}: no row under the header.")
+    return [Curve(name, *np.array(points).T) for name, points in tests.items()]
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A fitted number and the interval that holds it with 95 % confidence.
-
-    Attributes
-    ----------
-    at_bound : bool
-        Whether the curves alone would have it lower than a law may have it, so that ``value`` is the bound.
-    """
+    """A fitted number and its 95 % confidence interval."""
 
     name: str
     value: float
     low: float
     high: float
-    at_bound: bool = False
+    at_bound: bool = False  # the curves alone would have it below what a material law may have: ``value`` is the bound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A law fitted to curves.
+    """A material law fitted to curves.
 
     Attributes
     ----------
-    material : Material
     parameters : tuple of Parameter
         Moduli in MPa; an Ogden term's ``mu`` is its initial shear modulus.
     r2 : mapping of mode to float
@@ -54,9 +120,9 @@ class Fit:
     rmse_mpa : float
         Of the nominal stress over all points.
     others : tuple of Material
-        Laws of the same form that these curves cannot tell from this one.
+        Material laws of the same form that fit these curves equally well.
     stable : mapping of mode to (float, float)
-        Stretches between which the law is stable, of 1/5 to 5 (`Material.stable_range`).
+        Stretches between which the material law is stable, of 1/5 to 5 (`Material.stable_range`).
     reached : mapping of mode to (float, float)
         Least and greatest stretch of the curves.
     """
@@ -71,13 +137,13 @@ class Fit:
 
     @property
     def stable_where_measured(self) -> bool:
-        """Whether the law is stable at every stretch of the curves."""
+        """Whether the material law is stable at every stretch of the curves."""
         return all(self.stable[m][0] <= low and high <= self.stable[m][1] for m, (low, high) in self.reached.items())
 
 
 @dataclass(frozen=True, slots=True)
 class _Law:
-    """A law as the fit sees it: names of its parameters, their vector, the material, and first guesses."""
+    """A material law as the fit sees it: names of its parameters, their vector, and the material."""
 
     names: tuple[str, ...]
     vector: Callable[[FloatArray], FloatArray]
@@ -87,41 +153,37 @@ class _Law:
 
 
 def _polynomial(*names: str) -> _Law:
-    def vector(values: FloatArray) -> FloatArray:
-        return np.concatenate([values, np.zeros(4 - len(values))])
-
     def material(values: FloatArray, nu: float) -> Material:
         c10, c20, c30 = (*values.tolist(), 0.0)[:3]
         return Yeoh.of(c10, c20, c30, nu)
 
-    return _Law(names, vector, material, bounded=True)
+    return _Law(names, lambda values: np.append(values, np.zeros(OGDEN - len(values))), material, bounded=True)
 
 
 def _ogden(terms: int) -> _Law:
-    def vector(values: FloatArray) -> FloatArray:
-        return np.concatenate([np.zeros(OGDEN), np.column_stack([values[:terms], values[terms:]]).ravel()])
-
     numbers = [""] if terms == 1 else [str(q + 1) for q in range(terms)]
-    names = (*(f"mu{n}" for n in numbers), *(f"alpha{n}" for n in numbers))
-    return _Law(names, vector, lambda values, nu: Ogden.of(values[:terms], values[terms:], nu), terms)
+    return _Law(
+        (*(f"mu{n}" for n in numbers), *(f"alpha{n}" for n in numbers)),
+        lambda values: np.append(np.zeros(OGDEN), np.column_stack([values[:terms], values[terms:]])),
+        lambda values, nu: Ogden.of(values[:terms], values[terms:], nu),
+        terms,
+    )
 
 
 LAWS: Mapping[str, _Law] = {
-    "neo-Hooke": _Law(
-        ("mu",), lambda v: np.array([0.5 * v[0], 0.0, 0.0, 0.0]), lambda v, nu: NeoHooke.of(float(v[0]), nu)
-    ),
+    "neo-Hooke": _Law(("mu",), lambda v: 0.5 * v[0] * np.eye(OGDEN)[0], lambda v, nu: NeoHooke.of(float(v[0]), nu)),
     "Isihara": _polynomial("C10", "C20"),
     "Yeoh": _polynomial("C10", "C20", "C30"),
     "Ogden": _ogden(1),
     "Ogden-2": _ogden(2),
     "Ogden-3": _ogden(3),
-    "Hencky": _Law(("mu",), lambda v: v[0] * np.eye(1, OGDEN, HENCKY)[0], lambda v, nu: Hencky.of(float(v[0]), nu)),
+    "Hencky": _Law(("mu",), lambda v: v[0] * np.eye(OGDEN)[HENCKY], lambda v, nu: Hencky.of(float(v[0]), nu)),
 }
-"""Laws that can be fitted. Isihara's is Yeoh's without C30."""
+"""Material laws that can be fitted. Isihara's is Yeoh's without C30."""
 
 
 def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
-    """Fit a law to curves of an incompressible solid by least squares of the nominal stress.
+    """Fit a material law to curves of an incompressible solid by least squares of the nominal stress.
 
     Parameters
     ----------
@@ -135,26 +197,26 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     Raises
     ------
     InputError
-        If there are too few points, or none away from a stretch of 1; if no parameters can be told from these
-        curves; or if they say that the initial shear modulus is not positive.
+        If points are too few, or none lies away from a stretch of 1; if the curves do not determine the parameters, or
+        imply an initial shear modulus that is not positive.
 
     Notes
     -----
     A curve of one test may leave two exponents open: in uniaxial compression, alpha and about -alpha / 2 give nearly
-    the same stress. Of optima that an F test at 5 % does not tell apart, one whose exponents are all positive is
+    the same stress. Of optima that an F test at 5 % does not distinguish, one whose exponents are all positive is
     taken, and the rest are named.
 
-    Intervals are those of linearised regression with Student's t: they assume independent errors of the same
-    standard deviation at every point, and claim nothing of errors that a curve shares, such as a wrong area.
-    Parameters in which the stress is linear start at their best; an Ogden law's exponents from the four best of the
-    combinations of eight values.
+    Intervals are those of linearised regression with Student's t: they assume independent errors of the same standard
+    deviation at every point, and do not cover errors that a curve shares, such as a wrong area. Parameters in which
+    the stress is linear start at their best; Ogden exponents from the four best of the combinations of eight values.
 
-    C10, half the initial shear modulus, is positive in any law; a curve that is steep only at its end may leave it
-    open, and the best fit then has it below 0 as often as not. It is kept at a thousandth or more of that of the
-    neo-Hookean law which suits the same curves best. An interval reaches w below the lower, and w above the higher, of
-    the values with and without that bound, w being the half width without it; C10's ends at 0. So it contains all of
-    the usual interval that a law can have, and holds the truth as often or more often. Curves are refused that would
-    have C10 so far below 0 that chance does it to less than one in 10,000 of the curves of a true law.
+    C10, half the initial shear modulus, is positive in any material law; a curve that is steep only at its end may
+    leave it open, and the best fit then has it below 0 as often as not. It is kept at a thousandth or more of that of
+    the neo-Hookean model which fits the same curves best. An interval reaches w below the lower, and w above the
+    higher, of the values with and without that bound, w being the half width without it; C10's ends at 0. So it
+    contains all of the usual interval that a material law can have, and covers the truth as often or more often.
+    Curves are refused that would have C10 so far below 0 that chance does it to less than one in 10,000 of the curves
+    of a true material law.
     """
     sought, curves = _checked(curves, law, nu)
     count = len(sought.names)
@@ -175,18 +237,18 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         optima.append(optimum)
     best, others = _chosen(sought, optima, len(stress))
     if sought.exponents and np.abs(best.x[-sought.exponents :]).max() > _MOST:
-        raise InputError(f"{law}: the best exponent is beyond {_MOST:g}; these curves cannot tell it. Use fewer terms.")
+        raise InputError(
+            f"{law}: the best exponent is beyond {_MOST:g}; these curves do not determine it. Use fewer terms."
+        )
     deviations = _deviations(best.x, best.jac, best.fun)
     if deviations is None:
-        raise InputError(
-            f"{law}: its parameters cannot be told apart from these curves (singular); use a law with fewer."
-        )
+        raise InputError(f"{law}: these curves do not determine its parameters (singular); use a model with fewer.")
     values, parameters = _with_intervals(sought, best, deviations, curves, stress)
     try:
         material = sought.material(values, nu)
     except InputError as unusable:
         raise InputError(
-            f"The best fit is no law to compute with ({unusable}) Give points nearer to a stretch of 1, or use a law "
+            f"The best fit is no usable material law ({unusable}) Give points nearer to a stretch of 1, or fit one "
             "with fewer parameters."
         ) from unusable
     residual = modelled(values) - stress
@@ -202,16 +264,17 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
 
 
 def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[Curve]]:
-    """The law of that name, and the curves, one for each kind of test; or why they cannot be used."""
+    """The material law of that name, and one curve for each kind of test; or why they cannot be used."""
     named = {name.lower(): name for name in LAWS}
     if law.lower() not in named:
-        raise InputError(f"No law '{law}' to fit; there are {', '.join(LAWS)}.")
+        raise InputError(f"No material law '{law}' to fit; there are {', '.join(LAWS)}.")
     if not 0.0 <= nu <= HIGHEST_NU:
         raise InputError(f"Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {nu:g}.")
-    sought, curves = LAWS[named[law.lower()]], _by_mode(curves)
+    sought, curves = LAWS[named[law.lower()]], [_joined(mode, curves) for mode in dict.fromkeys(c.mode for c in curves)]
     count = len(sought.names)
-    stress = np.concatenate([c.stress_mpa for c in curves]) if curves else np.empty(0)
-    stretch = np.concatenate([c.stretch for c in curves]) if curves else np.empty(0)
+    stress, stretch = (
+        np.concatenate([np.empty(0), *(getattr(c, part) for c in curves)]) for part in ("stress_mpa", "stretch")
+    )
     apart = len(np.unique(np.round(stretch[np.abs(stretch - 1.0) > 1e-6], 9)))
     if len(stress) < count + 2 or apart < count:
         raise InputError(
@@ -231,7 +294,7 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
 def _with_intervals(
     law: _Law, best: OptimizeResult, deviations: FloatArray, curves: Sequence[Curve], stress: FloatArray
 ) -> tuple[FloatArray, tuple[Parameter, ...]]:
-    """The best values, the first kept positive where the law is bounded, and their 95 % confidence intervals."""
+    """The best values, the first kept positive where it has to be, and their 95 % confidence intervals."""
     values, least = best.x, np.full(len(best.x), -np.inf)
     freedom = len(stress) - len(values)
     widths = student.ppf(0.975, freedom) * deviations
@@ -239,7 +302,12 @@ def _with_intervals(
         absurd = values[0] + student.isf(_ABSURD, freedom) * deviations[0] <= 0.0
         if values[0] <= widths[0] and not absurd:  # zero is in its interval: the curves leave it open
             size = float(np.sqrt(np.mean(stress**2)))
-            values = _not_softer(values, _softest(curves), best.jac * size, stress)
+            unit = np.concatenate([nominal_stress(np.eye(OGDEN)[0], c.stretch, c.mode) for c in curves])
+            softest = _SOFTEST * float(unit @ stress / (unit @ unit))  # not above 0 where no positive modulus fits
+            columns = best.jac * size  # times the values they are the stress
+            if values[0] < softest:
+                rest, *_ = np.linalg.lstsq(columns[:, 1:], stress - columns[:, 0] * softest, rcond=None)
+                values = np.array([softest, *rest])
         least[0] = 0.0
     low, high = np.maximum(np.minimum(values, best.x) - widths, least), np.maximum(values, best.x) + widths
     at_bound = (least > -np.inf) & (values > best.x)
@@ -250,7 +318,7 @@ def _with_intervals(
 
 
 def _r2(curves: Sequence[Curve], residual: FloatArray) -> dict[str, float]:
-    """Share of the stress' variance that the law explains, by kind of test."""
+    """Share of the stress' variance that the material law explains, by kind of test."""
     r2, ends = {}, np.cumsum([0, *(len(c.stress_mpa) for c in curves)])
     for curve, first, last in zip(curves, ends, ends[1:], strict=False):
         spread = float(((curve.stress_mpa - curve.stress_mpa.mean()) ** 2).sum())
@@ -258,14 +326,10 @@ def _r2(curves: Sequence[Curve], residual: FloatArray) -> dict[str, float]:
     return r2
 
 
-def _by_mode(curves: Sequence[Curve]) -> list[Curve]:
-    """All points of one kind of test in one curve."""
-    joined = []
-    for mode in dict.fromkeys(c.mode for c in curves):
-        mine = [c for c in curves if c.mode == mode]
-        stretch, stress = (np.concatenate([getattr(c, part) for c in mine]) for part in ("stretch", "stress_mpa"))
-        joined.append(Curve(mode, stretch, stress))
-    return joined
+def _joined(mode: str, curves: Sequence[Curve]) -> Curve:
+    """All points of one kind of test."""
+    mine = [c for c in curves if c.mode == mode]
+    return Curve(mode, *(np.concatenate([getattr(c, part) for c in mine]) for part in ("stretch", "stress_mpa")))
 
 
 def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: FloatArray) -> list[FloatArray]:
@@ -284,7 +348,7 @@ def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: Flo
 def _chosen(
     law: _Law, optima: Sequence[OptimizeResult], points: int
 ) -> tuple[OptimizeResult, tuple[OptimizeResult, ...]]:
-    """The optimum to report, and those that the data do not tell from it."""
+    """The optimum to report, and those that the data do not distinguish from it."""
     ranked = sorted(optima, key=lambda o: o.cost)
     freedom = points - len(law.names)
     limit = ranked[0].cost * (1.0 + fisher.ppf(0.95, 1, freedom) / freedom)
@@ -299,22 +363,8 @@ def _chosen(
     return different[0], tuple(different[1:])
 
 
-def _softest(curves: Sequence[Curve]) -> float:
-    """The least C10 of a fit to these curves, MPa; not above 0 where they give no positive modulus at all."""
-    unit = np.concatenate([nominal_stress(np.array([1.0, 0.0, 0.0, 0.0]), c.stretch, c.mode) for c in curves])
-    return _SOFTEST * float(unit @ np.concatenate([c.stress_mpa for c in curves]) / (unit @ unit))
-
-
-def _not_softer(values: FloatArray, least: float, columns: FloatArray, stress: FloatArray) -> FloatArray:
-    """The best values with the first ``least`` or more; ``columns`` times the values is the stress."""
-    if values[0] >= least:
-        return values
-    rest, *_ = np.linalg.lstsq(columns[:, 1:], stress - columns[:, 0] * least, rcond=None)
-    return np.concatenate([[least], rest])
-
-
 def _deviations(values: FloatArray, jacobian: FloatArray, residual: FloatArray) -> FloatArray | None:
-    """Standard deviations of the values; None where the parameters cannot be told apart."""
+    """Standard deviations of the values; None where the curves do not determine them."""
     scaled = jacobian * np.maximum(np.abs(values), 1e-300)
     lengths = np.linalg.norm(scaled, axis=0)
     if not (lengths > 0.0).all():

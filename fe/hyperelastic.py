@@ -5,9 +5,10 @@ With F = U diag(s) V^T, logarithmic stretches e_i = ln s_i and their isochoric p
     W(F, p) = Wbar(ebar) + p (J - 1),
     Wbar = sum_k C_k0 (I1bar - 3)^k + mu_H sum_i ebar_i^2 + sum_q 2 mu_q / alpha_q^2 (sum_i exp(alpha_q ebar_i) - 3),
 
-I1bar = sum_i exp(2 ebar_i): Yeoh's polynomial, Hencky's quadratic, Ogden's terms. One sum holds every law, so there is
-one kernel. A law is a vector (C10, C20, C30, mu_H, mu_1, alpha_1, mu_2, alpha_2, ...), MPa but for the alphas, in which
-mu_q is the term's initial shear modulus. p is the pressure-like multiplier of the volume, MPa, positive in tension.
+I1bar = sum_i exp(2 ebar_i): Yeoh's polynomial, Hencky's quadratic, Ogden's terms. One sum holds every material law, so
+there is one kernel. A law is a vector (C10, C20, C30, mu_H, mu_1, alpha_1, mu_2, alpha_2, ...), MPa but for the alphas,
+in which mu_q is the term's initial shear modulus. p is the pressure-like multiplier of the volume, MPa, positive in
+tension.
 
 The first Piola-Kirchhoff stress of an isotropic solid is P = U diag(dW/ds) V^T, and its derivative has in the principal
 frame only the components (R. W. Ogden, Non-Linear Elastic Deformations, 1984, section 6.1.4)
@@ -16,28 +17,21 @@ frame only the components (R. W. Ogden, Non-Linear Elastic Deformations, 1984, s
     A_ijij + A_ijji = (W_i - W_j) / (s_i - s_j),   A_ijij - A_ijji = (W_i + W_j) / (s_i + s_j),   i != j.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 
 from dvc.arrays import FloatArray
 
 POLYNOMIAL, HENCKY, OGDEN = 0, 3, 4
-"""Where a law's vector holds C10; mu_H; and its first Ogden pair."""
+"""Where a material law's vector holds C10; mu_H; and its first Ogden pair."""
 
-_EQUAL = (
-    1e-5  # principal stretches nearer than this, relatively: the quotient is replaced by its limit, in error by 1e-10
-)
+_EQUAL = 1e-5  # relative distance of principal stretches below which the quotient's limit is used, in error by 1e-10
 _SWEEPS = 30
 
 
 @njit(cache=True, error_model="numpy")
 def isochoric(law: FloatArray, e: FloatArray, slope: FloatArray, curvature: FloatArray) -> float:
-    """Wbar (MPa) at logarithmic stretches ``e`` (3,), with its derivatives by e.
-
-    Written: ``slope`` (3,), the deviatoric principal Kirchhoff stresses, and ``curvature`` (3, 3).
-    """
+    """Wbar (MPa) at logarithmic stretches ``e`` (3,); its derivatives go to ``slope`` (3,), ``curvature`` (3, 3)."""
     mean = (e[0] + e[1] + e[2]) / 3.0
     energy, invariant = 0.0, 0.0
     curvature[:, :] = 0.0
@@ -148,21 +142,13 @@ def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) 
 
 @njit(cache=True, error_model="numpy")
 def principal_response(
-    law: FloatArray,
-    s: FloatArray,
-    J: float,
-    p: float,
-    bulk: float,
-    stress: FloatArray,
-    direct: FloatArray,
-    swapped: FloatArray,
-) -> float:
+    law: FloatArray, s: FloatArray, J: float, p: float, bulk: float,
+    stress: FloatArray, direct: FloatArray, swapped: FloatArray,
+) -> float:  # fmt: skip
     """W(F, p) in MPa at principal stretches ``s`` (3,), with its stress and tangent in the principal frame.
 
-    ``bulk`` is dp/dJ (MPa), 0 for a pressure that is a field of its own.
-
-    Written: ``stress`` (3,) = W_i; ``direct`` (3, 3) with A_ijij, A_iiii on its diagonal; ``swapped`` (3, 3, 2) with
-    A_iijj first and A_ijji second, i != j.
+    ``bulk`` is dp/dJ (MPa), 0 for a pressure that is a field of its own. Written: ``stress`` (3,) = W_i; ``direct`` (3,
+    3) with A_ijij, A_iiii on its diagonal; ``swapped`` (3, 3, 2) with A_iijj first and A_ijji second, i != j.
     """
     e, slope, curvature = np.empty(3), np.empty(3), np.empty((3, 3))
     for i in range(3):

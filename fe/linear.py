@@ -1,17 +1,15 @@
-"""Direct solution of the symmetric, indefinite systems of the solver: the one file that knows which library does it.
+"""Direct solution of the solver's symmetric, indefinite systems: the one file that knows which library does it.
 
-PARDISO of Intel's MKL where it runs (x86-64); elsewhere NGSolve's sparse Cholesky where it is installed, and SciPy's
-SuperLU where it is not. A factorisation takes most of a simulation's time, so PARDISO makes it in single precision, and
-an old one is used for as long as that is quicker: either way as the preconditioner of an iterative solution in double.
+MKL's PARDISO where it runs (x86-64); elsewhere NGSolve's sparse Cholesky where it is installed, else SciPy's SuperLU.
+Factorisations take most of a simulation's time, so PARDISO makes them in single precision, and an old one is used for
+as long as that is quicker: either way as the preconditioner of an iterative solution in double.
 """
-
-from __future__ import annotations
 
 import platform
 from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -31,79 +29,19 @@ class SingularError(MrstrainError, RuntimeError):
     """A matrix that cannot be factorised: a part of the model is free to move, or memory is short."""
 
 
-class Factors(Protocol):
-    """A matrix of fixed pattern, factorised anew whenever its values change.
-
-    Attributes
-    ----------
-    rough : bool
-        Whether it is factorised in single precision.
-    """
-
-    rough: bool
-
-    def factorise(self, data: FloatArray) -> None:
-        """Take new values of the upper triangle, in the order of the pattern."""
-        ...
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solve with the last values that were taken."""
-        ...
-
-    def close(self) -> None:
-        """Give the memory back."""
-        ...
-
-
-def factors(
-    indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None, rough: bool = False
-) -> Factors:
-    """A solver for symmetric matrices whose upper triangle has this pattern (CSR, sorted, with its whole diagonal).
-
-    Parameters
-    ----------
-    threads : int
-        Threads of PARDISO.
-    library : {"pardiso", "ngsolve", "superlu"}, optional
-        By default the fastest that this machine has.
-    rough : bool
-        In single precision, where the library can.
-    """
-    chosen = library or _fastest()
-    if chosen == "pardiso":
-        return _Pardiso(indptr, indices, threads, rough)
-    return _NGSolve(indptr, indices) if chosen == "ngsolve" else _SuperLU(indptr, indices)
-
-
-def _fastest() -> str:
-    if platform.machine().lower() in ("x86_64", "amd64"):
-        return "pardiso"
-    return "ngsolve" if find_spec("ngsolve") is not None else "superlu"
-
-
-def self_test() -> str:
-    """Solve a small system; return a sentence on what came out, for `mrstrain doctor`."""
-    A = sparse.diags([4.0, -1.0], [0, 1], shape=(100, 100), format="csr")
-    A.sort_indices()
-    solver = factors(A.indptr.astype(np.int64), A.indices.astype(np.int64))
-    solver.factorise(A.data)
-    x = solver.solve(np.ones(100))
-    solver.close()
-    whole = A + sparse.triu(A, 1).T
-    if np.abs(whole @ x - 1.0).max() > _FINE:
-        raise MrstrainError(f"{_fastest()} solved a hundred equations wrongly.")
-    return f"{_fastest()} solved a hundred equations"
+def _ones(indptr: IntArray, indices: IntArray) -> sparse.csr_matrix:
+    """A matrix of ones with this pattern."""
+    size = len(indptr) - 1
+    return sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
 
 
 class _Pardiso:
     def __init__(self, indptr: IntArray, indices: IntArray, threads: int, rough: bool) -> None:
         from pypardiso import PyPardisoSolver
 
-        size = len(indptr) - 1
         self.rough = rough
         self._kind = np.float32 if rough else np.float64
-        ones = np.ones(len(indices), dtype=self._kind)
-        self._matrix = sparse.csr_matrix((ones, indices, indptr), shape=(size, size))
+        self._matrix = _ones(indptr, indices).astype(self._kind)
         self._solver = PyPardisoSolver(mtype=-2)  # real, symmetric, indefinite
         for number, value in _IN_SINGLE.items() if rough else ():
             self._solver.set_iparm(number, value)
@@ -173,8 +111,7 @@ class _SuperLU:
     rough = False
 
     def __init__(self, indptr: IntArray, indices: IntArray) -> None:
-        size = len(indptr) - 1
-        self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
+        self._upper = _ones(indptr, indices)
         self._factors: linalg.SuperLU | None = None
 
     def factorise(self, data: FloatArray) -> None:
@@ -195,36 +132,63 @@ class _SuperLU:
         self._factors = None
 
 
+Factors = _Pardiso | _NGSolve | _SuperLU
+"""A symmetric matrix of fixed pattern: `factorise` takes new values of its upper triangle, in the pattern's order."""
+
+
+def factors(
+    indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None, rough: bool = False
+) -> Factors:
+    """A solver for symmetric matrices whose upper triangle has this pattern (CSR, sorted, with its whole diagonal).
+
+    ``threads`` are PARDISO's; ``library`` is pardiso, ngsolve or superlu, by default the fastest on this machine;
+    ``rough`` asks for single precision, where the library can.
+    """
+    chosen = library or _fastest()
+    if chosen == "pardiso":
+        return _Pardiso(indptr, indices, threads, rough)
+    return _NGSolve(indptr, indices) if chosen == "ngsolve" else _SuperLU(indptr, indices)
+
+
+def _fastest() -> str:
+    if platform.machine().lower() in ("x86_64", "amd64"):
+        return "pardiso"
+    return "ngsolve" if find_spec("ngsolve") is not None else "superlu"
+
+
+def self_test() -> str:
+    """Solve a small system; return a sentence on what came out, for `mrstrain doctor`."""
+    A = sparse.diags([4.0, -1.0], [0, 1], shape=(100, 100), format="csr")
+    A.sort_indices()
+    solver = factors(A.indptr.astype(np.int64), A.indices.astype(np.int64))
+    solver.factorise(A.data)
+    x = solver.solve(np.ones(100))
+    solver.close()
+    whole = A + sparse.triu(A, 1).T
+    if np.abs(whole @ x - 1.0).max() > _FINE:
+        raise MrstrainError(f"{_fastest()} solved a hundred equations wrongly.")
+    return f"{_fastest()} solved a hundred equations"
+
+
 class Solver:
-    """Solves with matrices that change a little from one to the next.
+    """Solves with matrices that change a little from one to the next; ``factorisations`` and ``steps`` count the work.
 
-    The generalised conjugate residual method (Eisenstat, Elman, Schultz 1983, doi:10.1137/0720023) with the last matrix
-    that was factorised as its preconditioner. Where it comes down too slowly the matrix at hand is factorised, first in
-    single precision; and where that does not do, in double until `forget`.
-
-    Parameters
-    ----------
-    indptr, indices, threads, library
-        As in `factors`.
-
-    Attributes
-    ----------
-    factorisations, steps : int
-        How many factorisations, and how many steps of the iterative method, have been made.
+    The generalised conjugate residual method (Eisenstat, Elman, Schultz 1983, doi:10.1137/0720023), preconditioned by
+    the last matrix that was factorised. Where it converges too slowly the current matrix is factorised, first in single
+    precision; and where that is not enough, in double until `forget`.
     """
 
     def __init__(self, indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None) -> None:
         self._new = partial(factors, indptr, indices, threads=threads, library=library)
         self._factors = self._new(rough=True)
         self._began_rough = self._factors.rough
-        size = len(indptr) - 1
-        self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
+        self._upper = _ones(indptr, indices)
         self._diagonal = indptr[:-1]  # the first of each row
         self._known = False
         self.factorisations, self.steps = 0, 0
 
     def solve(self, data: FloatArray, right: FloatArray, tolerance: float) -> FloatArray:
-        """Solve to a residual below ``tolerance`` times that of zero; 1e-8, where a factorisation is made for it."""
+        """Solve to a residual below ``tolerance`` times that of zero; 1e-8 if that takes a factorisation."""
         if self._known:
             solution = self._iterated(data, right, tolerance)
             if solution is not None:
@@ -245,13 +209,13 @@ class Solver:
         self._factors = self._new(rough=rough)
 
     def _factorise(self, data: FloatArray) -> None:
-        self._known = False  # whatever becomes of it, the old one is gone
+        self._known = False  # the old one is gone even if this fails
         self._factors.factorise(data)
         self._known = True
         self.factorisations += 1
 
     def forget(self) -> None:
-        """Factorise at the next solution, whatever came before: what is solved then depends on nothing older."""
+        """Factorise at the next solution in any case, so that it does not depend on earlier ones."""
         self._known = False
         if self._began_rough and not self._factors.rough:
             self._renew(rough=True)
@@ -287,5 +251,5 @@ class Solver:
         return None
 
     def close(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         self._factors.close()

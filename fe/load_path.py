@@ -1,9 +1,9 @@
-"""A plate pressed against tissue: from one converged increment to the next, in steps as large as converge."""
+"""A plate pressed against tissue, load after load, from one converged increment to the next."""
 
-from __future__ import annotations
-
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,19 +12,17 @@ from dvc import TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from fe.assembly import Assembler
 from fe.descent import descend
-from fe.elements import edges_of
+from fe.elements import Model, edges_of
 from fe.linear import Solver
 from fe.load_step import PlateTarget
-from fe.model import Model
-from fe.newton import Converged, Imposed, Tolerance, equilibrium
-from fe.plate import Contact, ContactStatus
-from fe.plate_rotation import Parallel, Turning
+from fe.newton import Imposed, Tolerance, equilibrium
+from fe.plate import Contact, ContactStatus, Parallel, Turning
 from fe.problem import Problem
 from fe.surface_sets import SKIN
 
 _FIRST_STEP = 0.25
 _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0
-_TIPPING = 0.5  # of how far a plate was in when it was level: it sinks in when it is let go
+_TIPPING = 0.5  # of a level plate's indentation: one that is released sinks in further
 _DOWNHILL_STEP, _LEAST_DOWNHILL_STEP = 0.1, 1.0 / 128.0
 _GROWTH, _SHRINK = 1.7, 0.4
 _APPROACH_MM, _MOST_APPROACH_MM = 0.25, 0.6
@@ -48,7 +46,7 @@ class PlateState:
     moment_nmm : (3,)
         On the tissue, about its pivot.
     area_mm2 : float
-        Of the surface that holds to it, as it is now: of faces with all their corners on the plate.
+        Of the deformed surface on it: of faces with all their corners on the plate.
     """
 
     displacement_mm: FloatArray
@@ -65,44 +63,19 @@ class PlateState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Increment:
-    """A converged increment, with all that it takes to go on from it.
+    """A converged increment, with all that it takes to go on from it."""
 
-    Attributes
-    ----------
-    unknowns : (unknowns,)
-        Displacements, along the plate's axes, and pressures.
-    plate : PlateState
-    contact : ContactStatus
-    """
-
-    unknowns: FloatArray
+    unknowns: FloatArray  # displacements along the plate's axes, and pressures
     plate: PlateState
     contact: ContactStatus
 
 
 class LoadPath:
-    """The body under a load that grows, increment by increment; vectors along the plate's axes.
+    """The body under a growing load, increment by increment; vectors along the plate's axes, ``mesh`` too.
 
-    Parameters
-    ----------
-    model : Model
-    mesh : TetMesh
-        That of the model, along the plate's axes.
-    problem : Problem
-        Its plate and what is fixed.
-    threads, tolerance
-        As in `fe.solution.SolverOptions`.
-
-    Attributes
-    ----------
-    state : (unknowns,)
-    plate : PlateState
-    curve : list of PlateState
-        The plate at every converged increment so far.
-    iterations : int
-        Newton steps so far.
-    log, is_over, on_converged : callable
-        Gets a line for each step; says whether to stop where it is; called at each increment that can be resumed from.
+    ``curve`` is the plate at every converged increment so far, ``iterations`` counts Newton steps. ``log`` gets a line
+    for each step, ``is_over`` says whether to stop, ``on_converged`` is called at each increment that can be resumed
+    from.
     """
 
     def __init__(self, model: Model, mesh: TetMesh, problem: Problem, threads: int, tolerance: Tolerance) -> None:
@@ -113,7 +86,8 @@ class LoadPath:
         held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in problem.fixed]))
         touching = np.setdiff1d(_nodes_on(model, mesh, SKIN), held)
         self.contact = Contact(problem.plate, model.space.nodes_mm, touching)
-        self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), self.contact.may_follow)
+        may_follow = {axis: 3 * touching + axis for axis in range(3)}
+        self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), may_follow)
         self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
         self.extent_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
         self.state = np.zeros(model.unknowns)
@@ -124,14 +98,14 @@ class LoadPath:
         self.iterations = 0
 
     def reached(self, target: PlateTarget) -> FloatArray:
-        """What is reached (3,) of what a target asks for."""
+        """What is reached (3,) of the quantities that a target prescribes."""
         return np.where(target.displaced, self.plate.displacement_mm, self.plate.force_n)
 
     def approach(self, target: PlateTarget) -> bool:
-        """Touch, move on to a part of the normal load asked for, and let a plate go that turns.
+        """Touch, press on to a part of the normal load, and release a plate that turns; whether going on makes sense.
 
-        Until then it stays level, as a plate on a node or two would tip over; and if it cannot be let go there, it is
-        pressed further and tried again. Returns whether going on makes sense.
+        Until then it stays level, as a plate on a node or two would tip over; if it cannot be released there, it is
+        pressed further first.
         """
         if not len(self.contact.held):
             self.contact.touch_first(self.state)
@@ -151,7 +125,7 @@ class LoadPath:
         return False
 
     def _let_go(self) -> bool:
-        """Take the moment away that kept the plate level, under the force that it has.
+        """Remove the moment that kept the plate level, under its present force; whether that succeeded.
 
         A plate that is held less sinks in further; one that comes back out instead tips over on too few nodes.
         """
@@ -167,7 +141,7 @@ class LoadPath:
                 if self.plate.displacement_mm[0] < least_mm:
                     break
                 left, step = least, step * _GROWTH
-                self._log(f"{1.0 - left:.0%} let go")
+                self._log(f"{1.0 - left:.0%} released")
             else:
                 self._back(last)
                 step *= _SHRINK
@@ -176,10 +150,10 @@ class LoadPath:
         return left == 0.0
 
     def raise_to(self, target: PlateTarget) -> bool:
-        """Go on from what is to the target, in steps as large as converge; whether it is there.
+        """Go on to the target, in steps as large as converge; whether it is reached.
 
-        Where Newton's method does not get on under forces, it goes on downhill (`fe.descent`), with a plate on
-        tape that does not turn. A displacement goes on in steps so small that nodes touch in their order.
+        Where Newton's method fails under forces, viscous descent takes over (`fe.descent`), with a taped plate that
+        does not turn. A displacement goes on in steps so small that nodes touch in their order.
         """
         before = self.reached(target)
         way = target.values - before
@@ -197,7 +171,8 @@ class LoadPath:
                 continue
             self._back(last)
             step *= _SHRINK
-            if step < _SOFT_STEP and not (downhill or target.displaced.any()) and self.contact.stays:
+            stays = self.contact.plate.taped and not self.contact.status.turns
+            if step < _SOFT_STEP and stays and not (downhill or target.displaced.any()):
                 downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0
 
@@ -233,7 +208,10 @@ class LoadPath:
         outside[equations] = np.where(displaced, 0.0, aim)
         self.assembler.share(contact.followers)
         if downhill:
-            converged = self._descended(outside)
+            converged = descend(
+                self.assembler, self.solver, self.state, outside, self.tolerance, self._changed_on_the_way, self.log,
+                self.is_over,
+            )  # fmt: skip
         else:
             rotation = Parallel()
             if contact.status.turns:
@@ -251,29 +229,15 @@ class LoadPath:
         self.state = converged.state
         self.iterations += converged.iterations
         self.plate = PlateState(
-            moved,
-            contact.force_n(converged.forces),
+            moved, contact.force_n(converged.forces),
             np.degrees(Rotation.from_matrix(contact.status.rotation).as_rotvec()),
-            contact.moment_nmm(converged.state, converged.forces),
-            self._area_mm2(),
-        )
+            contact.moment_nmm(converged.state, converged.forces), self._area_mm2(),
+        )  # fmt: skip
         self.curve.append(self.plate)
         return True
 
-    def _descended(self, outside: FloatArray) -> Converged | None:
-        """Equilibrium under forces; what touches on the way does so from where it was the step before."""
-
-        def changed(state: FloatArray, forces: FloatArray) -> bool:
-            touched = self._changed(state, forces)
-            self.contact.begin(state)
-            return touched
-
-        return descend(
-            self.assembler, self.solver, self.state, outside, self.tolerance, changed, self.log, self.is_over
-        )
-
     def _area_mm2(self) -> float:
-        """Area of the faces of which every corner holds to the plate, as they are now."""
+        """Present area of the faces with every corner on the plate."""
         u = self.state[: 3 * len(self.model.space.nodes_mm)].reshape(-1, 3)
         faces = self._faces[np.isin(self._faces, self.contact.held).all(axis=1)]
         a, b, c = np.moveaxis((self.model.space.nodes_mm + u)[faces], 1, 0)
@@ -285,9 +249,15 @@ class LoadPath:
         self.assembler.share(self.contact.followers)
         return True
 
+    def _changed_on_the_way(self, state: FloatArray, forces: FloatArray) -> bool:
+        """As `_changed`; what touches next does so from where it is now."""
+        touched = self._changed(state, forces)
+        self.contact.begin(state)
+        return touched
+
     @property
     def increment(self) -> Increment:
-        """The increment that it is at."""
+        """The current increment."""
         return Increment(self.state, self.plate, self.contact.status)
 
     def resume(self, where: Increment) -> None:
@@ -295,7 +265,7 @@ class LoadPath:
         self.state, self.plate, self.contact.status = where.unknowns, where.plate, where.contact
 
     def _back(self, where: Increment) -> None:
-        """Take steps back that were made since."""
+        """Undo the steps since an increment."""
         while self.curve[-1] is not where.plate:
             self.curve.pop()
         self.resume(where)
@@ -306,9 +276,8 @@ class LoadPath:
             ", ".join(f"{v:.3f}" for v in x) for x in (plate.displacement_mm, plate.force_n, plate.turn_deg)
         )
         turned = f", turned {turn} degrees" if self.contact.status.turns else ""
-        self.log(
-            f"{what}: displacement {moved} mm, force {force} N, {len(self.contact.held)} nodes on the plate{turned}"
-        )
+        nodes = len(self.contact.held)
+        self.log(f"{what}: displacement {moved} mm, force {force} N, {nodes} nodes on the plate{turned}")
 
 
 def _nodes_on(model: Model, mesh: TetMesh, facets: str) -> IntArray:
@@ -317,3 +286,89 @@ def _nodes_on(model: Model, mesh: TetMesh, facets: str) -> IntArray:
     if model.element.name != "P2":
         return corners
     return np.union1d(corners, model.space.middles(edges_of(mesh.facets[facets])))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checkpoint:
+    """What it takes to go on from the end of a load, or from a converged increment on the way to it.
+
+    Attributes
+    ----------
+    reached : float
+        Share of what the load adds to the one before it, all of it being 1: along the axis, of those that it changes,
+        where least is reached.
+    stages : int
+        Stages of the load that are done; for the first of a path the approach is one.
+    curve : tuple of PlateState
+        The plate at every converged increment from that of the load before it to this one.
+    iterations : int
+        Newton steps since the load before it, those of increments that failed not counted.
+    unknowns : (unknowns,)
+        Displacements, along the plate's axes, and pressures.
+    """
+
+    reached: float
+    stages: int
+    curve: tuple[PlateState, ...]
+    iterations: int
+    seconds: float
+    unknowns: FloatArray
+    contact: ContactStatus
+
+
+class Loading:
+    """A load in progress on a path that is where the load before it ended.
+
+    ``before`` is that load's target, None for the first, which has to touch; ``earlier`` is where this load came to in
+    an earlier solution. ``on_converged`` gets a checkpoint and the share that is done, at each converged increment.
+    """
+
+    def __init__(
+        self, path: LoadPath, target: PlateTarget, before: PlateTarget | None, earlier: Checkpoint | None,
+        on_converged: Callable[[Checkpoint, float], None],
+    ) -> None:  # fmt: skip
+        self._path, self._target, self._first = path, target, before is None
+        self._before = path.reached(target)
+        if before is not None:  # what was asked for, not what was reached to the tolerance
+            self._before = np.where(target.displaced == before.displaced, before.values, self._before)
+        self._began, self._counted = time.monotonic() - (earlier.seconds if earlier else 0.0), path.iterations
+        self._stages, self._complete = 0, False
+        path.solver.forget()  # so that a load depends on where it begins, and not on what was solved before
+        path.curve = path.curve[-1:]
+        if earlier is not None:
+            path.curve = list(earlier.curve)
+            path.resume(Increment(earlier.unknowns, earlier.curve[-1], earlier.contact))
+            self._stages, self._counted = earlier.stages, path.iterations - earlier.iterations
+        path.on_converged = lambda: on_converged(self.checkpoint(), float(np.clip(self._shares(), 0.0, 1.0).mean()))
+
+    def run(self) -> bool:
+        """Go to the target, normal first and then shear; whether it is reached."""
+        path, target = self._path, self._target
+        stages: list[Callable[[], bool]] = [partial(path.raise_to, target)]
+        if self._first and target.sheared:
+            stages.insert(0, partial(path.raise_to, target.unsheared()))
+        if self._first:
+            stages.insert(0, partial(path.approach, target))
+        for stage in stages[self._stages :]:
+            if not stage():
+                return False
+            self._stages += 1
+        self._complete = True
+        return True
+
+    def checkpoint(self) -> Checkpoint:
+        """Where it is now."""
+        path = self._path
+        reached = 1.0 if self._complete else max(0.0, float(self._shares().min(initial=1.0)))
+        return Checkpoint(
+            reached, self._stages, tuple(path.curve), path.iterations - self._counted,
+            time.monotonic() - self._began, path.state, path.contact.status,
+        )  # fmt: skip
+
+    def _shares(self) -> FloatArray:
+        """Share reached of what the load adds, along each of the plate's axes where it adds something."""
+        way = self._target.values - self._before
+        adds = way != 0.0
+        if not adds.any():
+            return np.ones(1)
+        return np.asarray((self._path.reached(self._target) - self._before)[adds] / way[adds])

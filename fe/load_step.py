@@ -1,42 +1,31 @@
 """Loads: what is asked of the plate, and which loads are reached one from the other."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Self
 
 import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
 
-_SAME_DIRECTIONS: Mapping[str, Hashable] = MappingProxyType({})
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateTarget:
-    """What the plate is to reach along each of its three axes: a force, or a displacement.
+    """What the plate is to reach along each of its three axes: a force, or a displacement."""
 
-    Attributes
-    ----------
-    values : (3,)
-        Forces in N, displacements from the plate's start in mm.
-    displaced : (3,) bool
-        Along which axes a displacement is prescribed.
-    """
-
-    values: FloatArray
-    displaced: BoolArray
+    values: FloatArray  # (3,) forces in N, displacements from the plate's start in mm
+    displaced: BoolArray  # (3,) axes along which a displacement is prescribed
 
     @property
     def sheared(self) -> bool:
         """Whether it asks for a force or a displacement across the normal."""
         return bool(self.values[1:].any() or self.displaced[1:].any())
 
-    def unsheared(self) -> PlateTarget:
+    def unsheared(self) -> Self:
         """The same along the normal, without a force across it."""
-        return PlateTarget(self.values * [1.0, 0.0, 0.0], self.displaced & [True, False, False])
+        return replace(self, values=self.values * [1.0, 0.0, 0.0], displaced=self.displaced & [True, False, False])
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +34,6 @@ class LoadStep:
 
     Attributes
     ----------
-    name : str
     normal_n, shear_n : float, optional
         Force of the plate on the tissue along the normal force's and the shear's direction, N.
     normal_mm, shear_mm : float, optional
@@ -93,7 +81,7 @@ class LoadStep:
 
 
 def paths_of(
-    loads: Sequence[LoadStep], directions: Mapping[str, Hashable] = _SAME_DIRECTIONS
+    loads: Sequence[LoadStep], directions: Mapping[str, Hashable] = MappingProxyType({})
 ) -> list[tuple[LoadStep, ...]]:
     """Loads by path: pressed alike and sheared to the same side, by force or by displacement, in the order of shear.
 

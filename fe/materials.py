@@ -1,17 +1,15 @@
-"""Laws of nearly incompressible, isotropic soft tissue: neo-Hooke, Yeoh, Ogden, Hencky.
+"""Material laws of nearly incompressible, isotropic soft tissue: neo-Hooke, Yeoh, Ogden, Hencky.
 
-Every law is W(F) = Wbar(F J^(-1/3)) + K / 2 (J - 1)^2 with J = det F. The bulk modulus K comes from the initial shear
-modulus mu0 and Poisson's ratio, K = 2 mu0 (1 + nu) / (3 (1 - 2 nu)). Units: MPa; stretches have none.
+Every material law is W(F) = Wbar(F J^(-1/3)) + K / 2 (J - 1)^2 with J = det F; its bulk modulus comes from the initial
+shear modulus mu0 and Poisson's ratio, K = 2 mu0 (1 + nu) / (3 (1 - 2 nu)). Units: MPa; stretches have none.
 
 What a number means depends on the program that it was made for; the constructors say which: `Ogden.from_ansys`,
 `Ogden.from_abaqus`, `Ogden.from_febio`. The same mu and alpha give initial shear moduli that differ by alpha / 2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +19,7 @@ from dvc.errors import InputError
 from fe.hyperelastic import HENCKY, OGDEN, POLYNOMIAL, along, least_stiffness, stress_and_tangent
 
 HIGHEST_NU = 0.49999
-"""Above it the bulk modulus is over 50,000 times the shear modulus: no measurement tells that from incompressible."""
+"""Above it the bulk modulus is over 50,000 times the shear modulus: measurements cannot tell it from infinite."""
 
 MODES: Mapping[str, tuple[float, float, float]] = {
     "uniaxial": (1.0, -0.5, -0.5),
@@ -35,7 +33,7 @@ _SEARCHED = float(np.log(5.0))  # stretches of 1/5 to 5 are searched for a loss 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Material:
-    """A hyperelastic law with its numbers; made by `NeoHooke`, `Yeoh`, `Ogden` and `Hencky`.
+    """A material law (hyperelastic) with its parameters; made by `NeoHooke`, `Yeoh`, `Ogden` and `Hencky`.
 
     Attributes
     ----------
@@ -61,7 +59,7 @@ class Material:
         vector = frozen(self.vector, np.float64)
         object.__setattr__(self, "vector", vector)
         if not (np.isfinite(vector).all() and np.isfinite(self.nu)):
-            raise InputError(f"{self.description}: every number of a law must be finite.")
+            raise InputError(f"{self.description}: every parameter of a material law must be finite.")
         if not 0.0 <= self.nu <= HIGHEST_NU:
             raise InputError(
                 f"{self.description}: Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {self.nu:g}. For "
@@ -127,7 +125,7 @@ class Material:
         return np.asarray(~folded & (least_stiffness(self.vector, strains) > 0.0))
 
     def stable_range(self, mode: str) -> tuple[float, float]:
-        """Least and greatest stretch of a test, between 1/5 and 5, between which the law is stable (Drucker).
+        """Least and greatest stretch of a test, between 1/5 and 5, between which the material law is stable (Drucker).
 
         Examples
         --------
@@ -144,8 +142,12 @@ class Material:
         return round(ends[0], 6), round(ends[1], 6)
 
 
+Materials = Mapping[str, Material]
+"""Materials by region."""
+
+
 def nominal_stress(vector: FloatArray, stretch: FloatArray, mode: str) -> FloatArray:
-    """As `Material.nominal_stress`, for a law's vector alone."""
+    """As `Material.nominal_stress`, for a material law's vector alone."""
     _check_mode(mode)
     if not (stretch > 0.0).all():
         raise InputError("Stretches must be positive.")
@@ -175,7 +177,7 @@ class NeoHooke(Material):
     law: ClassVar[str] = "neo-Hooke"
 
     @classmethod
-    def of(cls, mu_mpa: float, nu: float = 0.4999) -> NeoHooke:
+    def of(cls, mu_mpa: float, nu: float = 0.4999) -> Self:
         """From the initial shear modulus, MPa."""
         return cls(np.array([0.5 * mu_mpa, 0.0, 0.0, 0.0]), nu, f"neo-Hooke, mu {_kpa(mu_mpa)}, nu {nu:g}")
 
@@ -187,7 +189,7 @@ class Yeoh(Material):
     law: ClassVar[str] = "Yeoh"
 
     @classmethod
-    def of(cls, c10_mpa: float, c20_mpa: float, c30_mpa: float = 0.0, nu: float = 0.4999) -> Yeoh:
+    def of(cls, c10_mpa: float, c20_mpa: float, c30_mpa: float = 0.0, nu: float = 0.4999) -> Self:
         """From the coefficients of the polynomial, MPa."""
         description = f"Yeoh, C10 {_kpa(c10_mpa)}, C20 {_kpa(c20_mpa)}, C30 {_kpa(c30_mpa)}, nu {nu:g}"
         return cls(np.array([c10_mpa, c20_mpa, c30_mpa, 0.0]), nu, description)
@@ -197,14 +199,14 @@ class Yeoh(Material):
 class Hencky(Material):
     """Wbar = mu sum_i ebar_i^2: linear elastic in logarithmic strain.
 
-    It is what a linear elastic material amounts to in a run with large displacements; Saint Venant-Kirchhoff's law,
-    which is linear in the Green-Lagrange strain, collapses in compression.
+    It is what a linear elastic material amounts to under large displacements; Saint Venant-Kirchhoff's law, which is
+    linear in the Green-Lagrange strain, collapses in compression.
     """
 
     law: ClassVar[str] = "linear elastic (Hencky)"
 
     @classmethod
-    def of(cls, mu_mpa: float, nu: float = 0.4999) -> Hencky:
+    def of(cls, mu_mpa: float, nu: float = 0.4999) -> Self:
         """From the shear modulus, MPa: Young's modulus is 2 mu (1 + nu)."""
         return cls(np.array([0.0, 0.0, 0.0, mu_mpa]), nu, f"linear elastic (Hencky), mu {_kpa(mu_mpa)}, nu {nu:g}")
 
@@ -230,7 +232,7 @@ class Ogden(Material):
     law: ClassVar[str] = "Ogden"
 
     @classmethod
-    def of(cls, shear_modulus_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+    def of(cls, shear_modulus_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Self:
         """From each term's initial shear modulus (MPa) and exponent.
 
         Raises
@@ -247,25 +249,25 @@ class Ogden(Material):
         return cls(vector, nu, f"Ogden, {pairs}, nu {nu:g}")
 
     @classmethod
-    def from_ansys(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+    def from_ansys(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Self:
         """W = sum mu / alpha (sum l^alpha - 3), so mu0 = mu alpha / 2."""
         numbers, exponents = np.atleast_1d(mu_mpa).astype(float), np.atleast_1d(alpha).astype(float)
         _check_terms(numbers, exponents)
         return cls.of(0.5 * numbers * exponents, exponents, nu)
 
     @classmethod
-    def from_abaqus(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+    def from_abaqus(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Self:
         """W = sum 2 mu / alpha^2 (sum l^alpha - 3), so mu0 = mu; CalculiX writes it so as well."""
         return cls.of(mu_mpa, alpha, nu)
 
     @classmethod
-    def from_febio(cls, c_mpa: npt.ArrayLike, m: npt.ArrayLike, nu: float = 0.4999) -> Ogden:
+    def from_febio(cls, c_mpa: npt.ArrayLike, m: npt.ArrayLike, nu: float = 0.4999) -> Self:
         """W = sum c / m^2 (sum l^m - 3), so mu0 = c / 2."""
         return cls.of(0.5 * np.asarray(c_mpa), m, nu)
 
 
 def from_vector(description: str, vector_mpa: FloatArray, bulk_modulus_mpa: float) -> Material:
-    """A material from what `Material` tells of itself; Poisson's ratio, to ten digits, from the bulk modulus."""
+    """A material from its description and numbers; Poisson's ratio, to ten digits, from the bulk modulus."""
     (made,) = (one for one in (NeoHooke, Yeoh, Hencky, Ogden) if description.startswith(f"{one.law},"))
     mu, K = Material(vector_mpa, 0.0, description).shear_modulus_mpa, bulk_modulus_mpa
     return made(vector_mpa, round((3.0 * K - 2.0 * mu) / (6.0 * K + 2.0 * mu), 10), description)

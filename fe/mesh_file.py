@@ -1,7 +1,5 @@
 """Meshes made here, kept as files that ParaView opens and that are read back with every name."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping
@@ -12,9 +10,9 @@ import numpy as np
 
 from dvc import TetMesh, read_mesh
 from dvc.arrays import FloatArray, IntArray
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
-from fe.surface_sets import known_name
+from fe.surface_sets import BONE, CUT, SKIN
 
 _FIRST_FACET = 101  # numbers of facets in the array "region"; those of tissues begin at 1
 _MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, beside its components
@@ -39,15 +37,15 @@ def write_tet_mesh(
     with whole_file(path) as part:
         meshio.vtu.write(part, meshio.Mesh(mesh.points_mm, blocks, at_nodes, {"region": numbers}), binary=True)
     names = {str(number): name for named in (tissues, facets) for name, number in named.items()}
-    write_whole(_names_of(path), json.dumps({"regions": names} | about, indent=2) + "\n")
+    write_json(path.with_suffix(".json"), {"regions": names} | about)
 
 
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:
     """Read a mesh of tetrahedra with its named regions and facets, made here or elsewhere.
 
-    Where a JSON file of the same name tells the names of the numbers in the array ``region``, they are used. A set of
-    all cells is left out where others divide them, and so are the materials of ANSYS where components do. The facets
-    "bone", "skin" and "cut" are called so in whatever case the file has them: ANSYS knows capitals only.
+    A JSON file of the same name may give the names of the numbers in the array ``region``. A set of all cells is left
+    out where others divide them, and so are the materials of ANSYS where components do. The facets "bone", "skin" and
+    "cut" are recognised in any case: ANSYS has capitals only.
 
     Raises
     ------
@@ -60,20 +58,21 @@ def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> 
     if read.tets is None:
         raise InputError(f"{place}: the simulation takes tetrahedra; this mesh has cells of other shapes.")
     names: dict[str, str] = {}
-    if _names_of(place).is_file():
+    names_file = place.with_suffix(".json")
+    if names_file.is_file():
         try:
-            table = json.loads(_names_of(place).read_text(encoding="utf-8"))["regions"]
+            table = json.loads(names_file.read_text(encoding="utf-8"))["regions"]
             names = {f"region {number}": str(name) for number, name in table.items()}
         except (ValueError, KeyError, AttributeError, TypeError) as damaged:
-            raise InputError(f"{_names_of(place)}: no table of regions in it ({damaged}).") from damaged
+            raise InputError(f"{names_file}: no table of regions in it ({damaged}).") from damaged
     mesh = read.tets
-    regions = {names.get(name, name): cells for name, cells in mesh.regions.items()}
-    count = len(mesh.cells)
+    regions, count = {names.get(name, name): cells for name, cells in mesh.regions.items()}, len(mesh.cells)
     regions = _without(regions, {name for name, cells in regions.items() if len(cells) == count}, count)
     regions = _without(regions, {name for name in regions if _MATERIAL.fullmatch(name)}, count)
     facets: dict[str, IntArray] = {}
     for name, rows in mesh.facets.items():
-        known = known_name(names.get(name, name))
+        known = names.get(name, name)
+        known = known.casefold() if known.casefold() in (BONE, SKIN, CUT) else known
         if known in facets:
             raise InputError(f"{place}: two sets of facets are called '{known}'; case does not count. Rename one.")
         facets[known] = rows
@@ -85,7 +84,3 @@ def _without(regions: dict[str, IntArray], names: set[str], cell_count: int) -> 
     others = {name: cells for name, cells in regions.items() if name not in names}
     held = np.unique(np.concatenate([*others.values(), np.empty(0, dtype=np.int64)]))
     return others if len(held) == cell_count else regions
-
-
-def _names_of(path: Path) -> Path:
-    return path.with_suffix(".json")

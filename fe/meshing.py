@@ -1,7 +1,5 @@
 """From a label map to a conforming mesh of linear tetrahedra, with named tissues and surfaces."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -17,8 +15,7 @@ from dvc.mesh import FACES, signed_volumes
 from dvc.worker import Worker
 from fe.slivers import dihedral_angles_deg, without_slivers
 from fe.surface_sets import BONE, CUT, SKIN
-from fe.tissue_surfaces import Borders, borders_of, labels_at
-from fe.tissue_volumes import with_volumes
+from fe.tissue_surfaces import Borders, borders_of, labels_at, with_volumes
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
 _FARTHEST = 0.1  # of the smallest voxel edge: how far a node may move at once to keep the tissues' volumes
@@ -29,14 +26,15 @@ _ALIGNED = 0.8  # cosine between a face and the plane of a cut that it goes on i
 _RIM_VOXELS = 6.0  # how far the section of a skin may reach
 _REFINED_MM = 2.0  # spacing of the lattice that carries a finer edge length
 
+_Lattice = tuple[FloatArray, IntArray, FloatArray]  # points, tetrahedra and the edge length at each point, mm
+
 
 @dataclass(frozen=True, slots=True)
 class MeshQuality:
-    """What a mesh is like.
+    """Quality of a mesh.
 
     Attributes
     ----------
-    cells, nodes : int
     least_angle_deg, greatest_angle_deg : float
         Of the dihedral angles.
     edge_mm : (5th percentile, median, 95th percentile)
@@ -67,7 +65,7 @@ def check_meshing(
     spacing = float(labels.grid.spacing_mm.min())
     if not 0.5 * spacing <= edge_mm <= 20.0:
         raise InputError(
-            f"The edge length must lie between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm}."
+            f"The edge length must be between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm}."
         )
     if finer is not None and not 0.0 < finer[1] < edge_mm:
         raise InputError(f"The finer edge length must lie between 0 and {edge_mm} mm; got {finer[1]}.")
@@ -94,7 +92,6 @@ def mesh_labels(
 
     Parameters
     ----------
-    labels : LabelMap
     edge_mm : float
         Length of edges wanted, mm. Thin tissues get shorter ones.
     bones : sequence of str
@@ -104,7 +101,7 @@ def mesh_labels(
     limit_s : float
         Time after which meshing is given up.
     watch : callable
-        Gets the share that is done, about twice a second; the mesher tells none, so it is a guess from the sizes.
+        Gets the share that is done, about twice a second; the mesher reports none, so it is estimated from the sizes.
 
     Returns
     -------
@@ -124,9 +121,9 @@ def mesh_labels(
     Notes
     -----
     The tetrahedra are fTetWild's (Hu and others 2020, doi:10.1145/3386569.3392385). Borders are then moved, by three
-    tenths of a voxel at the most, until each region has the volume of its voxels (`fe.tissue_volumes`); where a cell
-    has an angle under 12 degrees, nodes are moved until there is none or no move helps. They differ a little from one
-    run to the next: keep a mesh, and its hash, with what was computed on it.
+    tenths of a voxel at the most, until each region has the volume of its voxels (`fe.tissue_surfaces`); where a cell
+    has an angle under 12 degrees, nodes are moved until there is none or no move helps. Meshes differ slightly from run
+    to run: keep a mesh, and its hash, with what was computed on it.
     """
     numbers = check_meshing(labels, edge_mm, bones, finer)
     soft = {name: number for name, number in numbers.items() if name not in bones}
@@ -138,7 +135,7 @@ def mesh_labels(
     body = np.isin(cell_labels, list(soft.values()))
     voxel_mm3 = labels.grid.voxel_volume_mm3
     volumes_mm3 = {number: voxel_mm3 * float((labels.labels == number).sum()) for number in numbers.values()}
-    _refuse_lost(numbers, soft, volumes_mm3, np.abs(signed_volumes(points[cells])), cell_labels)
+    _refuse_lost(numbers, volumes_mm3, np.abs(signed_volumes(points[cells])), cell_labels)
     points = with_volumes(points, cells, cell_labels, volumes_mm3, _FARTHEST * spacing)
     points = without_slivers(points, cells[body], cell_labels[body])
     mesh = _named(points, cells, cell_labels, soft, [numbers[b] for b in bones], labels)
@@ -155,25 +152,18 @@ def self_test() -> str:
 
 
 def _refuse_lost(
-    numbers: dict[str, int],
-    soft: dict[str, int],
-    volumes_mm3: dict[int, float],
-    of_cells: FloatArray,
-    cell_labels: IntArray,
+    numbers: dict[str, int], volumes_mm3: dict[int, float], of_cells: FloatArray, cell_labels: IntArray
 ) -> None:
     """Refuse a mesh in which a region, bones included, is gone or lost a fifth of what its voxels hold."""
-    lost = [name for name, number in soft.items() if not (cell_labels == number).any()]
-    if lost:
-        raise MrstrainError(
-            f"No cell is left of {', '.join(lost)}: smaller than the mesh can show. Ask for shorter edges, or give its "
-            "label to a neighbour."
-        )
+    instead = "Ask for shorter edges, or give its label to a neighbour."
     for name, number in numbers.items():
         made, given = float(of_cells[cell_labels == number].sum()) / 1000.0, volumes_mm3[number] / 1000.0
+        if not made:
+            raise MrstrainError(f"No cell is left of {name}: smaller than the mesh can show. {instead}")
         if abs(made - given) > _MOST_LOST * given:
             raise MrstrainError(
                 f"{name} has {made:.2f} mL in the mesh and {given:.2f} mL in the label map: it is finer than the mesh "
-                "or the voxels show. Ask for shorter edges, or give its label to a neighbour."
+                f"or the voxels show. {instead}"
             )
 
 
@@ -183,14 +173,10 @@ def _guessed(share: float) -> float:
 
 
 def _limited(
-    borders: Borders,
-    edge_mm: float,
-    envelope_mm: float,
-    lattice: tuple[FloatArray, IntArray, FloatArray] | None,
-    limit_s: float,
+    borders: Borders, edge_mm: float, envelope_mm: float, lattice: _Lattice | None, limit_s: float,
     watch: Callable[[float], None],
-) -> tuple[FloatArray, IntArray]:
-    """Tetrahedra of the whole box, made in a process of its own that ends when its time is over."""
+) -> tuple[FloatArray, IntArray]:  # fmt: skip
+    """Tetrahedra of the whole box, made in a process of its own that ends at the time limit."""
     began = time.monotonic()
     box_mm3 = float(np.prod(np.ptp(borders.points_mm, axis=0)))
     expected = _SECONDS_PER_TRIANGLE * len(borders.triangles) + _SECONDS_PER_CELL * box_mm3 / (0.12 * edge_mm**3)
@@ -215,11 +201,7 @@ def _limited(
 
 
 def _tetrahedra(
-    points_mm: FloatArray,
-    triangles: IntArray,
-    edge_mm: float,
-    envelope_mm: float,
-    lattice: tuple[FloatArray, IntArray, FloatArray] | None,
+    points_mm: FloatArray, triangles: IntArray, edge_mm: float, envelope_mm: float, lattice: _Lattice | None
 ) -> tuple[FloatArray, IntArray]:
     import pytetwild
 
@@ -233,7 +215,7 @@ def _tetrahedra(
     return np.asarray(points), np.asarray(cells, dtype=np.int64)
 
 
-def _lattice(labels: LabelMap, label: int, edge_mm: float, finer_mm: float) -> tuple[FloatArray, IntArray, FloatArray]:
+def _lattice(labels: LabelMap, label: int, edge_mm: float, finer_mm: float) -> _Lattice:
     """Edge lengths on a lattice of tetrahedra: ``finer_mm`` in a region, rising to ``edge_mm`` away from it."""
     from scipy.ndimage import distance_transform_edt
 
@@ -269,24 +251,16 @@ def _named(
     outer = first[count == 1]
     triangles, owner = faces[outer], np.tile(tissue, 4)[outer]
     bone_faces = np.sort(np.concatenate([cells[np.isin(cell_labels, bones)][:, face] for face in FACES]), axis=1)
-    at_bone = _rows_in(triangles, bone_faces)
+    which = np.unique(np.concatenate([bone_faces, triangles]), axis=0, return_inverse=True)[1].ravel()
+    at_bone = np.isin(which[len(bone_faces) :], which[: len(bone_faces)])
     free: BoolArray = np.logical_not(at_bone)
     cut = np.zeros(len(triangles), dtype=bool)
-    skins = [number for name, number in soft.items() if name.casefold() == SKIN]
-    if skins:
+    if skins := [number for name, number in soft.items() if name.casefold() == SKIN]:
         cut = free & np.isin(owner, skins, invert=True)
         cut |= _rim(points, triangles, free & np.logical_not(cut), cut, labels)
     facets = {BONE: triangles[at_bone], SKIN: triangles[free & ~cut], CUT: triangles[cut]}
     regions = {name: np.flatnonzero(tissue == number) for name, number in soft.items()}
     return TetMesh(points, body, regions, {name: rows for name, rows in facets.items() if len(rows)})
-
-
-def _rows_in(rows: IntArray, others: IntArray) -> IntArray:
-    """Which rows are among others, all sorted."""
-    together = np.concatenate([others, rows])
-    _, which = np.unique(together, axis=0, return_inverse=True)
-    which = which.ravel()
-    return np.asarray(np.isin(which[len(others) :], which[: len(others)]))
 
 
 def _rim(points: FloatArray, triangles: IntArray, asked: BoolArray, cut: BoolArray, labels: LabelMap) -> BoolArray:
@@ -334,12 +308,7 @@ def _thin(mesh: TetMesh) -> tuple[tuple[str, float], ...]:
     skin = next((name for name in mesh.regions if name.casefold() == SKIN), None)
     if skin is None or SKIN not in mesh.facets:
         return ()
-    outer = np.zeros(len(mesh.points_mm), dtype=bool)
-    outer[mesh.facets[SKIN]] = True
-    beneath = np.zeros(len(mesh.points_mm), dtype=bool)
-    for name, cells in mesh.regions.items():
-        if name != skin:
-            beneath[mesh.cells[cells]] = True
+    beneath = np.setdiff1d(np.arange(len(mesh.cells)), mesh.regions[skin])
     cells = mesh.cells[mesh.regions[skin]]
-    across = outer[cells].any(axis=1) & beneath[cells].any(axis=1)
-    return ((skin, float(across.mean())),)
+    across = [np.isin(cells, nodes).any(axis=1) for nodes in (mesh.facets[SKIN], mesh.cells[beneath])]
+    return ((skin, float((across[0] & across[1]).mean())),)

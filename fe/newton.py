@@ -1,6 +1,4 @@
-"""Newton's method for one increment of load: steps that keep every cell from folding, and a count of what they cost."""
-
-from __future__ import annotations
+"""Newton's method for one increment of load, in steps that keep every cell from folding."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,18 +8,16 @@ import numpy as np
 from dvc.arrays import FloatArray, IntArray
 from fe.assembly import Assembler
 from fe.linear import SingularError, Solver
-from fe.plate_rotation import Parallel
+from fe.plate import Parallel
 
 _LEAST_SHARE = 1.0 / 256.0
 _NEAR = 0.02  # forces out of balance, as a share of those on the supports, at which contact is looked at
-LEAST_VOLUME = 0.002
-"""No step brings det F at a quadrature point below this: from there the way to folding is short."""
-
+LEAST_VOLUME = 0.002  # no step brings det F at a quadrature point below this: from there folding is near
 _MOST_GROWTH = 3.0  # of the residual in one step
-# Steps in a row that hardly lowered the residual, after which each is measured before it is made; and no more are.
+# Steps in a row that hardly lowered the residual: from the first number on several lengths are tried, at the second
+# the search ends.
 _WANDERED, _LOST = 2, 12
-BALANCED, SMALL_MM = 5, 0.1
-"""So many steps in a row that end in balance, the last below this, count as converged."""
+BALANCED, SMALL_MM = 5, 0.1  # so many steps in a row that end in balance, the last below this, count as converged
 _SHARES = (1.0, 0.5, 0.25)
 _ROUGH, _INEXACT = 0.05, 1e-3  # residual of a linear solution that is not exact, far from equilibrium and near it
 
@@ -48,38 +44,20 @@ class Tolerance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Converged:
-    """A state in equilibrium, and what it took.
+    """A state in equilibrium."""
 
-    Attributes
-    ----------
-    state : (unknowns,)
-    forces : (unknowns,)
-        Internal forces, N.
-    iterations : int
-    """
-
-    state: FloatArray
-    forces: FloatArray
+    state: FloatArray  # (unknowns,)
+    forces: FloatArray  # (unknowns,) internal, N
     iterations: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Imposed:
-    """What an increment imposes from outside.
+    """What an increment imposes from outside."""
 
-    Attributes
-    ----------
-    forces_n : (equations,)
-        External forces.
-    prescribed : (h,) int
-        Equations whose unknowns are prescribed.
-    moves_mm : (h,)
-        How far those go from the first guess.
-    """
-
-    forces_n: FloatArray
-    prescribed: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    moves_mm: FloatArray = field(default_factory=lambda: np.empty(0))
+    forces_n: FloatArray  # (equations,) external forces
+    prescribed: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # (h,) equations
+    moves_mm: FloatArray = field(default_factory=lambda: np.empty(0))  # (h,) of their unknowns, from the first guess
 
 
 def equilibrium(
@@ -92,26 +70,11 @@ def equilibrium(
     log: Callable[[str], None] = lambda _: None,
     rotation: Parallel | None = None,
 ) -> Converged | None:
-    """Find the state in which internal forces balance the external ones.
+    """Find the state in which internal forces balance the external ones, from a first guess (unknowns,).
 
-    Parameters
-    ----------
-    state : (unknowns,)
-        First guess.
-    imposed : Imposed
-    tolerance : Tolerance
-    changed : callable
-        ``changed(state, forces)`` is asked once a state is near equilibrium, and again there: whether what the unknowns
-        follow has changed, as where more of a surface touches. It may move the state to where that is so.
-    log : callable
-        Gets a line for each step.
-    rotation : Parallel, optional
-        Of the plate; by default it stays parallel.
-
-    Returns
-    -------
-    Converged or None
-        None if it does not converge; where forces alone are given, `fe.descent` may.
+    ``changed(state, forces)`` is called once a state is near equilibrium, and again there: whether what the unknowns
+    follow has changed, as where more of a surface touches; it may move the state to where that is so. Without
+    ``rotation`` the plate stays parallel. None if it does not converge; where only forces are given, `fe.descent` may.
     """
     newton = _Newton(assembler, solver, imposed, rotation or Parallel())
     displacements = 3 * len(assembler.model.space.nodes_mm)
@@ -154,7 +117,7 @@ def equilibrium(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Iterate:
-    """A state on the way to equilibrium: its forces by unknown and by equation, its least det F, what is missing."""
+    """A state on the way to equilibrium: its forces by unknown and by equation, least det F, and imbalance."""
 
     state: FloatArray
     forces: FloatArray
@@ -165,7 +128,7 @@ class _Iterate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Newton:
-    """Steps of Newton's method for one increment. A step is the change of all unknowns, and the plate's turn (3,)."""
+    """Steps of Newton's method for one increment: the change of all unknowns, and the plate's turn (3,)."""
 
     assembler: Assembler
     solver: Solver
@@ -185,7 +148,7 @@ class _Newton:
         right[self.assembler.idle] = 0.0
         data = self.assembler.held(self.assembler.tangent(now.state), right, held, left_mm)
         level = self.solver.solve(data, right, accuracy)
-        solved, turn = self.rotation.solved(now.state, now.forces, data, level, held, _INEXACT)
+        solved, turn = self.rotation.solved(now.state, now.forces, data, level, held)
         solved[held] = left_mm  # exactly, though the solution may be rough
         change = self.assembler.spread(solved)
         if not np.isfinite(change).all():
@@ -198,7 +161,7 @@ class _Newton:
         return self.at(self.rotation.ahead(now.state, share * change, share * turn))
 
     def best_share(self, now: _Iterate, step: tuple[FloatArray, FloatArray]) -> float:
-        """The share of a step, of a few, that leaves the least out of balance."""
+        """The share of a step, among a few, that leaves the least imbalance."""
         tried = {share: self.ahead(now, step, share) for share in _SHARES}
         left = {share: at.unbalanced_n if at.lowest > LEAST_VOLUME else np.inf for share, at in tried.items()}
         return min(_SHARES, key=lambda share: left[share])

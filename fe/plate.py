@@ -1,18 +1,31 @@
-"""A rigid plate that tissue touches: taped to it from the first touch on, or free to slide along it."""
+"""A rigid plate that tissue touches: taped to it from the first touch on, or free to slide along it.
 
-from __future__ import annotations
+Its rotation adds three unknowns to the sparse system of all others. Nodes on a plate that turns by a small vector t
+about its pivot c move by t x r, r = x - c. With f their internal forces, the moment is sum r x f, and the second
+variation of the energy has, beside w_k . K w_l (w_k = e_k x r, K the tangent), the part of the curved path
+
+    sum  (r f^T + f r^T) / 2 - (r . f) I,
+
+which is symmetric. The system [K B; B^T C] [x; t] = [right; moment] is solved by elimination of x, so that K, its
+pattern and its factorisation are those of a plate that does not turn.
+"""
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from dvc import plate_axes
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
+from fe.assembly import Assembler
+from fe.linear import SingularError, Solver
 
 _BEYOND_MM = 0.5
 _SAME_MM = 1e-6  # nodes whose heights differ by less touch together, whatever the frame does to the last digits
+_LEAST_ARM_MM = 1e-3
+_ACCURACY = 1e-3  # of the linear solutions for a rotation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,41 +77,19 @@ class Plate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContactStatus:
-    """Which nodes are in contact with the plate, where on it, and how it is turned.
+    """Which nodes are in contact with the plate, where on it, and how it is turned."""
 
-    Attributes
-    ----------
-    nodes : (s,) bool
-        Of those that may touch.
-    places_mm : (s, 3)
-        From the pivot, along axes that turn with the plate; NaN where a node does not hold.
-    rotation : (3, 3)
-        Of those axes against the plate's axes at the start.
-    turns : bool
-        Whether the plate turns freely now.
-    """
-
-    nodes: BoolArray
-    places_mm: FloatArray
-    rotation: FloatArray
-    turns: bool
+    nodes: BoolArray  # (s,) of those that may touch
+    places_mm: FloatArray  # (s, 3) from the pivot, along axes that turn with the plate; NaN without contact
+    rotation: FloatArray  # (3, 3) of those axes against the plate's axes at the start
+    turns: bool  # whether the plate turns freely now
 
 
 class Contact:
     """The nodes on the plate, in the plate's axes at the start (the first is that of the normal force).
 
-    Parameters
-    ----------
-    plate : Plate
-    nodes_mm : (n, 3)
-        Reference positions of all nodes, plate's axes.
-    surface : (s,) int
-        Nodes that may touch.
-
-    Raises
-    ------
-    InputError
-        If tissue that may not touch lies nearer to the plate than all that may: the plate comes from the wrong side.
+    ``nodes_mm`` (n, 3) are the reference positions of all nodes, ``surface`` (s,) those that may touch. InputError if
+    other tissue lies nearer to the plate: the plate comes from the wrong side.
     """
 
     def __init__(self, plate: Plate, nodes_mm: FloatArray, surface: IntArray) -> None:
@@ -123,31 +114,18 @@ class Contact:
 
     @property
     def held(self) -> IntArray:
-        """Nodes that hold to the plate."""
+        """Nodes on the plate."""
         return self.nodes[self.status.nodes]
-
-    @property
-    def stays(self) -> bool:
-        """Whether what touches stays where it does, on a plate that does not turn now."""
-        return self.plate.taped and not self.status.turns
 
     @property
     def followers(self) -> dict[int, IntArray]:
         """Unknowns that follow each of the plate's three displacements."""
         return {axis: 3 * self.held + axis for axis in range(3 if self.plate.taped else 1)}
 
-    @property
-    def may_follow(self) -> dict[int, IntArray]:
-        """Unknowns that may ever follow the plate's displacements."""
-        return {axis: 3 * self.nodes + axis for axis in range(3)}
-
     def touch_first(self, state: FloatArray) -> None:
-        """Move the plate to the surface: its lowest node holds, or its lowest nodes."""
-        self.status = replace(
-            self.status,
-            nodes=self._first,
-            places_mm=np.where(self._first[:, None], (self._start - self._pivot) * [0.0, 1.0, 1.0], np.nan),
-        )
+        """Move the plate to the surface, onto its lowest node or nodes."""
+        places = np.where(self._first[:, None], (self._start - self._pivot) * [0.0, 1.0, 1.0], np.nan)
+        self.status = replace(self.status, nodes=self._first, places_mm=places)
         state[3 * self.held] = self._pivot[0] - self._start[self._first, 0]
 
     def begin(self, state: FloatArray) -> None:
@@ -155,11 +133,10 @@ class Contact:
         self._before = self._seen_from_plate(state)
 
     def centre_mm(self, state: FloatArray) -> FloatArray:
-        """Where the pivot is, (3,) mm."""
+        """Position of the pivot, (3,) mm."""
         status = self.status
-        centre = (self._positions(state)[status.nodes] - status.places_mm[status.nodes] @ status.rotation.T).mean(
-            axis=0
-        )
+        centres = self._positions(state)[status.nodes] - status.places_mm[status.nodes] @ status.rotation.T
+        centre = centres.mean(axis=0)
         if not self.plate.taped:
             centre[1:] = self._pivot[1:]
         return np.asarray(centre)
@@ -169,7 +146,7 @@ class Contact:
         return np.asarray(self.centre_mm(state) - self._pivot + [self.plate.gap_mm, 0.0, 0.0])
 
     def arms_mm(self, state: FloatArray) -> FloatArray:
-        """From the pivot to each node that holds (k, 3), mm."""
+        """From the pivot to each node on the plate (k, 3), mm."""
         return self._positions(state)[self.status.nodes] - self.centre_mm(state)
 
     def force_n(self, forces: FloatArray) -> FloatArray:
@@ -181,20 +158,11 @@ class Contact:
         return np.asarray(np.cross(self.arms_mm(state), forces[_unknowns(self.held)]).sum(axis=0))
 
     def update(self, state: FloatArray, forces: FloatArray) -> bool:
-        """Let nodes that are past the plate hold to it, and, without tape, those go that it would have to pull.
+        """Take up nodes past the plate and, without tape, release those that it would pull; whether any changed.
 
-        Parameters
-        ----------
-        state : (unknowns,)
-            Nodes that touch are put on the plate, in place: along its normal onto its face, and, on tape, across it to
-            where they crossed the face on a straight way from the state before, as seen from the plate.
-        forces : (unknowns,)
-            Internal forces, N.
-
-        Returns
-        -------
-        bool
-            Whether any node was taken or let go.
+        ``state`` is changed in place: nodes that touch are put onto the plate's face, along its normal and, on tape,
+        across it to where they crossed the face on a straight way from the state before, as seen from the plate.
+        ``forces`` (unknowns,) are internal, N.
         """
         status, now, before = self.status, self._seen_from_plate(state), self._before
         new = (now[:, 0] <= 0.0) & ~status.nodes
@@ -225,3 +193,74 @@ class Contact:
 
 def _unknowns(nodes: IntArray) -> IntArray:
     return np.asarray(3 * nodes[:, None] + np.arange(3))
+
+
+class Parallel:
+    """A plate that stays parallel: it has no unknowns of rotation."""
+
+    def missing_n(self, state: FloatArray, forces: FloatArray) -> float:
+        """Imbalance of the moment, N; none, as it takes up any."""
+        return 0.0
+
+    def solved(
+        self, state: FloatArray, forces: FloatArray, data: FloatArray, level: FloatArray, held: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Change of every equation, ``level`` as it is, and the turn (3,), none."""
+        return level, np.zeros(3)
+
+    def ahead(self, state: FloatArray, change: FloatArray, turn: FloatArray) -> FloatArray:
+        """The state after a change of all unknowns."""
+        return state + change
+
+
+class Turning(Parallel):
+    """A plate that turns until its moment about the pivot is ``moment_nmm`` (3,); it turns ``contact`` in place."""
+
+    def __init__(self, contact: Contact, assembler: Assembler, solver: Solver, moment_nmm: FloatArray) -> None:
+        self._contact, self._assembler, self._solver = contact, assembler, solver
+        self._moment = moment_nmm
+        self._rotation = contact.status.rotation
+        self._arms, self._on_plate = np.empty((0, 3)), np.empty((0, 3), dtype=int)
+
+    def missing_n(self, state: FloatArray, forces: FloatArray) -> float:
+        """Imbalance of the moment, N: over the root mean square arm of the nodes on the plate."""
+        arm = float(np.sqrt((self._contact.arms_mm(state) ** 2).sum(axis=1).mean()))
+        missing = self._moment - self._contact.moment_nmm(state, forces)
+        return float(np.linalg.norm(missing)) / max(arm, _LEAST_ARM_MM)
+
+    def solved(
+        self, state: FloatArray, forces: FloatArray, data: FloatArray, level: FloatArray, held: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Change of every equation and the turn (3,), from ``level``, the change (equations,) of a level plate.
+
+        ``data`` are the tangent's values, with ``held`` equations prescribed. SingularError if the tissue does not hold
+        the plate against turning.
+        """
+        self._rotation = self._contact.status.rotation
+        self._arms = self._contact.arms_mm(state)
+        self._on_plate = _unknowns(self._contact.held)
+        ways = np.zeros((len(state), 3))
+        for axis in range(3):
+            ways[self._on_plate, axis] = np.cross(np.eye(3)[axis], self._arms)
+        acted = self._assembler.acting(state, ways)
+        coupled = np.column_stack([self._assembler.by_equation(acted[:, axis]) for axis in range(3)])
+        right = coupled.copy()
+        right[held] = 0.0
+        answers = np.column_stack([self._solver.solve(data, right[:, axis], _ACCURACY) for axis in range(3)])
+        r, f = self._arms, forces[self._on_plate]
+        curved = r.T @ f
+        own = ways.T @ acted + 0.5 * (curved + curved.T) - (r * f).sum() * np.eye(3)
+        missing = self._moment - self._contact.moment_nmm(state, forces)
+        try:
+            turn = np.linalg.solve(own - right.T @ answers, missing - coupled.T @ level)
+        except np.linalg.LinAlgError as failure:
+            raise SingularError("The plate is not held against turning.") from failure
+        return level - answers @ turn, turn
+
+    def ahead(self, state: FloatArray, change: FloatArray, turn: FloatArray) -> FloatArray:
+        """The state after a change of all unknowns and a turn, rigid on the plate; the plate is turned to match."""
+        turned = Rotation.from_rotvec(turn).as_matrix()
+        tried = state + change
+        tried[self._on_plate] += self._arms @ (turned - np.eye(3)).T
+        self._contact.status = replace(self._contact.status, rotation=turned @ self._rotation)
+        return np.asarray(tried)

@@ -1,7 +1,5 @@
 """The boundary value problem: tissue under a rigid plate, with what it is made of and where it is held."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -14,7 +12,7 @@ from dvc.arrays import IntArray
 from dvc.errors import InputError
 from fe.elements import element as formulation
 from fe.load_step import LoadStep, paths_of
-from fe.materials import Material
+from fe.materials import Materials
 from fe.plate import Contact, Plate
 from fe.surface_sets import BONE, SKIN
 
@@ -29,7 +27,6 @@ class Problem:
         LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed; every cell in one
         region.
     materials : mapping of region to Material
-    plate : Plate
     loads : sequence of LoadStep
         Reached one from the other. The first must press.
     fixed : sequence of str
@@ -40,12 +37,12 @@ class Problem:
     Raises
     ------
     InputError
-        If a region has no material or a cell no region, a surface set is missing, tissue hangs on nothing that is
+        If a region has no material or a cell no region, a surface set is missing, tissue is joined to nothing that is
         fixed, the plate comes from the wrong side, or a load cannot be brought onto tissue.
     """
 
     mesh: TetMesh
-    materials: Mapping[str, Material]
+    materials: Materials
     plate: Plate
     loads: Sequence[LoadStep]
     fixed: Sequence[str] = (BONE,)
@@ -74,7 +71,7 @@ class Problem:
 
 def problems_of(
     mesh: TetMesh,
-    materials: Mapping[str, Material],
+    materials: Materials,
     plate: Plate | Mapping[str, Plate],
     loads: Sequence[LoadStep],
     fixed: Sequence[str] = (BONE,),
@@ -103,7 +100,7 @@ def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
             raise InputError(f"{load.name}: a plate without friction carries no shear; got {load}.")
 
 
-def check_materials(mesh: TetMesh, materials: Mapping[str, Material]) -> None:
+def check_materials(mesh: TetMesh, materials: Materials) -> None:
     """Refuse a mesh of which a cell has no material, or more than one, with an `InputError`."""
     times = np.zeros(len(mesh.cells), dtype=int)
     for region in materials:
@@ -114,13 +111,13 @@ def check_materials(mesh: TetMesh, materials: Mapping[str, Material]) -> None:
         bare, twice = int((times == 0).sum()), int((times > 1).sum())
         without = ", ".join(name for name in mesh.regions if name not in materials)
         raise InputError(
-            f"Every cell needs one law: {bare} have none and {twice} more than one. Regions without a law: "
+            f"Every cell needs one material law: {bare} have none and {twice} more than one. Regions without one: "
             f"{without or 'none'}."
         )
 
 
 def _check_bonded(mesh: TetMesh, held: IntArray, fixed: Sequence[str]) -> None:
-    """Refuse tissue that hangs on nothing: cells whose nodes are joined to no fixed one."""
+    """Refuse tissue that nothing holds: cells whose nodes are joined to no fixed one."""
     ends = np.repeat(mesh.cells[:, 0], 3), mesh.cells[:, 1:].ravel()
     count = len(mesh.points_mm)
     joined = sparse.csr_matrix((np.ones(len(ends[0]), dtype=np.int8), ends), shape=(count, count))

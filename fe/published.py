@@ -1,7 +1,5 @@
 """Material parameter sets, tissue by tissue: seven published ones, and the user's own in the same form."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import re
@@ -15,17 +13,17 @@ from types import MappingProxyType
 
 from dvc.errors import InputError
 from fe.hyperelastic import OGDEN
-from fe.materials import Hencky, Material, NeoHooke, Ogden, Yeoh
+from fe.materials import Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
 
 WHOLE = "all"
-"""Name of the tissue in a set that has one law for everything."""
+"""Name of the tissue in a set that has one material law for everything."""
 
 _INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
 
 @dataclass(frozen=True, slots=True)
 class _Form:
-    """How a law is written in a file: what makes it, and which of its numbers are stresses."""
+    """How a material law is written in a file: its constructor, and which of its numbers are stresses."""
 
     made: Callable[..., Material]
     stresses: tuple[str, ...]
@@ -61,43 +59,42 @@ class MaterialSet:
     name: str
     title: str
     source: str
-    materials: Mapping[str, Material]
+    materials: Materials
 
     def for_regions(self, regions: Iterable[str]) -> tuple[dict[str, Material], tuple[str, ...]]:
-        """The law of each region of a mesh, and a sentence for each region that has none of its own.
+        """The material law of each region of a mesh, and a sentence for each region that has none of its own.
 
-        Tendon and aponeurosis without a law take muscle's, or else fat's; muscle takes fat's. No other region takes
+        Tendon and aponeurosis without one take muscle's, or else fat's; muscle takes fat's. No other region takes
         another's.
 
         Raises
         ------
         InputError
-            If a region has no law and the set none to put in its place.
+            If a region has no material law and the set none to put in its place.
 
         Examples
         --------
         >>> materials, notes = material_set("friedman").for_regions(["fat", "skin", "muscle"])
         >>> materials["muscle"] is materials["fat"], notes
-        (True, ("friedman has no law for muscle; fat's is used.",))
+        (True, ("friedman has no material law for muscle; fat's is used.",))
         """
         by_region: dict[str, Material] = {}
         notes = []
+        if WHOLE in self.materials:
+            return dict.fromkeys(regions, self.materials[WHOLE]), ()
         known = {tissue.casefold(): law for tissue, law in self.materials.items()}
         for region in regions:
-            if WHOLE in self.materials:
-                by_region[region] = self.materials[WHOLE]
-                continue
             tried = (region, *_INSTEAD.get(region.casefold(), ()))
             name = next((t for t in tried if t.casefold() in known), None)
             if name is None:
                 instead = f", nor one for {' or '.join(tried[1:])} to put in its place" if tried[1:] else ""
                 raise InputError(
-                    f"The set {self.name} has no law for the region '{region}'{instead}; it has "
+                    f"The set {self.name} has no material law for the region '{region}'{instead}; it has "
                     f"{', '.join(self.materials)}. Add it to the set in a file of your own, or rename the region."
                 )
             by_region[region] = known[name.casefold()]
             if name != region:
-                notes.append(f"{self.name} has no law for {region}; {name}'s is used.")
+                notes.append(f"{self.name} has no material law for {region}; {name}'s is used.")
         return by_region, tuple(notes)
 
 
@@ -147,7 +144,7 @@ def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
     return _parsed(str(path), text)
 
 
-def as_toml(name: str, title: str, materials: Mapping[str, Material]) -> str:
+def as_toml(name: str, title: str, materials: Materials) -> str:
     """A set as text in the form that `read_material_sets` takes; Ogden's numbers in the convention of Abaqus.
 
     Examples
@@ -163,30 +160,27 @@ def as_toml(name: str, title: str, materials: Mapping[str, Material]) -> str:
     alpha = [6.2]
     nu = 0.4999
     """
-    key = json.dumps(name) if not re.fullmatch(r"[\w-]+", name, re.ASCII) else name
+    key = _key(name)
     lines = [f"[{key}]", f"title = {json.dumps(title)}"]
     for tissue, law in materials.items():
-        at = json.dumps(tissue) if not re.fullmatch(r"[\w-]+", tissue, re.ASCII) else tissue
-        lines += ["", f"[{key}.{at}]", f'law = "{_NAMES[type(law)]}"']
+        lines += ["", f"[{key}.{_key(tissue)}]"]
         lines += [f"{k} = {v}" for k, v in _numbers_of(law).items()]
     return "\n".join(lines) + "\n"
 
 
-_NAMES: Mapping[type[Material], str] = {NeoHooke: "neo-Hooke", Yeoh: "Yeoh", Hencky: "linear elastic", Ogden: "Ogden"}
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else json.dumps(name)
 
 
 def _numbers_of(law: Material) -> dict[str, object]:
-    """The numbers of a law as a file has them."""
+    """The name and numbers of a material law as a file has them."""
     c10, c20, c30, hencky = law.vector[:OGDEN].tolist()
+    mu, alpha = law.vector[OGDEN::2].tolist(), law.vector[OGDEN + 1 :: 2].tolist()
     given: dict[type[Material], dict[str, object]] = {
-        NeoHooke: {"mu_mpa": 2.0 * c10},
-        Yeoh: {"c10_mpa": c10, "c20_mpa": c20, "c30_mpa": c30},
-        Hencky: {"mu_mpa": hencky},
-        Ogden: {
-            "convention": '"abaqus"',
-            "mu_mpa": law.vector[OGDEN::2].tolist(),
-            "alpha": law.vector[OGDEN + 1 :: 2].tolist(),
-        },
+        NeoHooke: {"law": '"neo-Hooke"', "mu_mpa": 2.0 * c10},
+        Yeoh: {"law": '"Yeoh"', "c10_mpa": c10, "c20_mpa": c20, "c30_mpa": c30},
+        Hencky: {"law": '"linear elastic"', "mu_mpa": hencky},
+        Ogden: {"law": '"Ogden"', "convention": '"abaqus"', "mu_mpa": mu, "alpha": alpha},
     }
     return given[type(law)] | {"nu": law.nu}
 
@@ -204,13 +198,11 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
     sets = {}
     for name, content in tables.items():
         if not isinstance(content, dict):
-            raise InputError(
-                f"{where}: '{name}' stands outside any set; a file starts with the set's name in brackets."
-            )
+            raise InputError(f"{where}: '{name}' is outside any set; a file starts with the set's name in brackets.")
         head = {key: content.get(key, "") for key in ("title", "source")}
         tissues = {key: value for key, value in content.items() if key not in head}
         if not tissues:
-            raise InputError(f"{where}: the set '{name}' has no tissue; add [{name}.fat] with a law.")
+            raise InputError(f"{where}: the set '{name}' has no tissue; add [{name}.fat] with a material law.")
         materials = {tissue: _law(f"{where}, {name}.{tissue}", given) for tissue, given in tissues.items()}
         sets[name] = MaterialSet(name, str(head["title"]), str(head["source"]), MappingProxyType(materials))
     if not sets:
@@ -220,7 +212,7 @@ def _parsed(where: str, text: str) -> dict[str, MaterialSet]:
 
 def _law(where: str, given: object) -> Material:
     if not isinstance(given, dict):
-        raise InputError(f"{where}: a tissue is a table with a law and its numbers; got {given!r}.")
+        raise InputError(f"{where}: a tissue is a table with a material law and its numbers; got {given!r}.")
     law = given.get("law")
     form = _form(where, law, given.get("convention"))
     values: dict[str, float | list[float]] = {}
@@ -248,12 +240,12 @@ def _law(where: str, given: object) -> Material:
 
 
 def _form(where: str, law: object, convention: object) -> _Form:
+    if law == "Ogden" and convention not in _OGDEN:
+        raise InputError(
+            f"{where}: an Ogden law needs convention = {' or '.join(map(repr, _OGDEN))}, the program that its numbers "
+            f"are for: the same numbers differ by a factor of alpha / 2 in stiffness; got {convention!r}."
+        )
     if law == "Ogden":
-        if convention not in _OGDEN:
-            raise InputError(
-                f"{where}: an Ogden law needs convention = {' or '.join(map(repr, _OGDEN))}, the program that its "
-                f"numbers are for: the same numbers differ by a factor of alpha / 2 in stiffness; got {convention!r}."
-            )
         return _OGDEN[str(convention)]
     if law not in _LAWS:
         raise InputError(f"{where}: law must be one of {', '.join((*_LAWS, 'Ogden'))}; got {law!r}.")

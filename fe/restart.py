@@ -1,6 +1,4 @@
-"""Files from which a simulation that was cut goes on: where each load came to, and what it was computed from."""
-
-from __future__ import annotations
+"""Files from which an interrupted simulation resumes: where each load came to, and what it was computed from."""
 
 import hashlib
 import io
@@ -13,8 +11,7 @@ import numpy as np
 
 from dvc.atomic_files import whole_file
 from dvc.software import software_key
-from fe.load_path import PlateState
-from fe.loading import Checkpoint
+from fe.load_path import Checkpoint, PlateState
 from fe.plate import ContactStatus
 from fe.problem import Problem
 
@@ -25,10 +22,7 @@ _PLATE = [field.name for field in fields(PlateState)]
 
 
 def fingerprint(problem: Problem, load_count: int) -> str:
-    """A hash of all that the first loads of a problem depend on, the solver and its libraries included.
-
-    `dvc.software` tells those.
-    """
+    """A hash of all that the first loads of a problem depend on, solver and libraries (`dvc.software`) included."""
     mesh, plate = problem.mesh, problem.plate
     digest = hashlib.sha256()
 
@@ -65,7 +59,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint, made_from: str) -> None
 
 
 def read_checkpoint(path: Path, made_from: str) -> Checkpoint | None:
-    """Read where a load came to; None if there is no such file, it is damaged, or was made from something else."""
+    """Where a load came to; None if there is no such file, it is damaged, or was made from something else."""
     try:
         with np.load(io.BytesIO(path.read_bytes())) as file:
             if str(file["made_from"]) != made_from:

@@ -1,11 +1,9 @@
 """Results of a load: stress, volume, figures by region; VTU files for ParaView and tables, written and read back."""
 
-from __future__ import annotations
-
 import csv
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import meshio
@@ -15,9 +13,9 @@ from dvc import TetMesh
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
 from dvc.trust.regions import SHEAR_THRESHOLDS, volume_above
+from fe.elements import CROWDED
 from fe.load_path import PlateState
-from fe.materials import Material
-from fe.model import CROWDED
+from fe.materials import Materials
 from fe.solution import LoadState
 
 _SHARES = (0.5, 0.9, 0.99)
@@ -27,12 +25,11 @@ _VECTORS = {
     "force_n": "force_{}_n",
     "turn_deg": "turn_{}_deg",
     "moment_nmm": "moment_{}_nmm",
-}
-"""Vectors of a plate's state, and what the columns are called that hold their components."""
+}  # vectors of a plate's state, and the columns of their components
 
 
-def cauchy_stress(state: LoadState, mesh: TetMesh, materials: Mapping[str, Material]) -> FloatArray:
-    """Cauchy stress of each cell (m, 3, 3), MPa, LPS: the law's deviator, and the cell's mean pressure."""
+def cauchy_stress(state: LoadState, mesh: TetMesh, materials: Materials) -> FloatArray:
+    """Cauchy stress of each cell (m, 3, 3), MPa, LPS: the material law's deviator, and the cell's mean pressure."""
     F = np.eye(3) + state.gradients
     stress = np.empty_like(F)
     for region, law in materials.items():
@@ -63,10 +60,10 @@ def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
     return np.asarray(np.bincount(nodes, np.repeat(mesh.volumes_mm3 * jacobian, 4)) / before)
 
 
-def volume_share_off(mesh: TetMesh, state: LoadState, materials: Mapping[str, Material], by: float) -> float:
-    """Share of the volume where det F of nodal patches is further than ``by`` from what the law asks for, 1 + p / K.
+def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials, by: float) -> float:
+    """Share of the volume where det F of nodal patches differs by more than ``by`` from the material law's, 1 + p / K.
 
-    Mean over a cell's nodes. A law of low bulk modulus K may well give way; what is counted here is the mesh's error.
+    Mean over a cell's nodes. A material of low bulk modulus K may well give way; only the mesh's error is counted.
     """
     asked = np.empty(len(mesh.cells))
     for region, law in materials.items():
@@ -83,24 +80,22 @@ class RegionFigures:
 
     Attributes
     ----------
-    load : str
     reached : float
         Share of the load; below 1 the figures are those of the last state in equilibrium.
-    region : str
     volume_ml : float
         In the reference configuration.
     shear_p50, shear_p90, shear_p99 : float
-        Of the maximal shear (E1 - E3) / 2.
+        Of the maximum shear strain (E1 - E3) / 2 (Green-Lagrange).
     stress_p50_mpa, stress_p90_mpa, stress_p99_mpa : float
-        Of the equivalent stress (von Mises) of the Cauchy stress, MPa.
+        Of the equivalent stress (von Mises) of the Cauchy stress.
     above_ml : tuple of float
-        Volume whose maximal shear exceeds 0.2, 0.3, 0.4, 0.5.
+        Volume whose maximum shear strain exceeds 0.2, 0.3, 0.4, 0.5.
     volume_change : float
         Of the whole region, as a share of its volume.
     stable_share : float
-        Share of the volume in which the law is stable (Drucker) at the strain reached.
+        Share of the volume in which the material law is stable (Drucker) at the strain reached.
     crowded_share : float
-        Share of the volume with det F below `fe.model.CROWDED`, where the solver holds cells open beyond their law.
+        Share of the volume with det F below `fe.elements.CROWDED`, where the solver adds resistance of its own.
     """
 
     load: str
@@ -119,15 +114,14 @@ class RegionFigures:
     crowded_share: float
 
 
-def region_figures(mesh: TetMesh, state: LoadState, materials: Mapping[str, Material]) -> list[RegionFigures]:
+def region_figures(mesh: TetMesh, state: LoadState, materials: Materials) -> list[RegionFigures]:
     """Figures of each region under a load."""
     strain = state.strain
     stress = equivalent_stress(cauchy_stress(state, mesh, materials))
     rows = []
     for region, law in materials.items():
         cells = mesh.regions[region]
-        volumes = mesh.volumes_mm3[cells]
-        shear = strain.max_shear[cells]
+        volumes, shear = mesh.volumes_mm3[cells], strain.max_shear[cells]
         s50, s90, s99 = volume_percentiles(shear, volumes, _SHARES)
         m50, m90, m99 = volume_percentiles(stress[cells], volumes, _SHARES)
         stable = law.is_stable(np.eye(3) + state.gradients[cells])
@@ -159,42 +153,33 @@ def volume_percentiles(values: FloatArray, volumes: FloatArray, shares: Sequence
 
 def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
     """Write the figures of regions, a row for each load and region."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    above = [f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS]
-    writer.writerow(
-        ["load", "reached", "region", "volume_ml", "max_shear_p50", "max_shear_p90", "max_shear_p99",
-         "von_mises_p50_mpa", "von_mises_p90_mpa", "von_mises_p99_mpa", *above, "volume_change", "stable_share",
-         "crowded_share"]
-    )  # fmt: skip
+    columns = [
+        "load", "reached", "region", "volume_ml", *(f"max_shear_p{p}" for p in (50, 90, 99)),
+        *(f"von_mises_p{p}_mpa" for p in (50, 90, 99)), *(f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS),
+        "volume_change", "stable_share", "crowded_share",
+    ]  # fmt: skip
+    table = []
     for row in rows:
-        numbers = (
-            row.volume_ml, row.shear_p50, row.shear_p90, row.shear_p99,
-            row.stress_p50_mpa, row.stress_p90_mpa, row.stress_p99_mpa, *row.above_ml, row.volume_change,
-        )  # fmt: skip
-        writer.writerow(
-            [
-                row.load,
-                f"{row.reached:.4g}",
-                row.region,
-                *(f"{v:.6g}" for v in numbers),
-                f"{row.stable_share:.6g}",
-                f"{row.crowded_share:.6g}",
-            ]
-        )
-    write_whole(path, text.getvalue())
+        load, reached, region, *numbers = astuple(row)
+        flat = [*numbers[:7], *row.above_ml, *numbers[8:]]
+        table.append([load, f"{reached:.4g}", region, *(f"{v:.6g}" for v in flat)])
+    _write_csv(path, columns, table)
 
 
 def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
     """Write every converged increment: the plate's displacement, force, turn and moment along its axes, its contact."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     columns = [name.format(axis) for name in _VECTORS.values() for axis in _AXES]
-    writer.writerow(["load", *columns, "contact_area_mm2", "contact_pressure_mpa"])
+    table = []
     for state in states:
         for at in state.curve:
             values = np.concatenate([getattr(at, field) for field in _VECTORS] + [[at.area_mm2, at.pressure_mpa]])
-            writer.writerow([state.load.name, *(f"{v:.8g}" for v in values)])
+            table.append([state.load.name, *(f"{v:.8g}" for v in values)])
+    _write_csv(path, ["load", *columns, "contact_area_mm2", "contact_pressure_mpa"], table)
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
     write_whole(path, text.getvalue())
 
 
@@ -203,17 +188,17 @@ def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
     curves: dict[str, list[PlateState]] = {}
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            vectors = [np.array([float(row[name.format(axis)]) for axis in _AXES]) for name in _VECTORS.values()]
-            plate = PlateState(vectors[0], vectors[1], vectors[2], vectors[3], float(row["contact_area_mm2"]))
+            vectors = {k: np.array([float(row[n.format(axis)]) for axis in _AXES]) for k, n in _VECTORS.items()}
+            plate = PlateState(**vectors, area_mm2=float(row["contact_area_mm2"]))
             curves.setdefault(row["load"], []).append(plate)
     return curves
 
 
-def write_state(path: Path, mesh: TetMesh, state: LoadState, materials: Mapping[str, Material]) -> None:
+def write_state(path: Path, mesh: TetMesh, state: LoadState, materials: Materials) -> None:
     """Write a load's results as VTU: LPS mm and MPa, on the undeformed mesh (warp by ``displacement_mm``).
 
     At nodes: displacement, and det F of the patch around each. In cells: number of the region, F, Green-Lagrange
-    strain, its maximal shear, det F, pressure (positive in tension) and Cauchy stress.
+    strain, maximum shear strain, det F, pressure (positive in tension) and Cauchy stress.
     """
     strain = state.strain
     region = np.zeros(len(mesh.cells), dtype=np.int64)

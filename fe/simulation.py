@@ -1,38 +1,26 @@
 """A simulation: what a material parameter set gave under its loads, as arrays, as files, as a picture."""
 
-from __future__ import annotations
-
-import base64
 import html
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from dvc import TetMesh
 from dvc.arrays import FloatArray
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_json
 from dvc.deformation.nodal import OnMesh
 from dvc.errors import InputError
+from fe import result
 from fe.decks import write_calculix, write_febio
-from fe.elements import DESCRIPTIONS
+from fe.elements import CROWDED, DESCRIPTIONS
 from fe.load_step import LoadStep
-from fe.materials import MODES, Material
-from fe.model import CROWDED
+from fe.materials import MODES, Materials
 from fe.plate import Plate
 from fe.problem import Problem, problems_of
 from fe.published import MaterialSet
-from fe.result import (
-    RegionFigures,
-    cauchy_stress,
-    region_figures,
-    volume_share_off,
-    write_curve_csv,
-    write_regions_csv,
-    write_state,
-)
-from fe.simulation_files import RECORD, read_parts
+from fe.result import RegionFigures
+from fe.simulation_files import PLATE_VECTORS, RECORD, read_parts
 from fe.solution import LoadState, Observer, SolverOptions, solve
 from fe.surface_sets import BONE
 
@@ -41,7 +29,7 @@ if TYPE_CHECKING:
 
 _FAR = 0.05  # det F of a patch further from 1 than this is counted
 _MUCH = 0.05  # share of the volume above which that is noted
-_CROWD = 0.01  # share of a region's volume, squeezed flat, above which that is noted
+_CROWD = 0.01  # share of a region's volume below det F `CROWDED` above which that is noted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +39,7 @@ class Simulation:
     Attributes
     ----------
     materials : MaterialSet
-        Its models are those of the mesh's regions.
+        Its materials are those of the mesh's regions.
     mesh : TetMesh
         Undeformed, LPS mm.
     paths : tuple of tuple of LoadStep
@@ -65,7 +53,7 @@ class Simulation:
     turns : bool
         Whether the plate turned freely.
     remarks : tuple of str
-        What was assumed.
+        Assumptions.
     regions : tuple of RegionFigures
         Strain, stress and volume of each region under each load.
     """
@@ -81,11 +69,12 @@ class Simulation:
     regions: tuple[RegionFigures, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        rows = [row for state in self.states for row in region_figures(self.mesh, state, self.materials.materials)]
+        given = self.materials.materials
+        rows = [row for state in self.states for row in result.region_figures(self.mesh, state, given)]
         object.__setattr__(self, "regions", tuple(rows))
 
     @classmethod
-    def of(cls, materials: MaterialSet, problems: Sequence[Problem], states: Sequence[LoadState]) -> Simulation:
+    def of(cls, materials: MaterialSet, problems: Sequence[Problem], states: Sequence[LoadState]) -> Self:
         """The simulation that solved these problems, one for each path, with the states in which their loads ended."""
         first = problems[0]
         by_region, remarks = materials.for_regions(first.mesh.regions)
@@ -111,7 +100,7 @@ class Simulation:
 
     @property
     def timed_out(self) -> bool:
-        """Whether all that it lacks is what its limit of time did not let it reach."""
+        """Whether it is incomplete only because its time limit was reached."""
         ended = all(state.reached == 1.0 or state.out_of_time for state in self.states)
         return not self.complete and not self._unstable and ended
 
@@ -121,45 +110,44 @@ class Simulation:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was assumed, and what is not to be trusted."""
+        """Assumptions, and what is not to be trusted."""
         reached = {state.load.name for state in self.states}
-        return (
-            *self.remarks,
-            *(
-                f"{row.load}: the law of {row.region} is not stable (Drucker) in {1.0 - row.stable_share:.1%} of its "
-                "volume."
-                for row in self._unstable
-            ),
-            *(
-                f"{row.load}: {row.crowded_share:.1%} of {row.region} is squeezed below det F {CROWDED:g}, where the "
-                "solver holds cells open; the law bears no pressure above its bulk modulus "
-                f"({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa)."
-                for row in self.regions
-                if row.crowded_share > _CROWD
-            ),
-            *(
-                f"{state.load.name}: its time was over at {state.reached:.0%} of the load; given more, it goes on from "
-                "there."
-                if len(state.curve) > 1
-                else f"{state.load.name}: its time was over before the first equilibrium."
-                for state in self.states
-                if state.out_of_time
-            ),
-            *(
-                f"{load.name} was not tried: the load before it was not reached."
-                for load in self.loads
-                if load.name not in reached
-            ),
-            *(
-                f"{state.load.name}: det F of nodal patches is over 5 % off what the law asks for in {share:.0%} of "
-                "the volume; a finer mesh keeps volume better."
-                for state in self.states
-                if (share := self._share_off(state)) > _MUCH
-            ),
-        )
+        notes = [
+            f"{row.load}: the material law of {row.region} is not stable (Drucker) in {1.0 - row.stable_share:.1%} of "
+            "its volume."
+            for row in self._unstable
+        ]
+        notes += [
+            f"{row.load}: {row.crowded_share:.1%} of {row.region} is compressed below det F {CROWDED:g}, where the "
+            "solver holds cells open; the material law bears no pressure above its bulk modulus "
+            f"({self.materials.materials[row.region].bulk_modulus_mpa:.2g} MPa)."
+            for row in self.regions
+            if row.crowded_share > _CROWD
+        ]
+        for state in self.states:
+            if state.out_of_time and len(state.curve) > 1:
+                done = f"at {state.reached:.0%} of the load; given more, it goes on from there"
+                notes.append(f"{state.load.name}: its time was over {done}.")
+            elif state.out_of_time:
+                notes.append(f"{state.load.name}: its time was over before the first equilibrium.")
+        notes += [
+            f"{load.name} was not tried: the load before it was not reached."
+            for load in self.loads
+            if load.name not in reached
+        ]
+        notes += [
+            f"{state.load.name}: det F of nodal patches is over 5 % off the material law's in {share:.0%} of the "
+            "volume; a finer mesh keeps volume better."
+            for state in self.states
+            if (share := self._share_off(state)) > _MUCH
+        ]
+        return *self.remarks, *notes
+
+    def _rows(self, state: LoadState) -> list[RegionFigures]:
+        return [row for row in self.regions if row.load == state.load.name]
 
     def _share_off(self, state: LoadState) -> float:
-        return volume_share_off(self.mesh, state, self.materials.materials, _FAR)
+        return result.volume_share_off(self.mesh, state, self.materials.materials, _FAR)
 
     def state(self, load: str) -> LoadState:
         """The state in which a load ended.
@@ -169,11 +157,10 @@ class Simulation:
         InputError
             If no load of that name was simulated.
         """
-        for state in self.states:
-            if state.load.name == load:
-                return state
-        there = ", ".join(state.load.name for state in self.states)
-        raise InputError(f"No load '{load}' was simulated; there are {there or 'none'}.")
+        states = {state.load.name: state for state in self.states}
+        if load not in states:
+            raise InputError(f"No load '{load}' was simulated; there are {', '.join(states) or 'none'}.")
+        return states[load]
 
     def deformation(self, load: str) -> OnMesh:
         """The deformation under a load, at any point of the mesh."""
@@ -181,16 +168,12 @@ class Simulation:
 
     def cauchy_stress(self, load: str) -> FloatArray:
         """Cauchy stress of each cell (m, 3, 3) under a load, MPa, LPS."""
-        return cauchy_stress(self.state(load), self.mesh, self.materials.materials)
+        return result.cauchy_stress(self.state(load), self.mesh, self.materials.materials)
 
     def __str__(self) -> str:
         lines = []
         for state in self.states:
-            shear = "; ".join(
-                f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}"
-                for row in self.regions
-                if row.load == state.load.name
-            )
+            shear = "; ".join(f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
             force = f"{state.force_n[0]:.1f} N and {state.force_n[1]:.1f} N of shear"
             part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached ({force});"
             moved = state.plate_displacement_mm
@@ -200,39 +183,36 @@ class Simulation:
             )
         return "\n".join([*lines, *(f"{self.name}: {note}" for note in self.notes)])
 
-    def plot(self, loads: Sequence[str] | None = None) -> Figure:
+    def plot(self, loads: Sequence[str] | None = None) -> "Figure":
         """Maximum shear strain on a slice through the bone's lowest point, a panel for each load; all by default."""
         from fe.figures import sagittal_slice
 
         return sagittal_slice(self.mesh, self.states if loads is None else [self.state(name) for name in loads])
 
     def _repr_html_(self) -> str:
+        from dvc.report.page import Picture
         from dvc.report.sheet import png_bytes
 
-        picture = base64.b64encode(png_bytes(self.plot())).decode("ascii")
+        picture = Picture(self.name, "", png_bytes(self.plot())).data
         ended = sum(state.reached == 1.0 for state in self.states)
         title = f"{self.name}: {ended} of {len(self.loads)} loads reached"
-        names = list(self.materials.materials)
-        rows = [
-            ["load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N"]
-            + [f"{name}, max. shear strain p50 / p90" for name in names]
-        ]
+        columns = ["load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N"]
+        rows = [columns + [f"{name}, max. shear strain p50 / p90" for name in self.materials.materials]]
         for state in self.states:
             numbers = (*state.plate_displacement_mm[:2], *state.force_n[:2])
-            mine = [row for row in self.regions if row.load == state.load.name]
             rows.append(
                 [state.load.name, str(state.load), f"{state.reached:.0%}", *(f"{value:.2f}" for value in numbers)]
-                + [f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in mine]
+                + [f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state)]
             )
         table = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
         notes = "".join(f"<li>{html.escape(note)}</li>" for note in self.notes)
         return (
             f"<div><strong>{html.escape(title)}</strong><table>{table}</table><ul>{notes}</ul>"
-            f'<img style="max-width: 100%" alt="Maximum shear strain" src="data:image/png;base64,{picture}"></div>'
+            f'<img style="max-width: 100%" alt="Maximum shear strain" src="{picture}"></div>'
         )
 
     def parameters(self) -> dict[str, object]:
-        """Materials, loads and element as they stand in ``simulation.json``."""
+        """Materials, loads and element as they are written to ``simulation.json``."""
         turns = "let go to turn about its pivot once it presses" if self.turns else "rotation locked"
         return {
             "set": self.name,
@@ -255,7 +235,7 @@ class Simulation:
         }
 
     def write(self, folder: Path | str, *, record: Mapping[str, object] | None = None, fields: bool = True) -> None:
-        """Write it into a folder that exists, as `mrstrain.simulate` does.
+        """Write it into an existing folder, as `mrstrain.simulate` does.
 
         Parameters
         ----------
@@ -277,13 +257,12 @@ class Simulation:
         place = Path(folder)
         for state in self.states:
             if fields and len(state.curve) > 1:
-                write_state(place / f"{state.load.name}.vtu", self.mesh, state, self.materials.materials)
-        write_regions_csv(place / "regions.csv", self.regions)
-        write_curve_csv(place / "curve.csv", self.states)
+                result.write_state(place / f"{state.load.name}.vtu", self.mesh, state, self.materials.materials)
+        result.write_regions_csv(place / "regions.csv", self.regions)
+        result.write_curve_csv(place / "curve.csv", self.states)
         parameters = {"fixed": list(self.fixed), "turns": self.turns} | self.parameters()
         content = {"outcome": {s.load.name: self._outcome(s) for s in self.states}, "notes": list(self.notes)}
-        text = json.dumps(content | dict(record or {"parameters": parameters}), indent=2, allow_nan=False)
-        write_whole(place / RECORD, text + "\n")
+        write_json(place / RECORD, content | dict(record or {"parameters": parameters}))
         figures.write_figure(place / "slices.png", self.plot())
         figures.write_figure(place / "force_travel.png", figures.force_displacement(self.states))
 
@@ -307,12 +286,9 @@ class Simulation:
         return {
             "reached": state.reached,
             "out_of_time": state.out_of_time,
-            "stable_share": min(row.stable_share for row in self.regions if row.load == state.load.name),
+            "stable_share": min(row.stable_share for row in self._rows(state)),
             "plate_axes_lps": state.plate_axes.tolist(),
-            "plate_travel_mm": plate.displacement_mm.tolist(),
-            "plate_force_n": plate.force_n.tolist(),
-            "plate_turn_deg": plate.turn_deg.tolist(),
-            "plate_moment_nmm": plate.moment_nmm.tolist(),
+            **{key: getattr(plate, name).tolist() for name, key in PLATE_VECTORS.items()},
             "contact_area_mm2": plate.area_mm2,
             "contact_pressure_mpa": plate.pressure_mpa if plate.area_mm2 > 0.0 else None,
             "nodes_on_plate": len(state.on_plate),
@@ -322,12 +298,11 @@ class Simulation:
         }
 
     @classmethod
-    def read(cls, folder: Path | str, mesh: TetMesh | None = None) -> Simulation:
+    def read(cls, folder: Path | str, mesh: TetMesh | None = None) -> Self:
         """Read what `write` or `mrstrain.simulate` has written.
 
         Parameters
         ----------
-        folder : path
         mesh : TetMesh, optional
             The one simulated, for its surface sets, which the files do not hold. Without it, outer faces that did not
             move are called as what was fixed, or "bone", and the rest of the outside "skin".
@@ -342,14 +317,13 @@ class Simulation:
         Plate states on the way to a load have the eight digits of ``curve.csv``; all else is as it was computed.
         """
         read = cls(**read_parts(Path(folder), mesh))
-        return replace(
-            read, remarks=tuple(note for note in read.remarks if note not in replace(read, remarks=()).notes)
-        )
+        derived = replace(read, remarks=()).notes
+        return replace(read, remarks=tuple(note for note in read.remarks if note not in derived))
 
 
 def simulate(
     mesh: TetMesh,
-    materials: MaterialSet | Mapping[str, Material],
+    materials: MaterialSet | Materials,
     plate: Plate | Mapping[str, Plate],
     loads: Sequence[LoadStep],
     *,
@@ -372,9 +346,8 @@ def simulate(
         Surface sets that do not move.
     element : {"P1", "MINI", "P2"}
         As in `fe.elements`.
-    options : SolverOptions, optional
     observer : Observer, optional
-        Hears how each path gets on.
+        Receives the progress of each path.
 
     Raises
     ------

@@ -1,7 +1,5 @@
 """Files of a simulation read back, and removed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,17 +22,15 @@ from fe.solution import LoadState
 from fe.surface_sets import BONE, SKIN
 
 RECORD = "simulation.json"
+PLATE_VECTORS = {
+    "displacement_mm": "plate_travel_mm", "force_n": "plate_force_n", "turn_deg": "plate_turn_deg",
+    "moment_nmm": "plate_moment_nmm",
+}  # of a plate's state, and their keys in the record  # fmt: skip
 _TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
 
 
 def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
-    """What a `fe.Simulation` is made of, from its folder; all notes are among its remarks.
-
-    Raises
-    ------
-    InputError
-        If it is no folder of a simulation, a file is damaged, or the mesh is another.
-    """
+    """What a `fe.Simulation` is made of, from its folder; all notes are among its remarks."""
     try:
         return _parts(place, mesh)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as failure:
@@ -63,10 +59,8 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     states = []
     for name, at in outcome.items():  # no file: its time was over before the first equilibrium
         _, u_mm, gradients, pressure_mpa = files.get(name, undeformed)
-        moved, force, turn, moment = (
-            np.array(at[f"plate_{key}"]) for key in ("travel_mm", "force_n", "turn_deg", "moment_nmm")
-        )
-        plate = PlateState(moved, force, turn, moment, at["contact_area_mm2"])
+        vectors = {name: np.array(at[key]) for name, key in PLATE_VECTORS.items()}
+        plate = PlateState(**vectors, area_mm2=at["contact_area_mm2"])
         state = LoadState(
             loads[name], at["reached"], u_mm, pressure_mpa, gradients, np.empty(0, dtype=np.int64),
             (*curves[name][:-1], plate), at["iterations"], at["seconds"],
@@ -77,16 +71,12 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
         region: from_vector(law["law"], np.array(law["vector_mpa"]), law["bulk_modulus_mpa"])
         for region, law in given["laws"].items()
     }
+    material_set = MaterialSet(given["set"], given["title"], given["source"], materials)
     return {
-        "materials": MaterialSet(given["set"], given["title"], given["source"], materials),
-        "mesh": mesh,
-        "paths": paths,
-        "states": tuple(states),
-        "fixed": tuple(given["fixed"]),
-        "element": given["element"].split(":")[0],
-        "turns": given["turns"],
+        "materials": material_set, "mesh": mesh, "paths": paths, "states": tuple(states),
+        "fixed": tuple(given["fixed"]), "element": given["element"].split(":")[0], "turns": given["turns"],
         "remarks": tuple(content["notes"]),
-    }
+    }  # fmt: skip
 
 
 def _surfaces(cells: IntArray, u_mm: FloatArray, fixed: Sequence[str]) -> dict[str, IntArray]:
@@ -97,7 +87,7 @@ def _surfaces(cells: IntArray, u_mm: FloatArray, fixed: Sequence[str]) -> dict[s
 
 
 def _on_plate(mesh: TetMesh, state: LoadState, count: int) -> IntArray:
-    """The nodes on the plate, in number known: no other node of the skin lies as far along its normal."""
+    """The nodes on the plate, ``count`` of them: those of the skin that lie furthest along its normal."""
     assert state.plate_axes is not None
     skin = np.unique(mesh.facets[SKIN])
     towards = state.plate_axes @ Rotation.from_rotvec(state.plate.turn_deg, degrees=True).as_matrix()[:, 0]

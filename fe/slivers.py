@@ -1,6 +1,4 @@
-"""Cells that are nearly flat: told by their dihedral angles, mended by moving their nodes."""
-
-from __future__ import annotations
+"""Nearly flat cells: recognised by their dihedral angles, improved by moving their nodes."""
 
 import numpy as np
 
@@ -28,29 +26,12 @@ def dihedral_angles_deg(corners: FloatArray) -> FloatArray:
 
 
 def without_slivers(points_mm: FloatArray, cells: IntArray, tissue: IntArray, goal_deg: float = 12.0) -> FloatArray:
-    """Nodes moved until no cell is flatter than asked, or no move helps.
+    """Nodes (n, 3), mm, moved until dihedral angles are ``goal_deg`` or more from 0 and 180 degrees, or no move helps.
 
-    Parameters
-    ----------
-    points_mm : (n, 3)
-        Nodes, mm, in any frame.
-    cells : (m, 4) int
-        Tetrahedra, all counted the same way round; one that is quite flat is taken to be as well.
-    tissue : (m,) int
-        Cells of different tissues have a border between them, on which nodes stay: they slide in its plane, or
-        along its edge, and do not move at its corners.
-    goal_deg : float
-        Dihedral angles wanted: from this one to 180 degrees less this one.
-
-    Returns
-    -------
-    points_mm : (n, 3)
-        The same but around flat cells, and there no farther away than two fifths of an edge.
-
-    Notes
-    -----
-    Each node of a flat cell tries steps in 26 directions, and takes the one that raises the worst angle of all its
-    cells most: optimisation-based smoothing (L. A. Freitag and C. Ollivier-Gooch 1997,
+    All ``cells`` (m, 4) are oriented alike. Between ``tissue`` (m,) of different labels lies a border on which nodes
+    stay: they slide in its plane or along its edge, and stay put at its corners. Each node of a flat cell tries steps
+    in 26 directions, and takes the one that raises the worst angle of all its cells most, within two fifths of an edge
+    in all: optimisation-based smoothing (L. A. Freitag and C. Ollivier-Gooch 1997,
     doi:10.1002/(SICI)1097-0207(19971115)40:21<3979::AID-NME251>3.0.CO;2-9), searched without derivatives.
     """
     points = points_mm.copy()

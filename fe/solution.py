@@ -1,7 +1,5 @@
 """A problem solved: load after load on one path, and the equilibrium that each of them ends in."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,11 +8,9 @@ import numpy as np
 
 from dvc import StrainField, TetMesh
 from dvc.arrays import FloatArray, IntArray
-from fe.elements import element
-from fe.load_path import LoadPath, PlateState
+from fe.elements import Model, element
+from fe.load_path import Checkpoint, Loading, LoadPath, PlateState
 from fe.load_step import LoadStep
-from fe.loading import Checkpoint, Loading
-from fe.model import Model
 from fe.newton import Tolerance
 from fe.problem import Problem
 
@@ -40,7 +36,7 @@ class SolverOptions:
 
 
 class Observer:
-    """Hears how a solution gets on; this one does nothing with it."""
+    """Receives the progress of a solution; this one does nothing with it."""
 
     def log(self, line: str) -> None:
         """Take a line for each step."""
@@ -51,7 +47,7 @@ class Observer:
     def converged(self, load: LoadStep, checkpoint: Checkpoint) -> None:
         """Take what it takes to resume from a converged increment on the way to a load."""
 
-    def ended(self, state: LoadState) -> None:
+    def ended(self, state: "LoadState") -> None:
         """Take the state in which a load ended."""
 
 
@@ -61,9 +57,8 @@ class LoadState:
 
     Attributes
     ----------
-    load : LoadStep
     reached, curve, iterations, seconds
-        As in `fe.loading.Checkpoint`; the curve is empty where there is no plate.
+        As in `fe.Checkpoint`; the curve is empty where there is no plate.
     u_mm : (n, 3)
         Displacement of the mesh's nodes, mm.
     pressure_mpa : (m,)
@@ -125,9 +120,6 @@ def solve(
 
     Parameters
     ----------
-    problem : Problem
-    options : SolverOptions, optional
-    observer : Observer, optional
     earlier : sequence of Checkpoint
         Of the first loads, from an earlier solution of the same problem: they are not solved again. The last may have
         been on its way.
@@ -153,13 +145,8 @@ def solve(
                 observer.progress((number + done) / len(loads))
                 observer.converged(load, checkpoint)
 
-            loading = Loading(
-                path,
-                load.target,
-                states[-1].load.target if states else None,
-                earlier[number] if number < len(earlier) else None,
-                on_converged,
-            )
+            before = states[-1].load.target if states else None
+            loading = Loading(path, load.target, before, dict(enumerate(earlier)).get(number), on_converged)
             complete = loading.run()
             observer.progress((number + 1.0) / len(loads))
             states.append(_load_state(load, loading.checkpoint(), problem, path, not complete and path.is_over()))
@@ -179,16 +166,7 @@ def _load_state(
     u = checkpoint.unknowns[: 3 * len(model.space.nodes_mm)].reshape(-1, 3)[:count]
     held = path.contact.held
     return LoadState(
-        load=load,
-        reached=checkpoint.reached,
-        u_mm=u @ axes.T,
-        pressure_mpa=model.pressures(checkpoint.unknowns).mean(axis=1),
-        gradients=axes @ model.gradients(checkpoint.unknowns) @ axes.T,
-        on_plate=held[held < count],
-        curve=checkpoint.curve,
-        iterations=checkpoint.iterations,
-        seconds=checkpoint.seconds,
-        checkpoint=checkpoint,
-        out_of_time=out_of_time,
-        plate_axes=axes,
-    )
+        load, checkpoint.reached, u @ axes.T, model.pressures(checkpoint.unknowns).mean(axis=1),
+        axes @ model.gradients(checkpoint.unknowns) @ axes.T, held[held < count], checkpoint.curve,
+        checkpoint.iterations, checkpoint.seconds, checkpoint, out_of_time, axes,
+    )  # fmt: skip

@@ -1,18 +1,11 @@
 """Names of a mesh's surfaces, which are sets of facets; case does not count in them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from dvc import TetMesh
 
 BONE, SKIN, CUT = "bone", "skin", "cut"
 """The interface with bone, which is fixed; the outer surface, which the plate may touch; and where a label map ends."""
-
-
-def known_name(name: str) -> str:
-    """One of the three names where this is one in another case; else the name as it is."""
-    return name.casefold() if name.casefold() in (BONE, SKIN, CUT) else name
 
 
 def fixed_facets(mesh: TetMesh, beside: Sequence[str]) -> tuple[str, ...]:

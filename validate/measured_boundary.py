@@ -21,9 +21,8 @@ from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import outer_faces
 from fe import BONE, LoadState, LoadStep, Material, Tolerance, check_materials
 from fe.assembly import Assembler
-from fe.elements import element
+from fe.elements import Model, element
 from fe.linear import Solver
-from fe.model import Model
 from fe.newton import Imposed, equilibrium
 from validate.mapping import filled_from_nearest
 

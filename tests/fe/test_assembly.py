@@ -9,9 +9,8 @@ from scipy import sparse
 
 from fe import Hencky, NeoHooke, Ogden, Tolerance, Yeoh
 from fe.assembly import Assembler
-from fe.elements import Space, element
+from fe.elements import Model, Space, element
 from fe.linear import SingularError, Solver, factors
-from fe.model import Model
 from fe.newton import LEAST_VOLUME, Imposed, equilibrium
 from tests.blocks import block
 

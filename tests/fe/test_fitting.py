@@ -175,7 +175,7 @@ def test_a_curve_that_cannot_be_read_says_where(tmp_path: Path, text: str, mode:
 
 def test_curves_that_tell_nothing_are_refused() -> None:
     fat, stretch = NeoHooke.of(0.01), np.linspace(0.8, 1.2, 20)
-    with pytest.raises(InputError, match="No law 'Mooney'"):
+    with pytest.raises(InputError, match="No material law 'Mooney'"):
         fit([curve_of(fat, stretch)], "Mooney")
     with pytest.raises(InputError, match="needs 5 points or more"):
         fit([curve_of(fat, stretch[:4])], "Yeoh")
@@ -188,7 +188,7 @@ def test_curves_that_tell_nothing_are_refused() -> None:
     with pytest.raises(InputError, match="Poisson's ratio must lie between 0 and"):
         fit([curve_of(fat, stretch)], "neo-Hooke", nu=0.5)
     bent = np.linspace(1.0, 1.5, 20)
-    with pytest.raises(InputError, match="no law to compute with"):
+    with pytest.raises(InputError, match="no usable material law"):
         fit([Curve("uniaxial", bent, (bent - 1.0) ** 3 - 0.02 * (bent - 1.0))], "Yeoh")
     with pytest.raises(InputError, match="Cannot read the curve nowhere"):
         read_curves("nowhere.csv", "uniaxial")

@@ -14,9 +14,8 @@ import pytest
 
 from fe import NeoHooke, Tolerance
 from fe.assembly import Assembler
-from fe.elements import Element, element
+from fe.elements import Element, Model, element
 from fe.linear import Solver
-from fe.model import Model
 from fe.newton import Imposed, equilibrium
 from tests.blocks import block
 

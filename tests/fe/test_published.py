@@ -53,7 +53,7 @@ def test_published_laws_are_stable_and_say_where_they_are_from(name: str) -> Non
 def test_a_region_without_a_law_takes_its_neighbours_and_says_so() -> None:
     laws, notes = material_set("luboz").for_regions(["skin", "fat", "muscle", "tendon"])
     assert laws["tendon"] is laws["muscle"]
-    assert notes == ("luboz has no law for tendon; muscle's is used.",)
+    assert notes == ("luboz has no material law for tendon; muscle's is used.",)
     laws, notes = material_set("spears").for_regions(["skin", "fat", "muscle", "tendon"])
     assert laws["tendon"] is laws["muscle"] is laws["fat"]
     assert len(notes) == 2
@@ -65,9 +65,11 @@ def test_a_region_without_a_law_takes_its_neighbours_and_says_so() -> None:
 def test_a_set_without_fat_refuses_a_region_it_cannot_serve(tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
     file.write_text('[mine.skin]\nlaw = "neo-Hooke"\nmu_kpa = 100\nnu = 0.49\n')
-    with pytest.raises(InputError, match="no law for the region 'tendon', nor one for muscle or fat"):
+    with pytest.raises(InputError, match="no material law for the region 'tendon', nor one for muscle or fat"):
         material_set(file).for_regions(["skin", "tendon"])
-    with pytest.raises(InputError, match=r"no law for the region 'ligament'; it has skin, fat, muscle\. Add it"):
+    with pytest.raises(
+        InputError, match=r"no material law for the region 'ligament'; it has skin, fat, muscle\. Add it"
+    ):
         material_set("luboz").for_regions(["skin", "ligament"])
 
 
@@ -99,7 +101,7 @@ GOOD = 'law = "neo-Hooke"\nmu_kpa = 100\nnu = 0.49\n'
     [
         ("[a.fat\n", "not a TOML file"),
         ("", "no material set"),
-        ("mu = 1\n", "'mu' stands outside any set"),
+        ("mu = 1\n", "'mu' is outside any set"),
         ('[a]\ntitle = "x"\n', "has no tissue"),
         ("[a]\nfat = 3\n", "a tissue is a table"),
         ("[a.fat]\nmu_kpa = 1\n", "law must be one of neo-Hooke, Yeoh, linear elastic, Ogden; got None"),

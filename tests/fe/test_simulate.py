@@ -304,7 +304,7 @@ def test_a_plate_without_friction_carries_no_shear() -> None:
     [
         ({"loads": [LoadStep("pulled", -1.0)]}, "pulled: the normal force must press"),
         ({"loads": []}, "No load"),
-        ({"laws": {"fat": FAT}}, "Regions without a law: skin"),
+        ({"laws": {"fat": FAT}}, "Regions without one: skin"),
         ({"laws": LAWS | {"bone": FAT}}, "no region 'bone'; it has skin, fat"),
         ({"facets": {"skin": None}}, "no facets 'bone'"),
         ({"element": "P3"}, "No element 'P3'"),

@@ -157,7 +157,7 @@ def test_tissue_squeezed_beyond_its_law_is_told(mesh_file: Path, tmp_path: Path)
         given = ["simulate", str(mesh_file), "--set", name, "--load", "a=10", *PLATE, "--out", str(tmp_path / name)]
         told[name] = CliRunner().invoke(app, given).output
     assert re.search(
-        r"a: \d+\.\d% of fat is squeezed below det F 0\.4, .*its bulk modulus \(0\.029 MPa\)", told["friedman"]
+        r"a: \d+\.\d% of fat is compressed below det F 0\.4, .*its bulk modulus \(0\.029 MPa\)", told["friedman"]
     )
     assert "squeezed below" not in told["luboz"]
 
@@ -174,7 +174,7 @@ def test_a_law_that_is_not_stable_at_the_strain_reached_is_told_and_ends_with_st
         told[travel + " noted"] = outcome["notes"]
     assert told["0.2mm"].exit_code == 0, told["0.2mm"].output
     assert told["1.4mm"].exit_code == 1, told["1.4mm"].output
-    note = r"a: the law of fat is not stable \(Drucker\) in \d+\.\d% of its volume\."
+    note = r"a: the material law of fat is not stable \(Drucker\) in \d+\.\d% of its volume\."
     assert re.search("soft: " + note, told["1.4mm"].output)
     assert any(re.fullmatch(note, line) for line in told["1.4mm noted"])
     assert "Drucker" not in told["0.2mm"].output
@@ -203,7 +203,7 @@ def test_more_is_fixed_beside_the_bone_and_what_law_stands_in_is_told(tmp_path: 
         moved[name] = np.abs(meshio.read(tmp_path / name / "mine" / "a.vtu").point_data["displacement_mm"])
         told = json.loads((tmp_path / name / "mine" / "simulation.json").read_text())
         assert told["parameters"]["fixed"] == ["bone", "cut"][: 1 + len(fix)]
-        instead = "mine has no law for muscle; fat's is used."
+        instead = "mine has no material law for muscle; fat's is used."
         assert instead in told["notes"]
         assert f"mine: {instead}" in done.output
     assert moved["free"][bone].max() == moved["fixed"][bone].max() == moved["fixed"][cut].max() == 0.0

@@ -72,7 +72,7 @@ def test_a_tissue_without_a_law_is_told_and_one_that_takes_anothers_is_not(study
     values = np.full(GRID.shape, 9)
     values[:8], values[:4] = 1, 2
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 9: "skin"}))
-    assert wrong(study).startswith("The set mine has no law for the region 'skin'")
+    assert wrong(study).startswith("The set mine has no material law for the region 'skin'")
     assert wrong(study, ('"mine.toml", ', "")) == ""
 
 
@@ -126,7 +126,7 @@ def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
     file, friedman = ("[mesh]", '[mesh]\nfile = "dome.vtu"'), ('"mine.toml", ', "")
     write_tet_mesh(study / "dome.vtu", made, {})
     assert wrong(study, file, friedman) == ""
-    assert "mine has no law for the region 'skin'" in wrong(study, file)
+    assert "mine has no material law for the region 'skin'" in wrong(study, file)
     assert "no facets 'cut'" in wrong(study, file, friedman, ("sets", 'fixed = ["bone", "cut"]\nsets'))
     assert wrong(study, file, friedman, ("sets", 'fixed = ["Bone"]\nsets')) == ""  # case does not count
     assert "nothing to touch" in wrong(study, file, friedman, ("sets", 'fixed = ["skin"]\nsets'))
@@ -264,7 +264,7 @@ def test_stages_are_refused_by_what_they_need_and_not_by_what_others_do(study):
     values = np.full(GRID.shape, 9)
     values[:8], values[:4] = 1, 2
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 9: "skin"}))
-    assert "mine has no law for the region 'skin'" in refused("mesh", "simulate mine")
+    assert "mine has no material law for the region 'skin'" in refused("mesh", "simulate mine")
     assert refused("mesh") == refused("register") == refused("mesh", "simulate friedman") == ""
     second = STUDY.replace(
         "[plate]", '[loads.Load2]\nimage = "Load1.nii.gz"\nnormal_n = 2.0\nshear_direction = [2.0, 0.0, 0.0]\n[plate]'
