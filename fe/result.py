@@ -1,7 +1,6 @@
 """Results of a load: stress, volume, figures by region; VTU files for ParaView and tables, written and read back."""
 
 import csv
-import io
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 
 from dvc import TetMesh
 from dvc.arrays import FloatArray
-from dvc.atomic_files import whole_file, write_whole
+from dvc.atomic_files import whole_file, write_csv
 from dvc.trust.regions import SHEAR_THRESHOLDS, volume_above
 from fe.elements import CROWDED
 from fe.load_path import PlateState
@@ -163,7 +162,7 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
         load, reached, region, *numbers = astuple(row)
         flat = [*numbers[:7], *row.above_ml, *numbers[8:]]
         table.append([load, f"{reached:.4g}", region, *(f"{v:.6g}" for v in flat)])
-    _write_csv(path, columns, table)
+    write_csv(path, columns, table)
 
 
 def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
@@ -174,13 +173,7 @@ def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
         for at in state.curve:
             values = np.concatenate([getattr(at, field) for field in _VECTORS] + [[at.area_mm2, at.pressure_mpa]])
             table.append([state.load.name, *(f"{v:.8g}" for v in values)])
-    _write_csv(path, ["load", *columns, "contact_area_mm2", "contact_pressure_mpa"], table)
-
-
-def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
-    write_whole(path, text.getvalue())
+    write_csv(path, ["load", *columns, "contact_area_mm2", "contact_pressure_mpa"], table)
 
 
 def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:

@@ -6,7 +6,6 @@ No other module names one of them by a literal.
 from __future__ import annotations
 
 import csv
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dvc.arrays import Float32Array, FloatArray
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_csv
 from dvc.deformation.protocol import Deformation, RigidMotion, Within
 from dvc.deformation.strain import StrainField
 from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps
@@ -230,11 +229,8 @@ def write_uncertainty(
     if model is not None:
         model.write(folder / ERROR_MODEL)
     write_image(folder / SIGMA, Image(grid, uncertainty.sigma))
-    text = io.StringIO()
-    rows = [[f"{v:.6g}" if isinstance(v, float) else v for v in astuple(row)] for row in uncertainty.intervals]
-    head = [f.name for f in fields(Interval)]
-    csv.writer(text, lineterminator="\n").writerows([[*head, "verdict"], *([*row, verdict.words] for row in rows)])
-    write_whole(folder / INTERVALS, text.getvalue())
+    rows = ((*astuple(row), verdict.words) for row in uncertainty.intervals)
+    write_csv(folder / INTERVALS, [*(f.name for f in fields(Interval)), "verdict"], rows)
 
 
 def read_uncertainty(folder: Path, grid: Grid) -> tuple[Uncertainty, ErrorModel] | None:

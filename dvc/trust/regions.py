@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dvc.arrays import FloatArray
-from dvc.atomic_files import write_whole
+from dvc.atomic_files import write_csv
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import LabelMap
 from dvc.trust.verdict import Verdict
@@ -112,14 +111,12 @@ def write_regions_csv(path: Path, rows: Sequence[RegionRow], verdict: Verdict | 
     thresholds = sorted({t for row in rows for t in row.volume_above_ml})
     told = [] if verdict is None else [verdict.words]
     columns = ("region", "quantity", "voxels", "volume_ml", "defined_voxels", "defined_fraction", *_NUMBERS)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*columns, *(_ABOVE.format(t) for t in thresholds), *["verdict"] * len(told)])
-    for row in rows:
-        cells = [getattr(row, name) for name in columns]
-        cells += [*(row.volume_above_ml.get(t, "") for t in thresholds), *told]
-        writer.writerow([_plain(cell) for cell in cells])
-    write_whole(path, text.getvalue())
+    head = [*columns, *(_ABOVE.format(t) for t in thresholds), *["verdict"] * len(told)]
+    cells = (
+        [*(getattr(row, name) for name in columns), *(row.volume_above_ml.get(t, "") for t in thresholds), *told]
+        for row in rows
+    )
+    write_csv(path, head, ([_plain(cell) for cell in line] for line in cells))
 
 
 def read_regions_csv(path: Path) -> list[RegionRow]:

@@ -8,8 +8,6 @@ that of an NRRD file or a MetaImage: give them one of those, or the mask of vali
 
 from __future__ import annotations
 
-import csv
-import io
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
@@ -20,7 +18,7 @@ import nibabel
 import numpy as np
 import numpy.typing as npt
 
-from dvc.atomic_files import whole_file, write_json, write_whole
+from dvc.atomic_files import whole_file, write_csv, write_json
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.io import StrPath
@@ -77,9 +75,7 @@ def write_labels(path: StrPath, labels: LabelMap) -> None:
     if largest >= 2**31:
         raise OutputError(f"{place}: label {largest} is too large for the file format; number the labels anew.")
     _write(place, labels.grid, labels.labels.astype(dtype))
-    table = io.StringIO()
-    csv.writer(table, lineterminator="\n").writerows([("label", "name"), *sorted(labels.names.items())])
-    write_whole(_beside(place, ".csv"), table.getvalue())
+    write_csv(_beside(place, ".csv"), ("label", "name"), sorted(labels.names.items()))
 
 
 def write_vectors(

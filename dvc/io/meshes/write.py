@@ -6,7 +6,6 @@ boundary condition as it stands.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import meshio
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.atomic_files import whole_file, write_json
+from dvc.atomic_files import whole_file, write_csv, write_json
 from dvc.errors import InputError
 from dvc.io import StrPath
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS, MeshFile
@@ -75,12 +74,9 @@ def write_nodal_displacements(path: StrPath, mesh: MeshFile, u_mm: FloatArray, v
     missing_nodes = int(np.count_nonzero(undefined))
     declared: dict[str, object] = {"mesh": mesh.path.name, "frame": mesh.frame, "unit": mesh.unit, "columns": columns}
     declared |= {"node": node, "nodes": len(own_u), "nodes_without_displacement": missing_nodes}
-    with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(columns)
-        for number, X, u_X, missing in zip(mesh.node_ids, _own_points(mesh), own_u, undefined, strict=True):
-            values = [f"{x:.10g}" for x in (X if missing else (*X, *u_X))]
-            rows.writerow([int(number), *values, *([""] * 3 if missing else [])])
+    at_nodes = zip(mesh.node_ids.tolist(), _own_points(mesh), own_u, undefined, strict=True)
+    rows = ([n, *(f"{x:.10g}" for x in X), *("" if bare else f"{x:.10g}" for x in u)] for n, X, u, bare in at_nodes)
+    write_csv(path, columns, rows)
     write_json(path.with_suffix(".json"), declared | ({} if verdict is None else {"verdict": verdict.as_dict()}))
     return missing_nodes
 
