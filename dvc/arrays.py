@@ -1,7 +1,5 @@
 """Array types, and read-only arrays for value objects."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files and folders that take their name only when they are complete, or leave nothing behind."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

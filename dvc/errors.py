@@ -3,8 +3,6 @@
 A message says what was wrong, which rule it broke, which value was found, and what to do next.
 """
 
-from __future__ import annotations
-
 
 class MrstrainError(Exception):
     """Root of every error that mrstrain raises on purpose."""

@@ -1,7 +1,5 @@
 """A mesh of linear tetrahedra with named regions and facets, checked once at construction."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ A new page template costs computing time between two releases, and never gives a
 measure all presets on one state of the code.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from functools import cache

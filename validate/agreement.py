@@ -1,7 +1,5 @@
 """Cell-by-cell agreement of a simulated with a measured field, weighted by cell volume."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

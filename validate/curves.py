@@ -6,8 +6,6 @@ Ginzburg 2008) with volume in place of probability. The normalised area, A over 
 the range, is dimensionless.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ A measurement smooths and a model does not. Levelling simulates the measurement 
 the unloaded image, fresh noise is added, and the pair is registered as the scans were.
 """
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -4,8 +4,6 @@ A result is one file with mesh and displacement (VTU, VTK, Gmsh, CalculiX .frd, 
 .inp, ANSYS .cdb) and a table of its nodes' displacements (.csv: node number, and three components).
 """
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Figures of a comparison: PNG bytes, with the docstring as caption, and matplotlib figures for interactive use."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

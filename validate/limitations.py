@@ -1,7 +1,5 @@
 """What limits a comparison: the verdict on its inputs, and notes on its measurements and models."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

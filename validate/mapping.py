@@ -1,7 +1,5 @@
 """A measured and several simulated deformations, evaluated in the same cells."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

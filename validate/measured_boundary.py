@@ -4,8 +4,6 @@ Bone does not move; every other surface node has its measured displacement. The 
 constitutive models alone, not on how plate, contact and friction were idealised.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks that a model lies in the imaged tissue: slips of unit, frame or reference configuration."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import permutations, product
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Models ranked by the area between curves: under each load, over all loads, and over subjects."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise

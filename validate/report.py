@@ -1,7 +1,5 @@
 """The report of a comparison: verdict first, then the table of models and loads, curves, slices and agreement."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple
 

@@ -1,7 +1,5 @@
 """The files of a comparison: tables of every figure, fields on the mesh, and maps on the image's voxels."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

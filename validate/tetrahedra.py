@@ -1,7 +1,5 @@
 """Cells of any kind as linear tetrahedra: what one evaluator of deformations needs."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass

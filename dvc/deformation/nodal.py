@@ -1,7 +1,5 @@
 """A deformation given at the nodes of a tetrahedral mesh, evaluated at any points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

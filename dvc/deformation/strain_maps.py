@@ -1,7 +1,5 @@
 """Displacement and strain on the voxels of a grid, ready to be written or looked at."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

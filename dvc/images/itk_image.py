@@ -3,8 +3,6 @@
 Both are LPS mm. ITK keeps its arrays with the last axis first, and the components of a voxel last.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

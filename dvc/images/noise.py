@@ -1,7 +1,5 @@
 """Noise of a magnitude MR image: its standard deviation, and the signal-to-noise ratio of the tissue."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 

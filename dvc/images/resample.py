@@ -1,7 +1,5 @@
 """Image values at points in space, and images carried to another grid."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

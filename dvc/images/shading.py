@@ -1,7 +1,5 @@
 """Removal of the bias field: every MR scan has its own receive field, which is not tissue."""
 
-from __future__ import annotations
-
 import numpy as np
 import SimpleITK as sitk
 

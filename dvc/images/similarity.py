@@ -1,7 +1,5 @@
 """How alike two images on one grid are: in local structure, beside what their noise allows, and but for an offset."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

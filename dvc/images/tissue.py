@@ -1,7 +1,5 @@
 """Where the body is: a tissue mask made from the image, and masks widened in space."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from scipy.ndimage import binary_fill_holes, binary_opening, distance_transform_edt, label

@@ -1,7 +1,5 @@
 """What a measurement is made from, how a registration is judged, and what is written of it beside the maps."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

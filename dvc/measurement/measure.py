@@ -1,7 +1,5 @@
 """From a pair of images to a measurement."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from dvc.arrays import FloatArray

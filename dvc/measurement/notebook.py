@@ -1,7 +1,5 @@
 """A measurement at a glance: a figure of any of its quantities, and what a notebook shows of it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from html import escape
 

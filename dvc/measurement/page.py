@@ -1,7 +1,5 @@
 """Pictures and tables of a measurement in a report."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

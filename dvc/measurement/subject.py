@@ -1,7 +1,5 @@
 """The unloaded image and what is known about it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The engines that there are, by name: the one place where a new engine is entered."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -12,8 +12,6 @@ between voxels, which correlates with the noise beside it: the gradient of the u
 difference of two neighbours, is correlated neither with the voxel between them nor with the neighbours' mean.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

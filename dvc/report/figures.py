@@ -5,8 +5,6 @@ the page. Yellow marks at a panel's edge show where the other planes cut. Voxels
 zero: the loaded image is dark blue there, a map leaves the image below it plain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

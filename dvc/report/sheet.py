@@ -3,8 +3,6 @@
 Together with `dvc.report.figures` the only place that plots; nothing here holds state outside a `Sheet`.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterable, Sequence
 from typing import Any

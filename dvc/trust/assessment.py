@@ -1,7 +1,5 @@
 """How far a registration may be trusted: a verdict by its strain maps, the images' similarity, and more evidence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

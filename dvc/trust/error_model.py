@@ -6,8 +6,6 @@ deviation), for each registration of the study and for all together. Given m, th
 that deviation. This holds for tissue that is strained and imaged like the study's phantoms, and for no other.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

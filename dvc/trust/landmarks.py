@@ -1,7 +1,5 @@
 """Landmark pairs: the same anatomical points marked by hand in the unloaded and the loaded image."""
 
-from __future__ import annotations
-
 import csv
 import json
 import logging

@@ -1,7 +1,5 @@
 """Gaussian random fields of a given smoothness: how errors of neighbouring voxels go together."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 

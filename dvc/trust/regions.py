@@ -1,7 +1,5 @@
 """Figures per region: how much tissue, how much of it has a value, and how the values are spread."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

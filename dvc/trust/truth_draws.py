@@ -1,7 +1,5 @@
 """Draws of the truth behind a strain measured at scattered points, such as the cells of a mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

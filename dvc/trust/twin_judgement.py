@@ -1,7 +1,5 @@
 """Error bars judged by a pair whose strain is known: a synthetic warp of the very pair that they are for, its twin."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

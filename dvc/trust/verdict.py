@@ -1,7 +1,5 @@
 """A verdict on a result, in three levels and in words, with its reasons."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args

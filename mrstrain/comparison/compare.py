@@ -1,7 +1,5 @@
 """`compare`: finite-element models of any code against a measurement, from files to a report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`drive`: constitutive models under measured (Dirichlet) boundary conditions, free of plate, contact and friction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

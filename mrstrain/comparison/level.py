@@ -1,7 +1,5 @@
 """`level`: forward-model comparison, the measurement simulated on the displacement of a model (levelling)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What was done, in sentences for a methods section: filled in from the records beside what was compared."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

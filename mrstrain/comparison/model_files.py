@@ -1,7 +1,5 @@
 """Files of the models by load, and how a model's files are read: mesh, unit, frame."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Sequence

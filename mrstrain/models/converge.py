@@ -1,7 +1,5 @@
 """`converge`: the same loads on meshes of several sizes, and what the figures tend to."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

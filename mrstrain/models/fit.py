@@ -1,7 +1,5 @@
 """`fit`: parameters of a material law from a stretch-stress curve, with intervals, a picture and a material set."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 

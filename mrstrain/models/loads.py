@@ -1,7 +1,5 @@
 """Loads of a simulation: the published experiment's, and those that a user types."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

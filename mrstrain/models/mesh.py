@@ -1,7 +1,5 @@
 """`mesh`: a label map's soft tissues as tetrahedra, with a table of the mesh's quality and a picture."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path

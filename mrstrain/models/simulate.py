@@ -1,7 +1,5 @@
 """`simulate`: a mesh under a plate's loads, for one or more material parameter sets."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 import threading

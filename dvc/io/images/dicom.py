@@ -4,8 +4,6 @@ A classic series is a folder with a file for each slice; enhanced (multi-frame) 
 frames (`dvc.io.images.dicom_frames`), and all that follows is the same for both.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import Counter
 from collections.abc import Sequence

@@ -10,8 +10,6 @@ References
    Dimension Module (C.7.6.17): https://dicom.nema.org/medical/dicom/current/output/html/part03.html
 """
 
-from __future__ import annotations
-
 import logging
 import warnings
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Voxels of DICOM frames, decoded and scaled; a file of many frames is read once."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path

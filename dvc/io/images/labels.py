@@ -1,7 +1,5 @@
 """Masks and label maps: reading them, their names, and bringing them onto an image's grid."""
 
-from __future__ import annotations
-
 import csv
 import logging
 import re

@@ -5,8 +5,6 @@ References
 .. [1] MetaImage: https://itk.org/Wiki/ITK/MetaIO/Documentation
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@ A NIfTI file may give its geometry twice (qform and sform), in one of several un
 of the two and differ in which; here they must agree. Everything is returned in LPS mm.
 """
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ References
 .. [1] NRRD file format: https://teem.sourceforge.net/nrrd/format.html
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from contextlib import suppress

@@ -4,8 +4,6 @@ A damaged file, or one with an ambiguous geometry, is refused with the reason. C
 volume of a 4D file) are logged by ``dvc.images``.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from pathlib import Path

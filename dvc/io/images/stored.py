@@ -4,8 +4,6 @@ Libraries that read images often return whatever a truncated or damaged file hol
 with the header, and compressed streams are read to their end, so that their checksum counts.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass

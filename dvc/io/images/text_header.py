@@ -1,7 +1,5 @@
 """What the text headers of NRRD and MetaImage share: numbers, units, axes, and voxels in a file beside."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path

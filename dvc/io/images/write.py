@@ -6,8 +6,6 @@ Missing values are NaN. Programs built on ITK (Slicer, ITK-SNAP, SimpleITK) show
 that of an NRRD file or a MetaImage: give them one of those, or the mask of valid voxels.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain

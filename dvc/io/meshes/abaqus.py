@@ -4,8 +4,6 @@ The dialect of Abaqus that CalculiX shares. One part in global coordinates is re
 geometry elsewhere in the file is refused: a misplaced mesh gives wrong strains without a warning.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Blocks of fixed columns: NBLOCK (nodes), EBLOCK with the key SOLID (elements), C
 coincide is the tetrahedron, pyramid or wedge that ANSYS takes it for.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """CalculiX results (.frd, ASCII): nodes, elements and the last step's displacements, with the file's own numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path

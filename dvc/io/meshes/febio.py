@@ -5,8 +5,6 @@ chunks, as FEBio's specification of its binary database and the program itself h
 format, FEBio 3 and 4); states may be compressed, each by itself.
 """
 
-from __future__ import annotations
-
 import logging
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """A mesh as its file gives it, before unit, frame and geometry are checked: what every reader returns."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """A user's mesh file: every node and cell of it, with the numbers it uses, in LPS mm."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Of Gmsh it passes over node numbers, groups of one name and the order of some no
 sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
 """
 
-from __future__ import annotations
-
 import io
 import logging
 import re

@@ -4,8 +4,6 @@ Values come in LPS mm and are written in the mesh file's own frame and unit, so 
 boundary condition as it stands.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A displacement with strain discontinuities as a file of our own, as no ITK transform can hold one."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -1,7 +1,5 @@
 """The text form of elastix parameter and transform files."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Transforms of elastix and ITK, and displacement images, read to a Deformation: fixed to moving points, LPS mm."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

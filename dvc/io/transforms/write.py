@@ -1,7 +1,5 @@
 """Writing a registration's result as transform files of elastix and of ITK."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from functools import singledispatch

@@ -1,7 +1,5 @@
 """The elastix engine: one or more stages of elastix, each of which adds to the B-spline of the one before."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from collections.abc import Callable, Mapping, Sequence

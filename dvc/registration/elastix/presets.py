@@ -4,8 +4,6 @@ elastix ignores a misspelt parameter in silence. Here every name, and the name o
 with those that elastix knows before anything runs.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import re

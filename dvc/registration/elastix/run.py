@@ -4,8 +4,6 @@
 process takes 12 to 16 seconds.
 """
 
-from __future__ import annotations
-
 import re
 import tempfile
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """How strongly a Gauss-Newton registration smoothed, and why."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 
 from dvc.registration.engine import Regularisation

@@ -9,8 +9,6 @@ and every sum has a fixed order: the result is the same bit for bit on any numbe
 docs/decisions/0009.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace

@@ -6,8 +6,6 @@ all voxels of a mask. Its derivative by u is taken from the *fixed* image, carri
 moving image's gradient at places between voxels is correlated with its noise there, and pulls the result after it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One level of a Gauss-Newton registration: its energy, and steps that lower it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

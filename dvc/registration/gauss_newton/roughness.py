@@ -7,8 +7,6 @@ l = h / sqrt(2) and h between control points (their mean over the axes), it coun
 nothing away from the control grid's faces.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Self
 

@@ -5,8 +5,6 @@ many points put onto coefficients, and both in one sweep for a product with the 
 fixed order, so that it is the same bit for bit on any number of threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

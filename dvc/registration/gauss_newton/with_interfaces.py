@@ -12,8 +12,6 @@ strain, k, is chosen as the bending is, by the residual of left-out voxels: the 
 Reasons: docs/decisions/0009.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
