@@ -1,6 +1,5 @@
 """A simulation: what a material parameter set gave under its loads, as arrays, as files, as a picture."""
 
-import html
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -190,26 +189,21 @@ class Simulation:
         return sagittal_slice(self.mesh, self.states if loads is None else [self.state(name) for name in loads])
 
     def _repr_html_(self) -> str:
-        from dvc.report.page import Picture
+        from dvc.report.page import Picture, Table, notebook_html
         from dvc.report.sheet import png_bytes
 
-        picture = Picture(self.name, "", png_bytes(self.plot())).data
-        ended = sum(state.reached == 1.0 for state in self.states)
-        title = f"{self.name}: {ended} of {len(self.loads)} loads reached"
-        columns = ["load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N"]
-        rows = [columns + [f"{name}, max. shear strain p50 / p90" for name in self.materials.materials]]
+        rows: list[tuple[str | float, ...]] = []
         for state in self.states:
-            numbers = (*state.plate_displacement_mm[:2], *state.force_n[:2])
-            rows.append(
-                [state.load.name, str(state.load), f"{state.reached:.0%}", *(f"{value:.2f}" for value in numbers)]
-                + [f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state)]
-            )
-        table = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        notes = "".join(f"<li>{html.escape(note)}</li>" for note in self.notes)
-        return (
-            f"<div><strong>{html.escape(title)}</strong><table>{table}</table><ul>{notes}</ul>"
-            f'<img style="max-width: 100%" alt="Maximum shear strain" src="{picture}"></div>'
-        )
+            plate = (round(float(v), 2) for v in (*state.plate_displacement_mm[:2], *state.force_n[:2]))
+            shear = (f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
+            rows.append((state.load.name, str(state.load), f"{state.reached:.0%}", *plate, *shear))
+        columns = ("load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N")
+        title = "Plate, and maximum shear strain of each tissue: median / 90th percentile"
+        table = Table(title, (*columns, *self.materials.materials), tuple(rows))
+        picture = Picture("Maximum shear strain", "", png_bytes(self.plot()))
+        ended = sum(state.reached == 1.0 for state in self.states)
+        headline = f"{self.name}: {ended} of {len(self.loads)} loads reached"
+        return notebook_html(headline, picture, table, notes=self.notes)
 
     def parameters(self) -> dict[str, object]:
         """Materials, loads and element as they are written to ``simulation.json``."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from matplotlib.figure import Figure
 from dvc import LabelMap, TetMesh, Verdict
 from dvc.atomic_files import whole_folder, write_json
 from dvc.errors import InputError
-from dvc.report.page import Section, record_lines, write_report
+from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
 from dvc.report.sheet import png_bytes
 from dvc.trust.verdict import worst
 from validate import figures, tables
@@ -92,18 +90,13 @@ class Comparison:
     def _repr_html_(self) -> str:
         """For a notebook: the answer, the areas of all soft tissue, and the curves."""
         loads = list(self.coverage_ml)
-        head = ["model", "rank", *loads, *(["all loads"] if len(loads) > 1 else [])]
-        rows = [row[: len(head)] for row in area_rows(self.areas, self.ranking, loads)]
-        table = "".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
-        titles = "".join(f"<th>{html.escape(name)}</th>" for name in head)
-        verdict = "" if self.verdict is None else f"<p>Verdict on the inputs: <b>{self.verdict.words}</b></p>"
-        image = base64.b64encode(png_bytes(self.plot())).decode()
-        return (
-            f"<div><p><b>{html.escape(self._answer())}</b></p>{verdict}<table><caption>Area between volume-strain "
-            f"curves, maximum shear strain {self.strains[0]:g} to {self.strains[1]:g}, mL (95 % interval)</caption>"
-            f'<tr>{titles}</tr>{table}</table><img alt="Volume-strain curves" style="max-width:100%" '
-            f'src="data:image/png;base64,{image}"></div>'
-        )
+        head = ("model", "rank", *loads, *(["all loads"] if len(loads) > 1 else []))
+        rows = tuple(row[: len(head)] for row in area_rows(self.areas, self.ranking, loads))
+        low, high = self.strains
+        title = f"Area between volume-strain curves, maximum shear strain {low:g} to {high:g}, mL (95 % interval)"
+        picture = Picture("Volume-strain curves", "", png_bytes(self.plot()))
+        words = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}."]
+        return notebook_html(self._answer(), picture, Table(title, head, rows), notes=words)
 
     def _answer(self) -> str:
         """One sentence: the best match, or for a single model its area."""

@@ -23,8 +23,9 @@ from dvc.measurement.judgement import Evidence, Source
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
-from dvc.report.page import Picture, Section
+from dvc.report.page import Picture, Section, notebook_html
 from dvc.report.planes import PLANES, Plane, View
+from dvc.report.sheet import png_bytes
 from dvc.trust.assessment import assess
 from dvc.trust.error_model import Interval
 from dvc.trust.quality import Quality, noise_floor
@@ -240,8 +241,9 @@ class Measurement:
         return notebook.figure(self._view(point_mm), self.image, quantity, values, outline, planes, largest)
 
     def _repr_html_(self) -> str:
+        picture = Picture("Maximal shear", "", png_bytes(self.plot()))
         table = page.short_table(self.regions, self.intervals)
-        return notebook.html(self.name, self.verdict, self.plot(), table, self.error_bars.summary)
+        return notebook_html(self.name, picture, table, verdict=self.verdict, notes=self.error_bars.summary)
 
     def section(self, pictures: Mapping[str, Picture]) -> Section:
         """Its part of a report."""

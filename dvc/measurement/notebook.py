@@ -1,7 +1,6 @@
 """A measurement at a glance: a figure of any of its quantities, and what a notebook shows of it."""
 
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,20 +11,12 @@ from dvc.errors import InputError
 from dvc.images.image import Image, LabelMap
 from dvc.report import figures
 from dvc.report.figures import Scale
-from dvc.report.page import Cell, Picture, Table, shown
 from dvc.report.planes import PLANES, Plane, View
-from dvc.report.sheet import png_bytes
-from dvc.trust.verdict import Level, Verdict
 
 _RISING = {
     "max_shear": (figures.MAX_SHEAR, "viridis"),
     "sigma": (figures.SIGMA, "cividis"),
     "displacement_mm": ("length of the displacement relative to the bone, mm", "viridis"),
-}
-_TONES: dict[Level, tuple[str, str]] = {
-    "trust": ("#17693f", "#e9f5ee"),
-    "caution": ("#8a5300", "#fdf3e0"),
-    "distrust": ("#a91e17", "#fcebe9"),
 }
 _STEPS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 _SHOWN_PERCENT = 99.0
@@ -86,30 +77,3 @@ def _round_up(value: float) -> float:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
     return float(f"{next(s for s in _STEPS if s * power >= value * (1 - 1e-9)) * power:.3g}")
-
-
-def html(name: str, verdict: Verdict, drawn: Figure, table: Table, notes: Sequence[str]) -> str:
-    """What a notebook shows: the verdict with its reasons, a picture, a table, and notes; all text is escaped."""
-    tone, wash = _TONES[verdict.level]
-    picture = Picture(name, "", png_bytes(drawn))
-    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
-    cell = "padding:.2em .8em;border-bottom:1px solid #dde3ea;text-align:"
-    sides = ["right" if numeric else "left" for numeric in table.numeric]
-
-    def line(tag: str, style: str, cells: Sequence[Cell]) -> str:
-        sided = zip(cells, sides, strict=True)
-        return "".join(f'<{tag} style="{cell}{side}{style}">{escape(shown(c))}</{tag}>' for c, side in sided)
-
-    head = line("th", ";font-weight:600", table.columns)
-    rows = "".join(f"<tr>{line('td', '', row)}</tr>" for row in table.rows)
-    return (
-        '<div style="background:#fff;color:#1b2430;padding:.6em;max-width:66rem">'
-        f'<div style="border-left:6px solid {tone};background:{wash};padding:.5em .9em;border-radius:4px">'
-        f'{escape(name)}: <strong style="color:{tone}">{verdict.words}</strong>'
-        + (f"<ul>{reasons}</ul></div>" if reasons else "</div>")
-        + f'<img src="{picture.data}" width="{picture.width}" alt="{escape(table.title)}" style="max-width:100%">'
-        f'<table style="border-collapse:collapse;font-variant-numeric:tabular-nums;margin:.6em 0">'
-        f'<caption style="text-align:left;color:#4f5b69">{escape(table.title)}</caption>'
-        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
-        f"{''.join(f'<p>{escape(note)}</p>' for note in notes)}</div>"
-    )

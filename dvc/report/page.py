@@ -18,13 +18,18 @@ import numpy.typing as npt
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.images.image import Grid
-from dvc.trust.verdict import Verdict
+from dvc.trust.verdict import Level, Verdict
 
 Cell = str | float | int | None
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CSS_PIXELS_PER_DOT = 96 / 120  # figures are drawn at 120 dots per inch: text of 10 pt is then 10 pt on the page
 
+_TONES: Mapping[Level | None, tuple[str, str]] = {
+    "trust": ("#17693f", "#e9f5ee"), "caution": ("#8a5300", "#fdf3e0"), "distrust": ("#a91e17", "#fcebe9"),
+    None: ("#0b5cad", "#f0f3f6"),
+}  # fmt: skip
+"""Colours of a notebook's headline and its ground, by the level of the verdict in it."""
 _STEPS = 250  # of a volume's values: one byte for each voxel
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 NIIVUE = "0.69.0"
@@ -183,11 +188,22 @@ def write_report(
     of the sections with their verdicts stands at the top where there are two or more; ``notes``, a line each, stand
     between the verdict and it. OutputError if the file cannot be written.
     """
+    told = {"title": title, "verdict": verdict, "notes": notes, "provenance": provenance}
+    library = script() if any(section.viewers for section in sections) else ""
+    write_whole(path, _template("report").render(**told, sections=sections, closing=closing, script=library))
+
+
+def notebook_html(
+    headline: str, picture: Picture, table: Table, *, verdict: Verdict | None = None, notes: Sequence[str] = ()
+) -> str:
+    """What a notebook shows of a result: a headline with the verdict, if there is one, a picture, a table, notes."""
+    told = {"headline": headline, "picture": picture, "table": table, "verdict": verdict, "notes": notes}
+    return _template("notebook").render(**told, tones=_TONES)
+
+
+def _template(name: str) -> jinja2.Template:
+    """A template that escapes all text and refuses what is not given."""
     strict = jinja2.StrictUndefined
     environment = jinja2.Environment(autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
     environment.filters["shown"] = shown
-    template = (files("dvc.report") / "templates" / "report.html.j2").read_text(encoding="utf-8")
-    told = {"title": title, "verdict": verdict, "notes": notes, "provenance": provenance}
-    library = script() if any(section.viewers for section in sections) else ""
-    page = environment.from_string(template).render(**told, sections=sections, closing=closing, script=library)
-    write_whole(path, page)
+    return environment.from_string((files("dvc.report") / "templates" / f"{name}.html.j2").read_text(encoding="utf-8"))
