@@ -65,7 +65,7 @@ def check_meshing(
     spacing = float(labels.grid.spacing_mm.min())
     if not 0.5 * spacing <= edge_mm <= 20.0:
         raise InputError(
-            f"The edge length must be between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm}."
+            f"The edge length must lie between half a voxel ({0.5 * spacing:g} mm) and 20 mm; got {edge_mm}."
         )
     if finer is not None and not 0.0 < finer[1] < edge_mm:
         raise InputError(f"The finer edge length must lie between 0 and {edge_mm} mm; got {finer[1]}.")
@@ -156,10 +156,11 @@ def _refuse_lost(
 ) -> None:
     """Refuse a mesh in which a region, bones included, is gone or lost a fifth of what its voxels hold."""
     instead = "Ask for shorter edges, or give its label to a neighbour."
+    lost = [name for name, number in numbers.items() if not (cell_labels == number).any()]
+    if lost:
+        raise MrstrainError(f"No cell is left of {', '.join(lost)}: smaller than the mesh can show. {instead}")
     for name, number in numbers.items():
         made, given = float(of_cells[cell_labels == number].sum()) / 1000.0, volumes_mm3[number] / 1000.0
-        if not made:
-            raise MrstrainError(f"No cell is left of {name}: smaller than the mesh can show. {instead}")
         if abs(made - given) > _MOST_LOST * given:
             raise MrstrainError(
                 f"{name} has {made:.2f} mL in the mesh and {given:.2f} mL in the label map: it is finer than the mesh "

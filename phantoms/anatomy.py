@@ -4,8 +4,6 @@ Right foot, LPS mm: x to medial, toes toward -y, sole toward -z. Shapes are clos
 seed and of lattice coordinates, so that a point has the same signal at any voxel size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

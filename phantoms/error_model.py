@@ -1,7 +1,5 @@
 """The error model fitted to the runs of an accuracy study, and its coverage on heels that it was not fitted to."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

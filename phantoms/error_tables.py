@@ -1,7 +1,5 @@
 """Tables of an accuracy study: errors by tissue, position and strain, noise floor, and spatial resolution."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

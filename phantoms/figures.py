@@ -1,7 +1,5 @@
 """Figures of an accuracy study, each as PNG bytes; the docstring of each function is the caption."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

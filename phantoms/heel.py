@@ -1,7 +1,5 @@
 """A heel under a plate: its motions under Load1 to Load4, and its MR images, with exactly known strain."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType

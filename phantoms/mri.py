@@ -1,7 +1,5 @@
 """MR image formation from a noise-free signal: point spread, receive field (bias field), Rician noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

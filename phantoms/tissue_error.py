@@ -1,7 +1,5 @@
 """Error of a measured deformation against the truth, by tissue."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

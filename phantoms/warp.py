@@ -5,8 +5,6 @@ it like texture. It is therefore removed before the warp and drawn anew afterwar
 `synthetic_warp`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import meshio
 import numpy as np
@@ -28,7 +28,6 @@ LOWER, UPPER = "measured, low", "measured, high"
 """Fields of the curves that bound the 95 % band of the true one."""
 _CURVE_COLUMNS = ("load", "tissue", "field", "max_shear", "volume_above_ml", "verdict")
 _STEP = 0.005  # of the curves that are written
-_READERS = {"int": int, "float": float, "str": str}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +79,7 @@ def read_tables(folder: Path) -> list[tuple[Any, ...]]:
     """Rows of each of the `TABLES`, to the six digits of the file; one that is no such table is an `InputError`."""
     tables: list[tuple[Any, ...]] = []
     for name, kind in TABLES.items():
-        readers = {f.name: _READERS[str(f.type)] for f in fields(kind)}
+        readers = get_type_hints(kind)  # int, float or str
         rows = _rows(folder / name, readers)
         tables.append(tuple(kind(**{of: read(row[of]) for of, read in readers.items()}) for row in rows))
     return tables

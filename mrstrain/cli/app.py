@@ -1,7 +1,5 @@
 """The command line. It parses, calls one function, and prints; heavy imports wait until a command runs."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import sys

@@ -1,7 +1,5 @@
 """The commands that measure: from images, or what another tool made of them, to strain."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

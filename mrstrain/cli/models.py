@@ -1,7 +1,5 @@
 """The commands of the finite-element side. They parse, call one function, and print."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

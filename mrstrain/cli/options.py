@@ -1,7 +1,5 @@
 """Models of options as options of the command line, and the help that lists them in groups."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import operator

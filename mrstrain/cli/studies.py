@@ -1,7 +1,5 @@
 """The commands of a whole study. They parse, call one function, and print."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The commands that tell how exact a measurement is: phantoms, twins and their study."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

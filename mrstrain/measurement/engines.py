@@ -1,7 +1,5 @@
 """The engine that a command registers with, by the flat options that it was asked with."""
 
-from __future__ import annotations
-
 from dvc import Elastix, Engine, GaussNewton, GaussNewtonWithInterfaces, load_preset, read_parameter_file
 from dvc.errors import InputError, ParameterError
 from dvc.registration.engines import DEFAULT, ENGINES
@@ -27,11 +25,7 @@ def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
     The Gauss-Newton engine lets strain jump at tissue interfaces where ``labelled``, a label map tells them, unless
     ``borders`` is False.
 
-    Raises
-    ------
-    ParameterError
-    InputError
-        For tissue interfaces that no label map tells.
+    Raises InputError for tissue interfaces that no label map tells.
     """
     name, preset, parameters = _asked(how), how.preset, how.parameters
     bending, volume, borders = how.bending, how.volume, how.borders

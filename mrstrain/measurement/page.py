@@ -1,7 +1,5 @@
 """The report of a series of measurements, and how to read it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

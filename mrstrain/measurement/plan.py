@@ -1,7 +1,5 @@
 """How the loads of a subject are measured: one by one, in a series or by a worker of a study."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,17 +31,10 @@ class Registered:
 class Plan:
     """What all loads of a subject are registered and judged by.
 
-    Attributes
-    ----------
-    subject : Subject
-        With its tissue.
-    settings : Settings
-    evidence : Evidence
-        Landmarks and error model.
-    record : mapping
-        Provenance.
-    twin : bool
-        Whether each pair's twin is registered, too.
+    subject: With its tissue.
+    evidence: Landmarks and error model.
+    record: Provenance.
+    twin: Whether each pair's twin is registered, too.
     """
 
     subject: Subject

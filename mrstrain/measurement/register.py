@@ -1,7 +1,5 @@
 """`register`: images in, a folder of strain maps and a report out."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """One loaded image registered by itself: the part of a series that a study gives to a worker of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -36,18 +34,10 @@ def register_one(
 ) -> Case:
     """Register one loaded image by itself, as `register` does it in a series.
 
-    Parameters
-    ----------
-    out : path
-        Folder of this load's results; one that is called "repeat" is that of a repeat scan.
-    repeat : path, optional
-        Folder of the repeat scan's results: the noise floor.
-    after : path, optional
-        Folder of the load whose result is the start of this one's.
-    tell : callable, optional
-        ``tell(stage, fraction)``.
-
-    Other parameters, and errors, are those of `register`.
+    out: Folder of this load's results; one that is called "repeat" is that of a repeat scan.
+    repeat: Folder of the repeat scan's results: the noise floor.
+    after: Folder of the load whose result is the start of this one's.
+    tell: ``tell(stage, fraction)``.
     """
     subject = read_subject(load0, subject_files, onto, allow_missing=allow_missing)
     loaded = read_image(load, allow_missing=allow_missing)

@@ -1,7 +1,5 @@
 """`strain`: strain maps from a transform or displacement field that any tool has made."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,14 +22,8 @@ _TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm", ".npz")
 class Given:
     """A deformation that was found elsewhere, with the subject it belongs to.
 
-    Attributes
-    ----------
-    subject : Subject
-    whole : Deformation
-        Of points of the reference to points of the loaded image, LPS mm.
-    source : Path
-    record : dict
-        Provenance.
+    whole: Of points of the reference to points of the loaded image, LPS mm.
+    record: Provenance.
     """
 
     subject: Subject

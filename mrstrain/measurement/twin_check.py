@@ -1,7 +1,5 @@
 """The twin of a registered pair: the unloaded image moved by what was measured, and measured again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -28,16 +26,9 @@ def twin_check(
 
     The twin lies on the loaded image's grid, and is as noisy as the noisier of the two.
 
-    Parameters
-    ----------
-    found : Registration
-        Of the pair. Its strain is the twin's true one.
-    subject : Subject
-    start : Deformation or None
-        What the pair's registration started from.
-    worker : Worker
-    tell : callable
-        ``tell(stage, fraction)``.
+    found: Of the pair. Its strain is the twin's true one.
+    start: What the pair's registration started from.
+    tell: ``tell(stage, fraction)``.
     """
     tell("making the twin", 0.0)
     motion, seed = found.alignment.motion, found.settings.seed

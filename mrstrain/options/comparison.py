@@ -1,7 +1,5 @@
 """Options of comparing: how a model's results are read, and what is compared."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, ClassVar
 

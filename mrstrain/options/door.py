@@ -1,7 +1,5 @@
 """From the flat keywords that a person types to the models that functions take; once, at the door."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Options of measuring: the subject, the registration, and where results are wanted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 

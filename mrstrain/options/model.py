@@ -1,7 +1,5 @@
 """What every model of options can do, and the kinds of values that options have."""
 
-from __future__ import annotations
-
 import functools
 import numbers
 import operator
@@ -20,18 +18,11 @@ from pydantic.fields import FieldInfo
 class Cli:
     """How the command line calls a field, where it does not call it by its name.
 
-    Attributes
-    ----------
-    name : str, optional
-        The option, with its dashes.
-    help : str, optional
-        In place of the field's own.
-    panel : str, optional
-        Part of the help that it stands in, in place of its model's.
-    off : bool
-        Whether the option is a flag that turns the field off.
-    times : float
-        Factor from the option's unit to the field's.
+    name: The option, with its dashes.
+    help: In place of the field's own.
+    panel: Part of the help that it stands in, in place of its model's.
+    off: Whether the option is a flag that turns the field off.
+    times: Factor from the option's unit to the field's.
     """
 
     name: str | None = None
@@ -87,10 +78,7 @@ class Options(BaseModel):
     def of(cls, given: Mapping[str, Any]) -> Self:
         """The options given by name, the others by default.
 
-        Raises
-        ------
-        ParameterError
-            With each option that cannot be used, why, and what was given.
+        Raises ParameterError with each option that cannot be used, why, and what was given.
         """
         try:
             return cls(**given)

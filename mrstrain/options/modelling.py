@@ -1,7 +1,5 @@
 """Options of finite-element models: the mesh, the plate, and the simulation."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple
 

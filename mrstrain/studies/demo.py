@@ -1,7 +1,5 @@
 """`demo`: a heel phantom of known strain, taken through a whole study, with the error by tissue."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,22 +73,12 @@ def demo(
 ) -> Demonstration:
     """Make a heel phantom under four loads, run its study, and compare the measurement with the truth.
 
-    Parameters
-    ----------
-    out : path
-        The study's folder: images and truth of the phantom, ``study.toml``, ``results`` and ``error.csv``. A second
+    out: The study's folder: images and truth of the phantom, ``study.toml``, ``results`` and ``error.csv``. A second
         run in the same folder resumes.
-    seed : int
-        Seed of the phantom.
-    full : bool
-        The published size: all seven material sets on some 75,000 tetrahedra; otherwise three on a coarser mesh.
-    workers, progress
-        As in `mrstrain.run`.
-
-    Raises
-    ------
-    OutputError
-        If the folder holds another phantom, or other files that would be replaced.
+    seed: Seed of the phantom.
+    full: The published size: all seven material sets on some 75,000 tetrahedra; otherwise three on a coarser mesh.
+    workers, progress: As in `mrstrain.run`.
+    Raises OutputError if the folder holds another phantom, or other files that would be replaced.
     """
     target = Path(out)
     _make(target, seed, full, progress)

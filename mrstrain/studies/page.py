@@ -1,7 +1,5 @@
 """The report of a study: verdict, models against the measurement, registrations, and how each stage ended."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,12 +1,10 @@
 """Error of a study's measurement against the known strain of a phantom: table and section of the report."""
 
-from __future__ import annotations
-
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, fields
 from pathlib import Path
-from typing import Any
+from typing import get_type_hints
 
 from dvc.atomic_files import write_csv
 from dvc.report.page import Section, Table
@@ -18,7 +16,6 @@ TABLE = "error.csv"
 _MADE = "registered_utc"
 _HEADER = ("load", _MADE, *(f.name for f in fields(TissueError)))
 _FIGURES = ("true_p50", "true_p95", "shear_rmse", "shear_bias", "u_p50_mm", "u_p95_mm")
-_KINDS: Mapping[str, Callable[[str], Any]] = {"str": str, "int": int, "float": float}
 _COLUMNS = ("load", "tissue", "true max. shear, median", "p95", "RMSE", "bias", "u error, median", "u error, p95")
 
 
@@ -33,7 +30,7 @@ def read_errors(path: Path, outcomes: Mapping[str, StageOutcome]) -> dict[str, t
     errors: dict[str, tuple[TissueError, ...]] = {}
     for row in _rows(path):
         if row[_MADE] and row[_MADE] == _made(outcomes, row["load"]):
-            values = {field.name: _KINDS[str(field.type)](row[field.name]) for field in fields(TissueError)}
+            values = {name: kind(row[name]) for name, kind in get_type_hints(TissueError).items()}
             errors[row["load"]] = (*errors.get(row["load"], ()), TissueError(**values))
     return errors
 

@@ -1,7 +1,5 @@
 """`accuracy`: error of a registration preset by tissue, position, strain, noise and resolution, on phantoms."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The report of an accuracy study: tables, figures, and how to read them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`phantom`: images of a synthetic heel under Load0 to Load4, with the truth in the layout of `register`'s results."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass

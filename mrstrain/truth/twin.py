@@ -1,7 +1,5 @@
 """`twin`: synthetic warp of a subject's own unloaded image by a given deformation, with the truth beside it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
