@@ -45,60 +45,33 @@ class ForeignPackageError(ImportError):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one check.
-
-    Attributes
-    ----------
-    what : str
-        What was checked.
-    ok : bool
-        Whether it meets the needs of a run.
-    detail : str
-        Version, size or place found.
-    advice : str
-        What to do if it does not; empty otherwise.
-    """
+    """Result of one check: what was checked, whether it meets the needs of a run, and what to do if it does not."""
 
     what: str
     ok: bool
-    detail: str
+    detail: str  # version, size or place found
     advice: str = ""
 
 
 def examine(
     folder: str | os.PathLike[str] = ".", *, trials: Mapping[str, Callable[[], str]] | None = None
 ) -> list[Finding]:
-    """Check everything that a run depends on; a failed check does not stop the others.
+    """Check everything that a run depends on, in the order in which problems are best solved.
 
-    Parameters
-    ----------
-    folder : path
-        Folder for results; the disk of its nearest existing parent is checked.
-    trials : mapping of str to callable, optional
-        Short trial runs by name; each returns a line on how it went, or raises.
-
-    Returns
-    -------
-    list of Finding
-        In the order in which problems are best solved.
+    A failed check does not stop the others. ``folder`` is to hold results: the disk of its nearest existing parent is
+    checked. ``trials`` are short trial runs by name; each returns a line on how it went, or raises.
     """
     findings = [_python(), _foreign(), *_packages(), _cores(), _memory(), _disk(Path(folder)), _temporary()]
     return [*findings, *(_tried(what, trial) for what, trial in (trials or {}).items())]
 
 
 def refuse_foreign_packages() -> None:
-    """Refuse to run where ``dvc``, ``validate`` or another of our package names belongs to another distribution.
+    """Raise ForeignPackageError where one of our package names belongs to another distribution; takes milliseconds.
 
-    Takes a few milliseconds, and is called first in every run.
-
-    Raises
-    ------
-    ForeignPackageError
-        If one of the names resolves to a foreign location, or a distribution that installs into the same folder is
-        present (whichever was installed later overwrote files of the other).
+    Either the name resolves to a foreign location, or a distribution that installs into the same folder is present
+    (whichever was installed later overwrote files of the other).
     """
-    reasons = _foreign_packages()
-    if reasons:
+    if reasons := _foreign_packages():
         raise ForeignPackageError(
             f"{' '.join(reasons)} Install mrstrain in an environment of its own: python -m venv "
             "mrstrain-env, then mrstrain-env/bin/pip install mrstrain (or: uv tool install mrstrain)."
@@ -161,9 +134,8 @@ def _packages() -> list[Finding]:
         try:
             version = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            advice = f"pip install {name}"
-            if name == "itk-elastix":
-                advice += "; wheels: Linux (glibc 2.28), macOS 15 on Apple silicon, Windows x64"
+            wheels = "; wheels: Linux (glibc 2.28), macOS 15 on Apple silicon, Windows x64"
+            advice = f"pip install {name}{wheels if name == 'itk-elastix' else ''}"
             findings.append(Finding(name, False, "not installed", advice))
             continue
         ok = name != "itk-elastix" or version.startswith(_ELASTIX)
@@ -186,11 +158,8 @@ def _memory() -> Finding:
         return Finding("memory", True, "not known on this system")
     detail = f"{total / _GIB:.1f} GiB"
     if total < _LEAST_MEMORY_GIB * _GIB:
-        advice = (
-            f"A pair of 256 x 256 x 256 voxels takes up to {_LEAST_MEMORY_GIB:.0f} GiB: crop the images, or "
-            "use a larger machine."
-        )
-        return Finding("memory", False, detail, advice)
+        needed = f"A pair of 256 x 256 x 256 voxels takes up to {_LEAST_MEMORY_GIB:.0f} GiB"
+        return Finding("memory", False, detail, f"{needed}: crop the images, or use a larger machine.")
     return Finding("memory", True, detail)
 
 
@@ -226,10 +195,8 @@ def _disk(folder: Path) -> Finding:
     free = shutil.disk_usage(existing).free
     detail = f"{free / _GIB:.1f} GiB free for results"
     if free < _LEAST_DISK_GIB * _GIB:
-        advice = (
-            f"Results of one loaded image take up to {_LEAST_DISK_GIB:.0f} GiB: make room, or choose another folder."
-        )
-        return Finding("disk", False, detail, advice)
+        needed = f"Results of one loaded image take up to {_LEAST_DISK_GIB:.0f} GiB"
+        return Finding("disk", False, detail, f"{needed}: make room, or choose another folder.")
     if not os.access(existing, os.W_OK):
         return Finding("disk", False, f"{existing} is not writable", "Choose another folder for the results.")
     return Finding("disk", True, detail)
@@ -248,7 +215,6 @@ def _temporary() -> Finding:
 def _tried(what: str, trial: Callable[[], str]) -> Finding:
     try:
         return Finding(f"trial of {what}", True, trial())
-    except Exception as error:
-        # whatever goes wrong in a trial is a finding and must not end the examination
+    except Exception as error:  # a finding, which must not end the examination
         advice = "Reinstall mrstrain in an environment of its own; the line above is what the trial said."
         return Finding(f"trial of {what}", False, f"{type(error).__name__}: {error}", advice)

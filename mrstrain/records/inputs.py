@@ -52,13 +52,7 @@ def read_subject(
 
 
 def read_matrix(path: Path) -> FloatArray:
-    """Read a 4 x 4 matrix from a text file of four rows.
-
-    Raises
-    ------
-    InputError
-        If it is none.
-    """
+    """Read a 4 x 4 matrix from a text file of four rows; InputError for any other file."""
     try:
         matrix = np.loadtxt(path)
     except (OSError, ValueError) as error:
@@ -68,22 +62,14 @@ def read_matrix(path: Path) -> FloatArray:
     return np.asarray(matrix, dtype=np.float64)
 
 
-def case_names(loads: Sequence[Path]) -> list[str]:
-    """Names of the result folders, from the files' names.
+def image_stem(name: str) -> str:
+    """A file's name without the ending of its image format, if it has one."""
+    return next((name[: -len(ending)] for ending in IMAGE_ENDINGS if name.lower().endswith(ending)), name)
 
-    Raises
-    ------
-    InputError
-        If two files would share a folder.
-    """
-    names = []
-    for path in loads:
-        name = path.name
-        for suffix in IMAGE_ENDINGS:
-            if name.lower().endswith(suffix):
-                name = name[: -len(suffix)]
-                break
-        names.append(name)
+
+def case_names(loads: Sequence[Path]) -> list[str]:
+    """Names of the result folders, from the files' names; InputError if two files would share a folder."""
+    names = [image_stem(path.name) for path in loads]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
         raise InputError(
@@ -107,14 +93,8 @@ def refuse_touching_inputs(out: Path, case_folders: Sequence[str], inputs: Seque
 def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "", option: str = "--out") -> None:
     """Refuse an output folder, made or not yet made, on a disk with too little room for ``needed`` bytes.
 
-    Parameters
-    ----------
-    what : str
-        "the set needs", say.
-    instead : str
-        More that can be done about it, as it follows "choose another --out".
-    option : str
-        What names the folder.
+    The message says ``what`` needs them ("the set needs"), which ``option`` names the folder, and what can be done
+    ``instead`` of choosing another.
     """
     there = next(place for place in (out.resolve(), *out.resolve().parents) if place.exists())
     free = shutil.disk_usage(there).free

@@ -24,14 +24,8 @@ _LINE_OF_ALL_EVERY_S, _BETWEEN_ENDS_S = 60.0, 1.0
 def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[OnProgress]:
     """Show progress on standard error; standard output is for results. An interrupt is reported in a line.
 
-    Parameters
-    ----------
-    of_all : bool
-        Whether the case "all" is reported besides its parts, as studies do. Its bar is then the first and shown from
-        the start; without a terminal its line is the only one, because the cases have lines of their own in the study's
-        log.
-    console : Console, optional
-        Standard error by default.
+    ``of_all`` says that the case "all" is reported besides its parts, as studies do. Its bar is then the first and
+    shown from the start; without a terminal its line is the only one, because the study's log has those of the cases.
     """
     console = console or Console(stderr=True)
     try:
@@ -49,15 +43,9 @@ def live(*, of_all: bool = False, console: Console | None = None) -> Iterator[On
 def _bars(console: Console, of_all: bool) -> Iterator[OnProgress]:
     """Show a bar for each case under way; finished ones are hidden, because lines beyond the terminal are cut off."""
     bars: dict[str, TaskID] = {}
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-    ) as display:
+    name, percentage, left = (TextColumn(text) for text in ("{task.description}", "{task.percentage:>3.0f} %", "left"))
+    columns = name, BarColumn(), percentage, TimeElapsedColumn(), left, TimeRemainingColumn()
+    with Progress(*columns, console=console) as display:
         stages: dict[str, str] = {}
         if of_all:
             bars[ALL] = display.add_task(ALL, total=1.0)

@@ -62,11 +62,8 @@ def versions() -> dict[str, str]:
 def machine() -> dict[str, object]:
     """Kind of machine: processor, and the cores and memory that may be used."""
     memory = usable_memory_bytes()
-    return {
-        "processor": _processor(),
-        "cores": usable_cores(),
-        "memory_gib": None if memory is None else round(memory / 2**30, 1),
-    }
+    gib = None if memory is None else round(memory / 2**30, 1)
+    return {"processor": _processor(), "cores": usable_cores(), "memory_gib": gib}
 
 
 def _processor() -> str:
@@ -80,21 +77,15 @@ def _processor() -> str:
 def provenance(
     command: str, inputs: Mapping[str, Path | list[Path]], parameters: Mapping[str, object]
 ) -> dict[str, object]:
-    """Provenance record that is written beside a result.
+    """Provenance record that is written beside a result of a command or function.
 
-    Parameters
-    ----------
-    command : str
-        Name of the command or function.
-    inputs : mapping
-        File or files by role; only file names and hashes are recorded.
-    parameters : mapping
-        All other values that the result depends on, as plain values.
+    Of ``inputs``, file or files by role, only names and hashes are recorded; ``parameters`` are all other values that
+    the result depends on, as plain values.
     """
-    files: dict[str, list[dict[str, str]]] = {}
-    for role, given in inputs.items():
-        paths = [given] if isinstance(given, Path) else given
-        files[role] = [{"name": p.name, "sha256": file_hash(p)} for p in paths]
+    files = {
+        role: [{"name": p.name, "sha256": file_hash(p)} for p in ([given] if isinstance(given, Path) else given)]
+        for role, given in inputs.items()
+    }
     return {
         "command": command,
         "made_utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),

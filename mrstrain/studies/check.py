@@ -10,7 +10,7 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from dvc import Image, LabelMap, TetMesh, fit_mask, plate_axes, read_image, read_labels, read_mask
+from dvc import Image, LabelMap, fit_mask, plate_axes, read_image, read_labels, read_mask
 from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import REPEAT
 from dvc.measurement.subject import is_bones_name
@@ -34,15 +34,7 @@ _P = ParamSpec("_P")
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What `check` found.
-
-    Attributes
-    ----------
-    wrong : tuple of str
-        All that keeps the study from being run; empty where nothing does.
-    notes : tuple of str
-        What a person should know.
-    """
+    """Result of `check`: everything that prevents the study from being run, and notes."""
 
     wrong: tuple[str, ...]
     notes: tuple[str, ...]
@@ -54,13 +46,13 @@ class Checked:
 
 @dataclass(slots=True)
 class _Findings:
-    """What was found so far, as in `Checked`."""
+    """Results so far, as in `Checked`."""
 
     wrong: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def tried(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
-        """What a function gives; None where it refuses, which is noted once."""
+        """Result of a function; None if it raises an error, which is noted once."""
         try:
             return read(*given, **options)
         except (MrstrainError, OSError) as error:
@@ -114,7 +106,9 @@ def _shared(study: Study, found: _Findings, stages: Sequence[Stage] | None) -> t
     def asked(*names_or_kinds: str) -> bool:
         return known is None or not known.isdisjoint(names_or_kinds)
 
-    reference = _reference(study, found) if asked("register", "level") else None
+    reference = found.tried(_image, study, study.images.load0) if asked("register", "level") else None
+    if reference is not None:
+        found.notes.append(f"Load0: {reference.grid}")
     labels = _labels(study, found, reference) if asked("register", "level", "compare") else None
     every, own = asked("simulate", "drive", "compare"), towards(study)
     shared = (study.plate.plate_normal, study.plate.shear_direction)
@@ -126,8 +120,9 @@ def _shared(study: Study, found: _Findings, stages: Sequence[Stage] | None) -> t
     if study.models.sets and asked("mesh") and study.mesh.file is None:
         _meshing(study, found)
     if study.models.sets and asked("simulate", "drive"):
-        laws = [one for one in _sets(study, found) if asked(f"simulate {one.name}", f"drive {one.name}")]
-        _simulations(study, found, reference, laws)
+        sets = [found.tried(material_set, study.set_given(name)) for name in study.models.sets]
+        chosen = [one for one in sets if one is not None and asked(f"simulate {one.name}", f"drive {one.name}")]
+        _simulations(study, found, reference, chosen)
     if study.models.level and asked("level") and reference is not None and reference.missing.any():
         found.wrong.append("[models] level = true needs an unloaded image without voxels that are NaN or infinite.")
     if asked("compare"):
@@ -138,17 +133,9 @@ def _shared(study: Study, found: _Findings, stages: Sequence[Stage] | None) -> t
     return reference, labels
 
 
-def _reference(study: Study, found: _Findings) -> Image | None:
-    """Look at the unloaded image."""
-    reference = found.tried(_image, study, study.images.load0)
-    if reference is not None:
-        found.notes.append(f"Load0: {reference.grid}")
-    return reference
-
-
 def _labels(study: Study, found: _Findings, reference: Image | None) -> LabelMap | None:
-    """Look at the labels; give them on the unloaded image's grid."""
-    labels = found.tried(read_labels, study.path(study.images.labels), _optional(study, study.images.names))
+    """Check the labels; returns them on the unloaded image's grid."""
+    labels = found.tried(read_labels, study.path(study.images.labels), study.optional_path(study.images.names))
     if labels is not None:
         found.notes.append(f"Labels: {', '.join(labels.names.values())}")
         if reference is not None:
@@ -158,20 +145,21 @@ def _labels(study: Study, found: _Findings, reference: Image | None) -> LabelMap
 
 def _loaded(study: Study, found: _Findings, reference: Image | None) -> None:
     """Look at the loaded images and the repeat scan."""
-    images = study.images
     others: dict[str, str | Path] = {load: one.image for load, one in study.loads.items()}
-    if images.repeat is not None:
-        others[REPEAT] = images.repeat
+    if study.images.repeat is not None:
+        others[REPEAT] = study.images.repeat
     hashes: dict[str, str] = {}
     for name, other in others.items():
         image = found.tried(_image, study, other)
-        if image is not None:
-            found.notes.append(f"{name}: {image.grid}")
-            if reference is not None and _same(reference, image):
-                found.wrong.append(f"{name} is the unloaded image: every voxel is equal.")
-            twin = hashes.setdefault(hashlib.sha256(image.values.tobytes()).hexdigest(), name)
-            if twin != name:
-                found.wrong.append(f"{name} is the image of {twin}: every voxel is equal.")
+        if image is None:
+            continue
+        found.notes.append(f"{name}: {image.grid}")
+        same_grid = reference is not None and reference.grid.same_as(image.grid)
+        if reference is not None and same_grid and np.array_equal(reference.values, image.values, equal_nan=True):
+            found.wrong.append(f"{name} is the unloaded image: every voxel is equal.")
+        twin = hashes.setdefault(hashlib.sha256(image.values.tobytes()).hexdigest(), name)
+        if twin != name:
+            found.wrong.append(f"{name} is the image of {twin}: every voxel is equal.")
 
 
 def _registration(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> None:
@@ -196,14 +184,8 @@ def _registration(study: Study, found: _Findings, reference: Image | None, label
         )
 
 
-def _sets(study: Study, found: _Findings) -> list[MaterialSet]:
-    """Read the material sets."""
-    sets = [found.tried(material_set, study.set_given(name)) for name in study.models.sets]
-    return [one for one in sets if one is not None]
-
-
-def _simulations(study: Study, found: _Findings, reference: Image | None, laws: Sequence[MaterialSet]) -> None:
-    """Look for what `simulate` would refuse."""
+def _simulations(study: Study, found: _Findings, reference: Image | None, sets: Sequence[MaterialSet]) -> None:
+    """Report what `simulate` would refuse."""
     given, own = study.plate, towards(study)
     by_direction: dict[tuple[Vector, Vector], list[LoadStep]] = {}
     forced = found.tried(load_steps, study) or {}
@@ -219,33 +201,23 @@ def _simulations(study: Study, found: _Findings, reference: Image | None, laws: 
             found.tried(check_loads, plate, steps)
             loads.append((plate, steps))
     if study.mesh.file is None:
-        _on_labels(study, found, reference, laws)
+        _on_labels(study, found, reference, sets)
         return
     mesh = found.tried(mesh_given, study, study.mesh.file)
-    if mesh is not None:
-        if reference is not None:
-            found.tried(check_overlap, study.path(study.mesh.file), mesh, reference.grid)
-        _on_mesh(found, mesh, laws, loads, study.models.fixed)
-
-
-def _on_mesh(
-    found: _Findings,
-    mesh: TetMesh,
-    sets: Sequence[MaterialSet],
-    loads: Sequence[tuple[Plate, Sequence[LoadStep]]],
-    fixed: Sequence[str],
-) -> None:
-    """Ask `simulate` itself about a mesh that was made elsewhere."""
+    if mesh is None:
+        return
+    if reference is not None:
+        found.tried(check_overlap, study.path(study.mesh.file), mesh, reference.grid)
     for one in sets:
         chosen = found.tried(one.for_regions, mesh.regions)
         if chosen is None:
             continue
         for plate, steps in loads:
-            found.tried(Problem, mesh, chosen[0], plate, steps, fixed_facets(mesh, fixed))
+            found.tried(Problem, mesh, chosen[0], plate, steps, fixed_facets(mesh, study.models.fixed))
 
 
 def _meshing(study: Study, found: _Findings) -> None:
-    """Look whether the label map that is meshed has the regions that are named."""
+    """Check that the label map to be meshed has the regions that are named."""
     labels = found.tried(read_labels, *labels_to_mesh(study))
     if labels is not None:
         how = study.mesh
@@ -258,7 +230,7 @@ def _meshing(study: Study, found: _Findings) -> None:
 
 
 def _on_labels(study: Study, found: _Findings, reference: Image | None, sets: Sequence[MaterialSet]) -> None:
-    """Look whether each set has a law for every tissue that is meshed, and whether that lies where the images are."""
+    """Check that each set has a material for every meshed tissue, and that these lie where the images are."""
     fixed = {name.casefold() for name in study.models.fixed}
     unknown = fixed - {"bone", "cut"}
     if unknown:
@@ -295,14 +267,6 @@ def _image(study: Study, given: str | Path) -> Image:
     if not place.exists():
         raise InputError(f"{place}: there is no such file.")
     return read_image(place, allow_missing=study.images.allow_missing)
-
-
-def _optional(study: Study, given: Path | None) -> Path | None:
-    return None if given is None else study.path(given)
-
-
-def _same(one: Image, other: Image) -> bool:
-    return one.grid.same_as(other.grid) and np.array_equal(one.values, other.values, equal_nan=True)
 
 
 def _foreign(study: Study, found: _Findings, labels: LabelMap) -> None:

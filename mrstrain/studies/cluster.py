@@ -95,23 +95,10 @@ def cluster(
     scheduler: str | None = None,
     workers: int | None = None,
 ) -> Iterator[StageRunner]:
-    """A cluster of this machine's cores, or the one at an address; its stages end with it.
+    """A cluster of this machine's cores, or of the scheduler at an address (tcp://node1:8786); its stages end with it.
 
-    Parameters
-    ----------
-    watch : callable
-        ``watch(stage, what, fraction)``.
-    places : sequence of Path
-        Folders of results, which every worker must be able to see.
-    scheduler : str, optional
-        Address of a scheduler, such as tcp://node1:8786.
-    workers : int, optional
-        Workers of the local cluster; by default one for each core.
-
-    Raises
-    ------
-    InputError
-        If the scheduler cannot be reached, has no workers, or its workers are unsuitable.
+    Progress goes to ``watch(stage, what, fraction)``; every worker must see ``places``, the folders of results.
+    InputError is raised if the scheduler cannot be reached, has no workers, or has unsuitable ones.
     """
     logging.getLogger("distributed").setLevel(logging.ERROR)  # stages have a log of their own
     with dask.config.set(_SETTINGS):
@@ -128,9 +115,8 @@ def cluster(
         try:
             client = Client(scheduler, timeout=_CONNECT_S)
         except (OSError, ValueError) as error:
-            raise InputError(
-                f"No Dask scheduler answers at {scheduler} ({error}). Start one: see docs/cluster.md."
-            ) from error
+            advice = "Start one: see docs/cluster.md."
+            raise InputError(f"No Dask scheduler answers at {scheduler} ({error}). {advice}") from error
         with client:
             try:
                 client.wait_for_workers(1, timeout=_WORKERS_S)

@@ -29,24 +29,15 @@ _TOTAL = "all loads"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cohort:
-    """What `cohort` gave.
+    """Result of `cohort`.
 
-    Attributes
-    ----------
-    out : Path
-        With ``report.html``, ``cohort.csv`` (areas of every subject, model and load) and ``ranking.csv``.
-    ran : tuple of StudyRun
-        The studies, in the order given.
-    ranking : tuple of CohortRank
-        The models over all loads, the nearest first; empty where no subject has a result of all.
-    notes : tuple of str
-        Who is not among those ranked over, what is unlike between subjects, and whose registrations are doubtful.
+    The folder ``out`` has ``report.html``, ``cohort.csv`` (areas of every subject, model and load) and ``ranking.csv``.
     """
 
     out: Path
-    ran: tuple[StudyRun, ...]
-    ranking: tuple[CohortRank, ...]
-    notes: tuple[str, ...]
+    ran: tuple[StudyRun, ...]  # in the order given
+    ranking: tuple[CohortRank, ...]  # over all loads, the best match first; empty if no subject has all results
+    notes: tuple[str, ...]  # subjects left out, differences between subjects, doubtful registrations
 
     @property
     def complete(self) -> bool:
@@ -90,17 +81,17 @@ def cohort(
         If a study cannot be read, two have one name, a material set has other laws in one than in another, or no
         subject has been compared with a model.
     """
-    told = [read_study(place) for place in studies]
-    names = [study.study.name for study in told]
-    if not told or len(set(names)) < len(names):
+    read = [read_study(place) for place in studies]
+    names = [study.study.name for study in read]
+    if not read or len(set(names)) < len(names):
         raise InputError(f"A cohort needs studies, each with a name of its own ([study] name); got {', '.join(names)}.")
     target = Path(out)
     make_output(target)
-    ranges = {study.compare.strains for study in told}
+    ranges = {study.compare.strains for study in read}
     if len(ranges) > 1:
         raise InputError(f"The studies compare over different ranges of strain ([compare] strains): {sorted(ranges)}.")
-    refuse_other_laws(told)
-    ran = run_studies(told, scheduler=scheduler, workers=workers, progress=progress)
+    refuse_other_laws(read)
+    ran = run_studies(read, scheduler=scheduler, workers=workers, progress=progress)
     without = {one.study.study.name: why for one in ran if (why := _uncounted(one))}
     areas = {name: _areas(one.study.out) for one in ran if (name := one.study.study.name) not in without}
     if not any(areas.values()):
@@ -114,12 +105,10 @@ def cohort(
     try:
         ranking = rank_over_subjects(shares)
     except InputError as none:
-        ranking = ()
-        notes.append(str(none))
+        ranking, notes = (), [*notes, str(none)]
     _write_tables(target, areas, ranking)
     files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
-    record = provenance("cohort", {"studies": files}, {"subjects": names})
-    write_json(target / PROVENANCE, record)
+    write_json(target / PROVENANCE, record := provenance("cohort", {"studies": files}, {"subjects": names}))
     _write_page(target / REPORT, ran, shares, ranking, notes, record)
     return Cohort(target, tuple(ran), ranking, tuple(notes))
 
@@ -143,15 +132,16 @@ def _areas(out: Path) -> list[dict[str, str]]:
 
 def _doubts(ran: Sequence[StudyRun]) -> list[str]:
     """Of each subject, the registrations that are not to be trusted and yet count in its areas."""
-    notes = []
-    for one in ran:
-        doubted = [load for load, v in one.verdicts.items() if v.level == "distrust" and load != REPEAT]
-        if doubted:
-            notes.append(
-                f"{one.study.study.name}: the registration of {', '.join(doubted)} is not to be trusted, and counts in "
-                "its areas and in the ranking. Mend it, or leave this subject out."
-            )
-    return notes
+    doubts = {
+        one.study.study.name: [load for load, v in one.verdicts.items() if v.level == "distrust" and load != REPEAT]
+        for one in ran
+    }
+    return [
+        f"{name}: the registration of {', '.join(loads)} is not to be trusted, and counts in its areas and in the "
+        "ranking. Mend it, or leave this subject out."
+        for name, loads in doubts.items()
+        if loads
+    ]
 
 
 def _judged(model: str) -> bool:

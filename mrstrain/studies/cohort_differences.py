@@ -19,13 +19,7 @@ _NAMED = 3  # values, and studies to a value, that are named one by one
 
 
 def refuse_other_laws(studies: Sequence[Study]) -> None:
-    """Refuse studies in which one name stands for different laws.
-
-    Raises
-    ------
-    InputError
-        Naming set and studies, or as from `fe.material_set`.
-    """
+    """Raise InputError, naming set and studies, where one name stands for different material parameter sets."""
     seen: dict[str, tuple[str, MaterialSet]] = {}
     for study in studies:
         for given in study.models.sets:

@@ -47,10 +47,7 @@ def cells_expected(labels: LabelMap, bones: Sequence[str], edge_mm: float) -> fl
 def sizes_of(study: Study) -> tuple[float, float]:
     """Voxels of the unloaded image, and about how many cells sets are simulated on; 0 without sets.
 
-    Raises
-    ------
-    InputError
-        If the image, the mesh or the label map to be meshed cannot be read.
+    InputError is raised if the image, the mesh or the label map to be meshed cannot be read.
     """
     voxels = float(np.prod(read_image(study.path(study.images.load0), allow_missing=True).grid.shape))
     if not study.models.sets:
@@ -62,17 +59,7 @@ def sizes_of(study: Study) -> tuple[float, float]:
 
 
 def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
-    """About how long a stage takes on one core.
-
-    Parameters
-    ----------
-    stage : Stage
-    study : Study
-    voxels : float
-        Of the unloaded image.
-    cells : float
-        Of the mesh.
-    """
+    """About how long a stage takes on one core, seconds; voxels are those of the unloaded image, cells of the mesh."""
     loads = len(study.loads)
     if stage.kind in ("register", "level"):
         registering = _REGISTER_S + (_cost(study).seconds_per_mvoxel + _MAPS_S_PER_MVOXEL) * voxels / 1e6
@@ -80,7 +67,7 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
     if stage.kind == "mesh":
         return _MESH_S
     if stage.kind == "compare":
-        models = len({value for of in (stage.some.get("models", {}),) for value in of.values()})
+        models = len(set(stage.some.get("models", {}).values()))
         return loads * (_COMPARE_S + _MODEL_S * (models + len(study.models.results)))
     seconds = float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
     if stage.kind != "simulate":
@@ -150,10 +137,7 @@ def costs(
     there = usable_memory_bytes()
     if there is not None and needed > there / _GIB:
         fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
-        advice = (
-            f"run with --workers {fitting}."
-            if fitting
-            else "one stage alone is too large: crop the images, take a coarser mesh, or a larger machine."
-        )
+        smaller = "one stage alone is too large: crop the images, take a coarser mesh, or a larger machine."
+        advice = f"run with --workers {fitting}." if fitting else smaller
         lines.append(f"CARE: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
     return lines

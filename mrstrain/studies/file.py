@@ -34,12 +34,8 @@ def _seconds(minutes: float | None) -> float | None:
 
 def as_folder(text: str) -> str:
     """A name that becomes a folder, as it is; ValueError where it cannot."""
-    if (
-        not text
-        or text != text.strip()
-        or any(c in '/\\:*?"<>|' or not c.isprintable() for c in text)
-        or text[0] == "."
-    ):
+    unfit = any(c in '/\\:*?"<>|' or not c.isprintable() for c in text)
+    if unfit or not text or text != text.strip() or text[0] == ".":
         raise ValueError("a name that becomes a folder: no slash, colon or quotes, and not beginning with a dot")
     return text
 
@@ -52,17 +48,7 @@ class _Part(BaseModel):
 
 
 class About(_Part):
-    """What the study is called, and where its results go.
-
-    Attributes
-    ----------
-    name : str
-        Of the subject; in the report.
-    out : str
-        Folder of the results, below the study file's own.
-    seed : int
-        Of every random number.
-    """
+    """The subject's name, as in the report; the folder of the results, below the study file's own; and the seed."""
 
     name: Annotated[str, Field(min_length=1)]
     out: str = "results"
@@ -157,15 +143,7 @@ class Models(SimulationOptions):
 
 
 class Study(_Part):
-    """A whole study, as its file tells it.
-
-    Attributes
-    ----------
-    place : Path
-        Folder of the study file, which all paths start from.
-    study, images, loads, plate, registration, mesh, models, compare
-        The file's tables.
-    """
+    """A whole study: the tables of its file, and the folder of that file, which all paths start from."""
 
     place: Path
     study: About
@@ -197,20 +175,23 @@ class Study(_Part):
         """A path of the file, from the study's folder."""
         return self.place / given
 
+    def optional_path(self, given: str | Path | None) -> Path | None:
+        """A path of the file that may be left out, from the study's folder."""
+        return None if given is None else self.path(given)
+
     def set_given(self, name: str) -> str:
         """A material set as `simulate` takes it: a file's path, or a published name."""
         return str(self.path(name)) if name.endswith(".toml") else name
 
 
-def read_study(path: Path | str) -> Study:
-    """Read a study file (or a folder's ``study.toml``).
+def read_study(path: Path | str | Study) -> Study:
+    """Read a study file (or a folder's ``study.toml``); a study that is read already is returned as it is.
 
-    Raises
-    ------
-    InputError
-        If there is none, or with everything that is wrong in it: unknown keys with the nearest known one, values of
-        the wrong kind, results outside the study's folder.
+    InputError lists everything that is wrong in the file: unknown keys with the nearest known one, values of the wrong
+    kind, results outside the study's folder.
     """
+    if isinstance(path, Study):
+        return path
     place = Path(path)
     place = place / FILE if place.is_dir() else place
     try:
@@ -226,14 +207,12 @@ def read_study(path: Path | str) -> Study:
     except ValidationError as wrong:
         sentences = "\n".join(f"  {_sentence(one, told)}" for one in wrong.errors(include_url=False))
         raise InputError(f"{place}:\n{sentences}") from wrong
-    home = study.place
-    if home not in study.out.resolve().parents:
+    if study.place not in study.out.resolve().parents:
         raise InputError(
-            f"{place}: [study] out = '{study.study.out}' does not lie below the study's own folder {home}; results "
-            "stay with their study."
+            f"{place}: [study] out = '{study.study.out}' does not lie below the study's own folder {study.place}; "
+            "results stay with their study."
         )
-    reserved = {"repeat"} & set(study.loads)
-    if reserved:
+    if "repeat" in study.loads:
         raise InputError(f"{place}: 'repeat' is kept for the repeat scan and cannot name a load.")
     return study
 

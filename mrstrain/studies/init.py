@@ -15,7 +15,7 @@ from dvc.io.images.dicom import is_dicom, is_multiframe
 from fe import published_names
 from mrstrain.comparison.model_files import ENDINGS
 from mrstrain.models.loads import LOADS
-from mrstrain.records.inputs import IMAGE_ENDINGS as IMAGES
+from mrstrain.records.inputs import IMAGE_ENDINGS, image_stem
 from mrstrain.studies.file import FILE
 
 _UNLOADED = re.compile(r"load[ _-]?0|unloaded|no[ _-]?load|baseline", re.IGNORECASE)
@@ -64,11 +64,8 @@ class NewStudy:
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
-        todo = (
-            "Put the forces in"
-            if found.load0 and found.loads and found.labels
-            else "Put in what was not found, and the forces"
-        )
+        missing = not (found.load0 and found.loads and found.labels)
+        todo = "Put in what was not found, and the forces" if missing else "Put the forces in"
         return [*lines, f"Study file: {self.path}. {todo}; then: mrstrain check {self.path.parent}"]
 
 
@@ -98,9 +95,8 @@ def init(folder: Path | str, *, name: str = "Subject 01") -> NewStudy:
     found = _look(place)
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # TOML knows no pairs of surrogates
-    template = environment.from_string(
-        (files("mrstrain.studies") / "templates" / "study.toml.j2").read_text(encoding="utf-8")
-    )
+    source = files("mrstrain.studies") / "templates" / "study.toml.j2"
+    template = environment.from_string(source.read_text(encoding="utf-8"))
     forces = {load.name: (load.normal_n, load.shear_n) for load in LOADS}
     sets = [name for name in published_names() if not name.endswith(_VARIANT) and name != _SOFTEST]
     write_whole(target, template.render(found=found, name=name, forces=forces, sets=sets))
@@ -109,13 +105,13 @@ def init(folder: Path | str, *, name: str = "Subject 01") -> NewStudy:
 
 def _look(place: Path) -> StudyInputs:
     found = StudyInputs()
-    images = sorted(p.name for p in place.iterdir() if p.name.lower().endswith(IMAGES) and _is_volume(p))
+    images = sorted(p.name for p in place.iterdir() if p.name.lower().endswith(IMAGE_ENDINGS) and _is_volume(p))
     folders = sorted(p for p in place.iterdir() if p.is_dir())
     images += [p.name for p in folders if _holds_dicom(p)]
     for name in images:
-        role = _role(_stem(name))
+        role = _role(image_stem(name))
         if role == "load":
-            taken = found.loads.setdefault(_stem(name), name)
+            taken = found.loads.setdefault(image_stem(name), name)
         elif role is None:
             found.unused[name] = "whose name tells no role"
             continue
@@ -167,12 +163,7 @@ def _role(stem: str) -> str | None:
     return "load" if _LOADED.search(stem) and not again else None
 
 
-def _stem(name: str) -> str:
-    return next((name[: -len(s)] for s in IMAGES if name.lower().endswith(s)), name)
-
-
 def _table(place: Path, image: str | None) -> str | None:
     """The table of label names with the name of a label map."""
-    if image is None:
-        return None
-    return next((_stem(image) + e for e in _TABLES if (place / (_stem(image) + e)).is_file()), None)
+    names = [] if image is None else [image_stem(image) + ending for ending in _TABLES]
+    return next((name for name in names if (place / name).is_file()), None)

@@ -22,33 +22,19 @@ from mrstrain.studies.stages import StageResult
 
 
 class StageRecord(BaseModel):
-    """Record of a finished stage.
-
-    Attributes
-    ----------
-    stage : str
-    key : str
-        Hash of everything that it was made from.
-    made_utc : str
-    seconds : float
-    files : dict
-        Files that it made, relative to the study's results, with their sizes in bytes.
-    result : StageResult
-    made_from : dict
-        Hashes of its input files by their names, and its arguments.
-    """
+    """Record of a finished stage."""
 
     model_config = ConfigDict(
         frozen=True, ser_json_bytes="base64", val_json_bytes="base64", ser_json_inf_nan="constants"
     )
 
     stage: str
-    key: str
+    key: str  # hash of everything that it was made from
     made_utc: str
     seconds: float
-    files: dict[str, int]
+    files: dict[str, int]  # made by it, relative to the study's results, with their sizes in bytes
     result: StageResult
-    made_from: dict[str, Any] = {}
+    made_from: dict[str, Any] = {}  # hashes of its input files by their names, and its arguments
 
     @property
     def identity(self) -> str:
@@ -57,15 +43,7 @@ class StageRecord(BaseModel):
 
 
 class Ledger:
-    """The records of a study's results folder.
-
-    Parameters
-    ----------
-    out : Path
-        The study's results.
-    home : Path
-        The study's own folder.
-    """
+    """The records of the results folder ``out`` of a study whose own folder is ``home``."""
 
     def __init__(self, out: Path, home: Path) -> None:
         self.out, self.home = out, home

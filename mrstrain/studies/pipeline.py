@@ -20,26 +20,13 @@ Log = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class StageOutcome:
-    """How a stage ended.
-
-    Attributes
-    ----------
-    stage : str
-    record : StageRecord or None
-        Record of its result; None without one.
-    reason : str
-        Why there is no result, or why it does not match the study any more.
-    reused : bool
-        Whether the result existed already.
-    requested : bool
-        Whether the stage was among those that may be run.
-    """
+    """How a stage ended."""
 
     stage: str
-    record: StageRecord | None
-    reason: str = ""
-    reused: bool = False
-    requested: bool = True
+    record: StageRecord | None  # of its result
+    reason: str = ""  # why there is no result, or why it does not match the study any more
+    reused: bool = False  # the result existed already
+    requested: bool = True  # the stage was among those that may be run
 
     @property
     def left_out(self) -> bool:
@@ -62,18 +49,7 @@ class StageOutcome:
 
 
 class Pipeline:
-    """The stages of one study and their outcomes.
-
-    Parameters
-    ----------
-    stages : sequence of Stage
-        Each after those that it waits for.
-    ledger : Ledger
-    only : sequence of str
-        Names or kinds of stages that may be run; all where empty. The others are taken as they are.
-    force : sequence of str
-        Names or kinds of stages that are run even if they are finished.
-    """
+    """The stages of a study in an order that can be run, and their outcomes; ``only`` and ``force`` as in `run`."""
 
     def __init__(
         self, stages: Sequence[Stage], ledger: Ledger, *, only: Sequence[str] = (), force: Sequence[str] = ()
@@ -111,23 +87,19 @@ class Pipeline:
     def settle(self) -> list[tuple[Stage, Mapping[str, Any]]]:
         """Advance every stage as far as possible without work; return those to be run now, with their arguments."""
         ready = []
-        advanced = True
-        while advanced:
-            advanced = False
-            for stage in list(self._waiting.values()):
-                if any(name not in self.outcomes for name in stage.before):
-                    continue
-                del self._waiting[stage.name]
-                advanced = True
-                try:
-                    settled = self._settled(stage)
-                except (OSError, MrstrainError) as failure:  # an input that is gone, or may not be read
-                    reason = self.ledger.impersonal(str(failure), stage)
-                    settled = StageOutcome(stage.name, None, reason, requested=self._requested(stage))
-                if isinstance(settled, StageOutcome):
-                    self.outcomes[stage.name] = settled
-                else:
-                    ready.append((stage, settled))
+        for stage in list(self._waiting.values()):  # each after those that it waits for: one pass is enough
+            if any(name not in self.outcomes for name in stage.before):
+                continue
+            del self._waiting[stage.name]
+            try:
+                settled = self._settled(stage)
+            except (OSError, MrstrainError) as failure:  # an input that is gone, or may not be read
+                reason = self.ledger.impersonal(str(failure), stage)
+                settled = StageOutcome(stage.name, None, reason, requested=self._requested(stage))
+            if isinstance(settled, StageOutcome):
+                self.outcomes[stage.name] = settled
+            else:
+                ready.append((stage, settled))
         return ready
 
     def _settled(self, stage: Stage) -> StageOutcome | Mapping[str, Any]:
@@ -155,10 +127,7 @@ class Pipeline:
         return f"Built on {', '.join(outdated)}, out of date." if outdated else ""
 
     def forecast(self) -> dict[str, str]:
-        """What a run would do with each stage, without doing it.
-
-        "done already", "run", "left out", or "cannot be run" and why.
-        """
+        """What a run would do with each stage: "done already", "run", "left out", or "cannot be run" and why."""
         forecast: dict[str, str] = {}
         records: dict[str, StageRecord] = {}
         available: set[str] = set()
@@ -232,14 +201,8 @@ class Pipeline:
 def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Mapping[str, Log]) -> None:
     """Run what is left of several studies on one cluster.
 
-    Parameters
-    ----------
-    pipelines : mapping of str to Pipeline
-        By the prefix that tells one study's stage names from another's.
-    pool : callable
-        Gives a context with a `StageRunner`; called only if there is work.
-    logs : mapping
-        By the same prefixes: called with a line for each stage that ends.
+    Pipelines and logs are given by the prefix that tells one study's stage names from another's; a log gets a line for
+    each stage that ends. ``pool`` gives a context with a `StageRunner`, and is called only if there is work.
     """
     with ExitStack() as stack:
         runners: list[StageRunner] = []

@@ -26,31 +26,17 @@ REGISTRATION, MODELS, COMPARISON, MESH = "registration", "models", "comparison",
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One piece of work.
+    """One piece of work: a call of the function of its kind in `mrstrain.studies.stages`.
 
-    Attributes
-    ----------
-    name : str
-        Its kind, and what it is of: "register Load1".
-    arguments : mapping
-        Of the function of its kind in `mrstrain.studies.stages`; plain values.
-    files : tuple of Path
-        What it reads that no other stage makes, by content.
-    after : tuple of str
-        Stages that it cannot do without.
-    some : mapping
-        Argument to stages, at least one of which it needs; it gets what each that succeeded is listed with.
-    perhaps : mapping
-        The same of stages without which it does as well.
-    gives : tuple of Path
-        What it makes, all of it: removed before it is made anew.
+    ``some`` maps an argument to stages at least one of which it needs, and ``perhaps`` to stages that it can do
+    without; the argument lists the value that stands beside each stage that succeeded.
     """
 
-    name: str
-    arguments: Mapping[str, Any]
-    files: tuple[Path, ...]
-    gives: tuple[Path, ...]
-    after: tuple[str, ...] = ()
+    name: str  # its kind and object: "register Load1"
+    arguments: Mapping[str, Any]  # plain values
+    files: tuple[Path, ...]  # what it reads that no other stage makes, by content
+    gives: tuple[Path, ...]  # everything that it makes: removed before it is made again
+    after: tuple[str, ...] = ()  # stages that it cannot do without
     some: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     perhaps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
@@ -72,13 +58,10 @@ class Stage:
 
 
 def plan(study: Study) -> tuple[Stage, ...]:
-    """The stages of a study, each behind those that it waits for.
+    """The stages of a study, each after those that it waits for.
 
-    Raises
-    ------
-    InputError
-        If two material sets or models would share a folder, a load that is simulated has no force, or models are
-        levelled without a bone.
+    InputError is raised if two material sets or models would share a folder, a load that is simulated has no force, or
+    a forward-model comparison has no bone.
     """
     stages = _registrations(study)
     loads = tuple(study.loads)
@@ -172,7 +155,7 @@ def mesh_place(study: Study) -> Path:
 def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:
     """The label map that is meshed, and the table of its names."""
     of = study.mesh if study.mesh.labels else study.images
-    return study.path(of.labels or ""), None if of.names is None else study.path(of.names)
+    return study.path(of.labels or ""), study.optional_path(of.names)
 
 
 def _mesh(study: Study) -> list[Stage]:
@@ -223,17 +206,13 @@ def towards(study: Study) -> dict[str, tuple[Vector, Vector]]:
 
 
 def load_steps(study: Study) -> dict[str, LoadStep]:
-    """The loads that are simulated: those with a force or a travel along the normal.
+    """The loads that are simulated: those with a force or a plate displacement along the normal.
 
-    Raises
-    ------
-    InputError
-        If a load has only a shear, or both force and travel along an axis, or none has anything.
+    InputError is raised if a load has only a shear, or force and displacement along one axis, or no load has any.
     """
     steps = {}
     for name, load in study.loads.items():
-        along = (load.normal_n, load.normal_mm)
-        if along == (None, None):
+        if (load.normal_n, load.normal_mm) == (None, None):
             if (load.shear_n, load.shear_mm) != (None, None):
                 raise InputError(f"[loads.{name}] normal_n is missing: a plate that shears has to press.")
             continue
@@ -270,7 +249,7 @@ def _levelled(study: Study, folder: Path, load: str) -> Stage:
 def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, str]) -> Stage:
     how = study.compare.located(study.place)
     labels = study.path(study.images.labels)
-    names = None if study.images.names is None else study.path(study.images.names)
+    names = study.optional_path(study.images.names)
     elsewhere = [study.path(place) for place in study.models.results]
     taken = {Path(place).name for place in models.values()}
     twice = [place.name for place in elsewhere if place.name in taken]

@@ -31,14 +31,7 @@ _NOTHING = ("nothing",)  # may be run: every stage is taken as it is
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyRun:
-    """Result of `run`.
-
-    Attributes
-    ----------
-    study : Study
-    outcomes : dict
-        Outcome of every stage, by its name.
-    """
+    """Result of `run`: the study, and the outcome of every stage by its name."""
 
     study: Study
     outcomes: Mapping[str, StageOutcome]
@@ -117,7 +110,7 @@ def run(
     Returns
     -------
     StudyRun
-        With the outcome of every stage; a failed stage is named there, in the log and in the report.
+        Outcome of every stage; the log and the report name a failed stage as well.
 
     Raises
     ------
@@ -129,12 +122,9 @@ def run(
     OutputError
         If another run is at work in the same folder, or it cannot be written to.
     """
-    runs = run_studies([_read(study)], only=only, force=force, scheduler=scheduler, workers=workers, progress=progress)
-    return runs[0]
-
-
-def _read(study: Path | str | Study) -> Study:
-    return study if isinstance(study, Study) else read_study(study)
+    return run_studies(
+        [read_study(study)], only=only, force=force, scheduler=scheduler, workers=workers, progress=progress
+    )[0]
 
 
 def run_studies(
@@ -250,14 +240,8 @@ def _refuse_small_disk(
 
 
 def report(study: Path | str | Study) -> StudyRun:
-    """Write a study's report again from the existing results, without running anything.
-
-    Raises
-    ------
-    InputError
-        If no stage has a result.
-    """
-    study = _read(study)
+    """Write a study's report again from the existing results, without running anything; InputError without any."""
+    study = read_study(study)
     pipeline = Pipeline(plan(study), Ledger(study.out, study.place), only=_NOTHING)
     pipeline.settle()
     outcomes = pipeline.in_order()
@@ -270,7 +254,7 @@ def report(study: Path | str | Study) -> StudyRun:
 
 def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = ()) -> dict[str, str]:
     """What `run` would do with each stage (`Pipeline.forecast`); parameters and errors as in `run`."""
-    return _planned([_read(study)], only, force)[0][0].forecast()
+    return _planned([read_study(study)], only, force)[0][0].forecast()
 
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:
@@ -309,15 +293,13 @@ def refuse_wrong(studies: Sequence[Study], todo: Sequence[Sequence[Stage]]) -> N
 def _alone(out: Path) -> Iterator[None]:
     """Lock the results folder; the operating system releases it when the process ends, even by a kill."""
     make_output(out)
-    folder = out / ".study"
-    make_output(folder)
-    lock = FileLock(folder / "lock")
+    make_output(out / ".study")
+    lock = FileLock(out / ".study" / "lock")
     try:
         lock.acquire(timeout=0)
     except Timeout as taken:
-        raise OutputError(
-            f"{out}: another run is at work here. Wait for its end, or give another [study] out."
-        ) from taken
+        advice = "Wait for its end, or give another [study] out."
+        raise OutputError(f"{out}: another run is at work here. {advice}") from taken
     try:
         yield
     finally:

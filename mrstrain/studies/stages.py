@@ -19,30 +19,14 @@ Tell = Callable[[str, float], None]
 
 @dataclass(frozen=True, slots=True)
 class StageResult:
-    """What a stage gave.
+    """Result of a stage."""
 
-    Attributes
-    ----------
-    lines : tuple of str
-        For a person.
-    sections : tuple of Section
-        Its part of the study's report.
-    closing : tuple of Section
-        What belongs at the report's end: how to read its part.
-    complete : bool
-        Whether all of it was reached; a model that carried a part of its load was not.
-    retry : bool
-        Whether a part of it failed in a way that may not come again: it is run anew next time.
-    timed_out : bool
-        Whether all that it lacks is what its limit of time did not let it reach.
-    """
-
-    lines: tuple[str, ...]
-    sections: tuple[Section, ...] = ()
-    closing: tuple[Section, ...] = ()
-    complete: bool = True
-    retry: bool = False
-    timed_out: bool = False
+    lines: tuple[str, ...]  # summary
+    sections: tuple[Section, ...] = ()  # of the study's report
+    closing: tuple[Section, ...] = ()  # at the report's end: how to read its part
+    complete: bool = True  # everything was reached; False for a model that carried a part of its load
+    retry: bool = False  # a part failed in a way that may not recur: it is run again next time
+    timed_out: bool = False  # all that is missing is due to the time limit
 
 
 def register(tell: Tell, *, out: str, load0: str, load: str, repeat: Sequence[str], **options: Any) -> StageResult:
