@@ -49,7 +49,7 @@ class StageOutcome:
 
 
 class Pipeline:
-    """The stages of a study, each after those that it waits for, and their outcomes; ``only``, ``force`` of `run`."""
+    """The stages of a study in an order that can be run, and their outcomes; ``only`` and ``force`` as in `run`."""
 
     def __init__(
         self, stages: Sequence[Stage], ledger: Ledger, *, only: Sequence[str] = (), force: Sequence[str] = ()
