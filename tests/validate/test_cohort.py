@@ -15,7 +15,7 @@ from mrstrain.studies.ledger import StageRecord
 from mrstrain.studies.pipeline import StageOutcome
 from mrstrain.studies.run import StudyRun
 from mrstrain.studies.stages import StageResult
-from validate import rank_over_subjects
+from validate import LEVELLED, NOTHING, rank_over_subjects
 
 STUDY = """
 [study]
@@ -91,11 +91,12 @@ def test_no_common_subject():
 
 
 def compared(folder: Path, name: str, near: float, far: float) -> Path:
-    """A study's folder with the table that a comparison leaves."""
+    """A study's folder with the table that a comparison leaves; what is no model of its own would be the nearest."""
     comparison = folder / name / "results" / "comparison"
     comparison.mkdir(parents=True)
     (folder / name / "study.toml").write_text(STUDY.format(name=name))
-    rows = [f"Load1,all soft tissue,{model},{share},{share},,,nan" for model, share in (("near", near), ("far", far))]
+    shares = {"near": near, "far": far, "near" + LEVELLED: 0.01, NOTHING: 0.02}
+    rows = [f"Load1,all soft tissue,{model},{share},{share},,,nan" for model, share in shares.items()]
     (comparison / "areas.csv").write_text("\n".join([HEAD, *rows]) + "\n")
     return folder / name
 

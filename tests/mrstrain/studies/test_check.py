@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from dvc.errors import InputError, RegistrationError
 from dvc.images.image import Grid, Image, LabelMap
@@ -14,6 +15,7 @@ from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_labels
 from dvc.mesh import TetMesh
 from fe import write_tet_mesh
+from mrstrain.cli.app import app
 from mrstrain.studies import costs, stages
 from mrstrain.studies.check import check, wrong_with
 from mrstrain.studies.file import read_study
@@ -74,6 +76,17 @@ def test_a_tissue_without_a_law_is_told_and_one_that_takes_anothers_is_not(study
     write_labels(study / "tissues.nii.gz", LabelMap(GRID, values, {1: "fat", 2: "bone", 9: "skin"}))
     assert wrong(study).startswith("The set mine has no material law for the region 'skin'")
     assert wrong(study, ('"mine.toml", ', "")) == ""
+
+
+def test_the_command_ends_with_status_2_where_something_is_wrong_and_0_where_nothing_is(study):
+    text = (study / "study.toml").read_text().replace('"mine.toml", ', "")
+    (study / "study.toml").write_text(text)
+    well = CliRunner().invoke(app, ["check", str(study)])
+    assert (well.exit_code, "WRONG" in well.output) == (0, False), well.output
+    (study / "Load1.nii.gz").unlink()
+    ill = CliRunner().invoke(app, ["check", str(study)])
+    assert ill.exit_code == 2
+    assert "WRONG" in ill.output
 
 
 def test_a_bone_that_would_be_meshed_as_tissue_is_told(study):
