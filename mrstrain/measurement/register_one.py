@@ -15,7 +15,7 @@ from mrstrain.measurement.case import Case
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.plan import Plan, record_of
 from mrstrain.options.door import door
-from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, SubjectFiles
+from mrstrain.options.measurement import EarlierResults, MeshAndAxes, RegistrationOptions, Running, SubjectFiles
 from mrstrain.records.inputs import read_subject
 
 
@@ -29,46 +29,27 @@ def register_one(
     registration: RegistrationOptions,
     onto: MeshAndAxes,
     running: Running,
-    repeat: Path | None = None,
-    after: Path | None = None,
-    allow_missing: bool = False,
+    earlier: EarlierResults,
     tell: Callable[[str, float], None] = lambda *_: None,
 ) -> Case:
     """Register one loaded image by itself, as `register` does it in a series.
 
-    Parameters
-    ----------
-    out : path
-        Folder of this load's results; one that is called "repeat" is that of a repeat scan.
-    repeat : path, optional
-        Folder of the repeat scan's results: the noise floor.
-    after : path, optional
-        Folder of the load whose result is the start of this one's.
-    tell : callable, optional
-        ``tell(stage, fraction)``.
-
-    Other parameters, and errors, are those of `register`.
+    A folder ``out`` that is called "repeat" is that of a repeat scan. ``tell(stage, fraction)`` reports progress. Other
+    parameters, and errors, are those of `register`.
     """
-    subject = read_subject(load0, subject_files, onto, allow_missing=allow_missing)
-    loaded = read_image(load, allow_missing=allow_missing)
-    how = registration
+    how, missing = registration, earlier.allow_missing
+    subject = read_subject(load0, subject_files, onto, allow_missing=missing)
+    loaded = read_image(load, allow_missing=missing)
     threads = running.threads or 1
     chosen = engine_of(how, labelled=True)
     settings = Settings(chosen, how.align, running.seed, threads)
     model = error_model_of(chosen.name) if how.error_model is None else read_error_model(how.error_model)
-    floor = None if repeat is None else read_noise_floor(repeat / QUALITY)
-    start = None if after is None else spline_in(after)
-    record = record_of(
-        subject,
-        {"loads": [load]},
-        settings,
-        how.model_copy(update={"chain": after is not None}),
-        {
-            "allow_missing": allow_missing,
-            "bone_label": subject_files.bone_label,
-            "shear_direction_lps": onto.plain()["shear_direction"],
-        },
-    )
+    floor = None if earlier.repeat is None else read_noise_floor(earlier.repeat / QUALITY)
+    start = None if earlier.after is None else spline_in(earlier.after)
+    more = {"allow_missing": missing, "bone_label": subject_files.bone_label}
+    more["shear_direction_lps"] = onto.plain()["shear_direction"]
+    chained = how.model_copy(update={"chain": earlier.after is not None})
+    record = record_of(subject, {"loads": [load]}, settings, chained, more)
     plan = Plan(replace(subject, tissue=subject.body()), settings, Evidence(error_model=model), record, how.twin)
     with Worker(threads) as worker:
         done = plan.register(loaded, start, worker, tell, is_repeat=out.name == REPEAT)

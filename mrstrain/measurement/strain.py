@@ -22,17 +22,7 @@ _TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm", ".npz")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Given:
-    """A deformation that was found elsewhere, with the subject it belongs to.
-
-    Attributes
-    ----------
-    subject : Subject
-    whole : Deformation
-        Of points of the reference to points of the loaded image, LPS mm.
-    source : Path
-    record : dict
-        Provenance.
-    """
+    """A deformation from another tool, which maps points of the subject's reference to the loaded image, LPS mm."""
 
     subject: Subject
     whole: Deformation
@@ -45,7 +35,7 @@ class Given:
         return [self.source, *self.subject.files.values()]
 
     def measured(self, name: str) -> Measurement:
-        """The strain of it; relative to the bone, where there is one."""
+        """Its strain; relative to the bone, where there is one."""
         return Measurement.from_deformation(self.whole, self.subject, name=name)
 
 
@@ -70,13 +60,13 @@ def read_deformation(
 
 @dataclass(frozen=True, slots=True)
 class Strained:
-    """What `strain` gave: the folder and the case in it."""
+    """Result of `strain`: the folder and the case in it."""
 
     out: Path
     case: Case
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines."""
         return [*self.case.summary(), f"Report: {self.out / REPORT}"]
 
 
@@ -90,16 +80,15 @@ def strain(
     frame: Frame | None = None,
     onto: MeshAndAxes,
 ) -> Strained:
-    """Strain maps of a deformation that was found elsewhere.
+    """Strain maps of a deformation that another tool measured.
 
     Parameters
     ----------
     reference : path
         Unloaded image (reference configuration): gives the voxels.
     deformation : path
-        An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), a spline with borders of
-        tissues (.npz), or a displacement image. All map points of the reference to points of the loaded image.
-    out : path
+        An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), a spline with tissue
+        interfaces (.npz), or a displacement image. All map points of the reference to points of the loaded image.
     subject_files
         With a bone, its rigid motion (least squares over its voxels) is taken out of the displacement; ``tissue`` is
         where strain is wanted.
@@ -107,26 +96,17 @@ def strain(
         Frame of a displacement image's components, where no JSON file beside it tells.
     onto
         As in `register`.
-
-    Returns
-    -------
-    Strained
     """
     target, source = Path(out), Path(deformation)
     subject = read_subject(reference, subject_files, onto)
-    given = read_deformation(
-        subject,
-        deformation,
-        frame=frame,
-        command="strain",
-        parameters={
-            "bone_label": subject_files.bone_label,
-            "plate_normal_lps": subject.plate_normal.tolist(),
-            "shear_direction_lps": onto.plain()["shear_direction"],
-            "mesh_unit": onto.mesh_unit,
-            "mesh_frame": onto.mesh_frame,
-        },
-    )
+    parameters = {
+        "bone_label": subject_files.bone_label,
+        "plate_normal_lps": subject.plate_normal.tolist(),
+        "shear_direction_lps": onto.plain()["shear_direction"],
+        "mesh_unit": onto.mesh_unit,
+        "mesh_frame": onto.mesh_frame,
+    }
+    given = read_deformation(subject, deformation, frame=frame, command="strain", parameters=parameters)
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"
     refuse_touching_inputs(target, [name], given.files)
     measured = given.measured(name)
