@@ -107,17 +107,6 @@ class Scans(Options):
     """Leave NaN or infinite voxels out instead of refusing the image."""
 
 
-class EarlierResults(Options):
-    """Results that the registration of one load of a series builds on."""
-
-    repeat: Path | None = None
-    """Folder of the repeat scan's results: the noise floor."""
-    after: Path | None = None
-    """Folder of the load whose result is the start of this one's."""
-    allow_missing: Flag = False
-    """Leave NaN or infinite voxels out instead of refusing the image."""
-
-
 class Threads(Options):
     """With how many threads is computed."""
 
