@@ -49,7 +49,7 @@ _FORMAT = 2
 class AccuracyCase:
     """One registration of an accuracy study.
 
-    Attributes
+    Parameters
     ----------
     preset : str
         "gauss-newton", "gauss-newton-borders", name of an elastix preset, or path of a parameter file (.txt).
@@ -58,13 +58,13 @@ class AccuracyCase:
     snr : float
         Fat's signal over the noise's standard deviation.
     motion : str
-        "still" (registered as a repeat scan is), "smooth", "sliding", "swelling" (volume changes), "Load1" to
-        "Load4", or "wave-L" with a wavelength L in mm.
+        "still" (registered as a repeat scan is), "smooth", "sliding", "swelling" (volume changes), "Load1" to "Load4",
+        or "wave-L" with a wavelength L in mm.
     seed : int
         Of the heel, its images and the foot's motion.
     labels_off : int
-        Voxels by which bones and skin are too large (below zero: too small) in the label map that the registration
-        is given (`misdrawn`).
+        Voxels by which bones and skin are too large (below zero: too small) in the label map that the registration is
+        given (`misdrawn`).
     """
 
     preset: str
@@ -98,13 +98,12 @@ class ErrorSamples:
 
     Attributes
     ----------
-    case : AccuracyCase
     estimated_snr : float
         Signal-to-noise ratio estimated in the unloaded image (`dvc.images.noise`).
     seconds : float
         Time of the registration.
-    unknown : int
-        Sampled voxels without a result.
+    unknown, folded : int
+        Sampled voxels without a result, and with det F <= 0.
     tissue : (n,)
         Label numbers (`TISSUES`) in the label map that the registration was given.
     to_bone_mm, to_border_mm : (n,)
@@ -117,14 +116,11 @@ class ErrorSamples:
         Mean of the absolute values of the six components of the measured Green-Lagrange strain.
     true_slope, slope : (n,)
         H_dn = d . (grad u) n of a shear wave, true and measured; zero for another motion.
-    folded : int
-        Sampled voxels with det F <= 0.
     voxel : (n, 3)
         Index on the grid of the unloaded image.
-    correlation : (lags,)
-        Autocorrelation of the error of the maximum shear strain in soft tissue.
-    lag_mm : (lags,)
-        Distances of ``correlation``, mm: multiples of two voxels' longest edge, along the axes that have it.
+    correlation, lag_mm : (lags,)
+        Autocorrelation of the error of the maximum shear strain in soft tissue, and its distances: multiples of two
+        voxels' longest edge, along the axes that have it, mm.
     """
 
     case: AccuracyCase
@@ -147,8 +143,7 @@ class ErrorSamples:
 
     def write(self, path: Path, key: str) -> None:
         """Write to a file (npz) atomically; ``key`` is the hash of what the run was made from."""
-        numbers = {n: getattr(self, n) for n in _NUMBERS}
-        head = {"format": _FORMAT, "key": key, "case": asdict(self.case)} | numbers
+        head = {"format": _FORMAT, "key": key, "case": asdict(self.case)} | {n: getattr(self, n) for n in _NUMBERS}
         arrays = {n: getattr(self, n) for n in _ARRAYS}
         with whole_file(path) as part, part.open("wb") as file:
             np.savez_compressed(file, head=np.array(json.dumps(head)), **arrays)
@@ -175,13 +170,7 @@ _ARRAYS = tuple(f.name for f in fields(ErrorSamples) if f.name not in ("case", *
 
 
 def motion_named(heel: Heel, name: str) -> Motion | None:
-    """Motion of a heel's tissue by its name (see `AccuracyCase`); None for "still".
-
-    Raises
-    ------
-    InputError
-        If no motion has that name.
-    """
+    """Motion of a heel's tissue by its name (see `AccuracyCase`); None for "still"."""
     if name == "still":
         return None
     named = {"smooth": pressed, "sliding": lambda heel: sliding(heel, 4.0), "swelling": swelling}
@@ -209,7 +198,6 @@ def measure_run(
 
     Parameters
     ----------
-    case : AccuracyCase
     worker : Worker
         Process in which elastix runs.
     computing : context manager
@@ -322,23 +310,25 @@ def distances_mm(labels: LabelMap) -> tuple[Float32Array, Float32Array]:
     Bones are the regions "bone" and "ankle"; both arrays have the label map's shape.
     """
     values, spacing = labels.labels, labels.grid.spacing_mm
-    bone = np.isin(values, [number for number, name in labels.names.items() if name in RIGID])
     to_border = np.full(values.shape, np.inf, dtype=np.float32)
     for number in np.unique(values):
         inside = values == number
         to_border[inside] = to_surface_mm(~inside, spacing)[inside]
-    return to_surface_mm(bone, spacing), to_border
+    return to_surface_mm(_rigid(labels), spacing), to_border
+
+
+def _rigid(labels: LabelMap) -> BoolArray:
+    return np.isin(labels.labels, [number for number, name in labels.names.items() if name in RIGID])
 
 
 def _autocorrelation(
     error: Float32Array, known: BoolArray, sampled: BoolArray, labels: LabelMap
 ) -> tuple[FloatArray, FloatArray]:
     """Autocorrelation of the error in soft tissue and its lags in mm, along the axes with the longest edge."""
-    coarse = labels.labels[::_STRIDE, ::_STRIDE, ::_STRIDE]
     field = np.full(labels.labels.shape, np.nan, dtype=np.float32)
     field[sampled] = np.where(known, error, np.nan)
+    field[_rigid(labels)] = np.nan
     field = field[::_STRIDE, ::_STRIDE, ::_STRIDE]
-    field[np.isin(coarse, [number for number, name in labels.names.items() if name in RIGID])] = np.nan
     field -= np.nanmean(field)
     variance = float(np.nanmean(field**2))
     spacing = labels.grid.spacing_mm

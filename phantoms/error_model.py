@@ -25,12 +25,10 @@ _Moments = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class CoverageRow:
-    """How often the truth lies where an error model fitted to the other heels predicts.
+    """How often the truth lies where an error model fitted to the other heels predicts; the rest as in `ErrorRow`.
 
     Attributes
     ----------
-    preset, voxel_mm, snr, motion, tissue
-        As in `ErrorRow`.
     voxels_within : float
         Fraction of the samples whose truth lies within 1.96 standard deviations; 0.95 if the model is right.
     left_over : float
@@ -58,10 +56,8 @@ def fit_error_model(runs: Sequence[ErrorSamples], parameters: str, source: str) 
     ----------
     runs : sequence of ErrorSamples
         Runs of one preset.
-    parameters : str
-        Text of the preset.
-    source : str
-        Description of the runs, one sentence.
+    parameters, source : str
+        Text of the preset, and a sentence that describes the runs.
 
     Raises
     ------
@@ -97,18 +93,13 @@ def coverage_rows(runs: Sequence[ErrorSamples]) -> list[CoverageRow]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Validation:
-    """One tissue of one run, compared with a model of the other heels.
-
-    ``remaining`` are errors minus their expected bias, ``within`` whether each is within 1.96 standard deviations, and
-    ``scores`` the distance of the true figures from the middle of the draws, in units of the draws' interval on that
-    side.
-    """
+    """One tissue of one run, compared with a model of the other heels."""
 
     motion: str
     tissue: str
-    remaining: FloatArray
-    within: BoolArray
-    scores: FloatArray
+    remaining: FloatArray  # errors minus their expected bias
+    within: BoolArray  # whether each of these is within 1.96 standard deviations
+    scores: FloatArray  # distance of the true figures from the draws' middle, in units of their interval on that side
 
 
 def _validations(runs: Sequence[ErrorSamples]) -> list[_Validation]:

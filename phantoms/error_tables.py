@@ -24,17 +24,13 @@ class ErrorRow:
 
     Attributes
     ----------
-    preset : str
     voxel_mm : str
         Voxel size, such as "0.8" or "0.8 x 0.8 x 1.6".
-    snr : float
     labels_off : int
         As in `AccuracyCase`.
-    motion, tissue : str
     by : {"all", "distance to bone, mm", "distance to a border, mm", "true maximal shear"}
     low, high : float
         Limits of the bin; NaN for "all".
-    samples : int
     true_p50, true_p95 : float
         Percentiles of the true max. shear.
     shear_bias, shear_sd, shear_rmse, shear_p95 : float
@@ -129,9 +125,8 @@ def error_rows(runs: Sequence[ErrorSamples]) -> list[ErrorRow]:
         for (labels_off, motion), some in by_motion.items():
             for tissue in (*TISSUES.values(), POOLED):
                 for place, kept in _bins(some, [of_tissue(r, tissue) for r in some]):
-                    figures = _figures(some, kept)
-                    if figures is not None:
-                        rows.append(ErrorRow(*condition, labels_off, motion, tissue, *place, **figures))
+                    if any(k.any() for k in kept):
+                        rows.append(ErrorRow(*condition, labels_off, motion, tissue, *place, *_figures(some, kept)))
     return rows
 
 
@@ -171,10 +166,7 @@ def wavelength_recovered(rows: Sequence[ResolutionRow], share: float) -> float:
 
     Interpolated linearly between the rows, which are of one condition and tissue.
     """
-    lengths = np.array([r.wavelength_mm for r in rows])
-    recovered = np.array([r.recovered for r in rows])
-    order = np.argsort(lengths)
-    lengths, recovered = lengths[order], recovered[order]
+    lengths, recovered = np.array(sorted((r.wavelength_mm, r.recovered) for r in rows)).reshape(-1, 2).T
     below = np.flatnonzero(recovered < share)
     if not len(below) or below[-1] == len(rows) - 1:
         return float("nan")  # recovered even at the shortest, or not even at the longest
@@ -222,26 +214,14 @@ def _bins(
             yield (by, low, high), kept
 
 
-def _figures(runs: Sequence[ErrorSamples], kept: Sequence[BoolArray]) -> dict[str, Any] | None:
-    """Number of samples, true shear and errors of an `ErrorRow`; None without a sample."""
+def _figures(runs: Sequence[ErrorSamples], kept: Sequence[BoolArray]) -> tuple[Any, ...]:
+    """Number of samples, percentiles of the true shear, and errors, in the order of `ErrorRow`."""
     true = _joined(runs, kept, lambda r: r.true_shear).astype(np.float64)
-    if not len(true):
-        return None
     shear = _joined(runs, kept, lambda r: r.shear).astype(np.float64) - true
     u = _joined(runs, kept, lambda r: r.u_error_mm).astype(np.float64)
     mean = u.mean(axis=0)
     length = np.linalg.norm(u, axis=1)
-    p50, p95 = (float(p) for p in np.percentile(true, [50, 95]))
-    return {
-        "samples": len(true),
-        "true_p50": p50,
-        "true_p95": p95,
-        "shear_bias": float(shear.mean()),
-        "shear_sd": float(shear.std()),
-        "shear_rmse": float(np.sqrt(np.mean(shear**2))),
-        "shear_p95": float(np.percentile(np.abs(shear), 95)),
-        "u_bias_mm": float(np.linalg.norm(mean)),
-        "u_sd_mm": float(np.sqrt(((u - mean) ** 2).sum(axis=1).mean())),
-        "u_rmse_mm": float(np.sqrt(np.mean(length**2))),
-        "u_p95_mm": float(np.percentile(length, 95)),
-    }
+    of_shear = (shear.mean(), shear.std(), np.sqrt(np.mean(shear**2)), np.percentile(np.abs(shear), 95))
+    spread = np.sqrt(((u - mean) ** 2).sum(axis=1).mean())
+    of_u = (np.linalg.norm(mean), spread, np.sqrt(np.mean(length**2)), np.percentile(length, 95))
+    return (len(true), *(float(value) for value in (*np.percentile(true, [50, 95]), *of_shear, *of_u)))

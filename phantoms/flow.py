@@ -209,15 +209,10 @@ class Border:
     body : EllipsoidUnion
         Body with that surface.
     ramp : float
-        Thickness of the layer over which the motion rises, in units of the body's radius.
+        Thickness of the layer over which the motion rises, in units of the body's radius; positive.
     order : {2, 3}
         The velocity's potential rises as 1 - exp(-t^order), t = 0 at the surface and 1 at the end of the ramp.
         With 3 the strain is zero at the surface; with 2 it is discontinuous: tissue is sheared right up to it.
-
-    Raises
-    ------
-    InputError
-        If the ramp is not positive or the order is not 2 or 3.
     """
 
     body: EllipsoidUnion

@@ -18,12 +18,7 @@ from phantoms.flow import Border, Flow
 from phantoms.mri import acquire, sampled_by
 
 LOADS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
-    {
-        "Load1": (6.0, 0.0, 3.0),
-        "Load2": (1.4, 0.0, 0.7),
-        "Load3": (1.4, 4.2, 4.5),
-        "Load4": (1.4, 1.5, 1.5),
-    }
+    {"Load1": (6.0, 0.0, 3.0), "Load2": (1.4, 0.0, 0.7), "Load3": (1.4, 4.2, 4.5), "Load4": (1.4, 1.5, 1.5)}
 )
 """Indentation and shear displacement of the plate, and sliding of the pad inside its skin, of each load; mm at size 1.
 
@@ -49,12 +44,9 @@ class HeelPair:
 
     Parameters
     ----------
-    reference : Image
-        Unloaded.
-    loaded : Image
-        Under load, after a rigid motion of the foot: tissue at X lies at ``foot_motion.apply(X + u(X))``.
-    repeat : Image
-        Unloaded again, after the same rigid motion, with its own noise and bias field.
+    reference, loaded, repeat : Image
+        Unloaded; under load, where tissue at X lies at ``foot_motion.apply(X + u(X))``; and unloaded again after the
+        same rigid motion, with its own noise and bias field.
     labels : LabelMap
         Tissue at each voxel centre of the reference.
     bone : Mask
@@ -62,7 +54,7 @@ class HeelPair:
     deformation : Motion
         u relative to the bone and its gradient, reference configuration, LPS mm.
     foot_motion : RigidMotion
-        Rigid motion of the foot from the reference to the loaded and the repeat scan, LPS mm.
+        Rigid motion of the foot from the reference to the other two scans, LPS mm.
     """
 
     reference: Image
@@ -99,9 +91,9 @@ def heel_pair(
         Factor on the plate displacement; 1 is an indentation of 7.5 mm with a forward shear of 5 mm.
     motion : Motion, optional
         Motion of tissue relative to bone in place of that smooth load, for the heel of this seed.
-    foot_motion : RigidMotion
+    foot_motion : RigidMotion, optional
         Rigid motion of the foot between scans; a few degrees and mm by default.
-    loaded_grid : Grid
+    loaded_grid : Grid, optional
         Grid of the loaded and the repeat image; by default that of the reference, extended where the bone would leave
         it.
 
@@ -114,20 +106,15 @@ def heel_pair(
         raise InputError(f"The load must lie between 0 and 1.5; got {load}.")
     heel = Heel(seed)
     grid = centred_grid(shape, spacing_mm)
-    foot = default_foot_motion() if foot_motion is None else foot_motion
+    foot = foot_motion or default_foot_motion()
     flow = pressed(heel, load) if motion is None else motion
     labels = labels_of(heel, grid)
     bone = labels.region("bone")
     where = covering(grid, foot.apply(bone.points())) if loaded_grid is None else loaded_grid
-    return HeelPair(
-        reference=scan(heel, grid, snr=snr, number=0),
-        loaded=scan(heel, where, flow, foot, snr=snr, number=1),
-        repeat=scan(heel, where, None, foot, snr=snr, number=2),
-        labels=labels,
-        bone=bone,
-        deformation=flow,
-        foot_motion=foot,
-    )
+    reference = scan(heel, grid, snr=snr, number=0)
+    loaded = scan(heel, where, flow, foot, snr=snr, number=1)
+    repeat = scan(heel, where, None, foot, snr=snr, number=2)
+    return HeelPair(reference, loaded, repeat, labels, bone, flow, foot)
 
 
 def scan(
@@ -139,19 +126,15 @@ def scan(
     snr: float | None,
     number: int,
 ) -> Image:
-    """MR image of a heel after a motion of its tissue, followed by a rigid motion of the foot.
+    """MR image of a heel on a grid (LPS mm) after a motion of its tissue, followed by a rigid motion of the foot.
 
     I(y) = I0(phi^-1(R^T (y - t))), where I0 is the closed form of the anatomy, so that no sampled image is ever
-    resampled. Each acquisition has its own noise and bias field.
+    resampled.
 
     Parameters
     ----------
-    heel : Heel
-    grid : Grid
-        Grid of the image, LPS mm.
     motion : Motion, optional
         Motion of tissue relative to bone; none for an unloaded heel.
-    foot_motion : RigidMotion, optional
     snr : float or None
         Signal of fat over the standard deviation of the noise; None for an image without noise.
     number : int
@@ -198,14 +181,17 @@ def labels_to_mesh(heel: Heel, labels: LabelMap) -> LabelMap:
 def random_foot_motion(seed: int, number: int) -> RigidMotion:
     """Draw the rigid motion of the foot before an acquisition: up to 3 degrees about and 2 mm along each axis."""
     random = np.random.default_rng([seed, 3, number])
-    turn = Rotation.from_rotvec(random.uniform(-3.0, 3.0, 3), degrees=True).as_matrix()
-    return RigidMotion.about(np.array([0.0, 5.0, 0.0]), turn, random.uniform(-2.0, 2.0, 3))
+    return _foot_motion(random.uniform(-3.0, 3.0, 3), random.uniform(-2.0, 2.0, 3))
 
 
 def default_foot_motion() -> RigidMotion:
     """Return the default rigid motion of the foot between scans: 3.7 degrees, 2.9 mm."""
-    turn = Rotation.from_rotvec([2.5, -1.5, 2.2], degrees=True).as_matrix()
-    return RigidMotion.about(np.array([0.0, 5.0, 0.0]), turn, np.array([1.6, -2.0, 1.4]))
+    return _foot_motion(np.array([2.5, -1.5, 2.2]), np.array([1.6, -2.0, 1.4]))
+
+
+def _foot_motion(turn_deg: FloatArray, shift_mm: FloatArray) -> RigidMotion:
+    turn = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
+    return RigidMotion.about(np.array([0.0, 5.0, 0.0]), turn, shift_mm)
 
 
 def pressed(heel: Heel, load: float = 1.0) -> Flow:
@@ -218,17 +204,20 @@ def under_plate(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
 
     Its bones are constrained. Both displacements are those of a heel of size 1 and scale with the heel.
     """
-    bones = heel.skeleton
-    # a soft union is larger, so that the bones lie inside it and the motion rises smoothly around them
-    rest = EllipsoidUnion(bones.centres_mm, bones.forms, sharpness=1.25)
     return Flow(
         heel.size * np.array([0.0, -shear_mm, press_mm]),
         pivot_mm=heel.size * np.array([0.0, 15.0, -47.0]),
-        rest=Border(rest, ramp=1.0),
+        rest=_around_bones(heel),
         centre_mm=heel.size * np.array([0.0, 14.0, -50.0]),
         width_mm=heel.size * np.array([51.0, 58.0, 31.0]),
         steps=max(3, int(np.ceil(1.1 * np.hypot(press_mm, shear_mm)))),
     )
+
+
+def _around_bones(heel: Heel) -> Border:
+    """Constrained bones; their soft union is larger than they are, and the motion rises smoothly around it."""
+    bones = heel.skeleton
+    return Border(EllipsoidUnion(bones.centres_mm, bones.forms, sharpness=1.25), ramp=1.0)
 
 
 def sliding(heel: Heel, shear_mm: float) -> Flow:
@@ -255,11 +244,10 @@ def swelling(heel: Heel) -> Flow:
     Bones are constrained, and volume does not change in or at them. Tissue below the calcaneus is carried forward and
     slightly down, which compresses the tissue in front of it and expands that behind and above it.
     """
-    bones = heel.skeleton
     return Flow(
         heel.size * np.array([0.0, -2.4, -0.8]),
         pivot_mm=heel.size * np.array([0.0, 15.0, -47.0]),
-        rest=Border(EllipsoidUnion(bones.centres_mm, bones.forms, sharpness=1.25), ramp=1.0),
+        rest=_around_bones(heel),
         centre_mm=heel.size * np.array([0.0, 8.0, -40.0]),
         width_mm=heel.size * np.array([15.0, 14.0, 15.0]),
         keeps_volume=False,
@@ -267,13 +255,7 @@ def swelling(heel: Heel) -> Flow:
 
 
 def under_load(heel: Heel, load: str) -> Motion:
-    """Return the motion of a heel under one of LOADS: the pad slides inside its skin, then the plate moves all tissue.
-
-    Raises
-    ------
-    InputError
-        If the load is unknown.
-    """
+    """Motion of a heel under one of LOADS: the pad slides inside its skin, then the plate moves all tissue."""
     if load not in LOADS:
         raise InputError(f"No load '{load}'; there are {', '.join(LOADS)}.")
     press, shear, slide = LOADS[load]

@@ -18,12 +18,7 @@ _UNIT = 1e-6
 
 
 def stretched(stretches: FloatArray, centre_mm: FloatArray) -> Affine:
-    """Uniform stretch along x, y and z about a centre: F = diag(stretches).
-
-    Raises
-    ------
-    InputError
-        If a stretch is not positive.
+    """Uniform stretch along x, y and z about a centre: F = diag(stretches), all positive.
 
     Examples
     --------
@@ -38,13 +33,7 @@ def stretched(stretches: FloatArray, centre_mm: FloatArray) -> Affine:
 
 
 def compressed(axis: int, stretch: float, centre_mm: FloatArray) -> Affine:
-    """Incompressible compression along one axis: F has ``stretch`` there and 1 / sqrt(stretch) across.
-
-    Raises
-    ------
-    InputError
-        If the stretch is not positive or the axis is not 0, 1 or 2.
-    """
+    """Incompressible compression along axis 0, 1 or 2: F has ``stretch`` > 0 there and 1 / sqrt(stretch) across."""
     if axis not in {0, 1, 2} or not stretch > 0:
         raise InputError(f"A compression needs an axis 0, 1 or 2 and a positive stretch; got {axis}, {stretch}.")
     factors = np.full(3, stretch**-0.5)
@@ -53,13 +42,7 @@ def compressed(axis: int, stretch: float, centre_mm: FloatArray) -> Affine:
 
 
 def sheared(direction: FloatArray, normal: FloatArray, amount: float, centre_mm: FloatArray) -> Affine:
-    """Simple shear F = I + amount d (x) n, d and n orthogonal unit vectors.
-
-    Raises
-    ------
-    InputError
-        If d and n are not orthogonal unit vectors.
-    """
+    """Simple shear F = I + amount d (x) n about a centre; d and n are orthogonal unit vectors."""
     d, n = _frame(direction, normal)
     return _about(np.eye(3) + amount * np.outer(d, n), centre_mm)
 

@@ -28,8 +28,9 @@ def acquire(
 
     The signal is sampled at half the spacing of `sampled_by`. Only spatial frequencies that the voxels can represent
     are kept, the highest tapered as by a scanner's filter against ringing, so the image has no aliasing. It is
-    multiplied by a smooth receive field between 0.8 and 1.2, and given Rician noise: |s + n1 + i n2|, n1 and n2 normal
-    with standard deviation ``reference_signal / snr``.
+    multiplied by a smooth receive field between 0.8 and 1.2, and given Rician noise (Gudbjartsson and Patz, Magn Reson
+    Med 1995, doi:10.1002/mrm.1910340618): |s + n1 + i n2|, n1 and n2 normal with standard deviation ``reference_signal
+    / snr``.
 
     Parameters
     ----------
@@ -38,19 +39,13 @@ def acquire(
         either side of the centre.
     snr : float or None
         Signal-to-noise ratio at ``reference_signal``; None for an image without noise.
-    seed : int
-        Seed of the noise.
-    bias_seed : int or None
-        Seed of the receive field; None for a uniform one.
+    seed, bias_seed : int
+        Seeds of the noise and of the receive field; without the latter (None) the field is uniform.
 
     Raises
     ------
     InputError
         If the SNR is not positive, or an array does not fit the grid.
-
-    References
-    ----------
-    Gudbjartsson and Patz, Magn Reson Med 1995, doi:10.1002/mrm.1910340618 (the Rician distribution).
     """
     if snr is not None and not snr > 0:
         raise InputError(f"The SNR must be positive, or None for an image without noise; got {snr}.")

@@ -15,17 +15,14 @@ class TissueError:
 
     Attributes
     ----------
-    tissue : str
-    voxels : int
-        Voxels compared.
+    voxels, folded : int
+        Voxels compared, and those with det F <= 0.
     true_p50, true_p95 : float
         Percentiles of the true maximum shear strain (E_1 - E_3) / 2.
     shear_rmse, shear_bias, shear_error_p95 : float
         Root mean square and mean of measured minus true max. shear; 95th percentile of its absolute value.
     u_p50_mm, u_p95_mm : float
         Percentiles of the length of the difference between measured and true displacement.
-    folded : int
-        Voxels with det F <= 0.
     """
 
     tissue: str

@@ -52,16 +52,7 @@ class Acquisition:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticWarp:
-    """A warped image.
-
-    Attributes
-    ----------
-    image : Image
-    noise_sd : float
-        Standard deviation of its noise, in the unit of the unloaded image.
-    shown : float
-        Fraction of the tissue whose deformed position is known and lies in the image.
-    """
+    """A warped image, the standard deviation of its noise, and the fraction of the tissue that is known and in view."""
 
     image: Image
     noise_sd: float
@@ -90,7 +81,6 @@ def synthetic_warp(
         The body, bone included, on the unloaded image's grid; the warped image shows nothing else.
     motion : Deformation
         The total motion phi, rigid motion of the foot included: X to X + u(X), LPS mm, reference configuration.
-    acquisition : Acquisition
     near : RigidMotion, optional
         A rigid motion close to the total one, that of the bone: tissue is looked for within 30 mm of where it places
         it.
@@ -104,7 +94,9 @@ def synthetic_warp(
         If the mask does not fit the image, or the deformation folds, is undefined in half of the tissue, or moves the
         tissue out of the image.
 
-    Notes ----- Compared with an image of the true anatomy, denoising removes some fine texture, noise that it leaves
+    Notes
+    -----
+    Compared with an image of the true anatomy, denoising removes some fine texture, noise that it leaves
     moves with the tissue, and partial volume at interfaces is that of the unloaded scan, blurred once more by
     interpolation. The first makes a registration look worse, the second better. On a phantom at SNR 25 and 0.8 mm, 0.42
     of the noise amplitude remained and 0.18 of the finest texture was lost; the error of the maximum shear strain was

@@ -17,8 +17,6 @@ from mrstrain.options.measurement import Frame
 from mrstrain.options.model import Options, bare
 
 Out = Annotated[Path, typer.Option(help="Folder for the results; made where it is missing.", rich_help_panel="Output")]
-
-
 FieldFrame = Annotated[
     Frame | None,
     typer.Option(
@@ -26,16 +24,18 @@ FieldFrame = Annotated[
     ),
 ]
 
+_GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
+
 
 class Done(Protocol):
-    """What a function of a command gives."""
+    """Result of a command."""
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines."""
 
 
 def tell(done: Done, complete: bool = True) -> None:
-    """Print what was done, and end with status 1 where it is not all."""
+    """Print a summary, and end with status 1 where the result is not complete."""
     for line in done.summary():
         typer.echo(line)
     if not complete:
@@ -43,7 +43,7 @@ def tell(done: Done, complete: bool = True) -> None:
 
 
 class Grouped(TyperCommand):
-    """A command whose help lists its options in the groups that they belong to."""
+    """A command whose help lists its options in groups."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write each group under its name."""
@@ -52,16 +52,9 @@ class Grouped(TyperCommand):
             usual = "Arguments" if one.param_type_name == "argument" else "Options"
             if line := one.get_help_record(ctx):
                 groups.setdefault(getattr(one, "rich_help_panel", None) or usual, []).append(line)
-        for name in sorted(groups, key=_place):
+        for name in sorted(groups, key=_GROUPS.index):
             with formatter.section(name):
                 formatter.write_dl(groups[name])
-
-
-_ORDER = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
-
-
-def _place(group: str) -> int:
-    return _ORDER.index(group)
 
 
 def takes_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -55,7 +55,6 @@ def run(
         _refuse_idle("--report-only runs nothing", given | {"--dry-run": dry_run})
     if dry_run:
         _refuse_idle("--dry-run runs nothing", {name: given[name] for name in ("--scheduler", "--workers")})
-    if dry_run:
         for name, told in forecast(study, only=only or (), force=force or ()).items():
             typer.echo(f"{name}: {told}")
         return
@@ -102,7 +101,7 @@ def demo(
             "--full", help="The published size, an hour: seven sets, 75,000 cells; friedman is cut, which it tells."
         ),
     ] = False,
-    workers: Annotated[int | None, typer.Option(min=1, help="Stages at once. Default: one for each core.")] = None,
+    workers: Workers = None,
 ) -> None:
     """A heel phantom with known strain under four loads, taken through a whole study: error by tissue, and a report."""
     from mrstrain.records.progress import live

@@ -1,14 +1,18 @@
-"""The commands that tell how exact a measurement is: phantoms, twins and their study."""
+"""The commands that measure the accuracy of a registration: phantoms, synthetic warps and their study."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mrstrain.cli.options import FieldFrame, Out, takes_options
+from mrstrain.cli.options import FieldFrame, Out, takes_options, tell
 from mrstrain.options.measurement import SubjectFiles
+from mrstrain.options.modelling import HeelShape
+
+SliceSpacing = Annotated[float | None, typer.Option(help="Their edge along the third axis, where it is another, mm.")]
 
 
+@takes_options
 def phantom(
     out: Out,
     seed: Annotated[int, typer.Option(min=0, help="Of shapes, textures, noise and the foot's motions.")] = 1,
@@ -16,36 +20,24 @@ def phantom(
         list[str] | None, typer.Option(help="Load1, Load2, Load3 or Load4; repeat for several. Default: all.")
     ] = None,
     spacing: Annotated[float, typer.Option(help="Edge of the voxels, mm.")] = 0.8,
-    slice_spacing: Annotated[
-        float | None, typer.Option(help="Their edge along the third axis, where it is another, mm.")
-    ] = None,
+    slice_spacing: SliceSpacing = None,
     snr: Annotated[float, typer.Option(help="Fat's signal over the noise's standard deviation.")] = 25.0,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Images without noise.")] = False,
-    size: Annotated[float, typer.Option(help="Factor on all shapes; 1 is a calcaneus 67 mm long.")] = 1.0,
-    pad: Annotated[float, typer.Option(help="Tissue below the calcaneus, skin included, mm.")] = 18.0,
-    skin: Annotated[float, typer.Option(help="Thickness of the skin, mm.")] = 2.0,
-    lobules: Annotated[float, typer.Option(help="Width of the fat's lobules, mm.")] = 6.0,
+    *,
+    shape: HeelShape,
 ) -> None:
     """Images of a synthetic heel under Load0 to Load4, with their exactly known strain."""
     from mrstrain.records.progress import live
     from mrstrain.truth.phantom import phantom as run
     from phantoms import LOADS
 
+    edges = (spacing, spacing, spacing if slice_spacing is None else slice_spacing)
     with live() as progress:
-        made = run(
-            out,
-            seed=seed,
-            loads=load or tuple(LOADS),
-            spacing_mm=(spacing, spacing, spacing if slice_spacing is None else slice_spacing),
-            snr=None if no_noise else snr,
-            size=size,
-            pad_mm=pad,
-            skin_mm=skin,
-            lobule_mm=lobules,
+        made = run.with_options(
+            out, seed=seed, loads=load or tuple(LOADS), spacing_mm=edges, snr=None if no_noise else snr, shape=shape,
             progress=progress,
-        )
-    for line in made.summary():
-        typer.echo(line)
+        )  # fmt: skip
+    tell(made)
 
 
 @takes_options
@@ -63,16 +55,7 @@ def twin(
     """A loaded image made of your own unloaded one, with the truth beside it: to see how well that is found."""
     from mrstrain.truth.twin import twin as run
 
-    made = run.with_options(
-        load0,
-        deformation,
-        out=out,
-        subject_files=subject_files,
-        frame=frame,
-        seed=seed,
-    )
-    for line in made.summary():
-        typer.echo(line)
+    tell(run.with_options(load0, deformation, out=out, subject_files=subject_files, frame=frame, seed=seed))
 
 
 def accuracy(
@@ -82,9 +65,7 @@ def accuracy(
         typer.Option(help="gauss-newton, gauss-newton-borders (labels), elastix' preset or file (.txt); repeatable."),
     ] = None,
     spacing: Annotated[list[float] | None, typer.Option(help="Edge of the voxels, mm; repeat for several.")] = None,
-    slice_spacing: Annotated[
-        float | None, typer.Option(help="Their edge along the third axis, where it is another, mm.")
-    ] = None,
+    slice_spacing: SliceSpacing = None,
     snr: Annotated[list[float] | None, typer.Option(help="Signal-to-noise ratio; repeat for several.")] = None,
     motion: Annotated[
         list[str] | None,
@@ -113,7 +94,4 @@ def accuracy(
     cases = accuracy_cases(preset or (DEFAULT,), conditions, motion or (*MOTIONS, *WAVES), seed or SEEDS)
     with live() as progress:
         study = run(out, cases=cases, workers=workers, tell_plan=typer.echo, progress=progress)
-    for line in study.summary():
-        typer.echo(line)
-    if study.failures:
-        raise typer.Exit(1)
+    tell(study, not study.failures)

@@ -12,16 +12,7 @@ from dvc.report.page import Section
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """A measurement that was written: its folder and its part of the report, in place of its arrays.
-
-    Attributes
-    ----------
-    folder : Path
-    section : Section
-        Of the report.
-    lines : tuple of str
-        For a person.
-    """
+    """A measurement that was written: its folder, section of the report and summary, in place of its arrays."""
 
     folder: Path
     section: Section
@@ -34,12 +25,12 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Of the load."""
+        """Name of the load."""
         return self.section.title
 
     @property
     def verdict(self) -> Verdict:
-        """On the registration."""
+        """Verdict on the registration."""
         assert self.section.verdict is not None
         return self.section.verdict
 

@@ -1,5 +1,7 @@
 """The engine that a command registers with, by the flat options that it was asked with."""
 
+from __future__ import annotations
+
 from dvc import Elastix, Engine, GaussNewton, GaussNewtonWithInterfaces, load_preset, read_parameter_file
 from dvc.errors import InputError, ParameterError
 from dvc.registration.engines import DEFAULT, ENGINES
@@ -20,12 +22,10 @@ def volume_kept(how: EngineOptions) -> float | None:
 
 
 def engine_of(how: RegistrationOptions, *, labelled: bool = False) -> Engine:
-    """The engine asked for, with its preset, parameter files or weights; what belongs to the other one is refused.
+    """The engine asked for, with its preset, parameter files or weights; options of another engine are refused.
 
-    The Gauss-Newton engine lets strain jump at tissue interfaces where ``labelled``, a label map tells them, unless
+    With a label map (``labelled``) the Gauss-Newton engine allows strain discontinuities at tissue interfaces, unless
     ``borders`` is False.
-
-    Raises InputError for tissue interfaces that no label map tells.
     """
     name, preset, parameters = _asked(how), how.preset, how.parameters
     bending, volume, borders = how.bending, how.volume, how.borders

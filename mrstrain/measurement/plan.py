@@ -1,5 +1,7 @@
 """How the loads of a subject are measured: one by one, in a series or by a worker of a study."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +22,7 @@ _SETTINGS = {*EngineOptions.model_fields, "align", "bending", "volume", "allow_u
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """A pair that was registered, and what came back from its twin, if one was asked for."""
+    """A registered pair, and the check against its twin, if one was asked for."""
 
     found: Registration
     twin: TwinCheck | None
@@ -29,19 +31,13 @@ class Registered:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """What all loads of a subject are registered and judged by.
-
-    subject: With its tissue.
-    evidence: Landmarks and error model.
-    record: Provenance.
-    twin: Whether each pair's twin is registered, too.
-    """
+    """What all loads of a subject, whose tissue is known, are registered and judged by."""
 
     subject: Subject
     settings: Settings
-    evidence: Evidence
-    record: Mapping[str, object]
-    twin: bool = False
+    evidence: Evidence  # landmarks and error model
+    record: Mapping[str, object]  # provenance
+    twin: bool = False  # whether each pair's twin is registered, too
 
     def register(
         self, loaded: Image, start: Deformation | None, worker: Worker, tell: Tell, *, is_repeat: bool = False
@@ -62,7 +58,7 @@ class Plan:
         return Registered(found, twin_check(found, self.subject, start, worker, tell) if wanted else None, is_repeat)
 
     def write(self, folder: Path, done: Registered, floor: NoiseFloor | None) -> tuple[Case, NoiseFloor | None]:
-        """Judge what was registered and write it; with the noise floor by which it was judged, or which it is."""
+        """Judge what was registered and write it; return it with the noise floor that it was judged by, or gives."""
         more = Evidence(noise_floor=floor) if done.is_repeat else replace(self.evidence, noise_floor=floor)
         evidence = replace(more, error_model=self.evidence.error_model, twin=done.twin)
         measured = Measurement.from_registration(

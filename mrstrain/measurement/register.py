@@ -33,16 +33,16 @@ _BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plat
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """What a series gave.
+    """Result of `register`.
 
     Attributes
     ----------
     out : Path
         Folder of all results; ``report.html`` is in it.
     cases : tuple of Case
-        The loads that were registered, in the order given; the repeat scan first, if there is one.
+        The registered loads, in the order given; the repeat scan first, if there is one.
     failures : dict
-        Load to the reason why it was not.
+        Name of each load that could not be registered, and why.
     """
 
     out: Path
@@ -50,7 +50,7 @@ class Series:
     failures: dict[str, str]
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines."""
         lines = [line for case in self.cases for line in case.summary()]
         lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
         return [*lines, f"Report: {self.out / REPORT}"]
@@ -71,22 +71,18 @@ def register(
 ) -> Series:
     """Register loaded images to the unloaded one and write displacement, strain, quality and a report.
 
+    A load that fails is named in ``failures``; the others are finished.
+
     Parameters
     ----------
     load0 : path
         Unloaded image (reference configuration).
     loads : paths
         Loaded images. Each gets a folder in ``out`` named after its file.
-    out : path
     subject_files, registration, scans, onto, running
         Their fields are given as keywords, such as ``labels=...``.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
-
-    Returns
-    -------
-    Series
-        A load that fails is named in ``failures``; the others are finished.
 
     Raises
     ------
@@ -164,7 +160,7 @@ def _check_start(scans: Scans, engine: Engine) -> None:
 
 
 def _first_guess(scans: Scans, held: Mask | None) -> Deformation | None:
-    """What the loads start from, without the motion of the mask that is aligned on."""
+    """Deformation that the loads start from, without the rigid motion of the mask that is aligned on."""
     return None if scans.start is None else without_motion(read_any(scans.start, scans.start_frame), held)[0]
 
 

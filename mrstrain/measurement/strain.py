@@ -1,5 +1,7 @@
 """`strain`: strain maps from a transform or displacement field that any tool has made."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +22,7 @@ _TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm", ".npz")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Given:
-    """A deformation that was found elsewhere, with the subject it belongs to.
-
-    whole: Of points of the reference to points of the loaded image, LPS mm.
-    record: Provenance.
-    """
+    """A deformation from another tool, which maps points of the subject's reference to the loaded image, LPS mm."""
 
     subject: Subject
     whole: Deformation
@@ -37,7 +35,7 @@ class Given:
         return [self.source, *self.subject.files.values()]
 
     def measured(self, name: str) -> Measurement:
-        """The strain of it; relative to the bone, where there is one."""
+        """Its strain; relative to the bone, where there is one."""
         return Measurement.from_deformation(self.whole, self.subject, name=name)
 
 
@@ -62,13 +60,13 @@ def read_deformation(
 
 @dataclass(frozen=True, slots=True)
 class Strained:
-    """What `strain` gave: the folder and the case in it."""
+    """Result of `strain`: the folder and the case in it."""
 
     out: Path
     case: Case
 
     def summary(self) -> list[str]:
-        """A few lines for a person."""
+        """Summary, a few lines."""
         return [*self.case.summary(), f"Report: {self.out / REPORT}"]
 
 
@@ -82,16 +80,15 @@ def strain(
     frame: Frame | None = None,
     onto: MeshAndAxes,
 ) -> Strained:
-    """Strain maps of a deformation that was found elsewhere.
+    """Strain maps of a deformation that another tool measured.
 
     Parameters
     ----------
     reference : path
         Unloaded image (reference configuration): gives the voxels.
     deformation : path
-        An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), a spline with borders of
-        tissues (.npz), or a displacement image. All map points of the reference to points of the loaded image.
-    out : path
+        An elastix transform file (.txt, with its chain), an ITK transform (.h5, .tfm, .mat), a spline with tissue
+        interfaces (.npz), or a displacement image. All map points of the reference to points of the loaded image.
     subject_files
         With a bone, its rigid motion (least squares over its voxels) is taken out of the displacement; ``tissue`` is
         where strain is wanted.
@@ -99,26 +96,17 @@ def strain(
         Frame of a displacement image's components, where no JSON file beside it tells.
     onto
         As in `register`.
-
-    Returns
-    -------
-    Strained
     """
     target, source = Path(out), Path(deformation)
     subject = read_subject(reference, subject_files, onto)
-    given = read_deformation(
-        subject,
-        deformation,
-        frame=frame,
-        command="strain",
-        parameters={
-            "bone_label": subject_files.bone_label,
-            "plate_normal_lps": subject.plate_normal.tolist(),
-            "shear_direction_lps": onto.plain()["shear_direction"],
-            "mesh_unit": onto.mesh_unit,
-            "mesh_frame": onto.mesh_frame,
-        },
-    )
+    parameters = {
+        "bone_label": subject_files.bone_label,
+        "plate_normal_lps": subject.plate_normal.tolist(),
+        "shear_direction_lps": onto.plain()["shear_direction"],
+        "mesh_unit": onto.mesh_unit,
+        "mesh_frame": onto.mesh_frame,
+    }
+    given = read_deformation(subject, deformation, frame=frame, command="strain", parameters=parameters)
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"
     refuse_touching_inputs(target, [name], given.files)
     measured = given.measured(name)

@@ -1,4 +1,6 @@
-"""The twin of a registered pair: the unloaded image moved by what was measured, and measured again."""
+"""The twin of a registered pair: the unloaded image, warped by the measured deformation and measured again."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 
@@ -16,30 +18,19 @@ _FOLDED = 1e-3
 
 
 def twin_check(
-    found: Registration,
-    subject: Subject,
-    start: Deformation | None,
-    worker: Worker,
-    tell: Callable[[str, float], None],
+    found: Registration, subject: Subject, start: Deformation | None, worker: Worker, tell: Callable[[str, float], None]
 ) -> TwinCheck:
-    """Move the unloaded image by what was found, draw its noise anew, and register it as the pair was.
+    """Warp the unloaded image by the measured deformation, draw its noise anew, and register it as the pair was.
 
-    The twin lies on the loaded image's grid, and is as noisy as the noisier of the two.
-
-    found: Of the pair. Its strain is the twin's true one.
-    start: What the pair's registration started from.
-    tell: ``tell(stage, fraction)``.
+    The true strain of this twin is that of the pair's registration ``found``, which began at ``start``. The twin lies
+    on the loaded image's grid, and is as noisy as the noisier of the two images.
     """
     tell("making the twin", 0.0)
-    motion, seed = found.alignment.motion, found.settings.seed
     try:
+        acquisition = Acquisition(found.settings.seed, found.loaded.grid, noise_factor=_noisier(found))
+        near = found.alignment.motion
         twin = synthetic_warp(
-            found.reference,
-            found.tissue,
-            found.total,
-            Acquisition(seed, found.loaded.grid, noise_factor=_noisier(found)),
-            near=motion,
-            beyond_missing=True,
+            found.reference, found.tissue, found.total, acquisition, near=near, beyond_missing=True
         ).image
         tell("making the twin", 1.0)
         again = register(
@@ -63,7 +54,7 @@ def twin_check(
 
 
 def _noisier(found: Registration) -> float:
-    """How many times noisier the loaded image is than the unloaded one, for its signal; at least 1."""
+    """Noise-to-signal ratio of the loaded image relative to that of the unloaded one; at least 1."""
     try:
         loaded = signal_to_noise(found.loaded, tissue_mask(found.loaded))
     except InputError:  # no threshold finds the body there

@@ -47,13 +47,13 @@ def door(function: Callable[P, R_co]) -> Door[P, R_co]:
         }
         return function(*given, **options, **made)
 
-    flat.__signature__ = flat_signature(function, models)  # type: ignore[attr-defined]
+    flat.__signature__ = _flat_signature(function, models)  # type: ignore[attr-defined]
     flat.__doc__ = f"{inspect.cleandoc(function.__doc__ or '')}\n\n{_documented(models)}\n"
     flat.with_options = function  # type: ignore[attr-defined]
     return cast(Door[P, R_co], flat)
 
 
-def flat_signature(function: Callable[..., object], models: dict[str, type[Options]]) -> inspect.Signature:
+def _flat_signature(function: Callable[..., object], models: dict[str, type[Options]]) -> inspect.Signature:
     """The signature of a function with the fields of its models in their place, as keywords."""
     signature = inspect.signature(function)
     parameters = []

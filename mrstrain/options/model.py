@@ -1,5 +1,7 @@
 """What every model of options can do, and the kinds of values that options have."""
 
+from __future__ import annotations
+
 import functools
 import numbers
 import operator
@@ -16,20 +18,13 @@ from pydantic.fields import FieldInfo
 
 @dataclass(frozen=True, slots=True)
 class Cli:
-    """How the command line calls a field, where it does not call it by its name.
+    """How the command line offers a field, where it differs from the field itself."""
 
-    name: The option, with its dashes.
-    help: In place of the field's own.
-    panel: Part of the help that it stands in, in place of its model's.
-    off: Whether the option is a flag that turns the field off.
-    times: Factor from the option's unit to the field's.
-    """
-
-    name: str | None = None
+    name: str | None = None  # with its dashes
     help: str | None = None
-    panel: str | None = None
-    off: bool = False
-    times: float = 1.0
+    panel: str | None = None  # group of the help, in place of its model's
+    off: bool = False  # whether the option is a flag that turns the field off
+    times: float = 1.0  # factor from the option's unit to the field's
 
 
 def _number(given: Any) -> Any:
@@ -76,10 +71,7 @@ class Options(BaseModel):
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Self:
-        """The options given by name, the others by default.
-
-        Raises ParameterError with each option that cannot be used, why, and what was given.
-        """
+        """The options given by name, the others by default; ParameterError names each that cannot be used, and why."""
         try:
             return cls(**given)
         except ValidationError as wrong:
@@ -91,16 +83,16 @@ class Options(BaseModel):
 
     @classmethod
     def option(cls, name: str) -> str:
-        """What the command line calls a field."""
+        """Name of a field on the command line."""
         return cls.cli(name).name or "--" + name.replace("_", "-")
 
     @classmethod
     def cli(cls, name: str) -> Cli:
-        """How the command line takes a field."""
+        """How the command line offers a field."""
         return next((m for m in cls.model_fields[name].metadata if isinstance(m, Cli)), Cli())
 
     def located(self, folder: Path) -> Self:
-        """The same with every path from a folder."""
+        """The same options with every path relative to a folder."""
         return self.model_copy(update={name: _located(value, folder) for name, value in self if _paths(value)})
 
     @property
@@ -110,15 +102,15 @@ class Options(BaseModel):
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """All of them."""
+        """All paths among the fields."""
         return tuple(path for paths in self.files.values() for path in paths)
 
     def narrowed(self, model: type[_M]) -> _M:
-        """The part of these options that another model, one of their bases, has."""
+        """The fields that these options share with another model, one of their bases."""
         return model.model_validate({field: getattr(self, field) for field in model.model_fields})
 
     def plain(self) -> dict[str, Any]:
-        """Values that JSON holds."""
+        """The fields as values that JSON can hold."""
         return self.model_dump(mode="json")
 
 
@@ -141,7 +133,7 @@ def reason(error: Mapping[str, Any]) -> str:
 
 
 def bare(annotation: Any, metadata: list[Any]) -> Any:
-    """A type without what pydantic is told beside it, which is added to ``metadata``."""
+    """A type without its Annotated metadata, which is added to ``metadata``."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         for told in inner[1:]:

@@ -1,4 +1,4 @@
-"""Options of finite-element models: the mesh, the plate, and the simulation."""
+"""Options of models: the synthetic heel, the mesh, the plate, and the simulation."""
 
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple
@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 from pydantic import Field
 
 from mrstrain.options.measurement import Frame, Unit
-from mrstrain.options.model import Cli, Flag, Names, NotNegative, Options, Positive, Vector
+from mrstrain.options.model import Cli, Flag, Names, NotNegative, Options, Positive, Real, Vector
 
 MINUTE_S = 60.0
 
@@ -72,6 +72,19 @@ class Directions(Options):
     """The plate's outward normal, away from the foot, LPS; default, patient inferior: --plate-normal 0 0 -1."""
     shear_direction: Vector = (0.0, -1.0, 0.0)
     """Direction of the shear force on the tissue, LPS, such as --shear-direction 0 -1 0 (anterior)."""
+
+
+class HeelShape(Options):
+    """Shape of a synthetic heel; ranges as in `phantoms.Heel`."""
+
+    size: Real = 1.0
+    """Factor on all shapes; 1 is a calcaneus 67 mm long."""
+    pad_mm: Annotated[Real, Cli("--pad")] = 18.0
+    """Tissue below the calcaneus, skin included, mm."""
+    skin_mm: Annotated[Real, Cli("--skin")] = 2.0
+    """Thickness of the skin, mm."""
+    lobule_mm: Annotated[Real, Cli("--lobules")] = 6.0
+    """Width of the fat's lobules, mm."""
 
 
 class PlateOptions(Directions):

@@ -3,6 +3,7 @@
 import hashlib
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -184,12 +185,9 @@ def _finished(folder: Path) -> dict[str, ErrorSamples]:
     """Samples of this and earlier calls, by case, whose preset and software are unchanged."""
     runs: dict[str, ErrorSamples] = {}
     for path in sorted(folder.glob("*.npz")):
-        try:
-            samples = ErrorSamples.read(path, _key)
-        except MrstrainError:  # the parameter file no longer exists
-            continue
-        if samples is not None:
-            runs[samples.case.name] = samples
+        with suppress(MrstrainError):  # the parameter file no longer exists
+            if samples := ErrorSamples.read(path, _key):
+                runs[samples.case.name] = samples
     return runs
 
 
@@ -256,37 +254,28 @@ def _measure_all(
 
 
 def _write(target: Path, runs: Sequence[ErrorSamples], failures: dict[str, str]) -> AccuracyStudy:
-    study = AccuracyStudy(
-        target, tuple(error_rows(runs)), tuple(floor_rows(runs)), tuple(resolution_rows(runs)), failures
+    errors, floors, resolution = tuple(error_rows(runs)), tuple(floor_rows(runs)), tuple(resolution_rows(runs))
+    study, coverage = AccuracyStudy(target, errors, floors, resolution, failures), coverage_rows(runs)
+    tables: tuple[tuple[str, type[Any], Sequence[Any]], ...] = (
+        ("errors", ErrorRow, errors),
+        ("zero_strain", FloorRow, floors),
+        ("resolution", ResolutionRow, resolution),
+        ("coverage", CoverageRow, coverage),
+        ("runs", RunRow, run_rows(runs)),
     )
-    coverage = coverage_rows(runs)
-    tables: dict[str, tuple[type[Any], Sequence[Any]]] = {
-        "errors": (ErrorRow, study.errors),
-        "zero_strain": (FloorRow, study.floors),
-        "resolution": (ResolutionRow, study.resolution),
-        "coverage": (CoverageRow, coverage),
-        "runs": (RunRow, run_rows(runs)),
-    }
-    for name, (kind, rows) in tables.items():
+    for name, kind, rows in tables:
         write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], map(astuple, rows))
     presets = {preset: engine_named(preset).text for preset in dict.fromkeys(r.case.preset for r in runs)}
-    for preset, parameters in presets.items():
+    for preset, text in presets.items():
         some = [r for r in runs if r.case.preset == preset and r.case.keeps_volume and r.case.wavelength_mm is None]
         if some:
-            model = fit_error_model(some, parameters, _source(some))
+            model = fit_error_model(some, text, _source(some))
             model.write(target / f"error_model_{Path(preset).stem}.json")
-    record = provenance(
-        "accuracy",
-        {},
-        {
-            "cases": [r.case.name for r in runs],
-            "failures": dict(failures),
-            "presets": presets,
-            "seconds_of_registration": {r.case.name: round(r.seconds, 1) for r in runs},
-        },
-    )
+    seconds = {r.case.name: round(r.seconds, 1) for r in runs}
+    parameters = {"cases": list(seconds), "failures": failures, "presets": presets, "seconds_of_registration": seconds}
+    record = provenance("accuracy", {}, parameters)
     write_json(target / PROVENANCE, record)
-    write_accuracy_report(target / REPORT, study.errors, study.floors, study.resolution, coverage, failures, record)
+    write_accuracy_report(target / REPORT, errors, floors, resolution, coverage, failures, record)
     return study
 
 

@@ -1,12 +1,17 @@
 """The report of an accuracy study: tables, figures, and how to read them."""
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from __future__ import annotations
 
-from dvc.report.page import Picture, Section, Table, record_lines, write_report
+from collections.abc import Iterator, Mapping, Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import TypeVar
+
+from dvc.report.page import Picture, Section, Table, caption_of, record_lines, write_report
 from dvc.trust.error_model import POOLED
 from phantoms import CoverageRow, ErrorRow, FloorRow, ResolutionRow, figures, wavelength_recovered
 
+_R = TypeVar("_R", ErrorRow, ResolutionRow)
 _CLOSING = (
     Section(
         "How to read this",
@@ -38,19 +43,14 @@ def write_accuracy_report(
     record: Mapping[str, object],
 ) -> None:
     """Write the report of an accuracy study, one self-contained page."""
-    sections = []
-    for condition in dict.fromkeys(map(_condition, errors)):
-        rows = [row for row in errors if _condition(row) == condition]
-        still = [row for row in floors if _condition(row) == condition]
-        sections.append(_condition_section(condition, rows, still))
+    sections = [_condition_section(*of_one) for of_one in _by_condition(errors, floors)]
     if resolution:
         sections.append(_resolution_section(floors, resolution))
     if coverage:
         sections.append(_coverage_section(coverage))
     if failures:
-        sections.append(
-            Section("Without a result", tables=(Table("Failures", ("case", "reason"), tuple(failures.items())),))
-        )
+        table = Table("Failures", ("case", "reason"), tuple(failures.items()))
+        sections.append(Section("Without a result", tables=(table,)))
     write_report(path, "Accuracy of registration presets", None, sections, _CLOSING, record_lines(record))
 
 
@@ -58,36 +58,33 @@ def _condition(row: ErrorRow | FloorRow | ResolutionRow) -> tuple[str, str, floa
     return row.preset, row.voxel_mm, row.snr
 
 
-def _condition_section(
-    condition: tuple[str, str, float], errors: Sequence[ErrorRow], floors: Sequence[FloorRow]
-) -> Section:
-    preset, voxel, snr = condition
-    tables = [
-        Table(
-            "Error by motion and tissue",
-            ("motion", "tissue", "true shear: median", "p95", "error: bias", "SD", "RMSE", "p95", "u, mm: RMSE", "p95"),
-            tuple(
-                (
-                    _motion(r), r.tissue, r.true_p50, r.true_p95, r.shear_bias, r.shear_sd, r.shear_rmse, r.shear_p95,
-                    r.u_rmse_mm, r.u_p95_mm,
-                )
-                for r in errors
-                if r.by == "all"
-            ),
-        )
-    ]  # fmt: skip
+def _named(row: ResolutionRow | CoverageRow) -> tuple[str, str, float]:
+    return row.preset, f"{row.voxel_mm} mm", row.snr
+
+
+def _by_condition(rows: Sequence[_R], floors: Sequence[FloorRow]) -> Iterator[tuple[list[_R], list[FloorRow]]]:
+    """Rows of one condition, and its noise floor."""
+    for condition in dict.fromkeys(map(_condition, rows)):
+        yield [r for r in rows if _condition(r) == condition], [f for f in floors if _condition(f) == condition]
+
+
+def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> Section:
+    head = ("motion", "tissue", "true shear: median", "p95", "error: bias", "SD", "RMSE", "p95", "u, mm: RMSE", "p95")
+    values = attrgetter(
+        "tissue", "true_p50", "true_p95", "shear_bias", "shear_sd", "shear_rmse", "shear_p95", "u_rmse_mm", "u_p95_mm"
+    )
+    rows = tuple((_motion(r), *values(r)) for r in errors if r.by == "all")
+    tables = [Table("Error by motion and tissue", head, rows)]
     if floors:
-        tables.append(
-            Table(
-                "Noise floor: apparent strain without load",
-                ("tissue", "MAER", "SDER", "apparent shear, median", "p95"),
-                tuple((f.tissue, f.maer, f.sder, f.shear_p50, f.shear_p95) for f in floors),
-            )
-        )
+        of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
+        noise = tuple((f.tissue, f.maer, f.sder, f.shear_p50, f.shear_p95) for f in floors)
+        tables.append(Table("Noise floor: apparent strain without load", of_floor, noise))
+    caption = caption_of(figures.errors_by_place)
     pictures = tuple(
-        Picture.drawn(f"Error by {by.split(',')[0]}", figures.errors_by_place, errors, by)
+        Picture(f"Error by {by.split(',')[0]}", caption, figures.errors_by_place(errors, by))
         for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
     )
+    preset, voxel, snr = _condition(errors[0])
     return Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tuple(tables), pictures=pictures)
 
 
@@ -100,31 +97,25 @@ def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
         "Coverage of the error model",
         ("preset", "voxel", "SNR", "motion", "tissue", "voxels, %", "remaining error, mean", "tissue's figures, %"),
         tuple(
-            (
-                r.preset, f"{r.voxel_mm} mm", r.snr, r.motion, r.tissue, 100 * r.voxels_within, r.left_over,
-                100 * r.figures_within,
-            )
-            for r in rows
+            (*_named(r), r.motion, r.tissue, 100 * r.voxels_within, r.left_over, 100 * r.figures_within) for r in rows
         ),
         "Each heel is compared with a model fitted to the other heels under the same motions. Voxels: truth within "
         "1.96 SD, 95 % if the model is right. Figures: percentiles and volumes within the intervals that `register` "
         "would give.",
-    )  # fmt: skip
+    )
     return Section("Does the error model hold?", tables=(table,))
 
 
 def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow]) -> Section:
     table_rows = []
-    for condition in dict.fromkeys(map(_condition, rows)):
-        of_condition = [r for r in rows if _condition(r) == condition]
-        floor = next((f for f in floors if _condition(f) == condition and f.tissue == POOLED), None)
-        noise = (None, None, None) if floor is None else (floor.shear_p50, floor.maer, floor.sder)
+    for of_condition, still in _by_condition(rows, floors):
+        noise = next(((f.shear_p50, f.maer, f.sder) for f in still if f.tissue == POOLED), (None, None, None))
         wavelengths = [wavelength_recovered(of_condition, fraction) for fraction in (0.9, 0.5)]
-        preset, voxel, snr = condition
-        table_rows.append((preset, f"{voxel} mm", snr, *wavelengths, *noise))
+        table_rows.append((*_named(of_condition[0]), *wavelengths, *noise))
     columns = ("preset", "voxel", "SNR", "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
-    pictures = [Picture.drawn("Spatial resolution", figures.resolution, rows)]
+    pictures = [Picture("Spatial resolution", caption_of(figures.resolution), figures.resolution(rows))]
     if floors:
-        pictures.append(Picture.drawn("Noise against resolution", figures.trade_off, floors, rows, POOLED))
+        trade_off = figures.trade_off(floors, rows, POOLED)
+        pictures.append(Picture("Noise against resolution", caption_of(figures.trade_off), trade_off))
     table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows))
     return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypedDict, Unpack
 
 import numpy as np
 
@@ -14,6 +13,8 @@ from dvc.deformation.protocol import Motion
 from dvc.errors import InputError
 from dvc.io.result_folder import PROVENANCE, REGIONS, write_maps
 from dvc.trust.regions import region_statistics, write_regions_csv
+from mrstrain.options.door import door
+from mrstrain.options.modelling import HeelShape
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
@@ -22,15 +23,6 @@ from phantoms import LOADS, Heel, covering, heel_grid, labels_of, labels_to_mesh
 _BYTES_PER_VOXEL = 12  # measured: files of one load, image and truth
 _STAGE = "images and truth"
 _REPEAT = 100  # acquisition number of the repeat scan
-
-
-class HeelShape(TypedDict, total=False):
-    """Shape of the heel; see `phantoms.Heel`."""
-
-    size: float
-    pad_mm: float
-    skin_mm: float
-    lobule_mm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +44,7 @@ class PhantomFiles:
         ]
 
 
+@door
 def phantom(
     out: Path | str,
     *,
@@ -60,7 +53,7 @@ def phantom(
     spacing_mm: float | Sequence[float] = 0.8,
     snr: float | None = 25.0,
     progress: OnProgress | None = None,
-    **shape: Unpack[HeelShape],
+    shape: HeelShape,
 ) -> PhantomFiles:
     """Make images of a synthetic heel, unloaded and loaded, with exactly known strain.
 
@@ -79,8 +72,6 @@ def phantom(
         Signal of fat over the standard deviation of the noise; None for images without noise.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
-    **shape
-        ``size``, ``pad_mm``, ``skin_mm`` and ``lobule_mm`` of the heel; see `phantoms.Heel`.
 
     Raises
     ------
@@ -89,7 +80,7 @@ def phantom(
     OutputError
         If the folder cannot be written to, or the disk has too little room.
     """
-    heel = Heel(seed, **shape)
+    heel = Heel(seed, **dict(shape))
     grid = heel_grid(spacing_mm, heel.size)
     if snr is not None and not 1.0 <= snr <= 1000.0:
         raise InputError(
@@ -103,10 +94,10 @@ def phantom(
     refuse_small_disk(target, needed, "the images need", ", larger voxels or fewer loads")
     make_output(target)
     parameters = {"seed": seed, "spacing_mm": np.broadcast_to(spacing_mm, 3).tolist(), "snr": snr}
-    parameters |= {name: getattr(heel, name) for name in HeelShape.__annotations__}
+    parameters |= shape.plain()
     parameters["loads_press_shear_slide_mm"] = {load: LOADS[load] for load in motions}
     record = provenance("phantom", {}, parameters)
-    images, foot_motions = _write_images(target, heel, grid, snr, motions, record, progress)
+    images, foot_motions = _write_images(target, heel, grid, snr, motions, record, progress or (lambda *_: None))
     record["foot_motion"] = {
         name: {"rotation": m.rotation.tolist(), "translation_lps_mm": m.translation_mm.tolist()}
         for name, m in foot_motions.items()
@@ -122,9 +113,9 @@ def _write_images(
     snr: float | None,
     motions: Mapping[str, Motion],
     record: dict[str, object],
-    progress: OnProgress | None,
+    progress: OnProgress,
 ) -> tuple[dict[str, Path], dict[str, RigidMotion]]:
-    """Write all images and the truth; paths of the images and motions of the foot, by name."""
+    """Write all images and the truth; return paths of the images and rigid foot motions, by name."""
     labels = labels_of(heel, grid)
     bone, body = labels.region("bone"), Mask(grid, labels.labels > 0)
     images: dict[str, Path] = {}
@@ -133,8 +124,7 @@ def _write_images(
     steps = iter(np.linspace(0.0, 1.0, 3 + 2 * len(motions)))
 
     def step() -> None:
-        if progress is not None:
-            progress("phantom", _STAGE, float(next(steps)))
+        progress("phantom", _STAGE, float(next(steps)))
 
     # Files are compressed in one thread while the next image is formed here.
     with ThreadPoolExecutor(1) as pool:

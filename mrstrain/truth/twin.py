@@ -18,7 +18,7 @@ _IMAGE = "twin.nii.gz"
 
 @dataclass(frozen=True, slots=True)
 class TwinFiles:
-    """What `twin` wrote: the warped image, the folder of the truth, and the truth in a line."""
+    """Files that `twin` wrote: the warped image and the folder of the truth; and its strain in a line."""
 
     image: Path
     truth: Path
@@ -57,13 +57,9 @@ def twin(
     out : path
         Gets ``twin.nii.gz`` and ``truth/twin`` in the layout of `register`'s results.
     subject_files, frame
-        As in `strain`; the truth is relative to the bone. ``tissue`` is also all that the made image shows.
+        As in `strain`; the truth is relative to the bone. ``tissue`` is also all that the warped image shows.
     seed : int
         Of noise and receive field.
-
-    Returns
-    -------
-    TwinFiles
 
     Raises
     ------

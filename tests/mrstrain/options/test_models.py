@@ -32,6 +32,7 @@ from mrstrain.options.model import Options
 from mrstrain.options.modelling import (
     Directions,
     Followed,
+    HeelShape,
     Labelling,
     LabelMapFile,
     MaterialSets,
@@ -48,6 +49,7 @@ from validate.location import LEAST_ML
 COMMANDS: dict[str, tuple[type[Options], ...]] = {
     "register": (SubjectFiles, RegistrationOptions, Scans, MeshAndAxes, Running),
     "strain": (SubjectFiles, MeshAndAxes),
+    "phantom": (HeelShape,),
     "twin": (SubjectFiles,),
     "mesh": (Labelling, Meshing),
     "simulate": (SimulationOptions, PlateOptions, MeshCoordinates, Cores),
@@ -79,6 +81,7 @@ NOT_IN_A_STUDY = {  # what a study has in its own way
     LabelMapFile: "the labels are those of [images]",
     ComparisonOn: "compared on the first model's mesh",
     Followed: "a study has one mesh",
+    HeelShape: "a study has images",
     ModelReading: "model.toml in a model's folder",
 }
 MODELS = [
