@@ -1,7 +1,5 @@
 """The engine that a command registers with, by the flat options that it was asked with."""
 
-from __future__ import annotations
-
 from dvc import Elastix, Engine, GaussNewton, GaussNewtonWithInterfaces, load_preset, read_parameter_file
 from dvc.errors import InputError, ParameterError
 from dvc.registration.engines import DEFAULT, ENGINES

@@ -1,7 +1,5 @@
 """How the loads of a subject are measured: one by one, in a series or by a worker of a study."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

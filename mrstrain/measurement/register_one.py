@@ -1,7 +1,5 @@
 """One loaded image registered by itself: the part of a series that a study gives to a worker of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`strain`: strain maps from a transform or displacement field that any tool has made."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

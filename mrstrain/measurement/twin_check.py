@@ -1,7 +1,5 @@
 """The twin of a registered pair: the unloaded image, warped by the measured deformation and measured again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

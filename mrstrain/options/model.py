@@ -1,7 +1,5 @@
 """What every model of options can do, and the kinds of values that options have."""
 
-from __future__ import annotations
-
 import functools
 import numbers
 import operator

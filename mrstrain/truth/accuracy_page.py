@@ -1,13 +1,11 @@
 """The report of an accuracy study: tables, figures, and how to read them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import TypeVar
 
-from dvc.report.page import Picture, Section, Table, caption_of, record_lines, write_report
+from dvc.report.page import Picture, Section, Table, record_lines, write_report
 from dvc.trust.error_model import POOLED
 from phantoms import CoverageRow, ErrorRow, FloorRow, ResolutionRow, figures, wavelength_recovered
 
@@ -79,9 +77,8 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -
         of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
         noise = tuple((f.tissue, f.maer, f.sder, f.shear_p50, f.shear_p95) for f in floors)
         tables.append(Table("Noise floor: apparent strain without load", of_floor, noise))
-    caption = caption_of(figures.errors_by_place)
     pictures = tuple(
-        Picture(f"Error by {by.split(',')[0]}", caption, figures.errors_by_place(errors, by))
+        Picture.drawn(f"Error by {by.split(',')[0]}", figures.errors_by_place, errors, by)
         for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
     )
     preset, voxel, snr = _condition(errors[0])
@@ -113,9 +110,8 @@ def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow
         wavelengths = [wavelength_recovered(of_condition, fraction) for fraction in (0.9, 0.5)]
         table_rows.append((*_named(of_condition[0]), *wavelengths, *noise))
     columns = ("preset", "voxel", "SNR", "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
-    pictures = [Picture("Spatial resolution", caption_of(figures.resolution), figures.resolution(rows))]
+    pictures = [Picture.drawn("Spatial resolution", figures.resolution, rows)]
     if floors:
-        trade_off = figures.trade_off(floors, rows, POOLED)
-        pictures.append(Picture("Noise against resolution", caption_of(figures.trade_off), trade_off))
+        pictures.append(Picture.drawn("Noise against resolution", figures.trade_off, floors, rows, POOLED))
     table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows))
     return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))
