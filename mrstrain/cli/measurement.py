@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from mrstrain.cli.options import FieldFrame, Out, takes_options, tell
+import mrstrain
+from mrstrain.cli.options import FieldFrame, Out, carry_out, takes_options, tell
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
 
 
@@ -21,15 +22,12 @@ def register(
     running: Running,
 ) -> None:
     """Displacement and strain of loaded images against the unloaded one, with quality and a report."""
-    from mrstrain.measurement.register import register as run
-    from mrstrain.records.progress import live
-
-    with live() as progress:
-        results = run.with_options(
+    carry_out(
+        lambda progress: mrstrain.register.with_options(
             load0, loads, out=out, subject_files=subject_files, registration=registration, scans=scans, onto=onto,
             running=running, progress=progress,
-        )  # fmt: skip
-    tell(results, not results.failures)
+        )
+    )  # fmt: skip
 
 
 @takes_options
@@ -45,7 +43,8 @@ def strain(
     frame: FieldFrame = None,
 ) -> None:
     """Strain maps from a transform or displacement field that any tool has made."""
-    from mrstrain.measurement.strain import strain as run
-
-    results = run.with_options(reference, deformation, out=out, subject_files=subject_files, frame=frame, onto=onto)
-    tell(results)
+    tell(
+        mrstrain.strain.with_options(
+            reference, deformation, out=out, subject_files=subject_files, frame=frame, onto=onto
+        )
+    )

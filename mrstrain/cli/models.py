@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from mrstrain.cli.options import Out, takes_options, tell
+import mrstrain
+from mrstrain.cli.options import Out, carry_out, takes_options, tell
 from mrstrain.options.comparison import ComparisonOn, ModelReading
 from mrstrain.options.measurement import Cores, EngineOptions, Seeded, SubjectFiles
 from mrstrain.options.modelling import (
@@ -43,15 +44,12 @@ def mesh(
     meshing: Meshing,
 ) -> None:
     """Soft tissues of a label map as tetrahedra, with named tissues and surfaces (bone, skin, cut)."""
-    from mrstrain.models.mesh import mesh as run
-    from mrstrain.records.progress import live
-
-    with live() as progress:
-        made = run.with_options(
+    carry_out(
+        lambda progress: mrstrain.mesh.with_options(
             labels, out=out, labelling=labelling, meshing=meshing,
             watch=lambda share: progress("mesh", "meshing", share),
-        )  # fmt: skip
-    tell(made)
+        )
+    )  # fmt: skip
 
 
 @takes_options
@@ -66,15 +64,13 @@ def simulate(
 ) -> None:
     """A rigid plate presses and shears soft tissue on fixed bone: displacement, strain and stress for each load."""
     from mrstrain.models.loads import loads_named
-    from mrstrain.models.simulate import simulate as run
-    from mrstrain.records.progress import live
 
-    with live() as progress:
-        done = run.with_options(
+    carry_out(
+        lambda progress: mrstrain.simulate.with_options(
             mesh, out=out, simulation=simulation, loads=loads_named(load), plate_options=plate_options,
             coordinates=coordinates, cores=cores, progress=progress,
-        )  # fmt: skip
-    tell(done, done.complete)
+        )
+    )  # fmt: skip
 
 
 @takes_options
@@ -95,17 +91,15 @@ def compare(
     ] = None,
 ) -> None:
     """Finite-element models of any code against a measurement: curves, areas, location, agreement, and a report."""
-    from mrstrain.comparison.compare import compare as run
     from mrstrain.records.inputs import read_matrix
-    from mrstrain.records.progress import live
 
     matrix = None if to_image is None else read_matrix(to_image)
-    with live() as progress:
-        done = run.with_options(
+    carry_out(
+        lambda progress: mrstrain.compare.with_options(
             dvc, models, out=out, labelling=labelling, reading=reading, to_image=matrix, directions=directions,
             comparison=comparison, progress=progress,
-        )  # fmt: skip
-    tell(done)
+        )
+    )  # fmt: skip
 
 
 @takes_options
@@ -117,12 +111,11 @@ def drive(
     coordinates: MeshCoordinates,
 ) -> None:
     """A model whose outside goes where the measurement puts it: laws are judged apart from the plate."""
-    from mrstrain.comparison.drive import drive as run
-    from mrstrain.records.progress import live
-
-    with live() as progress:
-        done = run.with_options(mesh, dvc, out=out, material=material, coordinates=coordinates, progress=progress)
-    tell(done, done.complete)
+    carry_out(
+        lambda progress: mrstrain.drive.with_options(
+            mesh, dvc, out=out, material=material, coordinates=coordinates, progress=progress
+        )
+    )
 
 
 @takes_options
@@ -140,15 +133,12 @@ def level(
     ] = None,
 ) -> None:
     """A model sent through the measurement itself (it moves the image, which is registered): like against like."""
-    from mrstrain.comparison.level import level as run
-    from mrstrain.records.progress import live
-
-    with live() as progress:
-        done = run.with_options(
+    carry_out(
+        lambda progress: mrstrain.level.with_options(
             load0, model, out=out, subject_files=subject_files, loads=load or (), engine=engine, reading=reading,
             seeded=seeded, progress=progress,
-        )  # fmt: skip
-    tell(done)
+        )
+    )  # fmt: skip
 
 
 @takes_options
@@ -166,16 +156,14 @@ def converge(
     ] = None,
 ) -> None:
     """The same loads on meshes of several sizes: percentiles of strain and plate travel, and what they tend to."""
-    from mrstrain.models.converge import converge as run
     from mrstrain.models.loads import loads_named
-    from mrstrain.records.progress import live
 
-    with live() as progress:
-        done = run.with_options(
+    carry_out(
+        lambda progress: mrstrain.converge.with_options(
             labels, edge_mm, out=out, labelling=labelling, followed=followed, loads=loads_named(load),
             directions=directions, workers=workers, progress=progress,
-        )  # fmt: skip
-    tell(done)
+        )
+    )  # fmt: skip
 
 
 def fit(
@@ -196,6 +184,4 @@ def fit(
     ] = "fat",
 ) -> None:
     """Parameters of a material law from a stretch-stress curve, with 95 % intervals and the range of stability."""
-    from mrstrain.models.fit import fit as run
-
-    tell(run(curve, law, out=out, test=test, nu=nu, tissue=tissue))
+    tell(mrstrain.fit(curve, law, out=out, test=test, nu=nu, tissue=tissue))

@@ -6,7 +6,7 @@ import operator
 from collections.abc import Callable
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Protocol, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Union, get_args, get_origin, get_type_hints
 
 import typer
 from pydantic.fields import FieldInfo
@@ -15,6 +15,9 @@ from typer.core import TyperCommand
 from mrstrain.options.door import models_of
 from mrstrain.options.measurement import Frame
 from mrstrain.options.model import Options, bare
+
+if TYPE_CHECKING:
+    from mrstrain.records.progress import OnProgress
 
 Out = Annotated[Path, typer.Option(help="Folder for the results; made where it is missing.", rich_help_panel="Output")]
 FieldFrame = Annotated[
@@ -28,17 +31,26 @@ _GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Compariso
 
 
 class Done(Protocol):
-    """Result of a command."""
+    """What a function of a command returns; where a part can fail, with ``complete``, whether none did."""
 
     def summary(self) -> list[str]:
         """Summary, a few lines."""
 
 
-def tell(done: Done, complete: bool = True) -> None:
-    """Print a summary, and end with status 1 where the result is not complete."""
+def carry_out(work: "Callable[[OnProgress], Done]", *, of_all: bool = False) -> None:
+    """Show live progress of what a command does, then `tell` it."""
+    from mrstrain.records.progress import live
+
+    with live(of_all=of_all) as progress:
+        done = work(progress)
+    tell(done)
+
+
+def tell(done: Done) -> None:
+    """Print a summary of what was done, and end with status 1 where it is not complete."""
     for line in done.summary():
         typer.echo(line)
-    if not complete:
+    if not getattr(done, "complete", True):
         raise typer.Exit(1)
 
 

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from mrstrain.cli.options import Out, tell
+import mrstrain
+from mrstrain.cli.options import Out, carry_out, tell
 
 StudyFile = Annotated[Path, typer.Argument(help="The study file, or its folder.")]
 Scheduler = Annotated[
@@ -20,16 +21,12 @@ def init(
     name: Annotated[str, typer.Option(help="In the report; nothing that names a patient.")] = "Subject 01",
 ) -> None:
     """Write a study file, with comments, from what a folder holds."""
-    from mrstrain.studies.init import init as run
-
-    tell(run(folder, name=name))
+    tell(mrstrain.init(folder, name=name))
 
 
 def check(study: StudyFile, workers: Workers = None) -> None:
     """Look at every input of a study: all that is wrong at once, and the time, memory and disk that a run takes."""
-    from mrstrain.studies.check import check as run
-
-    done = run(study, workers=workers)
+    done = mrstrain.check(study, workers=workers)
     tell(done)
     if done.wrong:
         raise typer.Exit(2)
@@ -47,25 +44,23 @@ def run(
     workers: Workers = None,
 ) -> None:
     """A study from its file to its report: register, mesh, simulate, compare. Goes on where it stopped."""
-    from mrstrain.records.progress import live
-    from mrstrain.studies.run import forecast, report, run as start
+    from mrstrain.studies.run import forecast, report
 
     given = {"--only": only, "--force": force, "--scheduler": scheduler, "--workers": workers}
     if report_only:
         _refuse_idle("--report-only runs nothing", given | {"--dry-run": dry_run})
-    if dry_run:
+        tell(report(study))
+    elif dry_run:
         _refuse_idle("--dry-run runs nothing", {name: given[name] for name in ("--scheduler", "--workers")})
         for name, told in forecast(study, only=only or (), force=force or ()).items():
             typer.echo(f"{name}: {told}")
-        return
-    if report_only:
-        done = report(study)
     else:
-        with live(of_all=True) as progress:
-            done = start(
+        carry_out(
+            lambda progress: mrstrain.run(
                 study, only=only or (), force=force or (), scheduler=scheduler, workers=workers, progress=progress
-            )
-    tell(done, done.complete)
+            ),
+            of_all=True,
+        )
 
 
 def _refuse_idle(why: str, given: Mapping[str, object]) -> None:
@@ -84,12 +79,10 @@ def cohort(
     workers: Workers = None,
 ) -> None:
     """The studies of many subjects on one cluster: one table, one report, and the models ranked over all."""
-    from mrstrain.records.progress import live
-    from mrstrain.studies.cohort import cohort as start
-
-    with live(of_all=True) as progress:
-        done = start(studies, out=out, scheduler=scheduler, workers=workers, progress=progress)
-    tell(done, done.complete)
+    carry_out(
+        lambda progress: mrstrain.cohort(studies, out=out, scheduler=scheduler, workers=workers, progress=progress),
+        of_all=True,
+    )
 
 
 def demo(

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from mrstrain.cli.options import FieldFrame, Out, takes_options, tell
+import mrstrain
+from mrstrain.cli.options import FieldFrame, Out, carry_out, takes_options, tell
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.options.modelling import HeelShape
 
@@ -27,17 +28,15 @@ def phantom(
     shape: HeelShape,
 ) -> None:
     """Images of a synthetic heel under Load0 to Load4, with their exactly known strain."""
-    from mrstrain.records.progress import live
-    from mrstrain.truth.phantom import phantom as run
     from phantoms import LOADS
 
     edges = (spacing, spacing, spacing if slice_spacing is None else slice_spacing)
-    with live() as progress:
-        made = run.with_options(
+    carry_out(
+        lambda progress: mrstrain.phantom.with_options(
             out, seed=seed, loads=load or tuple(LOADS), spacing_mm=edges, snr=None if no_noise else snr, shape=shape,
             progress=progress,
-        )  # fmt: skip
-    tell(made)
+        )
+    )  # fmt: skip
 
 
 @takes_options
@@ -53,9 +52,7 @@ def twin(
     seed: Annotated[int, typer.Option(min=0, help="Of noise and shading.")] = 1,
 ) -> None:
     """A loaded image made of your own unloaded one, with the truth beside it: to see how well that is found."""
-    from mrstrain.truth.twin import twin as run
-
-    tell(run.with_options(load0, deformation, out=out, subject_files=subject_files, frame=frame, seed=seed))
+    tell(mrstrain.twin.with_options(load0, deformation, out=out, subject_files=subject_files, frame=frame, seed=seed))
 
 
 def accuracy(
@@ -85,13 +82,13 @@ def accuracy(
     50, of 1.2 mm and of 0.8 x 0.8 x 1.6 mm at SNR 25. With --spacing or --snr these alone (default 0.8 mm, 25).
     """
     from dvc.registration.engines import DEFAULT
-    from mrstrain.records.progress import live
-    from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES, accuracy as run, accuracy_cases
+    from mrstrain.truth.accuracy import CONDITIONS, MOTIONS, SEEDS, WAVES
 
     conditions = CONDITIONS
     if spacing or snr or slice_spacing:
         conditions = tuple(((s, s, slice_spacing or s), r) for s in spacing or [0.8] for r in snr or [25.0])
-    cases = accuracy_cases(preset or (DEFAULT,), conditions, motion or (*MOTIONS, *WAVES), seed or SEEDS)
-    with live() as progress:
-        study = run(out, cases=cases, workers=workers, tell_plan=typer.echo, progress=progress)
-    tell(study, not study.failures)
+    motions = motion or (*MOTIONS, *WAVES)
+    cases = mrstrain.accuracy_cases(preset or (DEFAULT,), conditions, motions, seed or SEEDS)
+    carry_out(
+        lambda progress: mrstrain.accuracy(out, cases=cases, workers=workers, tell_plan=typer.echo, progress=progress)
+    )

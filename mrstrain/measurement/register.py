@@ -49,6 +49,11 @@ class Series:
     cases: tuple[Case, ...]
     failures: dict[str, str]
 
+    @property
+    def complete(self) -> bool:
+        """Whether no load failed."""
+        return not self.failures
+
     def summary(self) -> list[str]:
         """Summary, a few lines."""
         lines = [line for case in self.cases for line in case.summary()]

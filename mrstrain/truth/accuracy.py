@@ -80,6 +80,11 @@ class AccuracyStudy:
     resolution: tuple[ResolutionRow, ...]
     failures: dict[str, str]
 
+    @property
+    def complete(self) -> bool:
+        """Whether no case failed."""
+        return not self.failures
+
     def summary(self) -> list[str]:
         """Summary, a few lines."""
         lines = [
