@@ -170,7 +170,7 @@ _ARRAYS = tuple(f.name for f in fields(ErrorSamples) if f.name not in ("case", *
 
 
 def motion_named(heel: Heel, name: str) -> Motion | None:
-    """Motion of a heel's tissue by its name (see `AccuracyCase`); None for "still"."""
+    """Motion of a heel's tissue by its name (see `AccuracyCase`); None for "still", InputError for an unknown name."""
     if name == "still":
         return None
     named = {"smooth": pressed, "sliding": lambda heel: sliding(heel, 4.0), "swelling": swelling}

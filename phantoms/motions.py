@@ -18,7 +18,7 @@ _UNIT = 1e-6
 
 
 def stretched(stretches: FloatArray, centre_mm: FloatArray) -> Affine:
-    """Uniform stretch along x, y and z about a centre: F = diag(stretches), all positive.
+    """Uniform stretch along x, y and z about a centre (3,), LPS mm: F = diag(stretches); InputError unless positive.
 
     Examples
     --------
@@ -33,7 +33,10 @@ def stretched(stretches: FloatArray, centre_mm: FloatArray) -> Affine:
 
 
 def compressed(axis: int, stretch: float, centre_mm: FloatArray) -> Affine:
-    """Incompressible compression along axis 0, 1 or 2: F has ``stretch`` > 0 there and 1 / sqrt(stretch) across."""
+    """Incompressible compression along axis 0, 1 or 2 about a centre (3,), LPS mm.
+
+    F has ``stretch`` along the axis and 1 / sqrt(stretch) across; InputError for another axis or unless it is positive.
+    """
     if axis not in {0, 1, 2} or not stretch > 0:
         raise InputError(f"A compression needs an axis 0, 1 or 2 and a positive stretch; got {axis}, {stretch}.")
     factors = np.full(3, stretch**-0.5)
@@ -42,7 +45,10 @@ def compressed(axis: int, stretch: float, centre_mm: FloatArray) -> Affine:
 
 
 def sheared(direction: FloatArray, normal: FloatArray, amount: float, centre_mm: FloatArray) -> Affine:
-    """Simple shear F = I + amount d (x) n about a centre; d and n are orthogonal unit vectors."""
+    """Simple shear F = I + amount d (x) n about a centre (3,), LPS mm.
+
+    InputError unless d, the direction, and n, the normal (LPS), are orthogonal unit vectors.
+    """
     d, n = _frame(direction, normal)
     return _about(np.eye(3) + amount * np.outer(d, n), centre_mm)
 
