@@ -25,7 +25,7 @@ def measure(
     settings: Settings | None = None,
     start: Deformation | None = None,
     repeat: Image | None = None,
-    landmarks: tuple[FloatArray, FloatArray] | None = None,
+    landmarks: tuple[FloatArray, FloatArray] | tuple[FloatArray, FloatArray, tuple[str, ...]] | None = None,
     error_model: ErrorModel | None = None,
     mesh: MeshFile | None = None,
     plate_normal: Sequence[float] | None = None,
@@ -51,7 +51,7 @@ def measure(
     repeat : Image, optional
         A second unloaded image: its apparent strain is the noise floor.
     landmarks : ((n, 3), (n, 3)), optional
-        Points of the unloaded image and the same of the loaded one, LPS mm.
+        Points of the unloaded image and the same of the loaded one, LPS mm; also as `read_landmarks` returns them.
     error_model : ErrorModel, optional
         By default the one that comes with the engine or preset.
     mesh : MeshFile, optional
@@ -85,5 +85,6 @@ def measure(
     finally:
         if own is not None:
             own.close()
-    evidence = Evidence(landmarks, floor, error_model or error_model_of(chosen.engine.name))
+    points = None if landmarks is None else landmarks[:2]
+    evidence = Evidence(points, floor, error_model or error_model_of(chosen.engine.name))
     return Measurement.from_registration(found, subject, evidence, name=name)

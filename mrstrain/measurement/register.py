@@ -40,7 +40,7 @@ class Series:
     out : Path
         Folder of all results; ``report.html`` is in it.
     cases : tuple of Case
-        The registered loads, in the order given; the repeat scan first, if there is one.
+        The registered loads, in the order given; the repeat scan last, if there is one.
     failures : dict
         Name of each load that could not be registered, and why.
     """

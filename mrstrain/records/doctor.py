@@ -24,8 +24,8 @@ _RIVALS = {
 }
 _NEEDED = (
     "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "meshio", "nibabel", "pydicom", "numba",
-    "matplotlib", "jinja2", "rich", "typer", "loky", "distributed", "filelock", "pydantic", "pytetwild", "pyvista",
-    "vtk",
+    "matplotlib", "jinja2", "lazy-loader", "rich", "typer", "loky", "distributed", "filelock", "pydantic", "pytetwild",
+    "pyvista", "vtk",
 )  # fmt: skip
 _ELASTIX = "0.25."  # the series that parameters are checked against
 _OLDEST_PYTHON = (3, 11)

@@ -134,6 +134,19 @@ def test_a_deformation_from_elsewhere_is_a_measurement_too(stretched, tmp_path):
         stretched.plot("sigma")
 
 
+def test_landmarks_are_taken_as_they_are_read(tiny_pair, worker):
+    grid, point = tiny_pair.reference.grid, tiny_pair.bone.points().mean(axis=0, keepdims=True)
+    given = {
+        "tissue": dvc.Mask(grid, tiny_pair.labels.labels > 0),
+        "landmarks": (point, point, ("heel",)),
+        "worker": worker,
+    }
+    settings = replace(Settings.of("gauss-newton").of_repeat(), align_on="none")
+    one = dvc.measure(tiny_pair.reference, tiny_pair.repeat, settings=settings, **given)
+    assert one.quality.landmark_errors_mm is not None
+    assert one.quality.landmark_errors_mm.size == 1
+
+
 def test_a_notebook_shows_the_verdict_a_picture_and_a_table_all_escaped(stretched):
     page = stretched._repr_html_()
     assert ATTACK not in page
