@@ -136,7 +136,6 @@ class Assembler:
         """Forces, tangents (upper triangles) and least det F of cells, all by default, `_CHUNK` at a time."""
         m, space, element = self.model, self.model.space, self.model.element
         count = 3 * len(space.nodes_mm)
-        count = 3 * len(space.nodes_mm)
         u = np.ascontiguousarray(state[:count].reshape(-1, 3))
         p = np.ascontiguousarray(state[count:])
         forces = np.empty((_CHUNK, self._cells.shape[1]))

@@ -73,12 +73,13 @@ class ImagePair:
         count = -(-np.array(self.grid.shape) // block)
         along = [a + s * np.arange(n) for a, s, n in zip(at, per_voxel, self.grid.shape, strict=True)]
         self.sums = SplineSums(control, along, self.inside, factors)
-        self._first = None if factors is None else tuple(slice(None, None, int(b)) for b in block)
-        compared = self.share(inside) > 0
-        if factors is None or self._first is None:
+        self._first: tuple[slice, ...] | None = None
+        compared = self.share(inside) > 0  # a block is, if any voxel of it is: before `_first` is set
+        if factors is None:
             middles = [s * ((np.arange(n) + 0.5) * b - 0.5) for s, n, b in zip(per_voxel, count, block, strict=True)]
             self.blocks = SplineSums(control, [a + m for a, m in zip(at, middles, strict=True)], compared)
         else:
+            self._first = tuple(slice(None, None, int(b)) for b in block)
             firsts = [a[f] for a, f in zip(along, self._first, strict=True)]
             self.blocks = SplineSums(control, firsts, compared, np.ascontiguousarray(factors[self._first]))
         self._carried = np.zeros(self.grid.shape, dtype=np.float32)
