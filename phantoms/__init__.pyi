@@ -9,7 +9,9 @@ from .error_tables import (
     FloorRow,
     ResolutionRow,
     RunRow,
+    TissueError,
     error_rows,
+    errors_by_tissue,
     floor_rows,
     resolution_rows,
     run_rows,
@@ -38,7 +40,6 @@ from .heel import (
 )
 from .motions import Bending, ShearWave, compressed, sheared, stretched
 from .mri import acquire, sensitivity
-from .tissue_error import TissueError, errors_by_tissue
 from .warp import Acquisition, SyntheticWarp, material_points, synthetic_warp
 
 __all__ = [

@@ -211,67 +211,49 @@ def measure_run(
         If the pair cannot be made or registered.
     """
     with computing:
-        pair = _PhantomPair.of(case)
+        reference, loaded, labels, motion = _phantom_pair(case)
     # A wave moves the bone too, so there is nothing to align on.
-    settings = Settings.of(
-        case.preset, align_on="bone" if case.wavelength_mm is None else "none", threads=worker.threads
-    )
-    if pair.motion is None:
+    align_on = "bone" if case.wavelength_mm is None else "none"
+    settings = Settings.of(case.preset, align_on=align_on, threads=worker.threads)
+    if motion is None:
         settings = settings.of_repeat()
     elif case.keeps_volume:
         settings = replace(settings, engine=settings.engine.keeping_volume())
     registration = register(
-        pair.reference,
-        pair.loaded,
-        bone=pair.labels.region("bone"),
-        tissue=pair.body,
-        labels=pair.labels,
-        settings=settings,
-        worker=worker,
+        reference, loaded, bone=labels.region("bone"), tissue=Mask(labels.grid, labels.labels > 0), labels=labels,
+        settings=settings, worker=worker,
         progress=lambda stage, fraction: progress(fraction if stage != "aligning" else 0.0),
-    )
+    )  # fmt: skip
     with computing:
-        return _sampled_errors(case, pair, registration)
+        return _sampled_errors(case, labels, motion, registration)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _PhantomPair:
+def _phantom_pair(case: AccuracyCase) -> tuple[Image, Image, LabelMap, Motion | None]:
     """Both images of a case, the label map that the registration is given, and the true motion (None: no strain)."""
-
-    reference: Image
-    loaded: Image
-    labels: LabelMap
-    motion: Motion | None
-
-    @classmethod
-    def of(cls, case: AccuracyCase) -> _PhantomPair:
-        heel = Heel(case.seed)
-        grid = heel_grid(case.spacing_mm)
-        motion = motion_named(heel, case.motion)
-        # Each case has noise, bias field and foot motion of its own, the same for all presets.
-        number = zlib.crc32(f"{case.motion} {case.spacing_mm} {case.snr}".encode())
-        foot = RigidMotion.identity() if case.wavelength_mm is not None else random_foot_motion(case.seed, number)
-        exact = labels_of(heel, grid)
-        reference = scan(heel, grid, snr=case.snr, number=number)
-        loaded_grid = covering(grid, foot.apply(exact.region("bone").points()))
-        loaded = scan(heel, loaded_grid, motion, foot, snr=case.snr, number=number + 1)
-        return cls(reference, loaded, misdrawn(exact, case.labels_off), motion)
-
-    @property
-    def body(self) -> Mask:
-        return Mask(self.labels.grid, self.labels.labels > 0)
+    heel = Heel(case.seed)
+    grid = heel_grid(case.spacing_mm)
+    motion = motion_named(heel, case.motion)
+    # Each case has noise, bias field and foot motion of its own, the same for all presets.
+    number = zlib.crc32(f"{case.motion} {case.spacing_mm} {case.snr}".encode())
+    foot = RigidMotion.identity() if case.wavelength_mm is not None else random_foot_motion(case.seed, number)
+    exact = labels_of(heel, grid)
+    reference = scan(heel, grid, snr=case.snr, number=number)
+    loaded_grid = covering(grid, foot.apply(exact.region("bone").points()))
+    loaded = scan(heel, loaded_grid, motion, foot, snr=case.snr, number=number + 1)
+    return reference, loaded, misdrawn(exact, case.labels_off), motion
 
 
-def _sampled_errors(case: AccuracyCase, pair: _PhantomPair, registration: Registration) -> ErrorSamples:
+def _sampled_errors(
+    case: AccuracyCase, labels: LabelMap, motion: Motion | None, registration: Registration
+) -> ErrorSamples:
     """Measured against true displacement and strain, in one of eight voxels of the body."""
-    labels, motion = pair.labels, pair.motion
     sampled = np.zeros(labels.grid.shape, dtype=bool)
     sampled[::_STRIDE, ::_STRIDE, ::_STRIDE] = True
     sampled &= labels.labels > 0
     u, H = evaluate_on_grid(registration.displacement, labels.grid, sampled)
     X = labels.grid.points(sampled)
     edge_mm = float(registration.displacement.spacing_mm.min())
-    known = np.isfinite(u).all(axis=1) & shows(pair.loaded, registration.alignment.motion.apply(X + u), edge_mm)
+    known = np.isfinite(u).all(axis=1) & shows(registration.loaded, registration.alignment.motion.apply(X + u), edge_mm)
     true_u, true_H = (np.zeros_like(u), np.zeros_like(H)) if motion is None else motion.evaluate(X)
     strain, truth = StrainField.from_gradient(H), StrainField.from_gradient(true_H)
     d, n = (motion.direction, motion.normal) if isinstance(motion, ShearWave) else (np.zeros(3), np.zeros(3))
@@ -285,7 +267,7 @@ def _sampled_errors(case: AccuracyCase, pair: _PhantomPair, registration: Regist
 
     return ErrorSamples(
         case=case,
-        estimated_snr=signal_to_noise(pair.reference, pair.body),
+        estimated_snr=signal_to_noise(registration.reference, registration.tissue),
         seconds=registration.seconds,
         unknown=int(np.count_nonzero(~known)),
         folded=int(np.count_nonzero(strain.jacobian[known] <= 0)),
@@ -332,13 +314,7 @@ def _autocorrelation(
     field -= np.nanmean(field)
     variance = float(np.nanmean(field**2))
     spacing = labels.grid.spacing_mm
-    longest = [axis for axis in range(3) if spacing[axis] > spacing.max() - 1e-6]
-    correlation = np.zeros(_LAGS)
-    for lag in range(1, _LAGS + 1):
-        products = []
-        for axis in longest:
-            ahead, behind = [slice(None)] * 3, [slice(None)] * 3
-            ahead[axis], behind[axis] = slice(lag, None), slice(None, -lag)
-            products.append(np.nanmean(field[tuple(ahead)] * field[tuple(behind)]))
-        correlation[lag - 1] = float(np.mean(products)) / variance
-    return correlation, _STRIDE * float(spacing.max()) * np.arange(1.0, _LAGS + 1)
+    along = [np.moveaxis(field, axis, 0) for axis in range(3) if spacing[axis] > spacing.max() - 1e-6]
+    lags = range(1, _LAGS + 1)
+    correlation = [float(np.mean([np.nanmean(f[lag:] * f[:-lag]) for f in along])) / variance for lag in lags]
+    return np.array(correlation), _STRIDE * float(spacing.max()) * np.array(lags, dtype=np.float64)

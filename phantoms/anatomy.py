@@ -6,6 +6,7 @@ seed and of lattice coordinates, so that a point has the same signal at any voxe
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -70,9 +71,7 @@ _RANGES = {
     "cortex_mm": (0.5, 3.0),
     "lobule_mm": (2.0, 12.0),
 }
-_Ellipsoid = tuple[FloatArray, FloatArray, tuple[float, float, float]]
 _Triple = tuple[float, float, float]
-_Shapes = tuple[tuple[_Triple, _Triple, _Triple], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,15 +124,9 @@ class Heel:
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"{name} must lie between {low:g} and {high:g}; got {getattr(self, name)}.")
         random = np.random.default_rng([self.seed, 1])
-        bodies: tuple[tuple[str, _Shapes, float], ...] = (
-            ("bone", _CALCANEUS, 0.6),
-            ("ankle", _ANKLE_BONES, 0.6),
-            ("muscle", _MUSCLES, 0.6),
-            ("outline", _OUTLINE, 0.4),
-        )
-        varied: dict[str, list[_Ellipsoid]] = {}
-        for name, shapes, jitter in bodies:
-            varied[name] = [
+
+        def vary(shapes: tuple[tuple[_Triple, _Triple, _Triple], ...], jitter: float) -> list[Any]:
+            return [
                 (
                     np.add(centre, jitter * random.uniform(-1.0, 1.0, 3)),
                     np.multiply(axes, 1.0 + 0.02 * random.uniform(-1.0, 1.0, 3)),
@@ -141,6 +134,9 @@ class Heel:
                 )
                 for centre, axes, turns in shapes
             ]
+
+        bones = {"bone": vary(_CALCANEUS, 0.6), "ankle": vary(_ANKLE_BONES, 0.6)}
+        varied = bones | {"muscle": vary(_MUSCLES, 0.6), "outline": vary(_OUTLINE, 0.4)}
         # Only the sole moves with the pad's thickness: half in the centre, half in the semi-axis leaves the top alone.
         lower = np.array([0.0, 0.0, 0.5 * (self.pad_mm - _PAD_MM)])
         varied["outline"] = [
@@ -158,12 +154,9 @@ class Heel:
     @property
     def skeleton(self) -> EllipsoidUnion:
         """All bones as one body, which holds each of them."""
-        bodies = (self.bone, self.ankle)
-        return EllipsoidUnion(
-            np.concatenate([body.centres_mm for body in bodies]),
-            np.concatenate([body.forms for body in bodies]),
-            min(body.sharpness for body in bodies),
-        )
+        a, b = self.bone, self.ankle
+        centres, forms = np.concatenate([a.centres_mm, b.centres_mm]), np.concatenate([a.forms, b.forms])
+        return EllipsoidUnion(centres, forms, min(a.sharpness, b.sharpness))
 
     def _parameters(self) -> tuple[FloatArray, ...]:
         bodies = (self.bone, self.ankle, self.muscle, self.outline, self.flesh)

@@ -60,18 +60,15 @@ class EllipsoidUnion:
 
     @classmethod
     def of(
-        cls,
-        ellipsoids: Sequence[tuple[Sequence[float], Sequence[float], Sequence[float]]],
-        sharpness: float = 5.0,
+        cls, ellipsoids: Sequence[tuple[Sequence[float], Sequence[float], Sequence[float]]], sharpness: float = 5.0
     ) -> EllipsoidUnion:
         """Merge ellipsoids, each given by centre (mm), semi-axes (mm) and turns about x, y, z (degrees)."""
         from scipy.spatial.transform import Rotation
 
         centres = np.array([centre for centre, _, _ in ellipsoids], dtype=np.float64)
         turns = [Rotation.from_euler("xyz", turn, degrees=True).as_matrix() for _, _, turn in ellipsoids]
-        forms = np.array(
-            [R @ np.diag(1.0 / np.square(axes)) @ R.T for R, (_, axes, _) in zip(turns, ellipsoids, strict=True)]
-        )
+        inverse = [np.diag(1.0 / np.square(axes)) for _, axes, _ in ellipsoids]
+        forms = np.array([R @ form @ R.T for R, form in zip(turns, inverse, strict=True)])
         return cls(centres, 0.5 * (forms + forms.transpose(0, 2, 1)), sharpness)
 
     def distance(self, points_mm: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, figures_of, widened
 from phantoms.accuracy_run import ErrorSamples
-from phantoms.error_tables import SOFT, by_condition, of_tissue
+from phantoms.error_tables import SOFT, OfCondition, by_condition, of_tissue
 
 _KNOTS = np.array([0.005, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18, 0.25, 0.35, 0.5])
 _EDGES = np.concatenate([[0.0], 0.5 * (_KNOTS[1:] + _KNOTS[:-1]), [np.inf]])
@@ -20,11 +21,10 @@ _PRIOR = 400.0  # samples that the prior of a cell counts for
 _FEW = 50.0
 _THRESHOLDS = (0.1, 0.3)
 _DRAWS = 8  # of each training run, when coverage of the intervals is evaluated
-_Moments = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
-class CoverageRow:
+class CoverageRow(OfCondition):
     """How often the truth lies where an error model fitted to the other heels predicts; the rest as in `ErrorRow`.
 
     Attributes
@@ -39,9 +39,6 @@ class CoverageRow:
         field of the intervals is left out, because it averages out over a tissue.
     """
 
-    preset: str
-    voxel_mm: str
-    snr: float
     motion: str
     tissue: str
     voxels_within: float
@@ -120,7 +117,7 @@ def _widening(validations: Sequence[_Validation]) -> float:
 
 
 def _validated(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Validation | None:
-    kept = of_tissue(run, tissue)
+    kept = of_tissue(run.tissue, tissue)
     if np.count_nonzero(kept) < _FEW:
         return None
     shear, true = run.shear[kept].astype(np.float64), run.true_shear[kept].astype(np.float64)
@@ -143,72 +140,63 @@ def _validated(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Validation
 def _table(runs: Sequence[ErrorSamples]) -> ErrorTable:
     """Errors of runs of one condition, for all runs together and for each run, by tissue."""
     tissues = (*SOFT, POOLED)
-    pooled = _filled(_moments(runs, POOLED, None))
-    of_all = {tissue: _cells(runs, tissue, pooled) for tissue in tissues}
+    pooled = _filled(_moments(runs, POOLED))
+    # The prior of a cell is its tissue's mean over all distances, whose own prior is that of all soft tissue.
+    priors = {tissue: _with_prior(_moments(runs, tissue), pooled) for tissue in SOFT} | {POOLED: pooled}
+    cells = {tissue: _by_distance(runs, tissue, priors[tissue][:, None]) for tissue in tissues}
     return ErrorTable(
         np.array(runs[0].case.spacing_mm),
         float(np.median([r.estimated_snr for r in runs])),
         _KNOTS,
         _BONE_MM,
-        {tissue: _rows(cells) for tissue, cells in of_all.items()},
-        tuple({tissue: _rows(_by_distance([run], tissue, of_all[tissue])) for tissue in tissues} for run in runs),
+        {tissue: _bias_and_sd(of_all) for tissue, of_all in cells.items()},
+        tuple({tissue: _bias_and_sd(_by_distance([r], tissue, cells[tissue])) for tissue in tissues} for r in runs),
         _correlation_mm(runs),
     )
 
 
-def _cells(runs: Sequence[ErrorSamples], tissue: str, pooled: _Moments) -> list[_Moments]:
-    """Moments by distance to bone and measured shear.
-
-    The prior of a cell is its tissue's mean over all distances, whose own prior is that of all soft tissue.
-    """
-    prior = pooled if tissue == POOLED else _with_prior(_moments(runs, tissue, None), pooled)
-    return _by_distance(runs, tissue, [prior] * len(_BONE_MM))
+def _by_distance(runs: Sequence[ErrorSamples], tissue: str, prior: FloatArray) -> FloatArray:
+    """Moments (3, k, m) for each distance to bone, with a prior (3, 1 or k, m)."""
+    bins = pairwise([*_BONE_MM, np.inf])
+    return _with_prior(np.stack([_moments(runs, tissue, low, high) for low, high in bins], axis=1), prior)
 
 
-def _by_distance(runs: Sequence[ErrorSamples], tissue: str, priors: Sequence[_Moments]) -> list[_Moments]:
-    """Moments for each distance to bone, with the prior of each."""
-    return [_with_prior(_moments(runs, tissue, k), prior) for k, prior in enumerate(priors)]
-
-
-def _rows(cells: Sequence[_Moments]) -> FloatArray:
-    """Bias and standard deviation by distance to bone and measured shear, (2, k, m)."""
-    mean = np.array([m for _, m, _ in cells])
-    square = np.array([q for _, _, q in cells])
+def _bias_and_sd(cells: FloatArray) -> FloatArray:
+    """Bias and standard deviation by distance to bone and measured shear, (2, k, m), from their moments (3, k, m)."""
+    _, mean, square = cells
     return np.stack([mean, np.sqrt(np.maximum(square - mean**2, 1e-10))])
 
 
-def _moments(runs: Sequence[ErrorSamples], tissue: str, bone_bin: int | None) -> _Moments:
-    """Number, mean and mean square of the errors by measured shear; every sample has the same weight."""
-    ends = [*_BONE_MM, np.inf]
-    count, total, square = (np.zeros(len(_KNOTS)) for _ in range(3))
+def _moments(runs: Sequence[ErrorSamples], tissue: str, low: float = 0.0, high: float = np.inf) -> FloatArray:
+    """Number, mean and mean square of the errors by measured shear, (3, m), from ``low`` to ``high`` mm off bone.
+
+    Every sample has the same weight.
+    """
+    count, total, square = np.zeros((3, len(_KNOTS)))
     for run in runs:
-        kept = of_tissue(run, tissue)
-        if bone_bin is not None:
-            kept = kept & (run.to_bone_mm >= ends[bone_bin]) & (run.to_bone_mm < ends[bone_bin + 1])
+        kept = of_tissue(run.tissue, tissue) & (run.to_bone_mm >= low) & (run.to_bone_mm < high)
         cell = np.searchsorted(_EDGES, run.shear[kept], side="right") - 1
         error = (run.shear - run.true_shear)[kept].astype(np.float64)
         count += np.bincount(cell, minlength=len(_KNOTS))
         total += np.bincount(cell, error, minlength=len(_KNOTS))
         square += np.bincount(cell, error**2, minlength=len(_KNOTS))
     some = np.maximum(count, 1.0)
-    return count, total / some, square / some
+    return np.stack([count, total / some, square / some])
 
 
-def _filled(moments: _Moments) -> _Moments:
+def _filled(moments: FloatArray) -> FloatArray:
     """Moments in which shears with few samples take those of the nearest with enough."""
-    count, mean, square = moments
-    often = np.flatnonzero(count >= _FEW)
+    often = np.flatnonzero(moments[0] >= _FEW)
     if not len(often):
         raise InputError(f"An error model needs at least {_FEW:.0f} samples of soft tissue.")
     nearest = often[np.argmin(np.abs(_KNOTS[:, None] - _KNOTS[often]), axis=1)]
-    return count, mean[nearest], square[nearest]
+    return np.stack([moments[0], *moments[1:, nearest]])
 
 
-def _with_prior(own: _Moments, prior: _Moments) -> _Moments:
+def _with_prior(own: FloatArray, prior: FloatArray) -> FloatArray:
     """Moments averaged with a prior that counts for 400 samples."""
     weight = own[0] / (own[0] + _PRIOR)
-    mean = weight * own[1] + (1 - weight) * prior[1]
-    return own[0] + _PRIOR, mean, weight * own[2] + (1 - weight) * prior[2]
+    return np.stack([own[0] + _PRIOR, *(weight * own[1:] + (1 - weight) * prior[1:])])
 
 
 def _correlation_mm(runs: Sequence[ErrorSamples]) -> float:

@@ -1,31 +1,130 @@
-"""Tables of an accuracy study: errors by tissue, position and strain, noise floor, and spatial resolution."""
+"""Errors against the truth by tissue, and tables of an accuracy study: errors, noise floor, spatial resolution."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from dvc.arrays import BoolArray, Float32Array
+from dvc import Deformation, LabelMap, StrainField, evaluate_on_grid
+from dvc.arrays import BoolArray, IntArray
+from dvc.errors import GeometryError
 from dvc.trust.error_model import POOLED
 from phantoms.accuracy_run import RIGID, ErrorSamples
 from phantoms.anatomy import TISSUES
 
 SOFT = tuple(name for name in TISSUES.values() if name not in RIGID)
-BONE_BINS_MM = (0.0, 1.5, 3.0, 6.0, 12.0, np.inf)
-BORDER_BINS_MM = (0.0, 1.0, 2.0, 4.0, np.inf)
-SHEAR_BINS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, np.inf)
+_BINS: Mapping[str, tuple[str, tuple[float, ...]]] = {
+    "distance to bone, mm": ("to_bone_mm", (0.0, 1.5, 3.0, 6.0, 12.0, np.inf)),
+    "distance to a border, mm": ("to_border_mm", (0.0, 1.0, 2.0, 4.0, np.inf)),
+    "true maximal shear": ("true_shear", (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, np.inf)),
+}
+_Pool = Mapping[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorRow:
+class TissueError:
+    """Error in one tissue over its voxels; reference configuration, displacement in mm, max. shear dimensionless.
+
+    Attributes
+    ----------
+    voxels, folded : int
+        Voxels compared, and those with det F <= 0.
+    true_p50, true_p95 : float
+        Percentiles of the true maximum shear strain (E_1 - E_3) / 2.
+    shear_rmse, shear_bias, shear_error_p95 : float
+        Root mean square and mean of measured minus true max. shear; 95th percentile of its absolute value.
+    u_p50_mm, u_p95_mm : float
+        Percentiles of the length of the difference between measured and true displacement.
+    """
+
+    tissue: str
+    voxels: int
+    true_p50: float
+    true_p95: float
+    shear_rmse: float
+    shear_bias: float
+    shear_error_p95: float
+    u_p50_mm: float
+    u_p95_mm: float
+    folded: int
+
+
+def errors_by_tissue(
+    labels: LabelMap, truth: Deformation, measured: Deformation, where: BoolArray
+) -> tuple[TissueError, ...]:
+    """Compare two deformations in the voxels of each tissue; tissues without such a voxel are left out.
+
+    Parameters
+    ----------
+    labels : LabelMap
+        Tissues on the reference grid.
+    truth, measured : Deformation
+        u and grad u in the reference configuration, LPS mm.
+    where : (ni, nj, nk) bool
+        Voxels to compare, as far as ``measured`` is defined there.
+
+    Raises
+    ------
+    GeometryError
+        If ``where`` is not on the labels' grid.
+    """
+    if where.shape != labels.grid.shape:
+        raise GeometryError(
+            f"The voxels to compare have shape {where.shape}; the labels' grid has {labels.grid.shape}."
+        )
+    inside = where & (labels.labels > 0)
+    true_u, true_H = evaluate_on_grid(truth, labels.grid, inside)
+    u, H = evaluate_on_grid(measured, labels.grid, inside)
+    true, strain = StrainField.from_gradient(true_H), StrainField.from_gradient(H)
+    error = strain.max_shear - true.max_shear
+    distance = np.linalg.norm(u - true_u, axis=1)
+    rows = []
+    for number, tissue in labels.names.items():
+        kept = (labels.labels[inside] == number) & strain.valid
+        if not kept.any():
+            continue
+        rows.append(
+            TissueError(
+                tissue=tissue,
+                voxels=int(np.count_nonzero(kept)),
+                true_p50=float(np.median(true.max_shear[kept])),
+                true_p95=float(np.percentile(true.max_shear[kept], 95)),
+                shear_rmse=float(np.sqrt(np.mean(error[kept] ** 2))),
+                shear_bias=float(error[kept].mean()),
+                shear_error_p95=float(np.percentile(np.abs(error[kept]), 95)),
+                u_p50_mm=float(np.median(distance[kept])),
+                u_p95_mm=float(np.percentile(distance[kept], 95)),
+                folded=int(np.count_nonzero(strain.jacobian[kept] <= 0)),
+            )
+        )
+    return tuple(rows)
+
+
+@dataclass(frozen=True, slots=True)
+class OfCondition:
+    """Row of one condition: preset, voxel size in mm, such as "0.8" or "0.8 x 0.8 x 1.6", and signal-to-noise ratio."""
+
+    preset: str
+    voxel_mm: str
+    snr: float
+
+    @property
+    def condition(self) -> tuple[str, str, float]:
+        """Preset, voxel size and SNR."""
+        return self.preset, self.voxel_mm, self.snr
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorRow(OfCondition):
     """Errors over one set of samples, measured minus true; max. shear dimensionless, displacement in mm.
 
     Attributes
     ----------
-    voxel_mm : str
-        Voxel size, such as "0.8" or "0.8 x 0.8 x 1.6".
+    preset, voxel_mm, snr
+        The condition: voxel size in mm, such as "0.8" or "0.8 x 0.8 x 1.6".
     labels_off : int
         As in `AccuracyCase`.
     by : {"all", "distance to bone, mm", "distance to a border, mm", "true maximal shear"}
@@ -40,9 +139,6 @@ class ErrorRow:
         95th percentile of that length.
     """
 
-    preset: str
-    voxel_mm: str
-    snr: float
     labels_off: int
     motion: str
     tissue: str
@@ -63,12 +159,9 @@ class ErrorRow:
 
 
 @dataclass(frozen=True, slots=True)
-class FloorRow:
+class FloorRow(OfCondition):
     """Noise floor: apparent strain in one tissue of an unloaded pair; MAER, SDER, percentiles of the max. shear."""
 
-    preset: str
-    voxel_mm: str
-    snr: float
     tissue: str
     maer: float
     sder: float
@@ -77,12 +170,9 @@ class FloorRow:
 
 
 @dataclass(frozen=True, slots=True)
-class ResolutionRow:
+class ResolutionRow(OfCondition):
     """Fraction of a sinusoidal shear of one wavelength that is recovered: slope of measured on true H_dn."""
 
-    preset: str
-    voxel_mm: str
-    snr: float
     tissue: str
     wavelength_mm: float
     recovered: float
@@ -104,7 +194,7 @@ def run_rows(runs: Sequence[ErrorSamples]) -> list[RunRow]:
     """One row for each run; errors are those of its soft tissue."""
     rows = []
     for run in runs:
-        error = (run.shear - run.true_shear)[of_tissue(run, POOLED)].astype(np.float64)
+        error = (run.shear - run.true_shear)[of_tissue(run.tissue, POOLED)].astype(np.float64)
         without = run.unknown / (run.unknown + len(run.shear))
         rmse = float(np.sqrt(np.mean(error**2)))
         rows.append(RunRow(run.case.name, run.estimated_snr, run.seconds, without, run.folded, rmse))
@@ -123,10 +213,11 @@ def error_rows(runs: Sequence[ErrorSamples]) -> list[ErrorRow]:
             if run.case.wavelength_mm is None:
                 by_motion.setdefault((run.case.labels_off, run.case.motion), []).append(run)
         for (labels_off, motion), some in by_motion.items():
+            pool = _pooled(some)
             for tissue in (*TISSUES.values(), POOLED):
-                for place, kept in _bins(some, [of_tissue(r, tissue) for r in some]):
-                    if any(k.any() for k in kept):
-                        rows.append(ErrorRow(*condition, labels_off, motion, tissue, *place, *_figures(some, kept)))
+                for place, kept in _bins(pool, of_tissue(pool["tissue"], tissue)):
+                    if kept.any():
+                        rows.append(ErrorRow(*condition, labels_off, motion, tissue, *place, *_figures(pool, kept)))
     return rows
 
 
@@ -135,11 +226,12 @@ def floor_rows(runs: Sequence[ErrorSamples]) -> list[FloorRow]:
     rows = []
     for condition, of_condition in by_condition(runs):
         still = [r for r in of_condition if r.case.motion == "still"]
+        pool = _pooled(still)
         for tissue in (*TISSUES.values(), POOLED) if still else ():
-            kept = [of_tissue(r, tissue) for r in still]
-            strain = _joined(still, kept, lambda r: r.mean_abs_strain)
-            if len(strain):
-                p50, p95 = (float(p) for p in np.percentile(_joined(still, kept, lambda r: r.shear), [50, 95]))
+            kept = of_tissue(pool["tissue"], tissue)
+            if kept.any():
+                strain = pool["mean_abs_strain"][kept]
+                p50, p95 = (float(p) for p in np.percentile(pool["shear"][kept], [50, 95]))
                 rows.append(FloorRow(*condition, tissue, float(strain.mean()), float(strain.std()), p50, p95))
     return rows
 
@@ -149,12 +241,11 @@ def resolution_rows(runs: Sequence[ErrorSamples]) -> list[ResolutionRow]:
     rows = []
     for condition, of_condition in by_condition(runs):
         wavelengths = sorted({r.case.wavelength_mm for r in of_condition if r.case.wavelength_mm is not None})
+        pools = {length: _pooled([r for r in of_condition if r.case.wavelength_mm == length]) for length in wavelengths}
         for tissue in (*SOFT, POOLED):
-            for wavelength in wavelengths:
-                waves = [r for r in of_condition if r.case.wavelength_mm == wavelength]
-                kept = [of_tissue(r, tissue) for r in waves]
-                true = _joined(waves, kept, lambda r: r.true_slope).astype(np.float64)
-                measured = _joined(waves, kept, lambda r: r.slope).astype(np.float64)
+            for wavelength, pool in pools.items():
+                kept = of_tissue(pool["tissue"], tissue)
+                true, measured = (pool[name][kept].astype(np.float64) for name in ("true_slope", "slope"))
                 if len(true):
                     recovered = float(true @ measured / (true @ true))
                     rows.append(ResolutionRow(*condition, tissue, wavelength, recovered))
@@ -185,40 +276,32 @@ def by_condition(runs: Sequence[ErrorSamples]) -> Iterator[tuple[tuple[str, str,
         yield (preset, " x ".join(f"{edge:g}" for edge in edges), snr), group
 
 
-def of_tissue(run: ErrorSamples, name: str) -> BoolArray:
-    """Which samples lie in a tissue, (n,) bool; "soft tissue" is all of SOFT."""
-    numbers = [n for n, tissue in TISSUES.items() if tissue == name or (name == POOLED and tissue in SOFT)]
-    return np.isin(run.tissue, numbers)
+def of_tissue(numbers: IntArray, name: str) -> BoolArray:
+    """Which label numbers (n,) are those of a tissue, (n,) bool; "soft tissue" is all of SOFT."""
+    return np.isin(numbers, [n for n, tissue in TISSUES.items() if tissue in (SOFT if name == POOLED else (name,))])
 
 
-def _joined(
-    runs: Sequence[ErrorSamples], kept: Sequence[BoolArray], values: Callable[[ErrorSamples], Float32Array]
-) -> Float32Array:
-    """Values of the kept samples of several runs, one after the other."""
-    return np.concatenate([values(run)[k] for run, k in zip(runs, kept, strict=True)])
+def _pooled(runs: Sequence[ErrorSamples]) -> _Pool:
+    """Samples of several runs, one after the other, by the names of `ErrorSamples`."""
+    names = (
+        "tissue", "to_bone_mm", "to_border_mm", "true_shear", "shear", "u_error_mm", "mean_abs_strain", "true_slope",
+        "slope",
+    )  # fmt: skip
+    return {name: np.concatenate([getattr(run, name) for run in runs]) for name in names} if runs else {}
 
 
-def _bins(
-    runs: Sequence[ErrorSamples], tissue: Sequence[BoolArray]
-) -> Iterator[tuple[tuple[str, float, float], list[BoolArray]]]:
-    """Quantity, low and high end of each bin, with each run's samples of the tissue in it."""
-    yield ("all", float("nan"), float("nan")), list(tissue)
-    quantities: Mapping[str, tuple[Callable[[ErrorSamples], Float32Array], tuple[float, ...]]] = {
-        "distance to bone, mm": (lambda r: r.to_bone_mm, BONE_BINS_MM),
-        "distance to a border, mm": (lambda r: r.to_border_mm, BORDER_BINS_MM),
-        "true maximal shear": (lambda r: r.true_shear, SHEAR_BINS),
-    }
-    for by, (value, ends) in quantities.items():
+def _bins(pool: _Pool, of_tissue: BoolArray) -> Iterator[tuple[tuple[str, float, float], BoolArray]]:
+    """Quantity, low and high end of each bin, with the samples of the tissue in it, (n,) bool."""
+    yield ("all", float("nan"), float("nan")), of_tissue
+    for by, (name, ends) in _BINS.items():
         for low, high in pairwise(ends):
-            kept = [k & (value(r) >= low) & (value(r) < high) for r, k in zip(runs, tissue, strict=True)]
-            yield (by, low, high), kept
+            yield (by, low, high), of_tissue & (pool[name] >= low) & (pool[name] < high)
 
 
-def _figures(runs: Sequence[ErrorSamples], kept: Sequence[BoolArray]) -> tuple[Any, ...]:
+def _figures(pool: _Pool, kept: BoolArray) -> tuple[Any, ...]:
     """Number of samples, percentiles of the true shear, and errors, in the order of `ErrorRow`."""
-    true = _joined(runs, kept, lambda r: r.true_shear).astype(np.float64)
-    shear = _joined(runs, kept, lambda r: r.shear).astype(np.float64) - true
-    u = _joined(runs, kept, lambda r: r.u_error_mm).astype(np.float64)
+    true, shear, u = (pool[name][kept].astype(np.float64) for name in ("true_shear", "shear", "u_error_mm"))
+    shear -= true
     mean = u.mean(axis=0)
     length = np.linalg.norm(u, axis=1)
     of_shear = (shear.mean(), shear.std(), np.sqrt(np.mean(shear**2)), np.percentile(np.abs(shear), 95))

@@ -98,9 +98,8 @@ class ShearWave:
     phase: float = 0.0
 
     def __post_init__(self) -> None:
-        d, n = _frame(self.direction, self.normal)
-        object.__setattr__(self, "direction", d)
-        object.__setattr__(self, "normal", n)
+        for name, vector in zip(("direction", "normal"), _frame(self.direction, self.normal), strict=True):
+            object.__setattr__(self, name, vector)
         if not (np.isfinite(self.wavelength_mm) and self.wavelength_mm > 0 and np.isfinite(self.peak)):
             raise InputError(f"A wave needs a positive wavelength in mm; got {self.wavelength_mm} and {self.peak}.")
 
@@ -155,10 +154,9 @@ class Bending:
     radius_mm: float
 
     def __post_init__(self) -> None:
-        along, through = _frame(self.length, self.thickness)
         object.__setattr__(self, "centre_mm", frozen(self.centre_mm, np.float64))
-        object.__setattr__(self, "length", along)
-        object.__setattr__(self, "thickness", through)
+        for name, vector in zip(("length", "thickness"), _frame(self.length, self.thickness), strict=True):
+            object.__setattr__(self, name, vector)
         if not (np.isfinite(self.radius_mm) and self.radius_mm > 0):
             raise InputError(f"A bending radius must be positive, mm; got {self.radius_mm}.")
 

@@ -57,11 +57,15 @@ def acquire(
     if bias_seed is not None:
         values *= sensitivity(grid, bias_seed)
     if snr is not None:
-        random = np.random.default_rng(seed)
-        sigma = np.float32(reference_signal / snr)
-        values += sigma * random.standard_normal(grid.shape, dtype=np.float32)
-        values = np.hypot(values, sigma * random.standard_normal(grid.shape, dtype=np.float32))
+        values = rician(values, reference_signal / snr, seed)
     return Image(grid, values)
+
+
+def rician(values: Float32Array, sd: float, seed: int) -> Float32Array:
+    """Magnitude of a signal with complex noise of standard deviation ``sd`` in each part."""
+    random, sigma = np.random.default_rng(seed), np.float32(sd)
+    values = values + sigma * random.standard_normal(values.shape, dtype=np.float32)
+    return np.asarray(np.hypot(values, sigma * random.standard_normal(values.shape, dtype=np.float32)))
 
 
 def sampled_by(grid: Grid) -> Grid:

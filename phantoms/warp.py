@@ -18,7 +18,7 @@ from dvc.deformation.protocol import Motion
 from dvc.errors import InputError
 from dvc.images.noise import noise_sd
 from dvc.images.resample import fill_missing
-from phantoms.mri import sensitivity
+from phantoms.mri import rician, sensitivity
 
 _TOLERANCE_MM = 1e-7
 _ROUNDS = 60
@@ -116,14 +116,12 @@ def synthetic_warp(
     values = _warped(_denoised(reference, tissue, sigma), drawn, motion, near, grid)
     if acquisition.bias_field:
         values *= sensitivity(grid, acquisition.seed + 1)
-    random = np.random.default_rng(acquisition.seed)
-    noise = np.float32(acquisition.noise_factor * sigma)
-    values += noise * random.standard_normal(values.shape, dtype=np.float32)
-    values = np.hypot(values, noise * random.standard_normal(values.shape, dtype=np.float32))
+    noise = acquisition.noise_factor * sigma
+    values = rician(values, noise, acquisition.seed)
     if beyond_missing:
         came_from = near.inverse().apply(grid.points().reshape(-1, 3))
         values[~reference.grid.contains(came_from).reshape(grid.shape)] = np.nan
-    return SyntheticWarp(Image(grid, values), float(noise), shown)
+    return SyntheticWarp(Image(grid, values), float(np.float32(noise)), shown)
 
 
 def _shown(tissue: Mask, motion: Deformation, grid: Grid) -> float:
@@ -171,11 +169,8 @@ def material_points(motion: Deformation, points_mm: FloatArray, start_mm: FloatA
         active, X, residual, H = active[kept], X[kept], residual[kept], H[kept]
         F = H + np.eye(3)
         determinant = np.linalg.det(F)
-        step = np.where(
-            (determinant > 1e-3)[:, None],
-            np.linalg.solve(F + 1e-9 * np.eye(3), residual[..., None])[..., 0],
-            0.5 * residual,
-        )
+        newton = np.linalg.solve(F + 1e-9 * np.eye(3), residual[..., None])[..., 0]
+        step = np.where((determinant > 1e-3)[:, None], newton, 0.5 * residual)
         # a long step may leave the region where the map is close to linear
         X = X + step * np.minimum(1.0, 4.0 / np.maximum(np.linalg.norm(step, axis=1), 1e-12))[:, None]
     return solution
@@ -199,10 +194,12 @@ def _warped(clean: Image, tissue: Mask, motion: Deformation, near: RigidMotion, 
     coefficients = spline_filter(clean.values.astype(np.float64), order=3, mode="mirror")
     back = _known_inverse(motion)
     # Newton's method starts at the voxel whose deformed position is nearest; one voxel in eight is close enough.
-    home = _thinned(tissue).points()
+    thin = np.zeros_like(tissue.inside)
+    thin[::2, ::2, ::2] = tissue.inside[::2, ::2, ::2]
+    home = tissue.grid.points(thin if np.count_nonzero(thin) >= _FEW else tissue.inside)
     there = home + motion.displacement(home)
-    home = home[np.all(np.isfinite(there), axis=1)]
-    moved = cKDTree(there[np.all(np.isfinite(there), axis=1)])
+    known = np.all(np.isfinite(there), axis=1)
+    home, moved = home[known], cKDTree(there[known])
     out = np.zeros(int(np.prod(grid.shape)), dtype=np.float32)
     x = grid.points().reshape(-1, 3)
     where = np.flatnonzero(_near(tissue, x, near))
@@ -217,13 +214,6 @@ def _warped(clean: Image, tissue: Mask, motion: Deformation, near: RigidMotion, 
         at = clean.grid.indices_of(X[inside]).T
         out[some[inside]] = map_coordinates(coefficients, at, order=3, mode="mirror", prefilter=False)
     return np.maximum(out, 0.0).reshape(grid.shape)
-
-
-def _thinned(tissue: Mask) -> Mask:
-    """Every other voxel along each axis; all of them where that would leave few."""
-    some = np.zeros_like(tissue.inside)
-    some[::2, ::2, ::2] = tissue.inside[::2, ::2, ::2]
-    return Mask(tissue.grid, some) if np.count_nonzero(some) >= _FEW else tissue
 
 
 def _known_inverse(motion: Deformation) -> Deformation | None:
