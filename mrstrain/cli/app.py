@@ -40,24 +40,10 @@ def _options(
 
 
 for _command in (
-    studies.init,
-    studies.check,
-    studies.run,
-    studies.cohort,
-    studies.demo,
-    measurement.register,
-    measurement.strain,
-    truth.phantom,
-    truth.twin,
-    truth.accuracy,
-    models.mesh,
-    models.simulate,
-    models.compare,
-    models.drive,
-    models.level,
-    models.converge,
-    models.fit,
-):
+    studies.init, studies.check, studies.run, studies.cohort, studies.demo, measurement.register, measurement.strain,
+    truth.phantom, truth.twin, truth.accuracy, models.mesh, models.simulate, models.compare, models.drive,
+    models.level, models.converge, models.fit,
+):  # fmt: skip
     app.command(cls=Grouped)(_command)
 
 

@@ -1,13 +1,14 @@
-"""A load that was measured and written."""
+"""A load that was measured and written, and the report of a series of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dvc import Measurement, Verdict
-from dvc.report.page import Section
+from dvc.report.page import Section, record_lines, write_report
+from dvc.trust.verdict import worst
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,3 +42,37 @@ class Case:
     def summary(self) -> list[str]:
         """The verdict with its reasons and the strain, for a person."""
         return list(self.lines)
+
+
+_CLOSING = (
+    Section(
+        "How to read this",
+        paragraphs=(
+            "Displacement u(X) = x - X is that of tissue relative to its bone: the rigid motion of the bone between "
+            "the scans is taken out. All maps are in the reference (unloaded) configuration, on the unloaded image's "
+            "voxels; components are in LPS (x to the patient's left, y to posterior, z to superior), lengths in mm.",
+            "Strain is Green-Lagrange, E = (F^T F - I)/2 with F = I + du/dX, from the analytic gradient of the cubic "
+            "B-spline; maximal shear is (E1 - E3)/2, half the difference of the largest and smallest principal strain. "
+            "det F is the ratio of deformed to reference volume.",
+            "A verdict judges the registration, not the tissue. It cannot see everything: inside a uniform region, and "
+            "along a smooth skin, an image does not show how tissue slides. Small shears are lifted by noise; a repeat "
+            "scan without load (--repeat) tells by how much. Strain that jumps at a border of tissues is smeared over "
+            "about one spacing of the control points (3 to 5 mm), unless a label map told where tissues meet. "
+            "Scanner distortion and creep between scans are not seen at all.",
+            "A noise floor is what a repeat scan shows where there is no strain. MAER is the mean over voxels of the "
+            "mean absolute value of the six strain components, SDER the standard deviation of the same.",
+            "Missing is NaN in every map, never zero; valid.nii.gz tells where values are. Programs built on ITK show "
+            "NaN in NIfTI as zero: use the NRRD twin or the validity mask there.",
+        ),
+    ),
+)
+
+
+def write_series_report(
+    path: Path, sections: Sequence[Section], failures: Mapping[str, str], record: Mapping[str, object]
+) -> None:
+    """Write the report of a series, one self-contained page."""
+    told = [*sections]
+    told += [Section(name, Verdict("distrust", (f"Not registered. {reason}",))) for name, reason in failures.items()]
+    verdict = worst([s.verdict for s in told if s.verdict is not None])
+    write_report(path, "Strain from MR image pairs", verdict, told, _CLOSING, record_lines(record))

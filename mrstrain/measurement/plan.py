@@ -1,21 +1,37 @@
-"""How the loads of a subject are measured: one by one, in a series or by a worker of a study."""
+"""How the loads of a subject are measured, in a series or by a worker of a study, and checked by their twins."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dvc import Deformation, Evidence, Image, Measurement, Registration, Settings, Subject, register as register_pair
+import numpy as np
+
+from dvc import (
+    Deformation,
+    Evidence,
+    Image,
+    Measurement,
+    Registration,
+    Settings,
+    Subject,
+    register as register_pair,
+    tissue_mask,
+)
+from dvc.errors import InputError, MrstrainError
+from dvc.images.noise import signal_to_noise
 from dvc.measurement.error_bars import TwinCheck
+from dvc.measurement.judgement import maps_of
 from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker
 from mrstrain.measurement.case import Case
-from mrstrain.measurement.twin_check import twin_check
 from mrstrain.options.measurement import EngineOptions, RegistrationOptions
 from mrstrain.records.provenance import provenance
+from phantoms import Acquisition, synthetic_warp
 
 Tell = Callable[[str, float], None]
 _SETTINGS = {*EngineOptions.model_fields, "align", "bending", "volume", "allow_unknown_parameters", "error_model"}
 """Options of a registration that its record has as settings, or by the file's hash."""
+_FOLDED = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,19 +57,13 @@ class Plan:
         self, loaded: Image, start: Deformation | None, worker: Worker, tell: Tell, *, is_repeat: bool = False
     ) -> Registered:
         """Register a loaded image, or a repeat scan, and the pair's twin."""
+        of, how = self.subject, self.settings.of_repeat() if is_repeat else self.settings
         found = register_pair(
-            self.subject.reference,
-            loaded,
-            bone=self.subject.bone,
-            tissue=self.subject.tissue,
-            labels=self.subject.labels,
-            settings=self.settings.of_repeat() if is_repeat else self.settings,
-            start=start,
-            worker=worker,
-            progress=tell,
-        )
+            of.reference, loaded, bone=of.bone, tissue=of.tissue, labels=of.labels, settings=how, start=start,
+            worker=worker, progress=tell,
+        )  # fmt: skip
         wanted = self.twin and not is_repeat
-        return Registered(found, twin_check(found, self.subject, start, worker, tell) if wanted else None, is_repeat)
+        return Registered(found, _twin_check(found, of, start, worker, tell) if wanted else None, is_repeat)
 
     def write(self, folder: Path, done: Registered, floor: NoiseFloor | None) -> tuple[Case, NoiseFloor | None]:
         """Judge what was registered and write it; return it with the noise floor that it was judged by, or gives."""
@@ -87,3 +97,39 @@ def record_of(
             **more,
         },
     )
+
+
+def _twin_check(
+    found: Registration, subject: Subject, start: Deformation | None, worker: Worker, tell: Tell
+) -> TwinCheck:
+    """Warp the unloaded image by a pair's measured motion, draw its noise anew, and register it as the pair was.
+
+    The measured strain is the true one of this twin, which lies on the loaded image's grid and is as noisy as the
+    noisier of the two images.
+    """
+    tell("making the twin", 0.0)
+    near, tissue = found.alignment.motion, found.tissue
+    try:
+        acquisition = Acquisition(found.settings.seed, found.loaded.grid, noise_factor=_noisier(found))
+        twin = synthetic_warp(found.reference, tissue, found.total, acquisition, near=near, beyond_missing=True).image
+        tell("making the twin", 1.0)
+        again = register_pair(
+            found.reference, twin, bone=subject.bone, tissue=tissue, labels=subject.labels, settings=found.settings,
+            start=start, worker=worker, progress=lambda stage, fraction: tell(f"twin: {stage}", fraction),
+        )  # fmt: skip
+    except MrstrainError as reason:
+        return TwinCheck(None, str(reason))
+    maps = maps_of(again)
+    folded = float(np.mean(maps.jacobian[tissue.inside] <= 0.0))
+    if folded > _FOLDED:
+        return TwinCheck(None, f"Its registration folds in {folded:.1%} of the tissue, so it tells nothing.")
+    return TwinCheck(maps.max_shear)
+
+
+def _noisier(found: Registration) -> float:
+    """How many times noisier the loaded image is than the unloaded one, for its signal; at least 1."""
+    try:
+        loaded = signal_to_noise(found.loaded, tissue_mask(found.loaded))
+    except InputError:  # no threshold finds the body there
+        return 1.0
+    return max(1.0, signal_to_noise(found.reference, found.tissue) / loaded)

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,8 @@ from dvc.registration.register import refuse_one_image_twice
 from dvc.trust.error_model import error_model_of, read_error_model
 from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker, each_in_workers, usable_cores
-from mrstrain.measurement.case import Case
+from mrstrain.measurement.case import Case, write_series_report
 from mrstrain.measurement.engines import engine_of
-from mrstrain.measurement.page import write_series_report
 from mrstrain.measurement.plan import Plan, Registered, record_of
 from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
@@ -195,11 +195,8 @@ class _Run:
         def one(name: str, worker: Worker) -> None:
             is_repeat = name == REPEAT
             start = None if is_repeat else last[-1] if chain and last else self.start
-
-            def told(stage: str, fraction: float) -> None:
-                self._told(name, stage, fraction)
-
             try:
+                told = partial(self._told, name)
                 done = self.plan.register(self.images[name], start, worker, told, is_repeat=is_repeat)
                 if not is_repeat:
                     last.append(done.found.displacement)

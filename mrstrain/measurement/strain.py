@@ -8,33 +8,13 @@ from dvc import Deformation, Measurement, Subject, read_displacement, read_trans
 from dvc.atomic_files import write_json
 from dvc.errors import InputError
 from dvc.io.result_folder import PROVENANCE, REPORT
-from mrstrain.measurement.case import Case
-from mrstrain.measurement.page import write_series_report
+from mrstrain.measurement.case import Case, write_series_report
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, MeshAndAxes, SubjectFiles
 from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 
 _TRANSFORMS = (".txt", ".h5", ".hdf5", ".tfm", ".mat", ".xfm", ".npz")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Given:
-    """A deformation from another tool, which maps points of the subject's reference to the loaded image, LPS mm."""
-
-    subject: Subject
-    whole: Deformation
-    source: Path
-    record: dict[str, object]
-
-    @property
-    def files(self) -> list[Path]:
-        """All files that were read."""
-        return [self.source, *self.subject.files.values()]
-
-    def measured(self, name: str) -> Measurement:
-        """Its strain; relative to the bone, where there is one."""
-        return Measurement.from_deformation(self.whole, self.subject, name=name)
 
 
 def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
@@ -48,12 +28,14 @@ def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
 
 
 def read_deformation(
-    subject: Subject, deformation: Path | str, *, frame: str | None, command: str, parameters: Mapping[str, object]
-) -> Given:
-    """Read a deformation of a subject's unloaded image from the file of any tool."""
-    source, whole = Path(deformation), read_any(deformation, frame)
-    record = provenance(command, {**subject.files, "deformation": source}, {"frame": frame, **parameters})
-    return Given(subject, whole, source, record)
+    subject: Subject, deformation: Path, *, frame: str | None, command: str, parameters: Mapping[str, object]
+) -> tuple[Deformation, dict[str, object]]:
+    """Read a deformation of a subject's unloaded image from the file of any tool, with its provenance.
+
+    It maps points of the reference to points of the loaded image, LPS mm.
+    """
+    whole = read_any(deformation, frame)
+    return whole, provenance(command, {**subject.files, "deformation": deformation}, {"frame": frame, **parameters})
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +86,12 @@ def strain(
         "mesh_unit": onto.mesh_unit,
         "mesh_frame": onto.mesh_frame,
     }
-    given = read_deformation(subject, deformation, frame=frame, command="strain", parameters=parameters)
+    whole, record = read_deformation(subject, source, frame=frame, command="strain", parameters=parameters)
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"
-    refuse_touching_inputs(target, [name], given.files)
-    measured = given.measured(name)
+    refuse_touching_inputs(target, [name], [source, *subject.files.values()])
+    measured = Measurement.from_deformation(whole, subject, name=name)
     make_output(target)
-    case = Case.of(measured, target / name, given.record)
-    write_json(target / PROVENANCE, given.record)
-    write_series_report(target / REPORT, [case.section], {}, given.record)
+    case = Case.of(measured, target / name, record)
+    write_json(target / PROVENANCE, record)
+    write_series_report(target / REPORT, [case.section], {}, record)
     return Strained(target, case)

@@ -38,6 +38,11 @@ def door(function: Callable[P, R_co]) -> Door[P, R_co]:
     They stand in its signature, and with their help in its docstring, as if they were written there.
     """
     models = models_of(function)
+    helps = [
+        f"{field}\n    {' '.join((info.description or '').split())}"
+        for model in models.values()
+        for field, info in model.model_fields.items()
+    ]
 
     @functools.wraps(function)
     def flat(*given: Any, **options: Any) -> Any:
@@ -48,7 +53,8 @@ def door(function: Callable[P, R_co]) -> Door[P, R_co]:
         return function(*given, **options, **made)
 
     flat.__signature__ = _flat_signature(function, models)  # type: ignore[attr-defined]
-    flat.__doc__ = f"{inspect.cleandoc(function.__doc__ or '')}\n\n{_documented(models)}\n"
+    own = inspect.cleandoc(function.__doc__ or "")
+    flat.__doc__ = "\n".join([own, "", "Other Parameters", "----------------", *helps, ""])
     flat.with_options = function  # type: ignore[attr-defined]
     return cast(Door[P, R_co], flat)
 
@@ -65,11 +71,3 @@ def _flat_signature(function: Callable[..., object], models: dict[str, type[Opti
             default, kind = own.empty if info.is_required() else info.default, bare(info.annotation, [])
             parameters.append(inspect.Parameter(field, own.KEYWORD_ONLY, default=default, annotation=kind))
     return signature.replace(parameters=parameters)
-
-
-def _documented(models: dict[str, type[Options]]) -> str:
-    lines = ["Other Parameters", "----------------"]
-    for model in models.values():
-        for field, info in model.model_fields.items():
-            lines += [field, f"    {' '.join((info.description or '').split())}"]
-    return "\n".join(lines)

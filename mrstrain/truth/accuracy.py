@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+import phantoms
 from dvc import engine_named
 from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError, MrstrainError
@@ -21,25 +22,7 @@ from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from mrstrain.truth.accuracy_page import write_accuracy_report
-from phantoms import (
-    AccuracyCase,
-    CoverageRow,
-    ErrorRow,
-    ErrorSamples,
-    FloorRow,
-    Heel,
-    ResolutionRow,
-    RunRow,
-    coverage_rows,
-    error_rows,
-    fit_error_model,
-    floor_rows,
-    heel_grid,
-    measure_run,
-    motion_named,
-    resolution_rows,
-    run_rows,
-)
+from phantoms import AccuracyCase, ErrorSamples, Heel, heel_grid, measure_run, motion_named
 
 MOTIONS = ("still", "smooth", "sliding", "Load1", "Load2", "Load3", "Load4")
 WAVES = tuple(f"wave-{length}" for length in (6, 8, 10, 12, 16, 20, 24, 48))
@@ -75,9 +58,9 @@ class AccuracyStudy:
     """
 
     out: Path
-    errors: tuple[ErrorRow, ...]
-    floors: tuple[FloorRow, ...]
-    resolution: tuple[ResolutionRow, ...]
+    errors: tuple[phantoms.ErrorRow, ...]
+    floors: tuple[phantoms.FloorRow, ...]
+    resolution: tuple[phantoms.ResolutionRow, ...]
     failures: dict[str, str]
 
     @property
@@ -259,14 +242,18 @@ def _measure_all(
 
 
 def _write(target: Path, runs: Sequence[ErrorSamples], failures: dict[str, str]) -> AccuracyStudy:
-    errors, floors, resolution = tuple(error_rows(runs)), tuple(floor_rows(runs)), tuple(resolution_rows(runs))
-    study, coverage = AccuracyStudy(target, errors, floors, resolution, failures), coverage_rows(runs)
+    errors, floors, resolution = (
+        tuple(phantoms.error_rows(runs)),
+        tuple(phantoms.floor_rows(runs)),
+        tuple(phantoms.resolution_rows(runs)),
+    )
+    study, coverage = AccuracyStudy(target, errors, floors, resolution, failures), phantoms.coverage_rows(runs)
     tables: tuple[tuple[str, type[Any], Sequence[Any]], ...] = (
-        ("errors", ErrorRow, errors),
-        ("zero_strain", FloorRow, floors),
-        ("resolution", ResolutionRow, resolution),
-        ("coverage", CoverageRow, coverage),
-        ("runs", RunRow, run_rows(runs)),
+        ("errors", phantoms.ErrorRow, errors),
+        ("zero_strain", phantoms.FloorRow, floors),
+        ("resolution", phantoms.ResolutionRow, resolution),
+        ("coverage", phantoms.CoverageRow, coverage),
+        ("runs", phantoms.RunRow, phantoms.run_rows(runs)),
     )
     for name, kind, rows in tables:
         write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], map(astuple, rows))
@@ -274,7 +261,7 @@ def _write(target: Path, runs: Sequence[ErrorSamples], failures: dict[str, str])
     for preset, text in presets.items():
         some = [r for r in runs if r.case.preset == preset and r.case.keeps_volume and r.case.wavelength_mm is None]
         if some:
-            model = fit_error_model(some, text, _source(some))
+            model = phantoms.fit_error_model(some, text, _source(some))
             model.write(target / f"error_model_{Path(preset).stem}.json")
     seconds = {r.case.name: round(r.seconds, 1) for r in runs}
     parameters = {"cases": list(seconds), "failures": failures, "presets": presets, "seconds_of_registration": seconds}

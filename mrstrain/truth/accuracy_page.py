@@ -52,18 +52,14 @@ def write_accuracy_report(
     write_report(path, "Accuracy of registration presets", None, sections, _CLOSING, record_lines(record))
 
 
-def _condition(row: ErrorRow | FloorRow | ResolutionRow) -> tuple[str, str, float]:
-    return row.preset, row.voxel_mm, row.snr
-
-
 def _named(row: ResolutionRow | CoverageRow) -> tuple[str, str, float]:
     return row.preset, f"{row.voxel_mm} mm", row.snr
 
 
 def _by_condition(rows: Sequence[_R], floors: Sequence[FloorRow]) -> Iterator[tuple[list[_R], list[FloorRow]]]:
     """Rows of one condition, and its noise floor."""
-    for condition in dict.fromkeys(map(_condition, rows)):
-        yield [r for r in rows if _condition(r) == condition], [f for f in floors if _condition(f) == condition]
+    for condition in dict.fromkeys(r.condition for r in rows):
+        yield [r for r in rows if r.condition == condition], [f for f in floors if f.condition == condition]
 
 
 def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -> Section:
@@ -81,7 +77,7 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -
         Picture.drawn(f"Error by {by.split(',')[0]}", figures.errors_by_place, errors, by)
         for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
     )
-    preset, voxel, snr = _condition(errors[0])
+    preset, voxel, snr = errors[0].condition
     return Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tuple(tables), pictures=pictures)
 
 

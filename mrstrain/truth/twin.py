@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dvc import write_image
+from dvc import Measurement, write_image
 from dvc.atomic_files import write_json
 from dvc.io.result_folder import PROVENANCE
 from mrstrain.measurement.strain import read_deformation
@@ -66,20 +66,20 @@ def twin(
     InputError
         Before anything is written: if the inputs do not fit together, or the deformation folds or leaves the image.
     """
-    target = Path(out)
+    target, source = Path(out), Path(deformation)
     subject = read_subject(load0, subject_files)
     subject = replace(subject, tissue=subject.body())
     recorded = {"bone_label": subject_files.bone_label, "seed": seed}
-    given = read_deformation(subject, deformation, frame=frame, command="twin", parameters=recorded)
-    refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], given.files)
-    measured = given.measured(_TRUTH.name)
+    whole, record = read_deformation(subject, source, frame=frame, command="twin", parameters=recorded)
+    refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], [source, *subject.files.values()])
+    measured = Measurement.from_deformation(whole, subject, name=_TRUTH.name)
     make_output(target)
     acquisition = Acquisition(seed)
-    made = synthetic_warp(subject.reference, subject.body(), given.whole, acquisition, near=measured.bone_motion)
+    made = synthetic_warp(subject.reference, subject.body(), whole, acquisition, near=measured.bone_motion)
     write_image(target / _IMAGE, made.image)
     (target / _TRUTH).parent.mkdir(exist_ok=True)
-    measured.write(target / _TRUTH, given.record)
-    write_json(target / PROVENANCE, given.record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
+    measured.write(target / _TRUTH, record)
+    write_json(target / PROVENANCE, record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
     told = " ".join(f"{subject_files.option(name)} {value}" for name, value in subject_files if value is not None)
     align = " --align none" if subject.bone is None else ""
     command = f"mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}"

@@ -12,7 +12,7 @@ from scipy.stats import foldnorm
 
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Image, LabelMap, Mask
-from dvc.measurement.error_bars import error_bars
+from dvc.measurement.error_bars import TwinCheck, error_bars
 from dvc.measurement.judgement import with_caution
 from dvc.measurement.page import error_tables
 from dvc.measurement.subject import Subject
@@ -25,7 +25,6 @@ from dvc.registration.register import Settings
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, error_model_of, uncertainty_of
 from dvc.trust.twin_judgement import judged
 from dvc.trust.verdict import Verdict
-from mrstrain.measurement.twin_check import TwinCheck
 
 GRID = Grid((40, 40, 40), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))
 NAMES = {1: "Calcaneus", 2: "fat", 3: "Left talus"}
