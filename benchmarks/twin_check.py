@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import read_image, read_labels
+from dvc import read_error_model, read_image, read_labels
 from dvc.atomic_files import write_json
-from dvc.trust.error_model import read_error_model, to_surface_mm
+from dvc.trust.error_model import to_surface_mm
 from mrstrain import phantom, register
 from mrstrain.records.provenance import versions
 from phantoms import RIGID

@@ -33,18 +33,19 @@ from .registration.engines import engine_named
 from .registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 from .registration.register import Registration, Settings, register
 from .trust.assessment import Similarity, assess
+from .trust.error_model import ErrorModel, ErrorTable, read_error_model
 from .trust.landmarks import read_landmarks, target_registration_error
 from .trust.quality import Quality, noise_floor
 from .trust.verdict import Verdict
 
 __all__ = [
     "Affine", "AlignedPair", "Alignment", "BSpline", "BorderedSpline", "Composed", "Deformation", "Elastix",
-    "Engine", "Evidence", "GaussNewton", "GaussNewtonWithInterfaces", "Grid", "Image", "LabelMap", "Mask",
-    "Measurement", "MeshFile", "Preset", "Quality", "Registration", "RigidMotion", "SampledDisplacement",
-    "Settings", "Similarity", "StrainField", "StrainMaps", "Subject", "TetMesh", "Verdict", "Within", "assess",
-    "engine_named", "errors", "evaluate_on_grid", "fit_mask", "load_preset", "local_correlation", "measure",
-    "noise_floor", "plate_axes", "preset_names", "principal_values", "read_displacement", "read_image",
-    "read_labels", "read_landmarks", "read_mask", "read_mesh", "read_parameter_file", "read_transform", "register",
-    "strain_maps", "target_registration_error", "tissue_mask", "write_image", "write_labels", "write_mask",
-    "write_vectors",
+    "Engine", "ErrorModel", "ErrorTable", "Evidence", "GaussNewton", "GaussNewtonWithInterfaces", "Grid", "Image",
+    "LabelMap", "Mask", "Measurement", "MeshFile", "Preset", "Quality", "Registration", "RigidMotion",
+    "SampledDisplacement", "Settings", "Similarity", "StrainField", "StrainMaps", "Subject", "TetMesh", "Verdict",
+    "Within", "assess", "engine_named", "errors", "evaluate_on_grid", "fit_mask", "load_preset",
+    "local_correlation", "measure", "noise_floor", "plate_axes", "preset_names", "principal_values",
+    "read_displacement", "read_error_model", "read_image", "read_labels", "read_landmarks", "read_mask",
+    "read_mesh", "read_parameter_file", "read_transform", "register", "strain_maps", "target_registration_error",
+    "tissue_mask", "write_image", "write_labels", "write_mask", "write_vectors",
 ]  # fmt: skip

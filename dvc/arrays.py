@@ -1,6 +1,8 @@
 """Array types, and read-only arrays for value objects."""
 
-from typing import TypeVar
+import copyreg
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +13,13 @@ FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
+
+
+def _sealed(content: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    return MappingProxyType(content)
+
+
+copyreg.pickle(MappingProxyType, lambda proxy: (_sealed, (dict(proxy),)))  # value objects hold them, and are pickled
 
 
 def frozen(values: npt.ArrayLike, dtype: type[_T]) -> npt.NDArray[_T]:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc import ErrorModel, ErrorTable
 from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import InputError
-from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, figures_of, widened
+from dvc.trust.error_model import POOLED, figures_of, widened
 from phantoms.accuracy_run import ErrorSamples
 from phantoms.error_tables import SOFT, OfCondition, by_condition, of_tissue
 

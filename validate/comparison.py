@@ -95,7 +95,7 @@ class Comparison:
         low, high = self.strains
         title = f"Area between volume-strain curves, maximum shear strain {low:g} to {high:g}, mL (95 % interval)"
         picture = Picture("Volume-strain curves", "", png_bytes(self.plot()))
-        words = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}."]
+        words = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}.", *self.verdict.reasons]
         return notebook_html(self._answer(), picture, Table(title, head, rows), notes=words)
 
     def _answer(self) -> str:

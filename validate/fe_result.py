@@ -42,6 +42,11 @@ class FeResult:
     path: Path
     deformation: OnMesh
 
+    @classmethod
+    def of(cls, name: str, deformation: OnMesh) -> "FeResult":
+        """The result of a model in memory, by its name in tables: ``simulation.deformation("Load1")``, say."""
+        return cls(name, Path(name), deformation)
+
     @property
     def mesh(self) -> TetMesh:
         """The linear tetrahedra on which it is defined."""

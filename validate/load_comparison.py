@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from dvc import Deformation, LabelMap, TetMesh, Verdict, plate_axes
+from dvc import Deformation, ErrorTable, LabelMap, Measurement, TetMesh, Verdict, plate_axes
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
-from dvc.trust.error_model import ErrorTable
 from dvc.trust.truth_draws import TruthDraws
 from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
@@ -90,10 +90,39 @@ class LoadCase:
 
     @classmethod
     def of(
-        cls, load: str, measured: Deformation, results: Sequence[FeResult], error: ErrorTable | None = None
+        cls,
+        load: str,
+        measured: Deformation | Measurement,
+        results: Sequence[FeResult],
+        error: ErrorTable | None = None,
     ) -> LoadCase:
-        """A load whose fields are in memory; set the rest with `dataclasses.replace`."""
-        return cls(load, lambda: (measured, results), error=error)
+        """A load whose fields are in memory; set the rest with `dataclasses.replace`.
+
+        Parameters
+        ----------
+        load : str
+            Its name.
+        measured : Deformation or Measurement
+            Of tissue relative to its bone, reference configuration, LPS mm. A measurement also gives its error, its
+            verdict, what it was aligned on, and the plate's axes where a shear direction was given.
+        results : sequence of FeResult
+            One for each model (`FeResult.of`, `read_result`).
+        error : ErrorTable, optional
+            Error of the measured maximum shear strain, in place of the measurement's own.
+        """
+        if not isinstance(measured, Measurement):
+            return cls(load, partial(_given, measured, results), error=error)
+        known, axes = measured.error_bars.uncertainty, None if measured.source is None else measured.source.subject.axes
+        own = None if known is None else known.table
+        case = cls(
+            load, partial(_given, measured.deformation, results), error=own if error is None else error,
+            verdict=measured.verdict, aligned_on=str(measured.alignment.get("on", "")),
+        )  # fmt: skip
+        return case if axes is None else replace(case, axes=axes)
+
+
+def _given(measured: Deformation, results: Sequence[FeResult]) -> Fields:
+    return measured, results
 
 
 @dataclass(frozen=True, slots=True, eq=False)

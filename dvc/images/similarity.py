@@ -1,11 +1,12 @@
 """How alike two images on one grid are: in local structure, beside what their noise allows, and but for an offset."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from dvc.arrays import Float32Array
+from dvc.arrays import Float32Array, FloatArray
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing
 
@@ -67,7 +68,11 @@ def most_similarity(
         x = np.where(known, values[box], 0.0).astype(np.float64)
         mean, square = (gaussian_filter(part, sigma, mode="constant") / weight for part in (x, x * x))
         shares.append(s**2 / max(float((square - mean**2)[known].mean()), 1e-12))
-    return lambda factor: float(np.sqrt(np.prod([max(0.0, 1.0 - factor**2 * share) for share in shares])))
+    return partial(_correlation_left, shares)
+
+
+def _correlation_left(shares: list[float], factor: float) -> float:
+    return float(np.sqrt(np.prod([max(0.0, 1.0 - factor**2 * share) for share in shares])))
 
 
 def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float) -> Callable[[float], float]:
@@ -83,21 +88,28 @@ def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float)
     known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
     at = np.argwhere(known)
     if len(at) < _FEWEST:
-        return lambda _: float("nan")
+        return _unknown
     x, y = (values[box][known].astype(np.float64) for values in (a.values, carried))
     size, bright = float(np.abs(x).max()), float(np.percentile(y, _BRIGHT))
     place = 2.0 * at / np.maximum(at.max(axis=0), 1) - 1.0
     linear = np.column_stack([np.ones(len(at)), place])
     gain = np.column_stack([linear, place**2, place * np.roll(place, 1, axis=1)])
-    terms = gain.shape[1]
     both = np.hstack([gain * (x / size)[:, None], linear])
     normal, right, own = both.T @ both, both.T @ y, gain.T @ gain
+    return partial(_offset, normal, right, own, linear, (noise, size, bright))
 
-    def offset(factor: float) -> float:
-        told = normal.copy()
-        told[:terms, :terms] -= (factor * noise / size) ** 2 * own
-        if not (bright > 0.0 and np.linalg.eigvalsh(told).min() > _LEAST * np.trace(told)):
-            return float("nan")
-        return float(np.percentile(np.abs(linear @ np.linalg.solve(told, right)[terms:]), 95)) / bright
 
-    return offset
+def _unknown(_: float) -> float:
+    return float("nan")
+
+
+def _offset(
+    normal: FloatArray, right: FloatArray, own: FloatArray, linear: FloatArray, scale: tuple[float, float, float],
+    factor: float,
+) -> float:  # fmt: skip
+    """The 95th percentile of the offset, with ``factor`` times the noise taken out of the normal matrix."""
+    (noise, size, bright), terms, left = scale, len(own), normal.copy()
+    left[:terms, :terms] -= (factor * noise / size) ** 2 * own
+    if not (bright > 0.0 and np.linalg.eigvalsh(left).min() > _LEAST * np.trace(left)):
+        return float("nan")
+    return float(np.percentile(np.abs(linear @ np.linalg.solve(left, right)[terms:]), 95)) / bright

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 import validate
-from dvc import Grid, LabelMap, TetMesh, plate_axes, read_labels
+from dvc import Deformation, Grid, LabelMap, TetMesh, plate_axes, read_labels
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, result_folders
@@ -149,9 +150,15 @@ def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
     return mesh
 
 
+def _read(
+    measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid
+) -> tuple[Deformation, list[validate.FeResult]]:
+    return measurement.deformation(), [file.read(grid) for file in files]
+
+
 def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> validate.LoadCase:
     image = measurement.folder / REGISTERED
     return validate.LoadCase(
-        measurement.load, lambda: (measurement.deformation(), [file.read(grid) for file in files]), axes,
+        measurement.load, partial(_read, measurement, files, grid), axes,
         measurement.table, measurement.verdict, measurement.aligned_on, image if image.is_file() else None,
     )  # fmt: skip

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import Deformation, Engine, Evidence, Image, Mask, Settings, read_image, read_landmarks
+from dvc import Deformation, Engine, Evidence, Image, Mask, Settings, read_error_model, read_image, read_landmarks
 from dvc.atomic_files import write_json
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
 from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
 from dvc.registration.align import without_motion
 from dvc.registration.engines import DEFAULT
 from dvc.registration.register import refuse_one_image_twice
-from dvc.trust.error_model import error_model_of, read_error_model
+from dvc.trust.error_model import error_model_of
 from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.measurement.case import Case, write_series_report
@@ -95,6 +95,8 @@ def register(
         For any input that cannot be used, before anything is computed; or if every load failed.
     """
     target = Path(out)
+    if isinstance(loads, str | Path):
+        raise InputError(f"`loads` is a list of files; for one give [{str(loads)!r}].")
     places = _places([Path(p) for p in loads], scans)
     cases, paths = list(places), list(places.values())
     chosen = engine_of(registration, labelled=subject_files.labels is not None)

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from dvc import Evidence, Settings, read_image
+from dvc import Evidence, Settings, read_error_model, read_image
 from dvc.io.result_folder import QUALITY, REPEAT, spline_in
-from dvc.trust.error_model import error_model_of, read_error_model
+from dvc.trust.error_model import error_model_of
 from dvc.trust.quality import read_noise_floor
 from dvc.worker import Worker
 from mrstrain.measurement.case import Case

@@ -8,11 +8,11 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from dvc import Image, LabelMap, fit_mask, plate_axes, read_image, read_labels, read_mask
+from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_image, read_labels, read_mask
 from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import REPEAT
 from dvc.measurement.subject import is_bones_name
-from dvc.trust.error_model import error_model_of, read_error_model
+from dvc.trust.error_model import error_model_of
 from dvc.worker import usable_cores
 from fe import LoadStep, MaterialSet, Plate, Problem, check_loads, check_meshing, fixed_facets, material_set
 from mrstrain.comparison.model_files import Reading, model_files
