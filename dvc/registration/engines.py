@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+from dvc.errors import ParameterError
 from dvc.registration.elastix.engine import Elastix
-from dvc.registration.elastix.presets import preset_or_file
+from dvc.registration.elastix.presets import preset_names, preset_or_file
 from dvc.registration.engine import Engine
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 
@@ -30,7 +31,12 @@ def engine_named(name: str) -> Engine:
     ParameterError, InputError
         If there is no such preset, or the file cannot be used.
     """
-    return ENGINES[name]() if name in ENGINES else Elastix((preset_or_file(name),))
+    if name in ENGINES:
+        return ENGINES[name]()
+    if not name.endswith(".txt") and name not in preset_names():
+        known = ", ".join((*ENGINES, *preset_names()))
+        raise ParameterError(f"No engine or preset '{name}'; there are {known}, or a parameter file of elastix (.txt).")
+    return Elastix((preset_or_file(name),))
 
 
 def methods_of(record: Mapping[str, Any], versions: Mapping[str, str]) -> str:

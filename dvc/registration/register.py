@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Composed, Deformation, RigidMotion, Within
-from dvc.errors import InputError
+from dvc.errors import InputError, ParameterError
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.images.shading import without_shading
 from dvc.images.tissue import tissue_mask
@@ -47,12 +47,25 @@ class Settings:
     threads : int
         Threads of each worker. What the Gauss-Newton engine finds, the bone's alignment and the correction of the bias
         field are equal bit for bit on any number of threads; what elastix finds, on equal numbers.
+
+    Raises
+    ------
+    ParameterError
+        For an engine by its name (see `Settings.of`), another alignment, or less than one thread.
     """
 
     engine: Engine = field(default_factory=lambda: engine_named(DEFAULT))
     align_on: AlignOn = "bone"
     seed: int = 1
     threads: int = 1
+
+    def __post_init__(self) -> None:
+        if not hasattr(self.engine, "find"):
+            raise ParameterError(f"`engine` is an Engine; for one by its name: Settings.of({self.engine!r}).")
+        if self.align_on not in get_args(AlignOn):
+            raise ParameterError(f"`align_on` is one of {', '.join(get_args(AlignOn))}; got {self.align_on!r}.")
+        if self.threads < 1:
+            raise ParameterError(f"`threads` is 1 or more; got {self.threads}.")
 
     def of_repeat(self) -> Settings:
         """The settings for a repeat scan, which is smoothed no more than a loaded image."""

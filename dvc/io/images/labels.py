@@ -210,7 +210,8 @@ def _count_inside(own: Grid, values: npt.NDArray[Any], grid: Grid) -> tuple[int,
 def _mirrored_axes(own: Grid, grid: Grid) -> str:
     """Name the world axes whose sign turns one grid into the other, or nothing."""
     wanted = grid.toward_lps()
-    for signs in product((1.0, -1.0), repeat=3):
+    signs_of_ras = (-1.0, -1.0, 1.0)  # before the others: an image may be its own mirror image along an axis
+    for signs in ((1.0, 1.0, 1.0), signs_of_ras, *product((1.0, -1.0), repeat=3)):
         flip = np.array(signs)
         mirror = Grid(own.shape, own.spacing_mm, own.origin_mm * flip, own.direction * flip[:, None])
         if mirror.toward_lps().same_as(wanted):
