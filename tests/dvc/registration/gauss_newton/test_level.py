@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, evaluate_on_grid
 from dvc.errors import InputError
-from dvc.images.image import Grid
+from dvc.images.image import Grid, Image
 from dvc.registration.gauss_newton.fit import control_grid, spline_through
+from dvc.registration.gauss_newton.image_term import ImagePair
 from dvc.registration.gauss_newton.level import Level, Splines, Weights, _share_at, cofactors, conjugate_gradients
 from dvc.registration.gauss_newton.spline_sums import SplineSums
 from tests.textures import GRID, everything, pair_of
@@ -36,6 +37,23 @@ def test_sums_are_those_of_the_spline(sums):
     np.testing.assert_allclose(u[points.inside], true_u, atol=1e-12)
     np.testing.assert_allclose(H[points.inside], true_H, atol=1e-12)
     assert not H[~points.inside].any()
+
+
+@pytest.mark.parametrize("interfaces", [False, True])
+def test_a_block_is_compared_if_any_voxel_of_it_is(interfaces):
+    """At its first voxel, where strain is taken with interfaces, a block may lie outside the mask."""
+    grid = Grid((8, 8, 8), np.ones(3), np.zeros(3))
+    image = Image(grid, np.random.default_rng(1).uniform(size=grid.shape).astype(np.float32))
+    inside = np.ones(grid.shape, dtype=bool)
+    inside[2, 4, 6], inside[4:6, 4:6, 4:6] = False, False
+    factors = np.zeros((*grid.shape, 1, 4))
+    factors[..., 0] = 1.0
+    control = control_grid(grid, np.full(3, 4.0))
+    pair = ImagePair(image, image, inside, control, np.full(3, 2), factors=factors if interfaces else None)
+    assert pair.blocks.inside[1, 2, 3]
+    assert not pair.blocks.inside[2, 2, 2]
+    assert pair.blocks.inside.sum() == 4**3 - 1
+    assert pair.share(inside)[1, 2, 3] == (0.0 if interfaces else 7.0)
 
 
 def test_gathering_is_the_transpose_of_evaluating(sums):
