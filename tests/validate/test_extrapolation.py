@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -72,9 +73,19 @@ def test_levelled_models_are_judged_as_found() -> None:
     assert np.isnan(area["a" + LEVELLED].estimate_ml)
 
 
-def test_what_comes_back_is_the_model_as_the_measurement_shows_it(
-    tmp_path: Path, heel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@dataclass(frozen=True)
+class Bumped:
+    """A heel's image and bone in a folder, and a model in it whose fat moves by up to 3 mm."""
+
+    folder: Path
+    grid: Grid
+    body: np.ndarray
+    mesh: TetMesh
+    u: np.ndarray
+
+
+@pytest.fixture
+def bumped(tmp_path: Path, heel) -> Bumped:
     grid = heel_grid(1.6)
     tissues = labels_of(heel, grid)
     write_image(tmp_path / "Load0.nii.gz", scan(heel, grid, snr=25.0, number=0))
@@ -90,21 +101,32 @@ def test_what_comes_back_is_the_model_as_the_measurement_shows_it(
     meshio.write(
         tmp_path / "model" / "Load1.vtu", meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], {"displacement": u})
     )
-    (tmp_path / "mine.txt").write_text(
+    body = tissues.labels[tuple(np.rint(grid.indices_of(mesh.points_mm)).astype(int).T)] > 0
+    return Bumped(tmp_path, grid, body, mesh, u)
+
+
+@pytest.mark.full_size
+def test_what_comes_back_is_the_model_as_the_measurement_shows_it(bumped: Bumped) -> None:
+    folder, body, u = bumped.folder, bumped.body, bumped.u
+    (folder / "mine.txt").write_text(
         QUICK.replace("8.0", "5.0").replace("Resolutions 2", "Resolutions 3").replace("80)", "200)")
     )
     # The model moves bone and changes volume, which our own engine would not let it do.
     done = level(
-        tmp_path / "Load0.nii.gz", tmp_path / "model", out=tmp_path / "out", bone=tmp_path / "bone.nii.gz",
-        parameters=[tmp_path / "mine.txt"],
+        folder / "Load0.nii.gz", folder / "model", out=folder / "out", bone=folder / "bone.nii.gz",
+        parameters=[folder / "mine.txt"],
     )  # fmt: skip
     assert done.folder.name == "model" + LEVELLED
     back = read_result("levelled", done.folder / "Load1.vtu")
-    body = tissues.labels[tuple(np.rint(grid.indices_of(mesh.points_mm)).astype(int).T)] > 0
     moved = np.linalg.norm(u, axis=1) > 1.0
     size, apart = (np.linalg.norm(v, axis=1)[body & moved] for v in (u, back.deformation.u_mm - u))
     assert np.median(apart) < 0.5 * np.median(size)  # voxels of 1.6 mm
     assert np.corrcoef(back.deformation.u_mm[body & moved, 1], u[body & moved, 1])[0, 1] > 0.8
+
+
+def test_what_cannot_be_levelled_is_refused(bumped: Bumped, monkeypatch: pytest.MonkeyPatch) -> None:
+    tmp_path = bumped.folder
+    (tmp_path / "out").mkdir()
     for wrong, message in (
         (tmp_path / "model" / "Load1.vtu", "no folder"),
         (tmp_path / "out", "file of a measured load|No (load|model)"),

@@ -86,6 +86,7 @@ def test_same_seed_same_result_bit_for_bit_other_seed_another(tiny_pair, worker)
     assert np.abs(other - one).max() > 1e-6
 
 
+@pytest.mark.full_size  # other orders of the voxels: test_any_frame
 def test_an_image_stored_in_another_orientation_gives_the_same_result(found, small_pair, worker):
     loaded = small_pair.loaded
     turned_grid = Grid(
@@ -270,17 +271,17 @@ def test_elastix_own_reason_is_told(tiny_pair, worker):
         )
 
 
-def test_missing_voxels_are_left_out(small_pair, worker):
+def test_missing_voxels_are_left_out(tiny_pair, worker):
     """A tenth of the bone is not shown: neither an edge for the rigid fit, nor a result there."""
-    grid, inside = small_pair.loaded.grid, small_pair.bone.points()
-    front = np.percentile(small_pair.foot_motion.apply(inside)[:, 1], 10.0)
-    values = np.array(small_pair.loaded.values)
+    grid, inside = tiny_pair.loaded.grid, tiny_pair.bone.points()
+    front = np.percentile(tiny_pair.foot_motion.apply(inside)[:, 1], 10.0)
+    values = np.array(tiny_pair.loaded.values)
     values[grid.points()[..., 1] < front] = np.nan
     cut = Image(grid, values)
-    found = register(small_pair.reference, cut, bone=small_pair.bone, settings=quick(), worker=worker)
-    assert rms_over(small_pair.bone, found.alignment.motion, small_pair.foot_motion) < 2 * COARSE_MM
+    found = register(tiny_pair.reference, cut, bone=tiny_pair.bone, settings=quick(), worker=worker)
+    assert rms_over(tiny_pair.bone, found.alignment.motion, tiny_pair.foot_motion) < 3 * COARSE_MM
     assert np.isfinite(found.displacement.coefficients_mm).all()
-    X = small_pair.bone.points()
+    X = tiny_pair.bone.points()
     assert 0.02 < 1.0 - shows(cut, found.alignment.motion.apply(X)).mean() < 0.2
 
 

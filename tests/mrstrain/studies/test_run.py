@@ -20,9 +20,8 @@ import pytest
 from filelock import FileLock
 
 from dvc.errors import InputError, OutputError
-from dvc.images.image import Grid, LabelMap
 from dvc.io.images.read import read_image
-from dvc.io.images.write import write_image, write_labels
+from dvc.io.images.write import write_image
 from mrstrain.studies.check import check
 from mrstrain.studies.cluster import cluster
 from mrstrain.studies.cohort import cohort
@@ -33,86 +32,20 @@ from mrstrain.studies.run import forecast, report, run, run_studies
 from tests.processes import cluster_of_two, under_way, wait_for
 from tests.quick import QUICK
 
-STUDY = """
-[study]
-name = "Heel <b>3</b>"
-[images]
-load0 = "Load0.nii.gz"
-labels = "tissues.nii.gz"
-names = "tissues.csv"
-repeat = "Load0-again.nii.gz"
-[loads.Load1]
-image = "Load1.nii.gz"
-normal_n = 8.0
-[loads.Load2]
-image = "Load2.nii.gz"
-normal_n = 2.0
-[registration]
-bending = 3.0
-volume = 300.0
-borders = false
-[mesh]
-edge_mm = 9.0
-labels = "to_mesh.nii.gz"
-names = "to_mesh.csv"
-[models]
-sets = ["akrami"]
-"""
 STAGES = ["register repeat", "register Load1", "register Load2", "mesh", "simulate akrami", "compare"]
-
-
-def coarse(labels: LabelMap) -> LabelMap:
-    """Bone and soft tissue at twice the voxel: a mesh of few cells."""
-    grid = labels.grid
-    bones = [n for n, name in labels.names.items() if name in ("bone", "ankle")]
-    values = labels.labels[::2, ::2, ::2]
-    both = np.where(np.isin(values, bones), 1, np.where(values > 0, 2, 0))
-    return LabelMap(
-        Grid(both.shape, 2.0 * grid.spacing_mm, grid.origin_mm, grid.direction), both, {1: "bone", 2: "fat"}
-    )
-
-
-@pytest.fixture(scope="module")
-def images(made_once, tiny_pair, small_pair) -> Path:
-    """A heel at 2.3 mm; the repeat scan serves for Load2 too, with one voxel changed: no image is given twice."""
-
-    def fill(folder: Path) -> None:
-        write_image(folder / "Load0.nii.gz", tiny_pair.reference)
-        write_image(folder / "Load1.nii.gz", tiny_pair.loaded)
-        values = tiny_pair.repeat.values.copy()
-        values[0, 0, 0] += 1.0
-        write_image(folder / "Load2.nii.gz", type(tiny_pair.repeat)(tiny_pair.repeat.grid, values))
-        write_image(folder / "Load0-again.nii.gz", tiny_pair.repeat)
-        write_labels(folder / "tissues.nii.gz", tiny_pair.labels)
-        write_labels(folder / "to_mesh.nii.gz", coarse(small_pair.labels))
-        (folder / "study.toml").write_text(STUDY)
-
-    return made_once("study-images", fill)
-
-
-@pytest.fixture(scope="module")
-def done(images, made_once, tmp_path_factory):
-    """The study, run once for all in a process of its own on two workers; each test worker has a copy."""
-
-    def fill(folder: Path) -> None:
-        shutil.copytree(images, folder / "study")
-        told = subprocess.run(
-            [sys.executable, "-m", "mrstrain", "run", str(folder / "study")],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert told.returncode == 0, told.stderr
-        (folder / "told.json").write_text(json.dumps([told.stdout, told.stderr]))
-
-    folder = made_once("study-done", fill)
-    own = tmp_path_factory.mktemp("done") / "study"
-    shutil.copytree(folder / "study", own)
-    return own, *json.loads((folder / "told.json").read_text())
 
 
 def shear_of(folder: Path, load: str) -> np.ndarray:
     return read_image(folder / "results" / "registration" / load / "max_shear.nii.gz", allow_missing=True).values
+
+
+def change(study: Path, *changes: tuple[str, str]) -> None:
+    """Change texts of a study's file."""
+    text = (study / "study.toml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (study / "study.toml").write_text(text)
 
 
 def areas(study: Path) -> list[float]:
@@ -154,7 +87,7 @@ def test_parameter_files_are_inputs_of_every_registration(images, tmp_path):
     shutil.copytree(images, study)
     (study / "quick.txt").write_text(QUICK)
     own = 'parameters = ["quick.txt"]\n'
-    (study / "study.toml").write_text(STUDY.replace("bending = 3.0\nvolume = 300.0\nborders = false\n", own))
+    change(study, ("bending = 3.0\nvolume = 300.0\nborders = false\n", own))
     registrations = [stage for stage in plan(read_study(study)) if stage.kind == "register"]
     assert len(registrations) == 3
     assert all(study / "quick.txt" in stage.files for stage in registrations)
@@ -200,7 +133,7 @@ def test_only_what_changed_is_done_anew(done, tmp_path):
     folder, *_ = done
     study = tmp_path / "study"
     shutil.copytree(folder, study)
-    (study / "study.toml").write_text(STUDY.replace("normal_n = 8.0", "normal_n = 6.0"))
+    change(study, ("normal_n = 8.0", "normal_n = 6.0"))
     told = forecast(study)
     assert [name for name, what in told.items() if what == "run"] == ["simulate akrami", "compare"]
     image = read_image(study / "Load2.nii.gz")
@@ -323,6 +256,7 @@ def test_a_registration_whose_process_is_killed_fails_alone_and_is_named(done, t
     assert forecast(study, only=["register"])["register Load1"] == "run"
 
 
+@pytest.mark.full_size
 def test_a_cluster_whose_worker_is_killed_loses_nothing(done, tmp_path):
     folder, *_ = done
     study = without_loads(folder, tmp_path / "study")
@@ -376,8 +310,8 @@ def test_check_tells_all_that_is_wrong_at_once(done, images, tmp_path):
     shutil.copytree(images, study)
     shutil.copy(study / "Load0.nii.gz", study / "Load1.nii.gz")
     (study / "Load2.nii.gz").unlink()
-    text = STUDY.replace('names = "tissues.csv"', 'names = "tissues.csv"\nbone = "heelbone"')
-    (study / "study.toml").write_text(text.replace('"akrami"', '"akramy"'))
+    named = 'names = "tissues.csv"'
+    change(study, (named, named + '\nbone = "heelbone"'), ('"akrami"', '"akramy"'))
     wrong = "\n".join(check(study).wrong)
     for words in ("Load1 is the unloaded image", "Load2.nii.gz", "heelbone", "akramy"):
         assert words in wrong, words
@@ -410,7 +344,7 @@ def test_a_cohort_of_finished_studies_is_one_table_and_one_report(done, tmp_path
     for name in ("Ada", "Ben"):
         places.append(tmp_path / name)
         shutil.copytree(folder, places[-1])
-        (places[-1] / "study.toml").write_text(STUDY.replace("Heel <b>3</b>", name))
+        change(places[-1], ("Heel <b>3</b>", name))
     told = cohort(places, out=tmp_path / "cohort")
     assert all(o.reused for one in told.ran for o in one.outcomes.values())
     (first,) = told.ranking
