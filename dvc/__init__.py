@@ -1,7 +1,14 @@
 """Measured deformation: MR images, alignment on bone, B-spline registration, strain, and how far to trust it.
 
 The public surface; a name is loaded when it is first used. All geometry is LPS mm in the reference (unloaded)
-configuration unless a docstring says otherwise.
+configuration unless a docstring says otherwise. Where to start:
+
+    import dvc
+
+    reference, loaded = dvc.read_image("Load0.nii.gz"), dvc.read_image("Load1.nii.gz")
+    measurement = dvc.measure(reference, loaded, bone=dvc.read_mask("calcaneus.nii.gz", reference.grid))
+    print(measurement)
+    measurement.write("Load1")
 """
 
 import lazy_loader

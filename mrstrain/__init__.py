@@ -1,8 +1,7 @@
 """Strain inside soft tissue from pairs of MR images, and how far a finite-element model of it may be trusted.
 
-The roof of the house: command line, study file, pipeline, provenance, doctor. It parses, wires and prints;
-what computes lies in `dvc`, `fe`, `phantoms` and `validate`. Importing it loads none of them: the functions below,
-which do what the commands of these names do, load what they need when they are first asked for.
+The commands as functions: each takes paths and writes a folder. For arrays see `dvc`, `fe`, `validate` and `phantoms`.
+Importing it loads none of them: a function loads what it needs when it is first used.
 """
 
 import lazy_loader

@@ -70,6 +70,18 @@ def evaluate_on_grid(
 class Affine:
     """x = matrix @ X + translation_mm, defined everywhere.
 
+    Attributes
+    ----------
+    matrix : (3, 3)
+        F, the same everywhere; LPS.
+    translation_mm : (3,)
+        LPS.
+
+    Raises
+    ------
+    InputError
+        For other shapes, or numbers that are not finite.
+
     Examples
     --------
     >>> stretch = Affine(np.diag([1.2, 1.0, 1.0]), np.zeros(3))

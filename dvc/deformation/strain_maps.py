@@ -52,9 +52,16 @@ class StrainMaps:
 def strain_maps(
     deformation: Deformation, mask: Mask, seen: Callable[[FloatArray], BoolArray] | None = None
 ) -> StrainMaps:
-    """Displacement and strain at the voxels of a mask on the reference grid.
+    """Displacement and strain at the voxels of a mask on the reference grid: what decides where strain is defined.
 
-    NaN where `seen` says of deformed points x (n, 3) LPS mm that the loaded image does not show them.
+    Parameters
+    ----------
+    deformation : Deformation
+        Of tissue relative to its bone, reference configuration, LPS mm.
+    mask : Mask
+        Voxels where the fields are wanted.
+    seen : callable, optional
+        Of deformed points x (n, 3), LPS mm: whether the loaded image shows them, (n,) bool. Fields are NaN where not.
     """
     grid = mask.grid
     valid = np.zeros(grid.shape, dtype=bool)

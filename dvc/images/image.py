@@ -183,7 +183,14 @@ def _check_shape(what: str, shape: tuple[int, ...], grid: Grid) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Image:
-    """A scalar image on a grid; single precision, as scanners give it. Missing voxels are NaN.
+    """A scalar image on a grid; single precision, as scanners give it.
+
+    Attributes
+    ----------
+    grid : Grid
+        LPS mm, in the frame of the scan.
+    values : (ni, nj, nk) float32
+        Grey values; NaN at missing voxels.
 
     Raises
     ------
@@ -212,12 +219,28 @@ class Image:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mask:
-    """A set of voxels on a grid."""
+    """A set of voxels on a grid.
+
+    Attributes
+    ----------
+    grid : Grid
+        LPS mm.
+    inside : (ni, nj, nk) bool
+        Which voxels belong to it.
+
+    Raises
+    ------
+    GeometryError, InputError
+        If voxels and grid differ in shape; for grey values, which are neither 0 nor 1.
+    """
 
     grid: Grid
     inside: BoolArray
 
     def __post_init__(self) -> None:
+        given = np.asarray(self.inside)
+        if given.dtype.kind == "f" and not np.isin(given, (0.0, 1.0)).all():
+            raise InputError("A mask holds 0 and 1; these are grey values. Compare them: Mask(grid, values > level).")
         object.__setattr__(self, "inside", frozen(self.inside, np.bool_))
         _check_shape("The mask", self.inside.shape, self.grid)
 
@@ -247,7 +270,16 @@ class Mask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelMap:
-    """Regions on a grid, each an integer with a name. Zero is background and has no name.
+    """Regions on a grid, each an integer with a name.
+
+    Attributes
+    ----------
+    grid : Grid
+        LPS mm.
+    labels : (ni, nj, nk) int
+        Number of the region of each voxel; 0 is background and has no name.
+    names : mapping of int to str
+        Name of each number.
 
     Raises
     ------

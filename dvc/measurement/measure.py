@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation
+from dvc.errors import GeometryError
 from dvc.images.image import Image, LabelMap, Mask
 from dvc.io.meshes.read import MeshFile
 from dvc.measurement.judgement import Evidence
@@ -42,9 +43,14 @@ def measure(
     ----------
     reference, loaded : Image
         Unloaded and loaded image, each in the frame of its own file (LPS mm).
-    bone, tissue, labels, start
-        As in `dvc.register`: on the reference grid. Labels give statistics by region, and strain discontinuities at
-        their borders.
+    bone : Mask, optional
+        The bone whose motion is taken out, on the reference grid; needed unless ``settings.align_on`` is not "bone".
+    tissue : Mask, optional
+        Body on the reference grid, bone included; found by a threshold where it is not given.
+    labels : LabelMap, optional
+        Tissues on the reference grid: statistics by region, and strain discontinuities at their borders.
+    start : Deformation, optional
+        A first guess of the displacement of tissue relative to its bone, such as another load's.
     settings : Settings, optional
         By default the Gauss-Newton engine, with strain discontinuities at tissue interfaces where there are labels; one
         thread.
@@ -68,9 +74,13 @@ def measure(
 
     Raises
     ------
+    GeometryError
+        If the labels lie on another grid.
     InputError, ParameterError, RegistrationError, WorkerError
         As `dvc.register`.
     """
+    if labels is not None and not labels.grid.same_as(reference.grid):
+        raise GeometryError("The labels lie on another grid than the unloaded image: `fit_mask` brings them onto it.")
     normal, axes = plate_directions(plate_normal, shear_direction)
     subject = Subject(reference, bone, tissue, labels, mesh, normal, axes)
     chosen = settings or Settings(GaussNewton() if labels is None else GaussNewtonWithInterfaces())

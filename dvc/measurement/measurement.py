@@ -48,7 +48,8 @@ class Measurement:
     maps : StrainMaps
         Displacement, Green-Lagrange strain, maximal shear, det F, and where they are valid.
     alignment : mapping
-        The bone's rigid motion between the scans and how well it is known, as plain values.
+        The bone's rigid motion between the scans and how well it is known, as plain values: "on" (what was aligned
+        on), "rotation" (3 x 3) and "translation_lps_mm" (`bone_motion`), "repeatability_rms_mm" and more.
     quality : Quality
         The figures behind the verdict.
     regions : tuple of RegionRow

@@ -24,12 +24,12 @@ def families() -> list[str]:
 
 
 def engine_named(name: str) -> Engine:
-    """An engine by the name that error models know it by: its own, that of a preset of elastix, or a .txt file.
+    """An engine by its name: gauss-newton, gauss-newton-borders, a preset of elastix, or a parameter file (.txt).
 
     Raises
     ------
     ParameterError, InputError
-        If there is no such preset, or the file cannot be used.
+        If there is no such engine or preset, or the file cannot be used.
     """
     if name in ENGINES:
         return ENGINES[name]()

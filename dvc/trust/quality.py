@@ -146,7 +146,7 @@ def _finite(reduce: Callable[[FloatArray], float], values: FloatArray) -> float:
 
 
 def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
-    """The apparent strain of a repeat scan, in the valid voxels of ``where``; None where there is none."""
+    """The apparent strain of a repeat scan's maps, in the valid voxels of ``where`` (ni, nj, nk); None without any."""
     kept = maps.valid & where
     if not kept.any():
         return None

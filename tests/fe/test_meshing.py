@@ -98,6 +98,7 @@ def test_surfaces_lie_where_they_should(meshed) -> None:
     assert (times % 2 == 0).all()  # closed
 
 
+@pytest.mark.full_size
 def test_a_finer_skin_is_two_cells_thick(meshed) -> None:
     """No cell of a skin of 3 mm reaches through it, but for one in a hundred at the rim of the cut."""
     _, coarse = meshed

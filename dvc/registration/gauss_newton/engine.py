@@ -31,7 +31,24 @@ _NOTE = (
 
 @dataclass(frozen=True, slots=True)
 class GaussNewton(Parameters, Engine):
-    """One cubic B-spline for all tissues. Attributes and errors are those of `Parameters`."""
+    """One cubic B-spline for all tissues, fitted by Gauss-Newton steps.
+
+    Attributes
+    ----------
+    spacing_mm : float
+        Between control points, at the finest level; never less than two voxels.
+    bending : float or None
+        Weight of the bending, 1/mm; None: chosen for each pair by cross-validation.
+    volume : float or None
+        Weight of the change of volume in soft tissue, 1/mm3; None: 300, unless the images ask for such a change.
+    rigidity : float
+        Weight of strain in the bone, 1/mm3.
+
+    Raises
+    ------
+    ParameterError
+        For a spacing that is not above zero, or a weight that is negative or not finite.
+    """
 
     family = name = "gauss-newton"
 

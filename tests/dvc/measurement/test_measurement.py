@@ -15,7 +15,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import dvc
-from dvc.errors import ImageFileError, InputError
+from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.io import result_folder as files
 from dvc.registration.register import Settings
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
@@ -132,6 +132,13 @@ def test_a_deformation_from_elsewhere_is_a_measurement_too(stretched, tmp_path):
         assert isinstance(one.plot(point_mm=GRID.points_at(np.array([7.0, 7.0, 9.0]))), Figure)
     with pytest.raises(InputError, match="error of this measurement is not known"):
         stretched.plot("sigma")
+
+
+def test_labels_of_another_grid_are_refused_before_anything_is_registered(tiny_pair):
+    labels = replace(tiny_pair.labels, grid=tiny_pair.labels.grid.moved_by(np.eye(3), np.ones(3)))
+    settings = Settings(dvc.GaussNewton())  # which does not need them
+    with pytest.raises(GeometryError, match="labels lie on another grid"):
+        dvc.measure(tiny_pair.reference, tiny_pair.loaded, bone=tiny_pair.bone, labels=labels, settings=settings)
 
 
 def test_landmarks_are_taken_as_they_are_read(tiny_pair, worker):

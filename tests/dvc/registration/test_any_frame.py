@@ -111,6 +111,7 @@ def test_voxels_in_another_order_change_nothing(axes, flips, plain, tiny_pair, w
     assert strain < 1e-6
 
 
+@pytest.mark.full_size
 def test_a_loaded_image_of_thicker_slices_gives_nearly_the_same(plain, tiny_pair, worker):
     """Slices of 4 mm instead of 2.3, along another axis, and a field of view that begins elsewhere."""
     pair = tiny_pair

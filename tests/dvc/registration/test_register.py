@@ -234,6 +234,7 @@ def test_row_27_without_alignment_too(settings, air_too, tiny_pair, worker):
         register(tiny_pair.reference, turned, settings=replace(settings, align_on="none"), worker=worker)
 
 
+@pytest.mark.full_size
 def test_row_27_mutual_information_follows_turned_contrast(tiny_pair, worker):
     turned = Image(tiny_pair.loaded.grid, tiny_pair.loaded.values.max() - tiny_pair.loaded.values)
     settings = replace(quick(Metric=("AdvancedMattesMutualInformation",)), align_on="none")
@@ -283,6 +284,24 @@ def test_missing_voxels_are_left_out(tiny_pair, worker):
     assert np.isfinite(found.displacement.coefficients_mm).all()
     X = tiny_pair.bone.points()
     assert 0.02 < 1.0 - shows(cut, found.alignment.motion.apply(X)).mean() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"engine": "gauss-newton"}, "Settings.of"),
+        ({"align_on": "bones"}, "bone, image"),
+        ({"threads": 0}, "1 or"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused_when_they_are_made(given, told):
+    with pytest.raises(ParameterError, match=told):
+        Settings(**given)
+
+
+def test_an_engine_that_is_not_there_is_refused_with_those_that_are():
+    with pytest.raises(ParameterError, match="there are gauss-newton, gauss-newton-borders, heel-mr, or a parameter"):
+        Settings.of("gauss")
 
 
 def test_stages_that_end_on_other_control_points_are_refused_first():

@@ -226,6 +226,7 @@ def test_voxels_that_only_the_twin_has_do_not_count() -> None:
     assert row.factor == 1.0
 
 
+@pytest.mark.full_size
 def test_a_model_as_it_was_made_is_seldom_doubted() -> None:
     # registrations differ in their bias: each alone holds less or more than 95 % of its voxels
     rows = {POOLED: np.stack([np.zeros((1, 2)), np.full((1, 2), 0.03)])}

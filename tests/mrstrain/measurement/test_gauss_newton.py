@@ -67,6 +67,7 @@ def test_the_report_tells_apart_what_weights_left():
     assert [row[-1] for row in table.rows[-3:]] == pytest.approx([0.042, 0.0, 0.03])
 
 
+@pytest.mark.full_size
 def test_another_persons_heel_is_not_trusted(written, small_pair, tmp_path):
     """Bone is found and folds there are none; only their noise tells that the images could be more alike."""
     write_image(tmp_path / "Load1.nii.gz", scan(Heel(5), small_pair.reference.grid, snr=25.0, number=7))
