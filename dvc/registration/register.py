@@ -60,7 +60,7 @@ class Settings:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        if not hasattr(self.engine, "find"):
+        if not hasattr(self.engine, "of_repeat"):
             raise ParameterError(f"`engine` is an Engine; for one by its name: Settings.of({self.engine!r}).")
         if self.align_on not in get_args(AlignOn):
             raise ParameterError(f"`align_on` is one of {', '.join(get_args(AlignOn))}; got {self.align_on!r}.")
