@@ -1,7 +1,6 @@
 """DICOM images: slices or frames put together by their position in space, never by their numbers.
 
-A classic series is a folder with a file for each slice; enhanced (multi-frame) files hold many slices each. Both give
-frames (`dvc.io.images.dicom_frames`), and all that follows is the same for both.
+A classic series is a folder with a file for each slice; enhanced (multi-frame) files hold many slices each.
 """
 
 import logging
@@ -9,6 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +16,11 @@ import numpy as np
 from dvc.arrays import Float32Array
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid
-from dvc.io.images.dicom_frames import CONVERT, STACK, TIME_POINT, Frame, Labels, read_frames
-from dvc.io.images.dicom_pixels import read_values
+from dvc.io.images.dicom_frames import CONVERT, STACK, TIME_POINT, Frame, Labels, read_frames, read_values
 from dvc.io.images.stored import MAX_BYTES, refuse_if_too_large
 
 _log = logging.getLogger("dvc.images")
 
-_SUFFIXES = (".dcm", ".ima")
 _OFF_PLACE = 0.1  # of a voxel
 _SAME_PLACE_MM = 0.01
 _SAME_DIRECTION = 1e-3
@@ -33,7 +31,7 @@ _SEVERAL = "several echoes, image types, orientations, stacks or time points"
 def is_dicom(path: Path) -> bool:
     """Whether a file looks like DICOM, from its first bytes or its suffix."""
     with path.open("rb") as file:
-        return file.read(132)[128:] == b"DICM" or path.suffix.lower() in _SUFFIXES
+        return file.read(132)[128:] == b"DICM" or path.suffix.lower() in (".dcm", ".ima")
 
 
 def is_multiframe(path: Path) -> bool:
@@ -65,10 +63,8 @@ def _frames_in(folder: Path) -> list[Frame]:
     contents = [read_frames(path) for path in paths if is_dicom(path)]
     for (_, total), held in Counter(part for _, part in contents if part).items():
         if held != total:
-            raise ImageFileError(
-                f"{folder}: an image that was stored in {total} files, of which {held} are here. Export the whole "
-                "series."
-            )
+            stored = f"an image that was stored in {total} files, of which {held} are here"
+            raise ImageFileError(f"{folder}: {stored}. Export the whole series.")
     frames = [frame for own, _ in contents for frame in own]
     skipped = len(paths) - sum(bool(own) for own, _ in contents)
     if skipped and frames:
@@ -185,31 +181,25 @@ def _parted(stack: _Stack, name: str) -> list[_Stack]:
     Scanners count along other dimensions than they say, or call each slice a stack; a label that follows the position
     alone does not distinguish volumes.
     """
+    of_frame = [dict(one.labels).get(name) for one in stack.frames]
     parts: dict[str | int | None, list[Frame]] = {}
-    for one in stack.frames:
-        parts.setdefault(dict(one.labels).get(name), []).append(one)
+    for one, label in zip(stack.frames, of_frame, strict=True):
+        parts.setdefault(label, []).append(one)
     if len(parts) == 1:
         return [stack]
-    apart = name == STACK and max(len(p) for p in parts.values()) > 1
-    if not apart:
-        normal = np.cross(*stack.frames[0].axes)
-        along = np.array([one.position_mm @ normal for part in parts.values() for one in part])
-        part_of = np.repeat(np.arange(len(parts)), [len(p) for p in parts.values()])
+    if name != STACK or max(len(part) for part in parts.values()) == 1:
+        along = np.array([one.position_mm for one in stack.frames]) @ np.cross(*stack.frames[0].axes)
         order = np.argsort(along)
-        place_of = np.cumsum(np.diff(along[order], prepend=along[order[0]]) > _SAME_PLACE_MM)
-        pairs = np.unique(np.stack([place_of, part_of[order]]), axis=1)
-        apart = pairs.shape[1] > int(place_of[-1]) + 1
-    if not apart:
-        return [stack]
+        place = np.cumsum(np.diff(along[order], prepend=along[order[0]]) > _SAME_PLACE_MM).tolist()
+        if len({(at, of_frame[k]) for at, k in zip(place, order, strict=True)}) == place[-1] + 1:
+            return [stack]
     return [_Stack(part, stack.labels if v is None else (*stack.labels, (name, v))) for v, part in parts.items()]
 
 
 def _named_stacks(stacks: Sequence[_Stack]) -> dict[str, _Stack]:
     """Name stacks by the shortest distinct end of their series UID, numbered within a series."""
     uids = sorted({stack.series for stack in stacks})
-    digits = 6
-    while len({uid[-digits:] for uid in uids}) < len(uids):
-        digits += 1
+    digits = next(n for n in count(6) if len({uid[-n:] for uid in uids}) == len(uids))
     named = {}
     for uid in uids:
         own = sorted((s for s in stacks if s.series == uid), key=_Stack.order)
@@ -233,8 +223,8 @@ def _pick_stack(place: Path, stacks: dict[str, _Stack], series: str | None) -> _
         what, move = "folder", "Move the files of one into a folder of its own, or write it"
     problem = f"series='{series}' fits {len(matching)} of the DICOM series in this {what}"
     if series is None:
-        count = len({stack.series for stack in stacks.values()})
-        problem = f"the {what} holds {f'{count} DICOM series' if count > 1 else _SEVERAL}; one is needed"
+        several = len({stack.series for stack in stacks.values()})
+        problem = f"the {what} holds {f'{several} DICOM series' if several > 1 else _SEVERAL}; one is needed"
     raise InputError(
         f"{place}: {problem}. {move} to a file: in Python, "
         f'dvc.write_image("one.nii.gz", dvc.read_image("{place}", series=NAME)) with a NAME out of this list:\n'

@@ -1,8 +1,8 @@
-"""One frame of a DICOM image: its place, what it shows and how its values are scaled, from a file of one or of many.
+"""The frames of a DICOM file: their places, what they show, and their values.
 
-Only what is needed of each header is read: no name, number or date of a patient; no message quotes a damaged header.
-What the standard puts into the functional groups of enhanced (multi-frame) files is read only from there, each frame's
-own first, then the shared ones: scanners repeat some of it, with other values, in private elements beside them.
+Only what is needed of a header is read: no name, number or date of a patient; no message quotes a damaged header. What
+the standard puts into the functional groups of enhanced (multi-frame) files is read only from there, each frame's own
+first, then the shared ones: scanners repeat some of it, with other values, in private elements beside them.
 
 References
 ----------
@@ -11,6 +11,7 @@ References
 """
 
 import logging
+import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,9 +22,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pydicom
 from pydicom.datadict import keyword_for_tag
+from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.encaps import encapsulate, generate_frames
+from pydicom.pixels.utils import iter_pixels
 
-from dvc.arrays import FloatArray
+from dvc.arrays import Float32Array, FloatArray
 from dvc.errors import ImageFileError
+from dvc.io.images.stored import Voxels
 
 CONVERT = "Convert it to NIfTI, for example with dcm2niix, and give the .nii.gz file."
 _SAME_DIRECTION = 1e-3
@@ -38,14 +43,18 @@ _TAGS = [
 STACK, TIME_POINT = "stack", "time point"
 
 _ENHANCED = [f"{origin}Enhanced{of}ImageStorage" for origin in ("", "LegacyConverted") for of in ("MR", "CT")]
-_MACROS = (
-    ("PlanePositionSequence", "ImagePositionPatient"),
-    ("PlaneOrientationSequence", "ImageOrientationPatient"),
-    ("PixelMeasuresSequence", "PixelSpacing"),
-)
-_SCALING = "PixelValueTransformationSequence"
+_SCALING = {"RescaleSlope": 1.0, "RescaleIntercept": 0.0}  # and what a missing one stands for
+_GROUP_OF = {
+    "ImagePositionPatient": "PlanePositionSequence", "ImageOrientationPatient": "PlaneOrientationSequence",
+    "PixelSpacing": "PixelMeasuresSequence",
+} | dict.fromkeys(_SCALING, "PixelValueTransformationSequence")  # fmt: skip
 _FRAME_TYPES = ("MRImageFrameTypeSequence", "CTImageFrameTypeSequence")
 _CONVERTED = ("UnassignedPerFrameConvertedAttributesSequence", "UnassignedSharedConvertedAttributesSequence")
+_OF_PIXELS = [  # of one frame
+    "Rows", "Columns", "SamplesPerPixel", "PhotometricInterpretation", "BitsAllocated", "BitsStored", "HighBit",
+    "PixelRepresentation",
+]  # fmt: skip
+_OF_ALL = ["NumberOfFrames", "PlanarConfiguration", "ExtendedOffsetTable", "ExtendedOffsetTableLengths", "PixelData"]
 
 
 class Kind(NamedTuple):
@@ -86,7 +95,7 @@ class Frame:
 
 
 @contextmanager
-def damage_named(path: Path, problem: str = "not a readable DICOM file", remedy: str = "") -> Iterator[None]:
+def _damage_named(path: Path, problem: str = "not a readable DICOM file", remedy: str = "") -> Iterator[None]:
     """Turn whatever fails on a damaged file into an error that names the file, and the cause by its kind only.
 
     Elements of a header are decoded when they are first accessed, so any access may fail. The text of a failure may
@@ -110,7 +119,7 @@ def damage_named(path: Path, problem: str = "not a readable DICOM file", remedy:
 
 def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
     """Frames of a file, none if it is no image (a report); UID and number of files of the image that it belongs to."""
-    with damage_named(path):
+    with _damage_named(path):
         header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
         kind = header.get("SOPClassUID") or header.file_meta.get("MediaStorageSOPClassUID") or ""
         stored = pydicom.uid.UID(str(kind))
@@ -155,26 +164,16 @@ def _several(value: Any) -> list[Any]:
     return [value] if isinstance(value, str | int | float) else list(value)
 
 
-def _build_frame(
-    path: Path,
-    header: Any,
-    number: int | None,
-    place: dict[str, Any],
-    scaling: tuple[Any, Any],
-    shows: tuple[Any, Any, str],
-    labels: Labels = (),
-) -> Frame:
-    """Build a frame from elements of its header; refused if they are not finite, perpendicular or positive.
+def _build_frame(path: Path, header: Any, number: int | None, own: dict[str, Any], labels: Labels = ()) -> Frame:
+    """Build a frame of its ``own`` elements; refused if they are not finite, perpendicular or positive.
 
-    `place` holds ImagePositionPatient, ImageOrientationPatient and PixelSpacing; `scaling` slope and intercept, None
-    where missing; `shows` echo time (ms), numbers of echoes and image type.
+    ``own`` holds place (ImagePositionPatient, ImageOrientationPatient, PixelSpacing) and scaling, echo time (ms) and
+    numbers of echoes, which are None where missing, and the parts of the image type that are shown.
     """
-    axes = np.array([float(v) for v in place["ImageOrientationPatient"]]).reshape(2, 3)
-    position = np.array([float(v) for v in place["ImagePositionPatient"]]).reshape(3)
-    row_spacing, column_spacing = (float(v) for v in place["PixelSpacing"])
-    slope = 1.0 if scaling[0] is None else float(scaling[0])
-    intercept = 0.0 if scaling[1] is None else float(scaling[1])
-    echo_time, echoes, image_type = shows
+    axes = np.array([float(v) for v in own["ImageOrientationPatient"]]).reshape(2, 3)
+    position = np.array([float(v) for v in own["ImagePositionPatient"]]).reshape(3)
+    row_spacing, column_spacing = (float(v) for v in own["PixelSpacing"])
+    slope, intercept = (float(usual if own[name] is None else own[name]) for name, usual in _SCALING.items())
     which = "" if number is None else f", frame {number}"
     if not np.isfinite([*axes.ravel(), *position, row_spacing, column_spacing, slope, intercept]).all():
         raise ImageFileError(f"{path}{which}: the DICOM header holds values that are not finite numbers; damaged.")
@@ -188,35 +187,40 @@ def _build_frame(
             f"{path}{which}: {columns} x {rows} voxels of {column_spacing:g} x {row_spacing:g} mm; all must be "
             "positive. The header is damaged."
         )
-    echo_ms = None if echo_time is None else round(float(echo_time), 2)
-    echo = tuple(str(int(e)) for e in _several(echoes))
+    echo_ms = None if own["EchoTime"] is None else round(float(own["EchoTime"]), 2)
+    echo = tuple(str(int(e)) for e in _several(own["EchoNumbers"]))
+    image_type = "/".join(map(str, own["ImageType"]))
     spacing = round(column_spacing, 4), round(row_spacing, 4)
     kind = Kind(str(header.SeriesInstanceUID), echo_ms, echo, image_type, columns, rows, *spacing)
     return Frame(path, number, position, axes, (column_spacing, row_spacing), kind, slope, intercept, labels)
 
 
 def _classic_frame(path: Path, header: Any) -> Frame:
-    place = {name: header.get(name) for name in _PLACE}
-    scaling = header.get("RescaleSlope"), header.get("RescaleIntercept")
-    image_type = "/".join(str(k) for k in _several(header.get("ImageType"))[2:])
-    shows = header.get("EchoTime"), header.get("EchoNumbers"), image_type
-    return _build_frame(path, header, None, place, scaling, shows)
+    own = {name: header.get(name) for name in (*_PLACE, *_SCALING, "EchoTime", "EchoNumbers")}
+    return _build_frame(path, header, None, own | {"ImageType": _several(header.get("ImageType"))[2:]})
 
 
 def _enhanced_frames(path: Path, header: Any) -> list[Frame]:
     """Frames of an enhanced MR or CT image, in the order of the file; refused if one is not described."""
-    own = list(header.get("PerFrameFunctionalGroupsSequence") or [])
+    each = list(header.get("PerFrameFunctionalGroupsSequence") or [])
     count = int(header.get("NumberOfFrames") or 0)
-    if count < 1 or len(own) != count:
+    if count < 1 or len(each) != count:
         raise ImageFileError(
-            f"{path}: the header claims {count} frames and describes {len(own)} (functional groups): damaged, cut "
+            f"{path}: the header claims {count} frames and describes {len(each)} (functional groups): damaged, cut "
             "short, or stripped by an anonymizer. Export it again."
         )
     shared = (list(header.get("SharedFunctionalGroupsSequence") or []) or [{}])[0]
     indices = header.get("DimensionIndexSequence") or []
     dimensions = [keyword_for_tag(index.get("DimensionIndexPointer") or 0) for index in indices]
-    scaled = any(_group(_SCALING, groups, shared) is not None for groups in own)
-    return [_frame(path, header, number, (groups, shared), dimensions, scaled) for number, groups in enumerate(own, 1)]
+    scaled = any(_group(_GROUP_OF["RescaleSlope"], groups, shared) is not None for groups in each)
+    frames = []
+    for number, groups in enumerate(each, start=1):
+        own = {name: (_group(group, groups, shared) or {}).get(name) for name, group in _GROUP_OF.items()}
+        missing = [name for name, value in own.items() if value is None and (scaled or name in _PLACE)]
+        _refuse_missing(path, missing, f" in the functional groups of frame {number}")
+        labels = _labels(_group("FrameContentSequence", groups, shared), dimensions)
+        frames.append(_build_frame(path, header, number, own | _shown(header, groups, shared), labels))
+    return frames
 
 
 def _group(name: str, *groups: Any) -> Any | None:
@@ -224,28 +228,19 @@ def _group(name: str, *groups: Any) -> Any | None:
     return next((items[0] for holder in groups if (items := holder.get(name))), None)
 
 
-def _frame(path: Path, header: Any, number: int, groups: tuple[Any, Any], dimensions: list[str], scaled: bool) -> Frame:
-    place = {name: (_group(macro, *groups) or {}).get(name) for macro, name in _MACROS}
-    scaling = _group(_SCALING, *groups) or {}
-    slope, intercept = scaling.get("RescaleSlope"), scaling.get("RescaleIntercept")
-    missing = [name for name, value in place.items() if value is None]
-    if scaled:
-        missing += [name for name, v in (("RescaleSlope", slope), ("RescaleIntercept", intercept)) if v is None]
-    _refuse_missing(path, missing, f" in the functional groups of frame {number}")
-    labels = _labels(_group("FrameContentSequence", *groups), dimensions)
-    return _build_frame(path, header, number, place, (slope, intercept), _shown(header, groups), labels)
-
-
-def _shown(header: Any, groups: tuple[Any, Any]) -> tuple[Any, Any, str]:
+def _shown(header: Any, *groups: Any) -> dict[str, Any]:
     """Echo time (ms), numbers of echoes and image type of a frame."""
     converted = [_group(name, *groups) or {} for name in _CONVERTED]
     echo_times = [(_group("MREchoSequence", *groups) or {}).get("EffectiveEchoTime")]
-    echo_time = next((t for t in echo_times + [c.get("EchoTime") for c in converted] if t is not None), None)
-    echoes = next((e for e in [c.get("EchoNumbers") for c in converted] if e is not None), None)
+    echo_times += [c.get("EchoTime") for c in converted]
     frame_type: Any = next((t for name in _FRAME_TYPES if (t := _group(name, *groups)) is not None), {})
     image_type = _several(frame_type.get("FrameType")) or _several(header.get("ImageType"))
     component = frame_type.get("ComplexImageComponent") or header.get("ComplexImageComponent")
-    return echo_time, echoes, "/".join(str(k) for k in (*image_type[2:], *_several(component)))
+    return {
+        "EchoTime": next((t for t in echo_times if t is not None), None),
+        "EchoNumbers": next((e for c in converted if (e := c.get("EchoNumbers")) is not None), None),
+        "ImageType": [*image_type[2:], *_several(component)],
+    }
 
 
 def _labels(content: Any | None, dimensions: list[str]) -> Labels:
@@ -259,3 +254,81 @@ def _labels(content: Any | None, dimensions: list[str]) -> Labels:
         name = dimensions[k] if k < len(dimensions) else ""
         labels.append((f"dimension {k + 1}" + (f" ({name})" if name else ""), int(index)))
     return tuple(labels)
+
+
+def read_values(frames: Sequence[Frame]) -> Float32Array:
+    """Rescaled values (frames, rows, columns) of frames of one size, in the order given."""
+    kind = frames[0].kind
+    values = np.empty((len(frames), kind.rows, kind.columns), dtype=np.float32)
+    places: dict[Path, list[int]] = {}
+    for k, frame in enumerate(frames):
+        places.setdefault(frame.path, []).append(k)
+    for path, own in places.items():
+        numbers = [(frames[k].number or 1) - 1 for k in own]
+        for k, stored in zip(own, _stored(path, numbers, (kind.rows, kind.columns)), strict=True):
+            values[k] = stored
+            values[k] *= np.float32(frames[k].slope)
+            values[k] += np.float32(frames[k].intercept)
+    return values
+
+
+def _stored(path: Path, numbers: list[int], shape: tuple[int, int]) -> Iterator[Voxels]:
+    """Stored values (rows, columns) of some frames of a file, numbered from 0, in the order given."""
+    with _damage_named(path):
+        header = pydicom.dcmread(path, specific_tags=[*_OF_PIXELS, *_OF_ALL])
+        data = header.get("PixelData")
+    if data is None:
+        raise ImageFileError(f"{path}: a DICOM file without pixels: damaged or cut short. Export it again.")
+    unusual = f"damaged or cut short, or an unusual compression. {CONVERT}"
+    with _damage_named(path, "its pixels cannot be decoded", unusual):
+        syntax = header.file_meta.get("TransferSyntaxUID")
+        packed = syntax is not None and syntax.is_encapsulated
+        count = int(header.get("NumberOfFrames") or 1)
+        needed = count * shape[0] * shape[1] * int(header.BitsAllocated) // 8
+        if not packed and len(data) < needed:
+            frames = f"{count} frames of " if count > 1 else ""
+            raise ImageFileError(
+                f"{path}: the file is cut short: {frames}{shape[1]} x {shape[0]} voxels need {needed} bytes, it holds "
+                f"{len(data)}. Copy or export it again."
+            )
+        if packed and syntax != pydicom.uid.RLELossless:
+            yield from _decoded_by_itk(path, header, numbers, count)
+        elif count == 1:
+            yield header.pixel_array
+        else:
+            yield from iter_pixels(header, indices=numbers, raw=True)
+
+
+def _decoded_by_itk(path: Path, header: Any, numbers: list[int], count: int) -> Iterator[Voxels]:
+    """Decode JPEG, JPEG-LS or JPEG 2000, for which the other reader needs plugins.
+
+    ITK gets each frame as a bare file of its own: of one with many frames it would scale all by the first one's slope.
+    """
+    import SimpleITK as sitk  # only compressed files need it
+
+    tables = header.get("ExtendedOffsetTable"), header.get("ExtendedOffsetTableLengths")
+    offsets = (tables[0], tables[1]) if tables[0] and tables[1] else None
+    packed = list(generate_frames(header.PixelData, number_of_frames=count, extended_offsets=offsets))
+    if len(packed) != count:
+        raise ImageFileError(
+            f"{path}: the header claims {count} frames, the file holds {len(packed)} compressed ones: damaged or cut "
+            "short. Copy or export it again."
+        )
+    bare = Dataset()
+    for name in _OF_PIXELS:
+        if name in header:
+            setattr(bare, name, header.get(name))
+    bare.SOPClassUID = pydicom.uid.MRImageStorage
+    bare.SOPInstanceUID = "2.25.1"
+    bare.PhotometricInterpretation = "MONOCHROME2"  # the other one would be inverted
+    bare.file_meta = FileMetaDataset()
+    bare.file_meta.TransferSyntaxUID = header.file_meta.TransferSyntaxUID
+    with tempfile.TemporaryDirectory() as folder:
+        one = Path(folder) / "frame.dcm"
+        for number in numbers:
+            bare.PixelData = encapsulate([packed[number]])
+            pydicom.dcmwrite(one, bare, enforce_file_format=True)
+            values = sitk.GetArrayFromImage(sitk.ReadImage(str(one)))
+            if values.shape != (1, int(header.Rows), int(header.Columns)):
+                raise ImageFileError(f"{path}: its pixels have another size than the header says; damaged.")
+            yield values[0]

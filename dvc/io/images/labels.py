@@ -4,6 +4,7 @@ import csv
 import logging
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import product
 from os import PathLike
 from pathlib import Path
@@ -16,8 +17,8 @@ from dvc.arrays import IntArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, LabelMap, Mask
 from dvc.io import StrPath
-from dvc.io.images.nrrd import nrrd_fields
 from dvc.io.images.read import read_voxels
+from dvc.io.images.text_headers import nrrd_fields
 
 _log = logging.getLogger("dvc.images")
 
@@ -159,9 +160,10 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     (64, 64.0)
     """
     own = mask_or_labels.grid
-    values: npt.NDArray[Any] = mask_or_labels.inside if isinstance(mask_or_labels, Mask) else mask_or_labels.labels
+    field = "inside" if isinstance(mask_or_labels, Mask) else "labels"
+    values: npt.NDArray[Any] = getattr(mask_or_labels, field)
     if own.same_as(grid):
-        return _with_values(mask_or_labels, grid, values)
+        return replace(mask_or_labels, grid=grid)
     inside, total = _count_inside(own, values, grid)
     if total == 0:
         raise GeometryError(f"{what}: it holds no voxel other than 0.")
@@ -178,23 +180,20 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
             f"{what}: its grid is the image's with the signs of {mirrored} reversed: a header in RAS was "
             f"taken for LPS, or the reverse. {boxes} Export it again from the image that it was drawn on."
         )
-    fitted = _nearest(own, values, grid)
+    fitted: Any = _nearest(own, values, grid)
     left = np.count_nonzero(fitted) * grid.voxel_volume_mm3
     if left == 0:
         raise GeometryError(f"{what}: nothing of it is left on the image's grid. {boxes}")
     before = total * own.voxel_volume_mm3
     change = f"{before / 1000:.4g} mL became {left / 1000:.4g} mL, {100 * share:.0f} % of it lies in the image"
-    told = "%s: on another grid than the image; resampled to it by nearest neighbour (%s). %s"
-    _log.warning(told, what, change, boxes)
+    _log.warning(
+        "%s: on another grid than the image; resampled to it by nearest neighbour (%s). %s", what, change, boxes
+    )
     if isinstance(mask_or_labels, LabelMap):
         lost = sorted(set(_counts(values)) - set(_counts(fitted)))
         if lost:
             _log.warning("%s: regions lost by it: %s", what, [mask_or_labels.names[v] for v in lost])
-    return _with_values(mask_or_labels, grid, fitted)
-
-
-def _with_values(source: _OnGrid, grid: Grid, values: npt.NDArray[Any]) -> _OnGrid:
-    return Mask(grid, values) if isinstance(source, Mask) else LabelMap(grid, values, source.names)
+    return replace(mask_or_labels, grid=grid, **{field: fitted})
 
 
 def _count_inside(own: Grid, values: npt.NDArray[Any], grid: Grid) -> tuple[int, int]:
@@ -242,21 +241,18 @@ def _integers(path: Path) -> tuple[Grid, IntArray]:
     if path.is_dir():
         raise InputError(f"{path}: masks and labels are read from one file, not from a folder (DICOM). Convert it.")
     grid, voxels = read_voxels(path)
+    rule = f"{path}: masks and labels hold whole numbers below {_LARGEST_LABEL};"
     if voxels.dtype.kind == "f":
         whole = np.isfinite(voxels) & (np.abs(voxels) < _LARGEST_LABEL)
         whole &= np.rint(np.where(whole, voxels, 0)) == voxels
         if not whole.all():
-            odd = np.unique(voxels[~whole])
+            odd = [f"{v:g}" for v in np.unique(voxels[~whole])[:_SHOWN]]
             raise InputError(
-                f"{path}: masks and labels hold whole numbers below {_LARGEST_LABEL}; {int((~whole).sum())} "
-                f"voxels do not, such as {_shortened([f'{v:g}' for v in odd[:_SHOWN]])}. Threshold a "
-                "probability map first, and resample labels with nearest neighbour only."
+                f"{rule} {int((~whole).sum())} voxels do not, such as {_shortened(odd)}. Threshold a probability map "
+                "first, and resample labels with nearest neighbour only."
             )
     elif int(voxels.max()) >= _LARGEST_LABEL:
-        raise InputError(
-            f"{path}: masks and labels hold whole numbers below {_LARGEST_LABEL}; found {int(voxels.max())}. "
-            "Number the labels anew."
-        )
+        raise InputError(f"{rule} found {int(voxels.max())}. Number the labels anew.")
     return grid, np.ascontiguousarray(voxels, dtype=np.int64)
 
 

@@ -1,20 +1,21 @@
 """NIfTI files, read with the checks that the usual readers leave out.
 
-A NIfTI file may give its geometry twice (qform and sform), in one of several units, in the frame RAS. Readers pick one
-of the two and differ in which; here they must agree. Everything is returned in LPS mm.
+A file may give its geometry twice (qform and sform), in one of several units, in the frame RAS. Programs differ in
+which of the two they take; here both must agree. Everything is returned in LPS mm.
 """
 
 import logging
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import nibabel
 import numpy as np
+from nibabel.quaternions import quat2mat
 
 from dvc.arrays import FloatArray
 from dvc.errors import ImageFileError
-from dvc.io.images.stored import MAX_BYTES, StoredVolume, expanded, pick_volume, refuse_if_too_large
-from dvc.io.images.text_header import grid_of_axes
+from dvc.io.images.stored import MAX_BYTES, StoredVolume, expanded, grid_of_axes, pick_volume, refuse_if_too_large
 
 _log = logging.getLogger("dvc.images")
 
@@ -31,8 +32,9 @@ def read_nifti_header(
     path: Path, volume: int | None = None, max_bytes: int = MAX_BYTES, vectors: bool = False, components: int = 3
 ) -> StoredVolume:
     """What a NIfTI-1 or -2 file holds: scalars, or with `vectors` c `components` per voxel, (ni, nj, nk, 1, c)."""
-    header = _header(path)
-    shape, count = (_vector_sizes(path, header, components), 1) if vectors else _sizes(path, header)
+    header, compressed = _header(path)
+    sizes = [int(n) for n in header["dim"][1 : 1 + int(header["dim"][0])]]
+    shape, count = (_vector_sizes(path, sizes, components), 1) if vectors else _sizes(path, sizes)
     layout = (*shape, components) if vectors else shape
     # Size and count come first: a header that is wrong there is not worth a look at its geometry.
     refuse_if_too_large(path, layout, max_bytes)
@@ -41,47 +43,30 @@ def read_nifti_header(
     unit, mm_per_unit = _unit(path, header)
     lps = LPS_FROM_RAS @ _ras_affine(path, header, shape)
     columns = lps[:3, :3] * mm_per_unit
+    grid = grid_of_axes(path, shape, columns, lps[:3, 3] * mm_per_unit, single_precision=True)
     bytes_each = int(np.prod(layout)) * dtype.itemsize
+    start = max(int(header["vox_offset"]), int(header["sizeof_hdr"]) + 4) + chosen * bytes_each
+    rest = (count - 1 - chosen) * bytes_each
     slope, intercept = float(header["scl_slope"]), float(header["scl_inter"])
-    scaled = slope != 0.0 and np.isfinite(slope)
-    return StoredVolume(
-        path=path,
-        grid=grid_of_axes(path, shape, columns, lps[:3, 3] * mm_per_unit, single_precision=True),
-        dtype=dtype,
-        layout=layout,
-        unit=unit,
-        compressed=_is_compressed(path),
-        stream_start=max(int(header["vox_offset"]), int(header["sizeof_hdr"]) + 4) + chosen * bytes_each,
-        stream_rest=(count - 1 - chosen) * bytes_each,
-        slope=slope if scaled else 1.0,
-        intercept=intercept if scaled and np.isfinite(intercept) else 0.0,
-        components=3 if vectors else None,
-    )
+    if slope == 0.0 or not np.isfinite(slope):
+        slope, intercept = 1.0, 0.0
+    intercept, axis = intercept if np.isfinite(intercept) else 0.0, 3 if vectors else None
+    return StoredVolume(path, grid, dtype, layout, unit, 0, compressed, start, rest, slope, intercept, components=axis)
 
 
-def _dimensions(header: Any) -> list[int]:
-    return [int(n) for n in header["dim"][1 : 1 + int(header["dim"][0])]]
-
-
-def _is_compressed(path: Path) -> bool:
+def _header(path: Path) -> tuple[Any, bool]:
+    """The file's header, and whether the file is compressed."""
     with path.open("rb") as file:
-        return file.read(2) == b"\x1f\x8b"
-
-
-def _header(path: Path) -> Any:
-    start = b""
-    if _is_compressed(path):
+        start = file.read(544)
+    compressed = start[:2] == b"\x1f\x8b"
+    if compressed:
+        start = b""
         for block in expanded(path):
             start += block
             if len(start) >= 544:
                 break
-    else:
-        with path.open("rb") as file:
-            start = file.read(544)
     for kind, size, magic in ((nibabel.Nifti1Header, 348, slice(344, 348)), (nibabel.Nifti2Header, 540, slice(4, 8))):
-        if len(start) < size:
-            continue
-        written = start[magic]
+        written = start[magic] if len(start) >= size else b""
         if written[:3] in (b"ni1", b"ni2"):
             raise ImageFileError(f"{path}: header of a pair of files (.hdr with .img). Convert it to one .nii.gz file.")
         if written[:3] in (b"n+1", b"n+2"):
@@ -91,15 +76,15 @@ def _header(path: Path) -> Any:
                 value = float(np.ravel(header[field])[0])
                 if not low <= value <= high:
                     raise ImageFileError(f"{path}: the NIfTI header is damaged ({field} = {value:g}). Export it again.")
-            return header
+            return header, compressed
     raise ImageFileError(
         f"{path}: not a NIfTI file: no NIfTI header at its start ({len(start)} bytes read). Check the "
         "file's name and copy or export it again."
     )
 
 
-def _sizes(path: Path, header: Any) -> tuple[tuple[int, int, int], int]:
-    sizes = _dimensions(header)
+def _sizes(path: Path, sizes: list[int]) -> tuple[tuple[int, int, int], int]:
+    """Shape of an image, and its number of volumes."""
     while len(sizes) > 3 and sizes[-1] in (0, 1):
         sizes.pop()
         if len(sizes) == 3:
@@ -115,8 +100,7 @@ def _sizes(path: Path, header: Any) -> tuple[tuple[int, int, int], int]:
     return (sizes[0], sizes[1], sizes[2]), sizes[3] if len(sizes) == 4 else 1
 
 
-def _vector_sizes(path: Path, header: Any, components: int) -> tuple[int, int, int]:
-    sizes = _dimensions(header)
+def _vector_sizes(path: Path, sizes: list[int], components: int) -> tuple[int, int, int]:
     if sizes[3:5] != [1, components] or any(n not in (0, 1) for n in sizes[5:]):
         raise ImageFileError(f"{path}: a NIfTI of shape {tuple(sizes)}; (ni, nj, nk, 1, {components}) is needed.")
     return sizes[0], sizes[1], sizes[2]
@@ -148,9 +132,8 @@ def _unit(path: Path, header: Any) -> tuple[str, float]:
 
 def _ras_affine(path: Path, header: Any, shape: tuple[int, int, int]) -> FloatArray:
     qforms = _qforms(path, header) if int(header["qform_code"]) > 0 else []
-    sforms = []
-    if int(header["sform_code"]) > 0:
-        sforms = [np.vstack([*(np.float64(header[f"srow_{axis}"]) for axis in "xyz"), [0.0, 0.0, 0.0, 1.0]])]
+    full = np.vstack([*(np.float64(header[f"srow_{axis}"]) for axis in "xyz"), [0.0, 0.0, 0.0, 1.0]])
+    sforms = [full] if int(header["sform_code"]) > 0 else []
     if not qforms and not sforms:
         raise ImageFileError(
             f"{path}: the header does not say how the image lies in space (qform_code and sform_code are "
@@ -180,30 +163,21 @@ def _qforms(path: Path, header: Any) -> list[FloatArray]:
         raise ImageFileError(f"{path}: the qform's quaternion is not a rotation; the header is damaged.")
     nominal = rest if rest >= _HALF_TURN else 0.0  # as the standard's own reader takes it
     least, most = np.sqrt(max(rest - _ROUNDING, 0.0)), np.sqrt(max(rest + _ROUNDING, 0.0))
-    return [_qform(header, float(a), b, c, d) for a in (np.sqrt(nominal), *np.linspace(least, most, 65))]
+    return [_qform(header, (a, b, c, d)) for a in (np.sqrt(nominal), *np.linspace(least, most, 65))]
 
 
-def _qform(header: Any, a: float, b: float, c: float, d: float) -> FloatArray:
+def _qform(header: Any, quaternion: tuple[float, ...]) -> FloatArray:
     """Compute R(a, b, c, d) diag(pixdim), third axis times qfac, with the offsets."""
-    a, b, c, d = np.array([a, b, c, d]) / np.sqrt(a * a + b * b + c * c + d * d)
-    rotation = np.array(
-        [
-            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
-            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
-            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
-        ]
-    )
     sizes = np.abs(np.float64(header["pixdim"][1:4]))
     sizes[2] *= -1.0 if float(header["pixdim"][0]) < 0 else 1.0  # 0 stands for +1
     affine = np.eye(4)
-    affine[:3, :3] = rotation * sizes
+    affine[:3, :3] = quat2mat(quaternion) * sizes
     affine[:3, 3] = [float(header[f"qoffset_{axis}"]) for axis in "xyz"]
     return affine
 
 
 def _refuse_disagreement(path: Path, qforms: list[FloatArray], sform: FloatArray, shape: tuple[int, int, int]) -> None:
-    bits = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.float64)
-    corners = bits * [*(np.array(shape) - 1), 1]
+    corners = np.array([[*corner, 1.0] for corner in product(*((0.0, n - 1.0) for n in shape))])
     apart = min(float(np.linalg.norm((corners @ (sform - q).T)[:, :3], axis=1).max()) for q in qforms)
     voxel = float(np.linalg.norm(sform[:3, :3], axis=0).min())
     if not apart <= _AGREEMENT_VOXELS * voxel:

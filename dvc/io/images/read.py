@@ -14,23 +14,19 @@ from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image
 from dvc.io import StrPath
 from dvc.io.images.dicom import is_dicom, read_dicom
-from dvc.io.images.metaimage import read_meta_header
 from dvc.io.images.nifti import read_nifti_header
-from dvc.io.images.nrrd import read_nrrd_header
 from dvc.io.images.stored import MAX_BYTES, StoredVolume, Voxels
+from dvc.io.images.text_headers import read_meta_header, read_nrrd_header
 
 _log = logging.getLogger("dvc.images")
 
 _MIN_SLICES = 4
 
 _FORMATS: dict[str, tuple[str, Callable[[Path, int | None, int, bool], StoredVolume]]] = {
-    ".nii": ("NIfTI", read_nifti_header),
-    ".nii.gz": ("NIfTI", read_nifti_header),
-    ".nrrd": ("NRRD", read_nrrd_header),
-    ".nhdr": ("NRRD", read_nrrd_header),
-    ".mha": ("MetaImage", read_meta_header),
-    ".mhd": ("MetaImage", read_meta_header),
-}
+    ".nii": ("NIfTI", read_nifti_header), ".nii.gz": ("NIfTI", read_nifti_header),
+    ".nrrd": ("NRRD", read_nrrd_header), ".nhdr": ("NRRD", read_nrrd_header),
+    ".mha": ("MetaImage", read_meta_header), ".mhd": ("MetaImage", read_meta_header),
+}  # fmt: skip
 
 
 def read_image(

@@ -1,11 +1,11 @@
 """Voxels as they lie in a file: where they start, how they are coded, and reading them with every check.
 
-Libraries that read images often return whatever a truncated or damaged file holds. Here the number of bytes is compared
-with the header, and compressed streams are read to their end, so that their checksum counts.
+Libraries often return whatever a damaged file holds. Here the number of bytes is compared with the header, and
+compressed streams are read to their end, so that their checksum counts.
 """
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dvc.errors import ImageFileError
+from dvc.arrays import FloatArray
+from dvc.errors import GeometryError, ImageFileError
 from dvc.images.image import Grid
 
 MAX_BYTES = 16 * 2**30
@@ -22,6 +23,7 @@ MAX_BYTES = 16 * 2**30
 _BLOCK = 1 << 20
 _TRAILING = 4096  # some writers pad the end of a file
 _DEFLATE_LIMIT = 1100  # deflate cannot expand by more than about 1032
+_ORTHONORMAL = 1e-4
 
 Voxels = npt.NDArray[Any]
 
@@ -44,11 +46,6 @@ class StoredVolume:
     select: tuple[int, int] | None = None  # (axis, index) of ``layout`` to keep, where it has four
     components: int | None = None  # axis of ``layout`` along which a vector's components lie, where they are kept
 
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of the volume as stored, expanded."""
-        return int(np.prod([int(n) for n in self.layout], dtype=object)) * self.dtype.itemsize
-
     def load(self) -> Voxels:
         """Read the voxels: (ni, nj, nk), vectors (ni, nj, nk, 3), in the stored number type where no scaling applies.
 
@@ -63,18 +60,19 @@ class StoredVolume:
             return values
         # Up to 16 bits survive single precision; wider integers are scaled in double.
         narrow = self.dtype.itemsize <= 2 or self.dtype == np.dtype(np.float32)
-        scaled = values.astype(np.float32 if narrow else np.float64)
-        np.multiply(scaled, self.slope, out=scaled)
-        np.add(scaled, self.intercept, out=scaled)
+        scaled: Voxels = values.astype(np.float32 if narrow else np.float64)
+        scaled *= self.slope
+        scaled += self.intercept
         return scaled
 
     def _bytes(self) -> npt.NDArray[np.uint8]:
-        expected = self.stream_start + self.size_bytes + self.stream_rest
+        size = int(np.prod(self.layout, dtype=object)) * self.dtype.itemsize
+        expected = self.stream_start + size + self.stream_rest
         on_disk = self.path.stat().st_size - self.file_start
         most = on_disk * _DEFLATE_LIMIT if self.compressed else on_disk
         if most < expected:
             raise self._cut_short(expected, on_disk, " compressed" if self.compressed else "")
-        raw = np.empty(self.size_bytes, dtype=np.uint8)
+        raw = np.empty(size, dtype=np.uint8)
         if not self.compressed:
             with self.path.open("rb") as file:
                 file.seek(self.file_start + self.stream_start)
@@ -122,10 +120,9 @@ def expanded(path: Path, start: int = 0) -> Iterator[bytes]:
                 yield block
             if decoder.eof:
                 # gzip files may be several streams in a row, and padded with zeros.
-                pending = (decoder.unused_data or file.read(_BLOCK)).lstrip(b"\0")
+                pending = decoder.unused_data.lstrip(b"\0")
                 while not pending:
-                    more = file.read(_BLOCK)
-                    if not more:
+                    if not (more := file.read(_BLOCK)):
                         return
                     pending = more.lstrip(b"\0")
                 decoder = zlib.decompressobj(wbits=47)
@@ -135,6 +132,24 @@ def expanded(path: Path, start: int = 0) -> Iterator[bytes]:
                 raise ImageFileError(
                     f"{path}: the file is cut short: its compressed voxels have no end. Copy or export it again."
                 )
+
+
+def grid_of_axes(
+    path: Path, shape: Sequence[int], columns: FloatArray, origin: FloatArray, *, single_precision: bool = False
+) -> Grid:
+    """The grid with these steps along its axes, (3, 3) by columns, and origin, LPS mm."""
+    with np.errstate(over="ignore"):
+        spacing = np.linalg.norm(columns, axis=0)
+    if not np.isfinite(spacing).all() or np.any(spacing <= 0):
+        raise ImageFileError(f"{path}: the header's voxel sizes are {spacing.tolist()} mm; all must be positive.")
+    direction = columns / spacing
+    if single_precision:
+        left, stretch, right = np.linalg.svd(direction)
+        direction = left @ right if np.abs(stretch - 1.0).max() < _ORTHONORMAL / 2 else direction
+    try:
+        return Grid((shape[0], shape[1], shape[2]), spacing, origin, direction)
+    except GeometryError as error:
+        raise ImageFileError(f"{path}: {error}") from error
 
 
 def refuse_if_too_large(path: Path, shape: tuple[int, ...], max_bytes: int) -> None:

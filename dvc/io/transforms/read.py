@@ -18,8 +18,8 @@ from dvc.errors import ImageFileError, InputError, ParameterError
 from dvc.images.image import Grid
 from dvc.images.itk_image import from_sitk as image_from_sitk
 from dvc.io import StrPath
-from dvc.io.images.nrrd import nrrd_fields
 from dvc.io.images.read import read_header
+from dvc.io.images.text_headers import nrrd_fields
 from dvc.io.transforms.bordered_spline import read_bordered_spline
 from dvc.io.transforms.elastix_text import Parameters, parse_parameters
 
