@@ -83,13 +83,9 @@ class TetMesh:
         if ids.shape != (len(points),) or len(np.unique(ids)) != len(ids):
             got = f"got {ids.shape[0]} numbers, {len(np.unique(ids))} of them different"
             raise InputError(f"node_ids must give each of the {len(points)} nodes a number of its own; {got}.")
-        named_cells = {
-            name: checked_indices(f"region {name!r}", index, len(tets)) for name, index in (regions or {}).items()
-        }
-        named_facets = {
-            name: checked_indices(f"facets {name!r}", index, len(points), 3) for name, index in (facets or {}).items()
-        }
-        for name, index in {**named_cells, **named_facets}.items():
+        named_cells = {n: checked_indices(f"region {n!r}", i, len(tets)) for n, i in (regions or {}).items()}
+        named_facets = {n: checked_indices(f"facets {n!r}", i, len(points), 3) for n, i in (facets or {}).items()}
+        for name, index in [*named_cells.items(), *named_facets.items()]:
             if len(index) == 0:
                 raise InputError(f"{name!r} is empty. Leave it out, or check how the mesh was made.")
 
@@ -109,14 +105,12 @@ class TetMesh:
             named_facets = {name: new_index[index] for name, index in named_facets.items()}
         check_extent(points)
 
-        def sealed(named: Mapping[str, IntArray]) -> Mapping[str, IntArray]:
-            return MappingProxyType({name: frozen(index, np.int64) for name, index in named.items()})
-
         object.__setattr__(self, "points_mm", frozen(points, np.float64))
-        object.__setattr__(self, "cells", frozen(tets, np.int64))
-        object.__setattr__(self, "regions", sealed(named_cells))
-        object.__setattr__(self, "facets", sealed(named_facets))
-        object.__setattr__(self, "node_ids", frozen(ids, np.int64))
+        for name, indices in (("cells", tets), ("node_ids", ids)):
+            object.__setattr__(self, name, frozen(indices, np.int64))
+        for name, named in (("regions", named_cells), ("facets", named_facets)):
+            sealed = {key: frozen(index, np.int64) for key, index in named.items()}
+            object.__setattr__(self, name, MappingProxyType(sealed))
 
     @property
     def volumes_mm3(self) -> FloatArray:
@@ -176,11 +170,7 @@ def checked_indices(what: str, index: npt.ArrayLike, count: int, width: int | No
 
 
 def box_told(low: FloatArray, high: FloatArray) -> str:
-    """A box by its lower and upper corner (3,), for messages.
-
-    >>> box_told(np.array([-15.0, 0.0, 0.01]), np.array([5.0, 120.4, 0.06]))
-    '-15 to 5 x 0 to 120 x 0.01 to 0.06'
-    """
+    """A box by its lower and upper corner (3,), for messages: '-15 to 5 x 0 to 120 x 0.01 to 0.06'."""
     edges = [[f"{v:.0f}" if abs(v) >= 10.0 else f"{v:.3g}" for v in pair] for pair in zip(low, high, strict=True)]
     return " x ".join(f"{a} to {b}" for a, b in edges)
 

@@ -1,13 +1,9 @@
 """The software that a result depends on, as one key for everything that is kept to be used again.
 
-A study's stages, the restart files of simulations and the runs of an accuracy study are kept under this key, and made
-anew when it changes. It covers the package that computes the result and those of ours that it imports (every source and
-data file in them, by place and content) and the versions of mrstrain and of the libraries that figures depend on.
-
-Why whole packages: a list of file names goes stale without a word. Following imports from file to file loses what is
-read by name (parameter files, material sets), and ends at nearly all files anyway, since a front door imports the rest.
-A new page template costs computing time between two releases, and never gives a wrong result. To make error models,
-measure all presets on one state of the code.
+Stages of a study, restart files of simulations and runs of an accuracy study are kept under this key, and made anew
+when it changes. It covers every file of the package that computes the result and of those of ours that it imports, and
+the versions of mrstrain and of the libraries that figures depend on. Whole packages, because a list of file names goes
+stale without a warning, and following imports loses what is read by name (parameter files, material sets).
 """
 
 import hashlib
@@ -40,12 +36,7 @@ def distribution_versions() -> dict[str, str]:
 def software_key(package: str) -> str:
     """All software that results of one of our packages ("dvc", "fe", ...) depend on; read once in a process.
 
-    Versions, and a hash of our own code, in parts that are divided by ", ".
-
-    >>> software_key("fe").split(", ")[1][:5]
-    'code '
-    >>> software_key("fe") == software_key("phantoms")
-    False
+    Versions, and a hash of our own code ("code ..."), divided by ", ".
     """
     hashes: dict[str, str] = {}
     waiting = [package]

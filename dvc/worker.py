@@ -1,19 +1,16 @@
-"""Work in child processes that may crash without taking the caller with them.
+"""Work in child processes that may crash without taking the caller with them, as native code (elastix) can.
 
-elastix is native code: a crash there ends its process. Each worker is a process of its own, kept alive between tasks
-because the first use of elastix costs many seconds; when one dies, its task raises `WorkerError`, the other workers go
-on, and the next task gets a fresh process.
+A child is kept alive between tasks, because the first use of elastix costs many seconds.
 """
 
-from __future__ import annotations
-
 import os
+import re
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, TimeoutError as FutureTimeout
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from loky import ProcessPoolExecutor
 from loky.process_executor import ShutdownExecutorError, TerminatedWorkerError
@@ -26,13 +23,10 @@ _POLL_S = 0.5
 
 
 class Worker:
-    """One child process that runs one task at a time.
+    """One child process that runs one task at a time; if it dies, that task fails and the next gets a fresh process.
 
-    Parameters
-    ----------
-    threads : int
-        Threads that native code (ITK, numba, BLAS) may use in the child. Results of elastix are equal bit
-        for bit only for equal numbers of threads.
+    Native code (ITK, numba, BLAS) may use ``threads`` threads in it; results of elastix are equal bit for bit only for
+    equal numbers of threads.
     """
 
     def __init__(self, threads: int) -> None:
@@ -63,10 +57,12 @@ class Worker:
                 except (TerminatedWorkerError, ShutdownExecutorError) as died:
                     self._executor.shutdown(wait=False, kill_workers=True)
                     self._executor = None
+                    code = re.search(r"\{(.*)\}", str(died), re.DOTALL)
                     raise WorkerError(
-                        f"The process {what} died ({_cause(died)}). Native code crashed or the system ended it, most "
-                        "often for lack of memory. Free memory, use fewer --workers, or, with parameter files of "
-                        'your own that hold several metrics, set (UseMultiThreadingForMetrics "false").'
+                        f"The process {what} died (exit code {code[1] if code else 'unknown'}). Native code crashed or "
+                        "the system ended it, most often for lack of memory. Free memory, use fewer --workers, or, "
+                        "with parameter files of your own that hold several metrics, set "
+                        '(UseMultiThreadingForMetrics "false").'
                     ) from died
 
     def _start(self) -> ProcessPoolExecutor:
@@ -88,7 +84,7 @@ class Worker:
                 self._executor.shutdown(wait=True)
                 self._executor = None
 
-    def __enter__(self) -> Worker:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -133,12 +129,6 @@ def _end_with(parent: int) -> None:
 
     if hasattr(os, "fork"):  # elsewhere a child keeps the number of a parent that is gone
         threading.Thread(target=watch, daemon=True).start()
-
-
-def _cause(died: BaseException) -> str:
-    text = str(died)
-    start, end = text.find("{"), text.rfind("}")
-    return f"exit code {text[start + 1 : end]}" if 0 <= start < end else "exit code unknown"
 
 
 def usable_cores() -> int:

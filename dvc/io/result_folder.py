@@ -1,9 +1,4 @@
-"""The results folder of one loaded image: the names of its files, their writers and readers.
-
-No other module names one of them by a literal.
-"""
-
-from __future__ import annotations
+"""The results folder of one loaded image: the names of its files (given here only), their writers and readers."""
 
 import csv
 import json
@@ -11,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -63,12 +58,16 @@ class ResultFolder:
     aligned_on: str = ""
 
     @classmethod
-    def at(cls, folder: Path) -> ResultFolder:
+    def at(cls, folder: Path) -> Self:
         """Open a folder; refused if its quality or its error model cannot be read."""
         model, verdict, aligned_on = folder / ERROR_MODEL, None, ""
         if (folder / QUALITY).is_file():
             told = read_quality(folder)
-            verdict, aligned_on = verdict_in(told, folder), str(told.get("alignment", {}).get("on", ""))
+            try:
+                verdict = Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"]))
+            except (KeyError, TypeError, InputError) as failure:
+                raise InputError(f"{folder / QUALITY}: it holds no verdict ({failure!r}). {AGAIN}") from failure
+            aligned_on = str(told.get("alignment", {}).get("on", ""))
         return cls(folder, read_error_model(model).tables[0] if model.is_file() else None, verdict, aligned_on)
 
     @property
@@ -131,14 +130,6 @@ def read_quality(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError) as failure:
         raise InputError(f"{path}: the quality of a registration cannot be read ({failure}). {AGAIN}") from failure
     return told
-
-
-def verdict_in(told: dict[str, Any], folder: Path) -> Verdict:
-    """The verdict in ``quality.json``."""
-    try:
-        return Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"]))
-    except (KeyError, TypeError, InputError) as failure:
-        raise InputError(f"{folder / QUALITY}: no verdict is told in it ({failure!r}). {AGAIN}") from failure
 
 
 def motion_in(alignment: dict[str, Any]) -> RigidMotion:

@@ -7,7 +7,7 @@ that of an NRRD file or a MetaImage: give them one of those, or the mask of vali
 """
 
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -69,7 +69,7 @@ def write_labels(path: StrPath, labels: LabelMap) -> None:
     """
     place = Path(path)
     largest = int(labels.labels.max())
-    dtype = np.uint8 if largest < 2**8 else np.uint16 if largest < 2**16 else np.int32
+    dtype = np.min_scalar_type(largest) if largest < 2**16 else np.int32
     if largest >= 2**31:
         raise OutputError(f"{place}: label {largest} is too large for the file format; number the labels anew.")
     _write(place, labels.grid, labels.labels.astype(dtype))
@@ -160,34 +160,27 @@ def _format(path: Path) -> str:
 def _write(path: Path, grid: Grid, values: npt.NDArray[Any], vector: bool = False) -> None:
     suffix = _format(path)
     values = values.astype(values.dtype.newbyteorder("<"), copy=False)
-    makers: dict[str, Callable[[Grid, npt.NDArray[Any], bool], bytes]] = {".nrrd": _nrrd, ".mha": _meta}
-    # NRRD and MetaImage keep the components of a voxel together, NIfTI one volume after the other.
-    blocks = _blocks(values, together=suffix in makers)
+    together = suffix in (".nrrd", ".mha")  # components of a voxel; NIfTI has one volume after the other
+    header = {".nrrd": _nrrd, ".mha": _meta}.get(suffix, _nifti)(grid, values, vector)
+    stream = chain([] if suffix == ".nrrd" else [header], _blocks(values, together))
     with whole_file(path) as part, part.open("wb") as file:
-        header = makers.get(suffix, _nifti)(grid, values, vector)
         if suffix == ".nrrd":
             file.write(header)
-            file.writelines(_deflated(blocks))
-        else:
-            file.writelines(_deflated([header], blocks) if suffix == ".nii.gz" else chain([header], blocks))
+        file.writelines(_deflated(stream) if suffix in (".nrrd", ".nii.gz") else stream)
 
 
 def _blocks(values: npt.NDArray[Any], together: bool) -> Iterator[bytes]:
     """Yield the voxels, first axis fastest, a few slices at a time."""
-    if values.ndim == 4 and not together:
-        for c in range(values.shape[3]):
-            yield from _blocks(values[..., c], together)
-        return
-    step = max(_BLOCK // max(values[:, :, 0].nbytes, 1), 1)
-    for k in range(0, values.shape[2], step):
-        part = values[:, :, k : k + step]
-        yield np.ascontiguousarray(part.transpose(2, 1, 0, *range(3, values.ndim))).tobytes()
+    for volume in [values] if together or values.ndim == 3 else np.moveaxis(values, 3, 0):
+        step = max(_BLOCK // max(volume[:, :, 0].nbytes, 1), 1)
+        for k in range(0, volume.shape[2], step):
+            yield volume[:, :, k : k + step].transpose(2, 1, 0, *range(3, volume.ndim)).tobytes()
 
 
-def _deflated(*parts: Iterable[bytes]) -> Iterator[bytes]:
+def _deflated(stream: Iterable[bytes]) -> Iterator[bytes]:
     """Yield a gzip stream without name and time, so that equal images give equal files."""
     coder = zlib.compressobj(_LEVEL, wbits=31)
-    yield from map(coder.compress, chain(*parts))
+    yield from map(coder.compress, stream)
     yield coder.flush()
 
 
@@ -211,41 +204,28 @@ def _nifti(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:
 def _nrrd(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:
     count, kind = [*values.shape[3:]], "vector" if vector else "list"
     directions = ["none" for _ in count] + [f"({_numbers(step, ',')})" for step in grid.affine[:3, :3].T]
-    sizes = [*count, *grid.shape]
-    lines = [
-        "NRRD0005",
-        f"type: {_NRRD_TYPES[values.dtype.str[1:]]}",
-        f"dimension: {len(sizes)}",
-        "space: left-posterior-superior",
-        f"sizes: {' '.join(map(str, sizes))}",
-        f"space directions: {' '.join(directions)}",
-        f"kinds: {' '.join([*(kind for _ in count), 'domain', 'domain', 'domain'])}",
-        "endian: little",
-        "encoding: gzip",
-        'space units: "mm" "mm" "mm"',
-        f"space origin: ({_numbers(grid.origin_mm, ',')})",
-    ]
-    return ("\n".join(lines) + "\n\n").encode()
+    fields = {
+        "type": _NRRD_TYPES[values.dtype.str[1:]], "dimension": str(len(directions)),
+        "space": "left-posterior-superior", "sizes": " ".join(map(str, (*count, *grid.shape))),
+        "space directions": " ".join(directions),
+        "kinds": " ".join([*(kind for _ in count), "domain", "domain", "domain"]),
+        "endian": "little", "encoding": "gzip",
+        "space units": '"mm" "mm" "mm"', "space origin": f"({_numbers(grid.origin_mm, ',')})",
+    }  # fmt: skip
+    return ("\n".join(["NRRD0005", *map(": ".join, fields.items())]) + "\n\n").encode()
 
 
 def _meta(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:
     del vector  # MetaImage has no word for it
-    lines = [
-        "ObjectType = Image",
-        "NDims = 3",
-        "BinaryData = True",
-        "BinaryDataByteOrderMSB = False",
-        "CompressedData = False",
-        f"TransformMatrix = {_numbers(grid.direction.T)}",
-        f"Offset = {_numbers(grid.origin_mm)}",
-        "CenterOfRotation = 0 0 0",
-        f"ElementSpacing = {_numbers(grid.spacing_mm)}",
-        f"DimSize = {' '.join(map(str, grid.shape))}",
-        *([f"ElementNumberOfChannels = {values.shape[3]}"] if values.ndim == 4 else []),
-        f"ElementType = {_META_TYPES[values.dtype.str[1:]]}",
-        "ElementDataFile = LOCAL",
-    ]
-    return ("\n".join(lines) + "\n").encode()
+    count = {"ElementNumberOfChannels": str(values.shape[3])} if values.ndim == 4 else {}
+    fields = {
+        "ObjectType": "Image", "NDims": "3",
+        "BinaryData": "True", "BinaryDataByteOrderMSB": "False", "CompressedData": "False",
+        "TransformMatrix": _numbers(grid.direction.T), "Offset": _numbers(grid.origin_mm), "CenterOfRotation": "0 0 0",
+        "ElementSpacing": _numbers(grid.spacing_mm), "DimSize": " ".join(map(str, grid.shape)),
+        **count, "ElementType": _META_TYPES[values.dtype.str[1:]], "ElementDataFile": "LOCAL",
+    }  # fmt: skip
+    return ("\n".join(map(" = ".join, fields.items())) + "\n").encode()
 
 
 def _numbers(array: npt.NDArray[Any], mark: str = " ") -> str:

@@ -14,8 +14,7 @@ from dvc.io.meshes.raw import NumberedMesh, RawMesh, damage_named
 
 _log = logging.getLogger("dvc.io.meshes.abaqus")
 
-# Shape and number of nodes by the stem of the element's name; the rest (H, R, I, M, T ...) chooses
-# the formulation, not the nodes.
+# Shape and number of nodes by the stem of the element's name; the rest (H, R, I, M, T ...) is the formulation.
 _SHAPES = {
     "C3D4": ("tetra", 4), "C3D10": ("tetra10", 10),
     "C3D8": ("hexahedron", 8), "C3D20": ("hexahedron20", 20),
@@ -40,11 +39,9 @@ class _Keyword:
 
 
 def read_abaqus(path: Path) -> RawMesh:
-    """Read the mesh of an Abaqus or CalculiX input file.
+    """Read ``*NODE``, ``*ELEMENT`` (solids, shells, membranes, surface elements), ``*ELSET`` and ``*NSET``.
 
-    Reads ``*NODE`` (any number of blocks), ``*ELEMENT`` (solids incl. hybrid and reduced ones, shells, membranes,
-    surface elements), ``*ELSET`` and ``*NSET`` (lists, GENERATE, sets of sets). Springs, trusses, connectors and the
-    reference points of an assembly are not tissue: they are left out, and logged.
+    Springs, trusses, connectors and the reference points of an assembly are not tissue: they are left out, and logged.
     """
     mesh = NumberedMesh(path)
     element_sets, node_sets = _Sets(path, "ELSET"), _Sets(path, "NSET")
@@ -68,9 +65,7 @@ def read_abaqus(path: Path) -> RawMesh:
                 if "ELSET" in keyword.options:
                     element_sets.extend(keyword, map(str, numbers))
             elif keyword.name in {"ELSET", "NSET"}:
-                rows: Iterable[Iterable[object]] = keyword.rows
-                if "GENERATE" in keyword.options:
-                    rows = map(_generated, keyword.rows)
+                rows = map(_generated, keyword.rows) if "GENERATE" in keyword.options else keyword.rows
                 chosen = element_sets if keyword.name == "ELSET" else node_sets
                 chosen.extend(keyword, (str(x) for row in rows for x in row if x))
     return mesh.by_index(element_sets.resolved(), node_sets.resolved())
@@ -82,10 +77,9 @@ def _keywords(path: Path) -> Iterator[_Keyword]:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise ImageFileError(f"{path} cannot be read: {error.strerror}.") from error
-    lines = text.splitlines()
     current: _Keyword | None = None
     head, head_line = "", 0
-    for number, raw in enumerate(lines, start=1):
+    for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip()
         if not line or line.startswith("**"):
             continue
@@ -165,22 +159,20 @@ class _Sets:
 
     def __init__(self, path: Path, kind: str) -> None:
         self._path, self._kind = path, kind
-        self._spelling: dict[str, str] = {}  # names are the same in any case; the first spelling is kept
-        self._entries: dict[str, list[str]] = {}
+        self._sets: dict[str, tuple[str, list[str]]] = {}  # names are the same in any case; the first spelling is kept
 
     def extend(self, keyword: _Keyword, more: Iterable[str]) -> None:
         if self._kind not in keyword.options:
             raise ImageFileError(f"{self._path}, line {keyword.line}: *{self._kind} without a name ({self._kind}=...).")
         name = keyword.options[self._kind].strip('"')
-        self._spelling.setdefault(name.casefold(), name)
-        self._entries.setdefault(name.casefold(), []).extend(more)
+        self._sets.setdefault(name.casefold(), (name, []))[1].extend(more)
 
     def resolved(self) -> dict[str, list[int]]:
         """Numbers of the members of each set."""
         members = {}
-        for key, name in self._spelling.items():
+        for name, _ in self._sets.values():
             try:
-                members[name] = self._members(key)
+                members[name] = self._members(name)
             except ImageFileError as error:
                 if self._kind == "ELSET":
                     raise
@@ -189,10 +181,10 @@ class _Sets:
 
     def _members(self, name: str, seen: tuple[str, ...] = ()) -> list[int]:
         key = name.strip('"').casefold()
-        if key in seen or key not in self._entries:
+        if key in seen or key not in self._sets:
             kind = {"ELSET": "element set", "NSET": "node set"}[self._kind]
             raise ImageFileError(f"{self._path}: the {kind} {name!r} is not defined, or contains itself.")
         members: list[int] = []
-        for entry in self._entries[key]:
+        for entry in self._sets[key][1]:
             members += [int(entry)] if entry.isdigit() else self._members(entry, (*seen, key))
         return members

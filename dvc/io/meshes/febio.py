@@ -60,17 +60,16 @@ def read_xplt(path: Path) -> RawMesh:
         if _ROOT not in last or _MESH not in last:
             raise ImageFileError(f"{path} has no mesh: it is cut short.")
         points, ids = _nodes(last[_MESH])
-        blocks, parts = _cells(path, last[_MESH])
-        u = _displacement(path, last[_ROOT], last[_STATE], len(points)) if _STATE in last else None
-        return RawMesh(path, points, ids, blocks, parts, at_nodes={} if u is None else {_DISPLACEMENT: u})
+        fields = _displacement(path, last[_ROOT], last[_STATE], len(points)) if _STATE in last else {}
+        return RawMesh(path, points, ids, *_cells(path, last[_MESH]), at_nodes=fields)
 
 
 def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Top chunks; a compressed one is recognised by its first bytes, which are no tag."""
     at = 4
     while at < len(data):
-        if len(data) >= at + 8 and struct.unpack_from("<I", data, at)[0] in (_ROOT, _MESH, _STATE):
-            tag, size = struct.unpack_from("<II", data, at)
+        tag, size = struct.unpack_from("<II", data, at) if len(data) >= at + 8 else (0, 0)
+        if tag in (_ROOT, _MESH, _STATE):
             if at + 8 + size > len(data):
                 raise ValueError("its last section is cut short")
             yield tag, data[at + 8 : at + 8 + size]
@@ -143,20 +142,17 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
     return blocks, {name: np.concatenate(cells) for name, cells in parts.items()}
 
 
-def _displacement(path: Path, root: bytes, state: bytes, count: int) -> FloatArray | None:
-    """Displacement in a state, (n, 3)."""
+def _displacement(path: Path, root: bytes, state: bytes, count: int) -> dict[str, FloatArray]:
+    """Displacement in a state, (n, 3), by its name; empty where it has none."""
     status = _at(state, *_STATUS)
     if status and _number(status):
         _log.warning("%s: FEBio marks its last state with status %d.", path, _number(status))
-    items = (_at(item, _ITEM_NAME) for tag, item in _chunks(_at(root, *_NODAL_NAMES)) if tag == _ITEM)
-    names = [_text(name) for name in items]
-    if _DISPLACEMENT not in names:
-        return None
-    wanted = names.index(_DISPLACEMENT) + 1
+    names = [_text(_at(item, _ITEM_NAME)) for tag, item in _chunks(_at(root, *_NODAL_NAMES)) if tag == _ITEM]
+    wanted = names.index(_DISPLACEMENT) + 1 if _DISPLACEMENT in names else None
     for _, variable in _chunks(_at(state, *_NODE_DATA)):
         if _number(_at(variable, _VARIABLE_ID)) == wanted:
             _, values = next(_chunks(_at(variable, _VARIABLE_DATA)))
             if len(values) != 12 * count:
                 raise ValueError(f"{len(values)} bytes of displacement for {count} nodes")
-            return np.frombuffer(values, "<f4").reshape(-1, 3).astype(np.float64)
-    return None
+            return {_DISPLACEMENT: np.frombuffer(values, "<f4").reshape(-1, 3).astype(np.float64)}
+    return {}

@@ -162,17 +162,9 @@ def _checked(raw: RawMesh, unit: str, frame: str) -> MeshFile:
     check_extent(points[np.unique(np.concatenate([block.nodes.ravel() for block in volumes]))])
     regions = {name: frozen(index, np.int64) for name, index in raw.regions.items() if len(index)}
     tets = _tetrahedra(raw, points, blocks, regions) if all(block.shape == "tetra" for block in volumes) else None
-    return MeshFile(
-        path=path,
-        unit=unit,
-        frame=frame,
-        points_mm=frozen(points, np.float64),
-        node_ids=frozen(raw.node_ids, np.int64),
-        blocks=tuple(blocks),
-        regions=MappingProxyType(regions),
-        tets=tets,
-        at_nodes=MappingProxyType({name: frozen(values, np.float64) for name, values in raw.at_nodes.items()}),
-    )
+    at_nodes = MappingProxyType({name: frozen(values, np.float64) for name, values in raw.at_nodes.items()})
+    points, node_ids = frozen(points, np.float64), frozen(raw.node_ids, np.int64)
+    return MeshFile(path, unit, frame, points, node_ids, tuple(blocks), MappingProxyType(regions), tets, at_nodes)
 
 
 def _tetrahedra(raw: RawMesh, points: FloatArray, blocks: list[CellBlock], regions: Mapping[str, IntArray]) -> TetMesh:

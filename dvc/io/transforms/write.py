@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from functools import singledispatch
 from pathlib import Path
 
 import numpy as np
@@ -115,41 +114,27 @@ def write_itk_transform(
     return place
 
 
-@singledispatch
 def _itk_part(displacement: Deformation, grid: Grid | None) -> sitk.Transform:
-    """Any displacement as a field at the voxels of a grid, 0 where it is not defined."""
+    """A B-spline as one; any other displacement as a field at the voxels of a grid, 0 where it is not defined."""
+    match displacement:
+        case BSpline(control=control, coefficients_mm=coefficients):
+            return sitk.BSplineTransform([to_sitk(control, c) for c in coefficients], 3)
+        case BorderedSpline(borders=borders):
+            grid = borders.grid
     if grid is None:
         raise InputError(f"To write a {type(displacement).__name__} for ITK, give the grid of its displacement field.")
     u = displacement.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
     return sitk.DisplacementFieldTransform(to_sitk(grid, np.nan_to_num(u)))
 
 
-@_itk_part.register
-def _(displacement: BSpline, grid: Grid | None) -> sitk.Transform:
-    return sitk.BSplineTransform([to_sitk(displacement.control, c) for c in displacement.coefficients_mm], 3)
-
-
-@_itk_part.register
-def _(displacement: BorderedSpline, grid: Grid | None) -> sitk.Transform:
-    grid = displacement.borders.grid
-    u = displacement.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
-    return sitk.DisplacementFieldTransform(to_sitk(grid, u))
-
-
-@singledispatch
 def write_displacement_as_found(found: Deformation, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
     """Write a displacement with its own gradient, and the motion `then` (R, t), to the files that hold its kind.
 
     A `BSpline` as elastix' text files (grid of transformix: `reference`); a `BorderedSpline` as a file of its own. Any
     other kind has no such file: its displacement image must do.
     """
-
-
-@write_displacement_as_found.register
-def _(found: BSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
-    write_elastix_transform(folder, found, then, reference)
-
-
-@write_displacement_as_found.register
-def _(found: BorderedSpline, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
-    write_bordered_spline(folder / BORDERED_SPLINE, found)
+    match found:
+        case BSpline():
+            write_elastix_transform(folder, found, then, reference)
+        case BorderedSpline():
+            write_bordered_spline(folder / BORDERED_SPLINE, found)
