@@ -101,17 +101,15 @@ def result_folders(place: Path, loads: Sequence[str] = ()) -> list[ResultFolder]
         raise InputError(
             f"{place}: no results of `register` or `strain` here (LOAD/{DISPLACEMENT}). Give the folder they wrote."
         )
-    absent = [load for load in loads if load not in [f.resolve().name for f in folders]]
+    names = [folder.resolve().name for folder in folders]
+    absent = [load for load in loads if load not in names]
     if absent:
         raise InputError(f"{place} has no results of {', '.join(absent)}.")
-    return [ResultFolder.at(folder) for folder in folders if not loads or folder.resolve().name in loads]
+    return [ResultFolder.at(folder) for folder, name in zip(folders, names, strict=True) if not loads or name in loads]
 
 
 def spline_in(folder: Path) -> Deformation:
-    """Displacement of tissue relative to its bone that `register` measured for one load.
-
-    With its own gradient, where the engine has a file that holds it; otherwise its displacement image.
-    """
+    """Displacement of tissue relative to its bone for one load: with its own gradient, or else from its image."""
     for name in (SPLINE_WITH_BORDERS, SPLINE):
         if (folder / name).is_file():
             return read_transform(folder / name)

@@ -103,11 +103,10 @@ def _assembled(place: Path, stack: list[Frame]) -> tuple[Grid, list[Frame]]:
     usual = float(np.median(steps))
     gaps = np.flatnonzero(steps > 1.5 * usual)
     if len(gaps):
-        first = gaps[0]
+        first, before, after = steps[gaps[0]], ordered[gaps[0]].name, ordered[gaps[0] + 1].name
         raise ImageFileError(
-            f"{place}: slices are missing: {len(gaps)} gaps in a stack with a slice every {usual:.4g} mm; "
-            f"the first, of {steps[first]:.4g} mm, between {ordered[first].name} and "
-            f"{ordered[first + 1].name}. Export the whole series."
+            f"{place}: slices are missing: {len(gaps)} gaps in a stack with a slice every {usual:.4g} mm; the first, "
+            f"of {first:.4g} mm, between {before} and {after}. Export the whole series."
         )
     spacing = float(along[-1] - along[0]) / (len(ordered) - 1)
     uneven = float(np.abs(along - along[0] - spacing * np.arange(len(ordered))).max())

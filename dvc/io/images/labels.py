@@ -96,10 +96,8 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
     nameless = [v for v in present if v not in known]
     if nameless:
         source = f" in {names}" if isinstance(names, str | PathLike) else ""
-        raise InputError(
-            f"{place}: labels without a name{source}: {_shortened(nameless)}; names are given for "
-            f"{_shortened(sorted(known))}. Add the missing ones."
-        )
+        lack = f"labels without a name{source}: {_shortened(nameless)}"
+        raise InputError(f"{place}: {lack}; names are given for {_shortened(sorted(known))}. Add the missing ones.")
     return LabelMap(grid, labels, {v: known[v] for v in present})
 
 

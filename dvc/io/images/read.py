@@ -1,7 +1,6 @@
 """Reading images: NIfTI, NRRD, MetaImage and DICOM, to an Image in LPS mm.
 
-A damaged file, or one with an ambiguous geometry, is refused with the reason. Conversions on the way (units, the only
-volume of a 4D file) are logged by ``dvc.images``.
+Conversions on the way (units, the only volume of a 4D file) are logged by ``dvc.images``.
 """
 
 import logging

@@ -1,7 +1,7 @@
 """Nodes, elements and element sets of an Abaqus input file (.inp), with the file's own numbers.
 
-The dialect of Abaqus that CalculiX shares. One part in global coordinates is read; what would move, join or create
-geometry elsewhere in the file is refused: a misplaced mesh gives wrong strains without a warning.
+One part in global coordinates is read, in the dialect that CalculiX shares; what would move, join or create geometry
+elsewhere in the file is refused: a misplaced mesh gives wrong strains without a warning.
 """
 
 import logging

@@ -1,8 +1,7 @@
 """FEBio's plot files (.xplt): nodes, elements, parts and the last state's displacements.
 
 A file is a tree of chunks: a tag and a length in bytes (two little-endian integers of 32 bits), then data or further
-chunks, as FEBio's specification of its binary database and the program itself have it (versions 2.0 to 3.5 of the
-format, FEBio 3 and 4); states may be compressed, each by itself.
+chunks (FEBio's binary database, versions 2.0 to 3.5, FEBio 3 and 4); states may be compressed, each by itself.
 """
 
 import logging

@@ -70,15 +70,17 @@ class NumberedMesh:
         """
         if not self.nodes:
             raise ImageFileError(f"{self.path} has no nodes: there is no mesh in it.")
+
+        def undefined(whose: str, node: int) -> ImageFileError:
+            return ImageFileError(f"{self.path}: {whose} node {node}, which the file does not define.")
+
         index_of = {number: index for index, number in enumerate(self.nodes)}
         rows: dict[str, list[list[int]]] = {}
         numbers: dict[str, list[int]] = {}
         for number, (kind, nodes) in self.elements.items():
             missing = [node for node in nodes if node not in index_of]
             if missing:
-                raise ImageFileError(
-                    f"{self.path}: element {number} uses node {missing[0]}, which the file does not define."
-                )
+                raise undefined(f"element {number} uses", missing[0])
             rows.setdefault(kind, []).append([index_of[node] for node in nodes])
             numbers.setdefault(kind, []).append(number)
         cell_of = {number: cell for cell, number in enumerate(n for group in numbers.values() for n in group)}
@@ -87,9 +89,7 @@ class NumberedMesh:
             fields[name] = np.full((len(index_of), 3), np.nan)
             for number, value in values.items():
                 if number not in index_of:
-                    raise ImageFileError(
-                        f"{self.path}: a {name} belongs to node {number}, which the file does not define."
-                    )
+                    raise undefined(f"a {name} belongs to", number)
                 fields[name][index_of[number]] = value
         return RawMesh(
             self.path,

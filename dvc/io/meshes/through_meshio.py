@@ -1,7 +1,7 @@
 """Gmsh (.msh) and VTK files (.vtu, .vtk), by meshio, with its many kinds of failure and its printing in one place.
 
-Of Gmsh it passes over node numbers, groups of one name and the order of some nodes: see the Gmsh reference manual,
-sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
+Gmsh's node numbers, groups of one name and order of some nodes, which meshio passes over, are read here: see the Gmsh
+reference manual, sections "MSH file format" (versions 2 and 4.1) and "Node ordering".
 """
 
 import io
@@ -56,9 +56,8 @@ def read_gmsh(path: Path) -> RawMesh:
         if not name.startswith("gmsh:"):
             if len(parts) != len(starts):
                 raise ImageFileError(f"{path}: its $Elements section is cut short.")
-            pairs = zip(parts, starts, strict=True)
-            cells = np.concatenate([np.asarray(part, dtype=np.int64) + start for part, start in pairs])
-            groups.append((real[name], cells))
+            own = [np.asarray(part, dtype=np.int64) + start for part, start in zip(parts, starts, strict=True)]
+            groups.append((real[name], np.concatenate(own)))
     regions: dict[str, IntArray] = {}
     for name, cells in groups:  # a volume and its surface may share a name: the shape distinguishes their cells
         regions[name] = np.union1d(regions.get(name, np.empty(0, dtype=np.int64)), cells)
@@ -66,11 +65,7 @@ def read_gmsh(path: Path) -> RawMesh:
 
 
 def _node_numbers(path: Path, count: int) -> IntArray:
-    """Node tags of a .msh file (version 2.2 or 4.1, text or binary), (count,), in the file's order.
-
-    Gmsh numbers nodes freely: from any number, with gaps, in any order. Boundary conditions refer to these numbers, so
-    they are read and never assumed.
-    """
+    """Node tags (count,) of a .msh file, in its order: any numbers, with gaps, to which boundary conditions refer."""
     data = path.read_bytes()
     with damage_named(f"{path}: its $MeshFormat section"):
         version, mode, size = _section(data, b"MeshFormat").split()[:3]

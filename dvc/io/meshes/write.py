@@ -1,8 +1,4 @@
-"""Results on the user's own mesh: VTU to look at, CSV of nodal displacements for the user's solver.
-
-Values come in LPS mm and are written in the mesh file's own frame and unit, so that a displacement can be used as a
-boundary condition as it stands.
-"""
+"""Results on the user's own mesh, in its frame and unit: VTU to look at, CSV of nodal displacements for a solver."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -69,14 +65,15 @@ def write_nodal_displacements(path: StrPath, mesh: MeshFile, u_mm: FloatArray, v
     columns = ["node", *(f"{axis}_{mesh.unit}" for axis in ("x", "y", "z", "ux", "uy", "uz"))]
     has_numbers = mesh.path.suffix.lower() not in {".vtu", ".vtk"}
     node = "number in the mesh file" if has_numbers else "index in the mesh file, counted from 0"
-    missing_nodes = int(np.count_nonzero(undefined))
+    missing = int(np.count_nonzero(undefined))
     declared: dict[str, object] = {"mesh": mesh.path.name, "frame": mesh.frame, "unit": mesh.unit, "columns": columns}
-    declared |= {"node": node, "nodes": len(own_u), "nodes_without_displacement": missing_nodes}
+    declared |= {"node": node, "nodes": len(own_u), "nodes_without_displacement": missing}
+    declared |= {} if verdict is None else {"verdict": verdict.as_dict()}
     at_nodes = zip(mesh.node_ids.tolist(), _own_points(mesh), own_u, undefined, strict=True)
     rows = ([n, *(f"{x:.10g}" for x in X), *("" if bare else f"{x:.10g}" for x in u)] for n, X, u, bare in at_nodes)
     write_csv(path, columns, rows)
-    write_json(path.with_suffix(".json"), declared | ({} if verdict is None else {"verdict": verdict.as_dict()}))
-    return missing_nodes
+    write_json(path.with_suffix(".json"), declared)
+    return missing
 
 
 def _add_verdict(vtu: Path, verdict: Verdict) -> None:

@@ -5,6 +5,7 @@ import json
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,19 +27,15 @@ def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
 
     Of the interfaces only the tissues' numbers are kept, from which the depths are computed again.
     """
+    borders = spline.borders
+    content: dict[str, Any] = {
+        "format": _FORMAT, "numbers": json.dumps(NUMBERS), "control": _rows_of(spline.control),
+        "smooth": spline.smooth.coefficients_mm, "jump": spline.jump.coefficients_mm,
+        "voxels": _rows_of(borders.grid), "own": borders.own.astype(np.int16), "rest": borders.rest,
+        "reach_mm": borders.reach_mm,
+    }  # fmt: skip
     with whole_file(path) as part, part.open("wb") as file:
-        np.savez_compressed(
-            file,
-            format=_FORMAT,
-            numbers=json.dumps(NUMBERS),
-            smooth=spline.smooth.coefficients_mm,
-            jump=spline.jump.coefficients_mm,
-            own=spline.borders.own.astype(np.int16),
-            rest=spline.borders.rest,
-            reach_mm=spline.borders.reach_mm,
-            control=_rows_of(spline.control),
-            voxels=_rows_of(spline.borders.grid),
-        )
+        np.savez_compressed(file, **content)
 
 
 def read_bordered_spline(path: Path | str) -> BorderedSpline:
@@ -54,10 +51,8 @@ def read_bordered_spline(path: Path | str) -> BorderedSpline:
             borders = _between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
             return BorderedSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
     except (*_UNREADABLE, MrstrainError) as failure:
-        raise InputError(
-            f"{path}: no displacement with borders as `mrstrain register` writes it ({type(failure).__name__}: "
-            f"{failure})."
-        ) from failure
+        why = f"{type(failure).__name__}: {failure}"
+        raise InputError(f"{path}: no displacement with borders as `mrstrain register` writes it ({why}).") from failure
 
 
 _latest: list[Interfaces] = []

@@ -15,10 +15,10 @@ _BAD_NAME = re.compile(r"[.,:;!@#$%^&'()*+|<>?\"\s]")
 
 
 def parse_parameters(text: str) -> dict[str, tuple[str, ...]]:
-    """Read the parameters of an elastix parameter or transform file, all values as text.
+    """Parameters of an elastix parameter or transform file, all values as text.
 
-    One parameter per line, ``(Name value "text value" ...)``; what follows ``//`` is a comment, even inside quotes, as
-    elastix has it. A line that elastix would not take is refused with its number.
+    One per line, ``(Name value "text value" ...)``; what follows ``//`` is a comment, even inside quotes, as elastix
+    has it. A line that elastix would not take is refused with its number.
     """
     parameters: dict[str, tuple[str, ...]] = {}
     for number, text_line in enumerate(text.split("\n"), start=1):

@@ -118,7 +118,7 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
         )
     infinite = np.isinf(values).any(axis=-1)
     if infinite.any():
-        first = tuple(int(n) for n in np.argwhere(infinite)[0])
+        first = tuple(np.argwhere(infinite)[0].tolist())
         raise ImageFileError(
             f"{place}: the displacement of {int(infinite.sum())} of {infinite.size} voxels is infinite, the first at "
             f"index {first}. Where it is not known, it is NaN: repair the file, or make it again."
@@ -184,11 +184,8 @@ def _about(centre: FloatArray, matrix: FloatArray, translation: FloatArray) -> A
 
 _ELASTIX: dict[str, Callable[[Parameters], Deformation]] = {
     "EulerTransform": rigid_from_elastix,
-    "BSplineTransform": bspline_from_elastix,
-    "RecursiveBSplineTransform": bspline_from_elastix,
-    "AffineTransform": _affine_from_elastix,
-    "SimilarityTransform": _affine_from_elastix,
-    "TranslationTransform": _affine_from_elastix,
+    **dict.fromkeys(("BSplineTransform", "RecursiveBSplineTransform"), bspline_from_elastix),
+    **dict.fromkeys(("AffineTransform", "SimilarityTransform", "TranslationTransform"), _affine_from_elastix),
 }
 
 
