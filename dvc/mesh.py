@@ -8,6 +8,7 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+from dvc.arguments import expect
 from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
 from dvc.errors import ExtentError, GeometryError, InputError
 
@@ -41,7 +42,7 @@ class TetMesh:
     Raises
     ------
     InputError
-        If a shape is wrong, an index is out of range, a region is empty, or a node id is repeated.
+        If a shape or a type is wrong, an index is out of range, a region is empty, or a node id is repeated.
     GeometryError
         If a coordinate is not finite, a cell has no volume, the mesh folds over itself, or its size is not
         that of a body part in mm.
@@ -80,9 +81,11 @@ class TetMesh:
         if len(tets) == 0:
             raise InputError("The mesh has no tetrahedron.")
         ids = np.arange(len(points)) if node_ids is None else np.asarray(node_ids)
-        if ids.shape != (len(points),) or len(np.unique(ids)) != len(ids):
-            got = f"got {ids.shape[0]} numbers, {len(np.unique(ids))} of them different"
-            raise InputError(f"node_ids must give each of the {len(points)} nodes a number of its own; {got}.")
+        if ids.shape != (len(points),) or ids.dtype.kind not in "iu" or len(np.unique(ids)) != len(ids):
+            got = f"got shape {ids.shape} of {ids.dtype}, {len(np.unique(ids))} of them different"
+            raise InputError(f"node_ids must be a whole number of its own for each of the {len(points)} nodes; {got}.")
+        for name, named in (("regions", regions), ("facets", facets)):
+            expect(name, named, Mapping | None, "a mapping of names to indices, such as {'fat': [0, 1]}")
         named_cells = {n: checked_indices(f"region {n!r}", i, len(tets)) for n, i in (regions or {}).items()}
         named_facets = {n: checked_indices(f"facets {n!r}", i, len(points), 3) for n, i in (facets or {}).items()}
         for name, index in [*named_cells.items(), *named_facets.items()]:
@@ -140,7 +143,10 @@ def _faces(cells: IntArray) -> IntArray:
 
 def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
     """Nodes (n, 3); InputError for another shape, GeometryError for a coordinate that is not finite."""
-    points = np.array(points_mm, dtype=np.float64)
+    try:
+        points = np.array(points_mm, dtype=np.float64)
+    except (TypeError, ValueError) as wrong:
+        raise InputError(f"Nodes of a mesh must be an (n, 3) array of numbers ({wrong}).") from wrong
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InputError(f"Nodes of a mesh must be an (n, 3) array of coordinates; got shape {points.shape}.")
     bad = ~np.isfinite(points).all(axis=1)
@@ -152,7 +158,10 @@ def checked_points(points_mm: npt.ArrayLike) -> FloatArray:
 
 def checked_indices(what: str, index: npt.ArrayLike, count: int, width: int | None = None) -> IntArray:
     """Integer indices below ``count``, (k,) or (k, width); InputError for another type, shape or range."""
-    array = np.asarray(index)
+    try:
+        array = np.asarray(index)
+    except ValueError as wrong:
+        raise InputError(f"{what}: indices must be an array of integers ({wrong}).") from wrong
     if array.size == 0:
         array = array.reshape((0,) if width is None else (0, width)).astype(np.int64)
     if not np.issubdtype(array.dtype, np.integer):

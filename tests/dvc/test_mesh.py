@@ -133,10 +133,31 @@ def test_a_unit_that_cannot_be_is_refused_with_the_option_to_use() -> None:
         ({"regions": {"fat": [48]}}, InputError, "region 'fat': 1 indices are outside 0 to 47"),
         ({"regions": {"fat": []}}, InputError, "'fat' is empty"),
         ({"facets": {"skin": [[0, 1, 99]]}}, InputError, "facets 'skin': .* the first is 99"),
-        ({"node_ids": np.zeros(27, dtype=int)}, InputError, "27 numbers, 1 of them different"),
+        ({"node_ids": np.zeros(27, dtype=int)}, InputError, "1 of them different"),
     ],
 )
 def test_what_makes_no_mesh_is_refused(change: dict[str, object], error: type[Exception], message: str) -> None:
     points, cells = block()
     with pytest.raises(error, match=message):
         TetMesh(**({"points_mm": points, "cells": cells} | change))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"points_mm": "a.vtu"}, r"^Nodes of a mesh must be an \(n, 3\) array of numbers \(could not convert"),
+        ({"points_mm": [[0, 0, 0], [1, 1]]}, r"^Nodes of a mesh must be an \(n, 3\) array of numbers \("),
+        ({"points_mm": object()}, r"^Nodes of a mesh must be an \(n, 3\) array of numbers \("),
+        ({"cells": [[0, 1, 2, 3], [0, 1]]}, "^cells: indices must be an array of integers"),
+        ({"regions": ["fat"]}, "^regions must be a mapping of names to indices.*; got list"),
+        ({"facets": np.array([[0, 1, 2]])}, r"^facets must be a mapping of names to .*; got ndarray of shape \(1, 3\)"),
+        ({"node_ids": 5}, r"^node_ids must be .* of the 4 nodes; got shape \(\)"),
+        ({"node_ids": [0.5, 1, 2, 3]}, r"^node_ids must be .* of the 4 nodes; got shape \(4,\) of float64"),
+        ({"node_ids": ["a", "b", "c", "d"]}, r"^node_ids must be .* of the 4 nodes; got shape \(4,\) of <U1"),
+        ({"node_ids": [1, 2, 2, 3]}, r"^node_ids must be .* 4 nodes; got shape \(4,\) of int64, 3 of them different"),
+    ],
+)  # fmt: skip
+def test_what_is_no_mesh_is_refused_by_its_name(change, told):
+    given = {"points_mm": [[0, 0, 0], [6, 0, 0], [0, 6, 0], [0, 0, 6]], "cells": [[0, 1, 2, 3]]}
+    with pytest.raises(InputError, match=told):
+        TetMesh(**{**given, **change})

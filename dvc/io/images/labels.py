@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from dvc.arguments import expect, path_of
 from dvc.arrays import IntArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, LabelMap, Mask
@@ -51,7 +52,7 @@ def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
     GeometryError
         If it does not lie on ``grid``.
     """
-    place = Path(path)
+    place = path_of(path)
     own, labels = _integers(place)
     counts = _counts(labels)
     if not counts:
@@ -83,7 +84,8 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
     InputError
         If the map is empty, a value is negative or not a whole number, or a label has no name.
     """
-    place = Path(path)
+    place = path_of(path)
+    expect("names", names, str | PathLike | Mapping | None, "a mapping such as {1: 'fat'}, or the file of a table")
     grid, labels = _integers(place)
     present = _counts(labels)
     if not present:
@@ -140,12 +142,15 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     Parameters
     ----------
     mask_or_labels : Mask or LabelMap
+        On any grid, LPS mm.
     grid : Grid
         The image's grid.
     what : its name in messages, such as its path
 
     Raises
     ------
+    InputError
+        If an argument is of another kind.
     GeometryError
         If less than half of its volume lies in the image, if it is the image's grid mirrored (RAS taken for
         LPS), or if nothing of it is left on the grid.
@@ -157,6 +162,8 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     >>> int(fitted.inside.sum()), coarse.volume_mm3
     (64, 64.0)
     """
+    expect("mask_or_labels", mask_or_labels, Mask | LabelMap, "a dvc.Mask or dvc.LabelMap (read_mask, read_labels)")
+    expect("grid", grid, Grid, "a dvc.Grid, such as that of an image (image.grid)")
     own = mask_or_labels.grid
     field = "inside" if isinstance(mask_or_labels, Mask) else "labels"
     values: npt.NDArray[Any] = getattr(mask_or_labels, field)

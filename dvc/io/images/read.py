@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvc.arguments import expect, path_of
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image
 from dvc.io import StrPath
@@ -56,7 +57,8 @@ def read_image(
         If the file is damaged, of an unknown kind, not a scalar 3D image of four slices or more, constant, or its
         geometry is missing or contradictory.
     InputError
-        If voxels are NaN or infinite and ``allow_missing`` is not set, or ``series`` is missing or unknown.
+        If there is no such file, an argument is of another kind, voxels are NaN or infinite and ``allow_missing`` is
+        not set, or ``series`` is missing or unknown.
     """
     grid, voxels = read_voxels(path, series=series, volume=volume, max_bytes=max_bytes)
     if min(grid.shape) < _MIN_SLICES:
@@ -90,7 +92,10 @@ def read_voxels(
 
     Parameters and errors as in `read_image`, whose checks of the values are left out.
     """
-    place = Path(path)
+    place = path_of(path)
+    expect("series", series, str | None, "the end of a DICOM series' name")
+    expect("volume", volume, int | np.integer | None, "the number of a volume, from 0")
+    expect("max_bytes", max_bytes, int | float, "a number of bytes")
     if not place.exists():
         raise InputError(f"{place}: no such file or folder. Check the path.")
     if place.is_dir() or (_known_suffix(place.name) is None and is_dicom(place)):

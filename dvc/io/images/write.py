@@ -7,7 +7,7 @@ that of an NRRD file or a MetaImage: give them one of those, or the mask of vali
 """
 
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import nibabel
 import numpy as np
 import numpy.typing as npt
 
+from dvc.arguments import expect, path_of
 from dvc.atomic_files import whole_file, write_csv, write_json
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
@@ -37,9 +38,13 @@ def write_image(path: StrPath, image: Image) -> None:
     ----------
     path : .nii, .nii.gz, .nrrd or .mha
         NIfTI gets equal qform and sform (code 1, mm, RAS); the others are in LPS.
+    image : Image
+        Values (ni, nj, nk) on a grid in LPS mm.
 
     Raises
     ------
+    InputError
+        If an argument is of another kind, such as an array: make it an image on a grid first.
     OutputError
         If the file cannot be written; nothing is left under its name.
 
@@ -54,20 +59,37 @@ def write_image(path: StrPath, image: Image) -> None:
     >>> bool((back.values == image.values).all()), back.grid.same_as(image.grid)
     (True, True)
     """
-    _write(Path(path), image.grid, image.values)
+    place = path_of(path)
+    expect("image", image, Image, "a dvc.Image, such as dvc.Image(grid, values) of an array on a dvc.Grid")
+    _write(place, image.grid, image.values)
 
 
 def write_mask(path: StrPath, mask: Mask) -> None:
-    """Write a mask as 0 and 1. Formats and errors as `write_image`."""
-    _write(Path(path), mask.grid, mask.inside.view(np.uint8))
+    """Write a mask (ni, nj, nk), on its own grid, as 0 and 1 in 8 bits. Formats and errors as in `write_image`.
+
+    Parameters
+    ----------
+    path : .nii, .nii.gz, .nrrd or .mha
+    mask : Mask
+    """
+    place = path_of(path)
+    expect("mask", mask, Mask, "a dvc.Mask, such as dvc.Mask(grid, inside) of an array on a dvc.Grid")
+    _write(place, mask.grid, mask.inside.view(np.uint8))
 
 
 def write_labels(path: StrPath, labels: LabelMap) -> None:
     """Write a label map, and its names in a table beside it: stem and ``.csv``, columns label and name.
 
-    Formats and errors as `write_image`.
+    Formats and errors as in `write_image`.
+
+    Parameters
+    ----------
+    path : .nii, .nii.gz, .nrrd or .mha
+    labels : LabelMap
+        Labels (ni, nj, nk) below 2**31, written in 8, 16 or 32 bits, the fewest that hold them.
     """
-    place = Path(path)
+    place = path_of(path)
+    expect("labels", labels, LabelMap, "a dvc.LabelMap, such as dvc.LabelMap(grid, labels, {1: 'fat'})")
     largest = int(labels.labels.max())
     dtype = np.min_scalar_type(largest) if largest < 2**16 else np.int32
     if largest >= 2**31:
@@ -80,7 +102,7 @@ def write_vectors(
     path: StrPath,
     grid: Grid,
     values: npt.ArrayLike,
-    components: tuple[str, ...],
+    components: Sequence[str],
     meaning: str,
     frame: str = "LPS",
     *,
@@ -97,8 +119,10 @@ def write_vectors(
     ----------
     path : .nii, .nii.gz, .nrrd or .mha
         The JSON file has the same stem.
+    grid : Grid
+        Of the reference image, LPS mm.
     values : (ni, nj, nk, c)
-        NaN where not defined.
+        Real numbers, written in single precision; NaN where not defined.
     components : names of the c components
     meaning : what is written, in a line
     frame : "LPS", or "invariant" for components that do not depend on the frame
@@ -109,7 +133,7 @@ def write_vectors(
     Raises
     ------
     InputError
-        If shapes, names and frame do not fit together.
+        If shapes, names and frame do not fit together, or an argument is of another kind.
     OutputError
         If a file cannot be written; nothing is left under its name.
 
@@ -117,12 +141,17 @@ def write_vectors(
     ----------
     .. [1] NIfTI-1 intent codes: https://nifti.nimh.nih.gov/nifti-1/documentation/nifti1fields
     """
-    place, array = Path(path), np.asarray(values)
+    place, array = path_of(path), np.asarray(values)
+    expect("grid", grid, Grid, "a dvc.Grid, such as that of the reference image (image.grid)")
+    expect("components", components, Sequence, "a name for each component, such as ('x', 'y', 'z')")
+    expect("verdict", verdict, Verdict | None, "a dvc.Verdict, such as that of a measurement's quality")
     if array.shape != (*grid.shape, len(components)):
         raise InputError(
             f"{place}: values have shape {array.shape}; the grid and {len(components)} components need "
             f"{(*grid.shape, len(components))}."
         )
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"values must be real numbers; got {array.dtype}.")
     if frame not in ("LPS", "invariant"):
         raise InputError(f"{place}: frame '{frame}'; components are written in LPS, or are invariant.")
     vector = frame == "LPS" and len(components) == 3

@@ -8,6 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from meshio._common import num_nodes_per_cell
 
+from dvc.arguments import path_of
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.io import StrPath
@@ -54,6 +55,8 @@ class MeshFile:
 
     Attributes
     ----------
+    path : Path
+        The file.
     unit, frame : str
         The file's own: "mm" or "m", "LPS" or "RAS".
     points_mm : (n, 3)
@@ -61,7 +64,8 @@ class MeshFile:
     node_ids : (n,) int
         The file's numbers of its nodes; the index from 0 in VTK files, which give none.
     blocks : tuple of CellBlock
-        All cells, surfaces and lines too; cells are counted through all blocks.
+        All cells, surfaces and lines too, each block of one ``kind`` (meshio's names: tetra, tetra10 ...) with the
+        indices of its cells' ``nodes`` (m, k); cells are counted through all blocks.
     regions : mapping of str to (k,) int
         Indices of the cells in each named set.
     tets : TetMesh or None
@@ -119,16 +123,16 @@ def read_mesh(path: StrPath, *, unit: str = "mm", frame: str = "LPS") -> MeshFil
     Raises
     ------
     InputError
-        If the unit, the frame or the format is not one of those above.
+        If the unit, the frame or the format is not one of those above, or ``path`` is no path.
     ImageFileError
         If the file is missing, damaged, or has no volume cells.
     GeometryError
         If the mesh is not usable; see `dvc.TetMesh`.
     """
-    path = Path(path)
-    if unit not in MM_PER_UNIT:
+    path = path_of(path)
+    if unit not in [*MM_PER_UNIT]:
         raise InputError(f"The unit of a mesh is mm or m; got {unit!r}.")
-    if frame not in TO_LPS:
+    if frame not in [*TO_LPS]:
         raise InputError(f"The frame of a mesh is LPS or RAS; got {frame!r}.")
     if path.suffix.lower() not in _READERS:
         raise InputError(f"{path}: a mesh is a file ending in {', '.join(_READERS)}; got {path.suffix!r}.")

@@ -11,6 +11,7 @@ import numpy as np
 import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
 
+from dvc.arguments import expect, path_of
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
@@ -61,11 +62,11 @@ def read_transform(path: StrPath) -> Deformation:
     Raises
     ------
     InputError
-        If the file is missing, damaged, not 3D or of a kind that is not read.
+        If the file is missing, damaged, not 3D or of a kind that is not read, or ``path`` is no path.
     ParameterError
         If an elastix file contradicts itself or lacks something.
     """
-    place = Path(path)
+    place = path_of(path)
     if not place.is_file():
         raise InputError(f"{place}: no such transform file. Check the path.")
     if place.suffix.lower() == ".npz":
@@ -93,12 +94,13 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
     Raises
     ------
     InputError
-        If there is no such file.
+        If there is no such file, or an argument is of another kind.
     ImageFileError
         If the file is damaged, not a 3D image of three components, in another unit than mm, or holds infinite
         values, or if its geometry or frame is missing or contradictory.
     """
-    place = Path(path)
+    place = path_of(path)
+    expect("frame", frame, str | None, "'LPS' or 'RAS'")
     if not place.is_file():
         raise InputError(f"{place}: no such displacement image. Check the path.")
     declared = {frame, _frame_beside(place)}
