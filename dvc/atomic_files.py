@@ -26,10 +26,8 @@ def whole_file(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(part, path)
     except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}). Check that the folder exists and may be "
-            "written to, and that the disk has room."
-        ) from error
+        advice = "Check that the folder exists and may be written to, and that the disk has room."
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}). {advice}") from error
     finally:
         with suppress(OSError):
             part.unlink()
@@ -80,7 +78,5 @@ def whole_folder(final: Path) -> Iterator[Path]:
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
-        raise OutputError(
-            f"{final}: results cannot be written ({error.strerror or error}). Check the folder's rights and the "
-            "room on the disk; nothing half-written is left."
-        ) from error
+        advice = "Check the folder's rights and the room on the disk; nothing half-written is left."
+        raise OutputError(f"{final}: results cannot be written ({error.strerror or error}). {advice}") from error

@@ -50,10 +50,9 @@ class TetMesh:
     Notes
     -----
     What is provably safe is mended, and logged (logger ``dvc.mesh``): nodes that no cell uses are dropped (``node_ids``
-    keeps the numbers of the others), and two nodes are swapped in cells of negative volume, which leaves each the same
-    set of points. Where all cells are negative the file merely counts the other way round. Where only some are, they
-    are mended only if the two cells on either side of every face lie on opposite sides of it; otherwise a negative
-    volume is a sign of tissue folded over itself, and the mesh is refused.
+    keeps the numbers of the others), and two nodes are swapped in cells of negative volume. Where all cells are
+    negative the file merely counts the other way round. Where only some are, they are mended only if the cells on
+    either side of every face lie on opposite sides of it; otherwise the tissue folds over itself, which is refused.
 
     Examples
     --------

@@ -10,7 +10,8 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, TimeoutError as FutureTimeout
-from typing import Any, Self, TypeVar
+from contextlib import AbstractContextManager
+from typing import Any, TypeVar
 
 from loky import ProcessPoolExecutor
 from loky.process_executor import ShutdownExecutorError, TerminatedWorkerError
@@ -22,7 +23,7 @@ _I = TypeVar("_I")
 _POLL_S = 0.5
 
 
-class Worker:
+class Worker(AbstractContextManager["Worker", None]):
     """One child process that runs one task at a time; if it dies, that task fails and the next gets a fresh process.
 
     Native code (ITK, numba, BLAS) may use ``threads`` threads in it; results of elastix are equal bit for bit only for
@@ -44,7 +45,11 @@ class Worker:
         """
         with self._lock:
             if self._executor is None:
-                self._executor = self._start()
+                count = str(self.threads)
+                names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
+                # elastix and meshes take memory and keep it: loky must not take that for a leak and end the process.
+                environment = dict.fromkeys(names, count) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
+                self._executor = ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
             future = self._executor.submit(task, *args)
             while True:
                 try:
@@ -65,13 +70,6 @@ class Worker:
                         '(UseMultiThreadingForMetrics "false").'
                     ) from died
 
-    def _start(self) -> ProcessPoolExecutor:
-        count = str(self.threads)
-        names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
-        # elastix and meshes take memory and keep it: loky must not take that for a leak and end the process for it.
-        environment = dict.fromkeys(names, count) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
-        return ProcessPoolExecutor(max_workers=1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
-
     def kill(self) -> None:
         """End the child process at once, whatever it is doing; a task in it raises `WorkerError`."""
         if (executor := self._executor) is not None:
@@ -83,9 +81,6 @@ class Worker:
             if self._executor is not None:
                 self._executor.shutdown(wait=True)
                 self._executor = None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -98,9 +98,8 @@ def result_folders(place: Path, loads: Sequence[str] = ()) -> list[ResultFolder]
     folders = [place] if (place / DISPLACEMENT).is_file() else sorted(p.parent for p in place.glob(f"*/{DISPLACEMENT}"))
     folders = [f for f in folders if f == place or f.name != REPEAT]
     if not folders:
-        raise InputError(
-            f"{place}: no results of `register` or `strain` here (LOAD/{DISPLACEMENT}). Give the folder they wrote."
-        )
+        what = f"no results of `register` or `strain` here (LOAD/{DISPLACEMENT})"
+        raise InputError(f"{place}: {what}. Give the folder they wrote.")
     names = [folder.resolve().name for folder in folders]
     absent = [load for load in loads if load not in names]
     if absent:

@@ -131,19 +131,16 @@ def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
         enhanced = "PerFrameFunctionalGroupsSequence" in header or "Enhanced" in stored.name
         kinds = [str(k) for k in _several(header.get("ImageType"))]
         if not enhanced and ("MOSAIC" in kinds or int(header.get("NumberOfFrames") or 1) > 1):
-            raise ImageFileError(
-                f"{path}: a mosaic, or a multi-frame DICOM file that does not say where its frames lie; it is not "
-                f"read. {CONVERT}"
-            )
+            problem = "a mosaic, or a multi-frame DICOM file that does not say where its frames lie"
+            raise ImageFileError(f"{path}: {problem}; it is not read. {CONVERT}")
         needed = _NEEDED if enhanced else (*_NEEDED, *_PLACE)
         _refuse_missing(path, [name for name in needed if header.get(name) is None])
         colour = str(header.get("PhotometricInterpretation", ""))
         if not colour.startswith("MONOCHROME") or int(header.get("SamplesPerPixel", 1)) != 1:
             raise ImageFileError(f"{path}: a DICOM image in colour; grey values (MONOCHROME) are needed.")
         if enhanced and stored.keyword not in _ENHANCED:
-            raise ImageFileError(
-                f"{path}: a multi-frame DICOM file of a kind that is not read; enhanced MR and CT images are. {CONVERT}"
-            )
+            problem = "a multi-frame DICOM file of a kind that is not read; enhanced MR and CT images are"
+            raise ImageFileError(f"{path}: {problem}. {CONVERT}")
         uid, total = header.get("ConcatenationUID"), header.get("InConcatenationTotalNumber")
         frames = _enhanced_frames(path, header) if enhanced else [_classic_frame(path, header)]
         return frames, (str(uid), int(total)) if uid and total else None
@@ -151,10 +148,8 @@ def read_frames(path: Path) -> tuple[list[Frame], tuple[str, int] | None]:
 
 def _refuse_missing(path: Path, missing: Sequence[str], where: str = "") -> None:
     if missing:
-        raise ImageFileError(
-            f"{path}: a DICOM image without {', '.join(missing)}{where}: damaged, or not a slice with a place in "
-            "space. Export it again."
-        )
+        problem = f"a DICOM image without {', '.join(missing)}{where}"
+        raise ImageFileError(f"{path}: {problem}: damaged, or not a slice with a place in space. Export it again.")
 
 
 def _several(value: Any) -> list[Any]:
@@ -178,15 +173,11 @@ def _build_frame(path: Path, header: Any, number: int | None, own: dict[str, Any
     if not np.isfinite([*axes.ravel(), *position, row_spacing, column_spacing, slope, intercept]).all():
         raise ImageFileError(f"{path}{which}: the DICOM header holds values that are not finite numbers; damaged.")
     if abs(axes[0] @ axes[1]) > _SAME_DIRECTION or np.abs(np.linalg.norm(axes, axis=1) - 1).max() > _SAME_DIRECTION:
-        raise ImageFileError(
-            f"{path}{which}: its rows and columns are not perpendicular unit vectors; the header is damaged."
-        )
+        raise ImageFileError(f"{path}{which}: rows and columns are not perpendicular unit vectors; damaged.")
     columns, rows = int(header.Columns), int(header.Rows)
     if min(row_spacing, column_spacing) <= 0 or min(columns, rows) < 1:
-        raise ImageFileError(
-            f"{path}{which}: {columns} x {rows} voxels of {column_spacing:g} x {row_spacing:g} mm; all must be "
-            "positive. The header is damaged."
-        )
+        voxels = f"{columns} x {rows} voxels of {column_spacing:g} x {row_spacing:g} mm"
+        raise ImageFileError(f"{path}{which}: {voxels}; all must be positive. The header is damaged.")
     echo_ms = None if own["EchoTime"] is None else round(float(own["EchoTime"]), 2)
     echo = tuple(str(int(e)) for e in _several(own["EchoNumbers"]))
     image_type = "/".join(map(str, own["ImageType"]))
@@ -310,10 +301,8 @@ def _decoded_by_itk(path: Path, header: Any, numbers: list[int], count: int) -> 
     offsets = (tables[0], tables[1]) if tables[0] and tables[1] else None
     packed = list(generate_frames(header.PixelData, number_of_frames=count, extended_offsets=offsets))
     if len(packed) != count:
-        raise ImageFileError(
-            f"{path}: the header claims {count} frames, the file holds {len(packed)} compressed ones: damaged or cut "
-            "short. Copy or export it again."
-        )
+        claim = f"the header claims {count} frames, the file holds {len(packed)} compressed ones"
+        raise ImageFileError(f"{path}: {claim}: damaged or cut short. Copy or export it again.")
     bare = Dataset()
     for name in _OF_PIXELS:
         if name in header:

@@ -191,9 +191,7 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
         raise GeometryError(f"{what}: nothing of it is left on the image's grid. {boxes}")
     before = total * own.voxel_volume_mm3
     change = f"{before / 1000:.4g} mL became {left / 1000:.4g} mL, {100 * share:.0f} % of it lies in the image"
-    _log.warning(
-        "%s: on another grid than the image; resampled to it by nearest neighbour (%s). %s", what, change, boxes
-    )
+    _log.warning("%s: on another grid than the image; resampled by nearest neighbour (%s). %s", what, change, boxes)
     if isinstance(mask_or_labels, LabelMap):
         lost = sorted(set(_counts(values)) - set(_counts(fitted)))
         if lost:

@@ -34,7 +34,9 @@ def read_nifti_header(
     """What a NIfTI-1 or -2 file holds: scalars, or with `vectors` c `components` per voxel, (ni, nj, nk, 1, c)."""
     header, compressed = _header(path)
     sizes = [int(n) for n in header["dim"][1 : 1 + int(header["dim"][0])]]
-    shape, count = (_vector_sizes(path, sizes, components), 1) if vectors else _sizes(path, sizes)
+    if vectors and (sizes[3:5] != [1, components] or any(n not in (0, 1) for n in sizes[5:])):
+        raise ImageFileError(f"{path}: a NIfTI of shape {tuple(sizes)}; (ni, nj, nk, 1, {components}) is needed.")
+    shape, count = _sizes(path, sizes[:3] if vectors else sizes)
     layout = (*shape, components) if vectors else shape
     # Size and count come first: a header that is wrong there is not worth a look at its geometry.
     refuse_if_too_large(path, layout, max_bytes)
@@ -77,10 +79,8 @@ def _header(path: Path) -> tuple[Any, bool]:
                 if not low <= value <= high:
                     raise ImageFileError(f"{path}: the NIfTI header is damaged ({field} = {value:g}). Export it again.")
             return header, compressed
-    raise ImageFileError(
-        f"{path}: not a NIfTI file: no NIfTI header at its start ({len(start)} bytes read). Check the "
-        "file's name and copy or export it again."
-    )
+    problem = f"no NIfTI header at its start ({len(start)} bytes read)"
+    raise ImageFileError(f"{path}: not a NIfTI file: {problem}. Check the file's name, or export it again.")
 
 
 def _sizes(path: Path, sizes: list[int]) -> tuple[tuple[int, int, int], int]:
@@ -95,15 +95,9 @@ def _sizes(path: Path, sizes: list[int]) -> tuple[tuple[int, int, int], int]:
         raise ImageFileError(f"{path}: a {len(sizes)}D image of {sizes} voxels; a 3D image is needed.")
     if len(sizes) > 4:
         raise ImageFileError(
-            f"{path}: a {len(sizes)}D file of sizes {sizes} (vectors or tensors); a 3D scalar image is needed."
+            f"{path}: a {len(sizes)}D file, {sizes} (vectors or tensors); a 3D scalar image is needed."
         )
     return (sizes[0], sizes[1], sizes[2]), sizes[3] if len(sizes) == 4 else 1
-
-
-def _vector_sizes(path: Path, sizes: list[int], components: int) -> tuple[int, int, int]:
-    if sizes[3:5] != [1, components] or any(n not in (0, 1) for n in sizes[5:]):
-        raise ImageFileError(f"{path}: a NIfTI of shape {tuple(sizes)}; (ni, nj, nk, 1, {components}) is needed.")
-    return sizes[0], sizes[1], sizes[2]
 
 
 def _number_type(path: Path, header: Any) -> np.dtype[Any]:
@@ -113,10 +107,8 @@ def _number_type(path: Path, header: Any) -> np.dtype[Any]:
     except KeyError:
         raise ImageFileError(f"{path}: unknown NIfTI data type {code}; the header is damaged.") from None
     if dtype.kind not in "iuf" or dtype.itemsize > 8 or dtype.itemsize < 1:
-        raise ImageFileError(
-            f"{path}: the voxels are not plain numbers (NIfTI data type {code}); colour and complex images "
-            "are not read. Save the magnitude image."
-        )
+        problem = f"the voxels are not plain numbers (NIfTI data type {code}: colour or complex)"
+        raise ImageFileError(f"{path}: {problem}, which are not read. Save the magnitude image.")
     return dtype
 
 
@@ -136,9 +128,8 @@ def _ras_affine(path: Path, header: Any, shape: tuple[int, int, int]) -> FloatAr
     sforms = [full] if int(header["sform_code"]) > 0 else []
     if not qforms and not sforms:
         raise ImageFileError(
-            f"{path}: the header does not say how the image lies in space (qform_code and sform_code are "
-            "0), and programs guess differently. Export it again with its orientation, or copy the header "
-            "of the image it was made from."
+            f"{path}: the header does not say how the image lies in space (qform_code and sform_code are 0), and "
+            "programs guess differently. Export it again with its orientation, or copy its source's header."
         )
     for name, affines in (("qform", qforms), ("sform", sforms)):
         if not np.isfinite(affines).all():
@@ -163,17 +154,11 @@ def _qforms(path: Path, header: Any) -> list[FloatArray]:
         raise ImageFileError(f"{path}: the qform's quaternion is not a rotation; the header is damaged.")
     nominal = rest if rest >= _HALF_TURN else 0.0  # as the standard's own reader takes it
     least, most = np.sqrt(max(rest - _ROUNDING, 0.0)), np.sqrt(max(rest + _ROUNDING, 0.0))
-    return [_qform(header, (a, b, c, d)) for a in (np.sqrt(nominal), *np.linspace(least, most, 65))]
-
-
-def _qform(header: Any, quaternion: tuple[float, ...]) -> FloatArray:
-    """Compute R(a, b, c, d) diag(pixdim), third axis times qfac, with the offsets."""
     sizes = np.abs(np.float64(header["pixdim"][1:4]))
-    sizes[2] *= -1.0 if float(header["pixdim"][0]) < 0 else 1.0  # 0 stands for +1
-    affine = np.eye(4)
-    affine[:3, :3] = quat2mat(quaternion) * sizes
-    affine[:3, 3] = [float(header[f"qoffset_{axis}"]) for axis in "xyz"]
-    return affine
+    sizes[2] *= -1.0 if float(header["pixdim"][0]) < 0 else 1.0  # qfac, of which 0 stands for +1
+    offset = [float(header[f"qoffset_{axis}"]) for axis in "xyz"]
+    turned = (quat2mat((a, b, c, d)) * sizes for a in (np.sqrt(nominal), *np.linspace(least, most, 65)))
+    return [np.vstack([np.column_stack([columns, offset]), [0.0, 0.0, 0.0, 1.0]]) for columns in turned]
 
 
 def _refuse_disagreement(path: Path, qforms: list[FloatArray], sform: FloatArray, shape: tuple[int, int, int]) -> None:

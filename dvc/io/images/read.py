@@ -116,10 +116,8 @@ def read_header(
     """Read what a file holds, its voxels not yet read: scalars, or with `vectors` three components per voxel."""
     suffix = _known_suffix(path.name)
     if suffix is None:
-        raise ImageFileError(
-            f"{path}: images of this kind are not read. What is read: {', '.join(_FORMATS)}, enhanced DICOM files and "
-            "folders of DICOM files."
-        )
+        known = f"{', '.join(_FORMATS)}, enhanced DICOM files and folders of DICOM files"
+        raise ImageFileError(f"{path}: images of this kind are not read. What is read: {known}.")
     return _FORMATS[suffix][1](path, volume, max_bytes, vectors)
 
 

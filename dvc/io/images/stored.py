@@ -113,9 +113,8 @@ def expanded(path: Path, start: int = 0) -> Iterator[bytes]:
             try:
                 block = decoder.decompress(pending, _BLOCK)
             except zlib.error as error:
-                raise ImageFileError(
-                    f"{path}: the compressed voxels are damaged ({error}). Copy or export the file again."
-                ) from error
+                problem = f"the compressed voxels are damaged ({error})"
+                raise ImageFileError(f"{path}: {problem}. Copy or export the file again.") from error
             if block:
                 yield block
             if decoder.eof:
@@ -129,9 +128,8 @@ def expanded(path: Path, start: int = 0) -> Iterator[bytes]:
                 continue
             pending = decoder.unconsumed_tail or file.read(_BLOCK)
             if not pending and not block:
-                raise ImageFileError(
-                    f"{path}: the file is cut short: its compressed voxels have no end. Copy or export it again."
-                )
+                problem = "the file is cut short: its compressed voxels have no end"
+                raise ImageFileError(f"{path}: {problem}. Copy or export it again.")
 
 
 def grid_of_axes(

@@ -59,9 +59,8 @@ def write_image(path: StrPath, image: Image) -> None:
     >>> bool((back.values == image.values).all()), back.grid.same_as(image.grid)
     (True, True)
     """
-    place = path_of(path)
     expect("image", image, Image, "a dvc.Image, such as dvc.Image(grid, values) of an array on a dvc.Grid")
-    _write(place, image.grid, image.values)
+    _write(path_of(path), image.grid, image.values)
 
 
 def write_mask(path: StrPath, mask: Mask) -> None:
@@ -72,9 +71,8 @@ def write_mask(path: StrPath, mask: Mask) -> None:
     path : .nii, .nii.gz, .nrrd or .mha
     mask : Mask
     """
-    place = path_of(path)
     expect("mask", mask, Mask, "a dvc.Mask, such as dvc.Mask(grid, inside) of an array on a dvc.Grid")
-    _write(place, mask.grid, mask.inside.view(np.uint8))
+    _write(path_of(path), mask.grid, mask.inside.view(np.uint8))
 
 
 def write_labels(path: StrPath, labels: LabelMap) -> None:
@@ -88,9 +86,8 @@ def write_labels(path: StrPath, labels: LabelMap) -> None:
     labels : LabelMap
         Labels (ni, nj, nk) below 2**31, written in 8, 16 or 32 bits, the fewest that hold them.
     """
-    place = path_of(path)
     expect("labels", labels, LabelMap, "a dvc.LabelMap, such as dvc.LabelMap(grid, labels, {1: 'fat'})")
-    largest = int(labels.labels.max())
+    place, largest = path_of(path), int(labels.labels.max())
     dtype = np.min_scalar_type(largest) if largest < 2**16 else np.int32
     if largest >= 2**31:
         raise OutputError(f"{place}: label {largest} is too large for the file format; number the labels anew.")
@@ -145,18 +142,17 @@ def write_vectors(
     expect("grid", grid, Grid, "a dvc.Grid, such as that of the reference image (image.grid)")
     expect("components", components, Sequence, "a name for each component, such as ('x', 'y', 'z')")
     expect("verdict", verdict, Verdict | None, "a dvc.Verdict, such as that of a measurement's quality")
-    if array.shape != (*grid.shape, len(components)):
-        raise InputError(
-            f"{place}: values have shape {array.shape}; the grid and {len(components)} components need "
-            f"{(*grid.shape, len(components))}."
-        )
+    needed = (*grid.shape, len(components))
+    if array.shape != needed:
+        what = f"the grid and {len(components)} components need {needed}"
+        raise InputError(f"{place}: values have shape {array.shape}; {what}.")
     if array.dtype.kind not in "biuf":
         raise InputError(f"values must be real numbers; got {array.dtype}.")
     if frame not in ("LPS", "invariant"):
         raise InputError(f"{place}: frame '{frame}'; components are written in LPS, or are invariant.")
     vector = frame == "LPS" and len(components) == 3
     _write(place, grid, array.astype(np.float32, copy=False), vector=vector)
-    declared: dict[str, object] = {"file": place.name, "meaning": meaning, "components": components, "frame": frame}
+    declared: dict[str, object] = {"file": place.name, "meaning": meaning, "components": [*components], "frame": frame}
     declared |= {"unit": unit, "configuration": "reference", "missing": "NaN"}
     write_json(_beside(place, ".json"), declared | ({} if verdict is None else {"verdict": verdict.as_dict()}))
 
@@ -169,10 +165,8 @@ def refuse_overwriting_inputs(outputs: Iterable[StrPath], inputs: Iterable[StrPa
         for source in sources:
             same = there == source.resolve() or (output.exists() and source.exists() and output.samefile(source))
             if same or (source.is_dir() and source.resolve() in there.parents):
-                raise OutputError(
-                    f"{output}: this output would overwrite or lie within the input {source}. Choose "
-                    "another file or folder for the outputs."
-                )
+                problem = f"this output would overwrite or lie within the input {source}"
+                raise OutputError(f"{output}: {problem}. Choose another file or folder for the outputs.")
 
 
 def _beside(path: Path, suffix: str) -> Path:

@@ -99,9 +99,9 @@ def _keywords(path: Path) -> Iterator[_Keyword]:
     if current is not None:
         if head or (current.name in _READ and not text.endswith(("\n", "\r"))):
             # The format has no mark of its end, and half a number would be another node.
+            where = f"after *{current.name} in line {current.line}"
             raise ImageFileError(
-                f"{path} ends within a line, after *{current.name} in line {current.line}, so it may be cut "
-                "short. If it is whole, end its last line."
+                f"{path} ends within a line, {where}, so it may be cut short. If it is whole, end its last line."
             )
         yield current
 
@@ -117,10 +117,8 @@ def _refuse_what_lies_elsewhere(where: str, keyword: _Keyword, parts: int) -> No
     elif keyword.name == "NODE" and keyword.options.get("SYSTEM", "R").upper() != "R":
         reason = "gives cylindrical or spherical coordinates"
     if reason is not None:
-        raise ImageFileError(
-            f"{where} {reason}, and that is not read. Write the mesh as one part in global coordinates (an "
-            "orphan mesh), or as VTU."
-        )
+        advice = "Write the mesh as one part in global coordinates (an orphan mesh), or as VTU."
+        raise ImageFileError(f"{where} {reason}, and that is not read. {advice}")
 
 
 def _generated(row: list[str]) -> range:

@@ -101,9 +101,8 @@ def _add_nodes(lines: Iterator[str], mesh: NumberedMesh) -> None:
         mesh.add_node(int(line[:width]), [float(text or 0.0) for text in at])
 
 
-def _add_elements(
-    lines: Iterator[str], types: dict[str, str], mesh: NumberedMesh, materials: dict[int, list[int]]
-) -> None:
+def _add_elements(lines: Iterator[str], types: dict[str, str], mesh: NumberedMesh, of: dict[int, list[int]]) -> None:
+    """Add the elements of a block to the mesh, and their numbers to those ``of`` their materials."""
     _, width, *_ = _format(_next(lines, "EBLOCK"))
     left_out: Counter[str] = Counter()
     while (line := _next(lines, "EBLOCK")).strip() != "-1":
@@ -119,7 +118,7 @@ def _add_elements(
             left_out[types[kind]] += 1
         else:
             mesh.add_element(number, *cell)
-            materials.setdefault(material, []).append(number)
+            of.setdefault(material, []).append(number)
     for kind, count in left_out.items():
         _log.warning("%s: %d elements of type %s are left out: no solid or shell that is read.", mesh.path, count, kind)
 

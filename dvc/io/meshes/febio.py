@@ -39,7 +39,6 @@ _KINDS = {
     10: (6, "triangle6", 6), 11: (8, "quad8", 8), 12: (9, "quad9", 9), 13: (15, "wedge15", 15),
     16: (5, "pyramid", 5), 17: (5, "tetra", 4), 18: (13, "pyramid13", 13),
 }  # fmt: skip
-_LINES = (5, 19)  # springs and beams, which carry no tissue
 
 
 def read_xplt(path: Path) -> RawMesh:
@@ -125,7 +124,7 @@ def _cells(path: Path, mesh: bytes) -> tuple[list[tuple[str, IntArray]], dict[st
     known = 0
     for _, domain in _chunks(_at(mesh, _DOMAINS)):
         number, part = _number(_at(domain, *_KIND)), _number(_at(domain, *_PART))
-        if number in _LINES:
+        if number in (5, 19):  # they carry no tissue
             _log.info("%s: springs and beams are left out.", path)
             continue
         if number not in _KINDS:

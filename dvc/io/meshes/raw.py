@@ -52,9 +52,9 @@ class NumberedMesh:
         if number in self.elements:
             raise ImageFileError(f"{self.path}: element {number} is defined twice.")
         if len(nodes) != num_nodes_per_cell[kind]:
+            needed = f"a {kind} has {num_nodes_per_cell[kind]}"
             raise ImageFileError(
-                f"{self.path}: element {number} has {len(nodes)} nodes; a {kind} has {num_nodes_per_cell[kind]}. "
-                "The file is damaged."
+                f"{self.path}: element {number} has {len(nodes)} nodes; {needed}. The file is damaged."
             )
         self.elements[number] = kind, nodes
 

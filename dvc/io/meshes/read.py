@@ -159,10 +159,8 @@ def _checked(raw: RawMesh, unit: str, frame: str) -> MeshFile:
     volumes = [block for block in blocks if block.shape in _VOLUMES]
     if not volumes:
         kinds = ", ".join(sorted({block.kind for block in blocks})) or "no cells at all"
-        raise ImageFileError(
-            f"{path} holds no volume cells (found: {kinds}). Results are given in the tissue: hand over the "
-            "volume mesh, not its surface."
-        )
+        advice = "Results are given in the tissue: pass the volume mesh, not its surface."
+        raise ImageFileError(f"{path} holds no volume cells (found: {kinds}). {advice}")
     check_extent(points[np.unique(np.concatenate([block.nodes.ravel() for block in volumes]))])
     regions = {name: frozen(index, np.int64) for name, index in raw.regions.items() if len(index)}
     tets = _tetrahedra(raw, points, blocks, regions) if all(block.shape == "tetra" for block in volumes) else None

@@ -84,9 +84,8 @@ def _node_numbers(path: Path, count: int) -> IntArray:
 
     tags: IntArray = _read(path, read_tags)
     if len(tags) != count or len(np.unique(tags)) != count:
-        raise ImageFileError(
-            f"{path}: {len(np.unique(tags))} different node numbers were found for {count} nodes; the file is damaged."
-        )
+        different = len(np.unique(tags))
+        raise ImageFileError(f"{path}: {different} different node numbers for {count} nodes; the file is damaged.")
     return tags
 
 

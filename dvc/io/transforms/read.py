@@ -81,6 +81,8 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
 
     Parameters
     ----------
+    path : path
+        Its ending gives the format; the image's geometry is that of the reference configuration.
     frame : {"LPS", "RAS"}, optional
         Frame of the components. Where the file, or the JSON file of the same stem beside it (key "frame"), gives the
         frame too, both must agree. MetaImage is LPS, NRRD is LPS where its space is; NIfTI files differ by the
@@ -115,7 +117,7 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
     frames = sorted(f for f in declared if f is not None)
     if len(frames) != 1 or frames[0] not in ("LPS", "RAS"):
         raise ImageFileError(
-            f"{place}: the components' frame must be LPS or RAS, and told alike wherever it is told; "
+            f"{place}: the components' frame must be LPS or RAS, and the same wherever it is given; "
             f"found {frames or 'none'}. Pass frame=, or set 'frame' in the JSON file beside it."
         )
     infinite = np.isinf(values).any(axis=-1)

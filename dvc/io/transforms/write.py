@@ -31,25 +31,18 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
     that follows, with the first as its initial transform. transformix resamples moving images to `reference`, of either
     handedness.
     """
-    image = _image_parameters(reference)
-    stages = {ELASTIX_FILES[0]: _bspline_parameters(bspline)}
-    if then is not None:
-        stages[ELASTIX_FILES[1]] = {
-            "Transform": ["EulerTransform"],
-            "NumberOfParameters": [6],
-            "TransformParameters": [*_euler_angles(then.rotation), *then.translation_mm.tolist()],
-            "InitialTransformParameterFileName": list(stages),
-            "CenterOfRotationPoint": [0.0, 0.0, 0.0],
-            "ComputeZYX": [False],
-        }
-    for name, stage in stages.items():
-        write_whole(Path(folder) / name, format_parameters({**stage, **image}))
-    return [Path(folder) / name for name in stages]
-
-
-def _bspline_parameters(bspline: BSpline) -> dict[str, Sequence[Value]]:
     control = bspline.control
-    return {
+    image: dict[str, Sequence[Value]] = {
+        "HowToCombineTransforms": ["Compose"], "FixedImageDimension": [3], "MovingImageDimension": [3],
+        "FixedInternalImagePixelType": ["float"], "MovingInternalImagePixelType": ["float"],
+        "Size": list(reference.shape), "Index": [0, 0, 0],
+        "Spacing": reference.spacing_mm.tolist(), "Origin": reference.origin_mm.tolist(),
+        "Direction": reference.direction.T.ravel().tolist(), "UseDirectionCosines": [True],
+        "ResampleInterpolator": ["FinalBSplineInterpolator"], "FinalBSplineInterpolationOrder": [3],
+        "Resampler": ["DefaultResampler"], "DefaultPixelValue": [0],
+        "ResultImageFormat": ["nii.gz"], "ResultImagePixelType": ["float"], "CompressResultImage": [True],
+    }  # fmt: skip
+    stages: list[dict[str, Sequence[Value]]] = [{
         # RecursiveBSplineTransform is the same map, but elastix then gives I - H as its Jacobian.
         "Transform": ["BSplineTransform"],
         "NumberOfParameters": [bspline.coefficients_mm.size],
@@ -59,31 +52,27 @@ def _bspline_parameters(bspline: BSpline) -> dict[str, Sequence[Value]]:
         "GridSpacing": control.spacing_mm.tolist(), "GridOrigin": control.origin_mm.tolist(),
         "GridDirection": control.direction.T.ravel().tolist(),
         "BSplineTransformSplineOrder": [3], "UseCyclicTransform": [False],
-    }  # fmt: skip
-
-
-def _image_parameters(grid: Grid) -> dict[str, Sequence[Value]]:
-    return {
-        "HowToCombineTransforms": ["Compose"], "FixedImageDimension": [3], "MovingImageDimension": [3],
-        "FixedInternalImagePixelType": ["float"], "MovingInternalImagePixelType": ["float"],
-        "Size": list(grid.shape), "Index": [0, 0, 0],
-        "Spacing": grid.spacing_mm.tolist(), "Origin": grid.origin_mm.tolist(),
-        "Direction": grid.direction.T.ravel().tolist(), "UseDirectionCosines": [True],
-        "ResampleInterpolator": ["FinalBSplineInterpolator"], "FinalBSplineInterpolationOrder": [3],
-        "Resampler": ["DefaultResampler"], "DefaultPixelValue": [0],
-        "ResultImageFormat": ["nii.gz"], "ResultImagePixelType": ["float"], "CompressResultImage": [True],
-    }  # fmt: skip
+    }]  # fmt: skip
+    if then is not None:
+        stages.append({
+            "Transform": ["EulerTransform"], "NumberOfParameters": [6],
+            "TransformParameters": [*_euler_angles(then.rotation), *then.translation_mm.tolist()],
+            "InitialTransformParameterFileName": [ELASTIX_FILES[0]],
+            "CenterOfRotationPoint": [0.0, 0.0, 0.0], "ComputeZYX": [False],
+        })  # fmt: skip
+    files = [Path(folder) / name for name, _ in zip(ELASTIX_FILES, stages, strict=False)]
+    for file, stage in zip(files, stages, strict=True):
+        write_whole(file, format_parameters({**stage, **image}))
+    return files
 
 
 def _euler_angles(rotation: FloatArray) -> list[float]:
     """Angles (x, y, z) of R = Rz Rx Ry."""
     x = np.arctan2(rotation[2, 1], np.hypot(rotation[2, 0], rotation[2, 2]))
     y = np.arctan2(-rotation[2, 0], rotation[2, 2])
-    # From Rz Rx = R Ry^T and not from R: where x is close to a right angle, y is hardly determined, and z
-    # must be the one that belongs to the y chosen.
-    z = np.arctan2(
-        rotation[1, 0] * np.cos(y) + rotation[1, 2] * np.sin(y), rotation[0, 0] * np.cos(y) + rotation[0, 2] * np.sin(y)
-    )
+    # From Rz Rx = R Ry^T and not from R: where x is close to a right angle, y is hardly determined, and z must fit it.
+    cos_z, sin_z = rotation[:2, 0] * np.cos(y) + rotation[:2, 2] * np.sin(y)
+    z = np.arctan2(sin_z, cos_z)
     return [float(x), float(y), float(z)]
 
 

@@ -43,8 +43,10 @@ def test_what_is_written_is_of_the_writers_kind(tmp_path: Path, kind: str, value
     for other in [value, *(thing for name, thing in made.items() if name != kind)]:
         with pytest.raises(InputError, match=rf"^{kind} must be a dvc\.\w+, .*; got "):
             write(tmp_path / "a.nii", other)
-    with pytest.raises(InputError, match=r"^path must be .*; got (Image|Mask|LabelMap)"):
+    with pytest.raises(InputError, match=rf"^{kind} must be .*; got (Posix|Windows)Path"):
         write(made[kind], tmp_path / "a.nii")
+    with pytest.raises(InputError, match=r"^path must be .*; got None"):
+        write(None, made[kind])
     assert not any(tmp_path.iterdir())
 
 
