@@ -201,10 +201,7 @@ def check_extent(points_mm: FloatArray) -> None:
 
 
 def signed_volumes(corners: FloatArray) -> FloatArray:
-    """Volumes of tetrahedra (...), in the cube of the corners' unit, from their corners (..., 4, 3) in any frame.
-
-    Positive where the first three corners turn to the left, seen from the fourth.
-    """
+    """Volumes (...) of tetrahedra by corners (..., 4, 3); positive if corners 0, 1, 2 turn left, seen from corner 3."""
     a, b, c = (corners[..., i, :] - corners[..., 0, :] for i in (1, 2, 3))
     return np.asarray(np.einsum("...j,...j->...", a, np.cross(b, c)) / 6.0)
 

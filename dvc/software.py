@@ -34,10 +34,7 @@ def distribution_versions() -> dict[str, str]:
 
 @cache
 def software_key(package: str) -> str:
-    """All software that results of one of our packages ("dvc", "fe", ...) depend on; read once in a process.
-
-    Versions, and a hash of our own code ("code ..."), divided by ", ".
-    """
+    """Versions, and a hash of our own code, that results of one of our packages ("dvc", "fe", ...) depend on."""
     hashes: dict[str, str] = {}
     waiting = [package]
     while waiting:

@@ -1,7 +1,4 @@
-"""Work in child processes that may crash without taking the caller with them, as native code (elastix) can.
-
-A child is kept alive between tasks, because the first use of elastix costs many seconds.
-"""
+"""Work in child processes that may crash without taking the caller with them, as native code (elastix) can."""
 
 import os
 import re
@@ -26,8 +23,8 @@ _POLL_S = 0.5
 class Worker(AbstractContextManager["Worker", None]):
     """One child process that runs one task at a time; if it dies, that task fails and the next gets a fresh process.
 
-    Native code (ITK, numba, BLAS) may use ``threads`` threads in it; results of elastix are equal bit for bit only for
-    equal numbers of threads.
+    Native code (ITK, numba, BLAS) may use ``threads`` threads in it: results of elastix are equal bit for bit only for
+    equal numbers. It is kept alive between tasks, because the first use of elastix costs many seconds.
     """
 
     def __init__(self, threads: int) -> None:
@@ -38,10 +35,9 @@ class Worker(AbstractContextManager["Worker", None]):
         self._lock = threading.Lock()
 
     def run(self, what: str, task: Callable[..., _T], *args: Any, watch: Callable[[], None] | None = None) -> _T:
-        """Run ``task(*args)`` in the child and return its result; its exceptions are raised here.
+        """Run ``task(*args)`` in the child; its exceptions are raised here, and `WorkerError` if the child dies.
 
-        ``what`` is the task in words ("registering Load1") for `WorkerError`, which is raised if the child dies;
-        ``watch`` is called about twice a second while the task runs.
+        ``what`` is the task in words ("registering Load1"); ``watch`` is called about twice a second meanwhile.
         """
         with self._lock:
             if self._executor is None:
@@ -87,10 +83,7 @@ class Worker(AbstractContextManager["Worker", None]):
 
 
 def each_in_workers(items: Iterable[_I], task: Callable[[_I, Worker], None], *, at_once: int, threads: int) -> None:
-    """Run ``task(item, worker)`` for every item, ``at_once`` at a time, each thread with a worker of its own.
-
-    Whatever ends it, an interrupt too, the workers end with it: now, and not after what they are doing.
-    """
+    """Run ``task(item, worker)`` for every item, ``at_once`` at a time; an error or interrupt ends every worker."""
     local = threading.local()
     workers: list[Worker] = []
 

@@ -210,10 +210,7 @@ def in_axes(tensor: Float32Array, axes: FloatArray) -> Float32Array:
 def write_uncertainty(
     folder: Path, grid: Grid, uncertainty: Uncertainty, model: ErrorModel | None, verdict: Verdict
 ) -> None:
-    """Write the map of the standard deviation, the intervals, and the error model that was used.
-
-    The registration's verdict stands beside every interval: after a failed one they are meaningless.
-    """
+    """Write the map of the standard deviation, the error model, and the intervals, each with the verdict."""
     if model is not None:
         model.write(folder / ERROR_MODEL)
     write_image(folder / SIGMA, Image(grid, uncertainty.sigma))

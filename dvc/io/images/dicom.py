@@ -1,7 +1,4 @@
-"""DICOM images: slices or frames put together by their position in space, never by their numbers.
-
-A classic series is a folder with a file for each slice; enhanced (multi-frame) files hold many slices each.
-"""
+"""DICOM images, a file for each slice or enhanced (multi-frame): slices stacked by their position, never by number."""
 
 import logging
 from collections import Counter

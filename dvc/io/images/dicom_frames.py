@@ -96,10 +96,9 @@ class Frame:
 
 @contextmanager
 def _damage_named(path: Path, problem: str = "not a readable DICOM file", remedy: str = "") -> Iterator[None]:
-    """Turn whatever fails on a damaged file into an error that names the file, and the cause by its kind only.
+    """Turn whatever fails on a damaged file, at any access, into an error that names the file and the kind of failure.
 
-    Elements of a header are decoded when they are first accessed, so any access may fail. The text of a failure may
-    quote the header, so only its kind is given.
+    Its text is left out, because it may quote the header.
     """
     logger = logging.getLogger("pydicom")
     before = logger.disabled

@@ -107,8 +107,7 @@ def read_names(path: StrPath) -> dict[int, str]:
     """Names of labels from a table: CSV, ITK-SNAP's label descriptions, or a Slicer colour table.
 
     CSV needs a header line with a column of labels (label, value, index or id) and one of names (name, label or
-    structure). ITK-SNAP: ``index r g b a visible mesh "name"``. Slicer: ``index name r g b a``. Label 0 is the
-    background and has no name.
+    structure). ITK-SNAP: ``index r g b a visible mesh "name"``. Slicer: ``index name r g b a``. Label 0 has no name.
     """
     place = Path(path)
     try:

@@ -1,7 +1,4 @@
-"""Reading images: NIfTI, NRRD, MetaImage and DICOM, to an Image in LPS mm.
-
-Conversions on the way (units, the only volume of a 4D file) are logged by ``dvc.images``.
-"""
+"""Reading images (NIfTI, NRRD, MetaImage, DICOM) to an Image in LPS mm; conversions are logged by ``dvc.images``."""
 
 import logging
 from collections.abc import Callable
@@ -88,10 +85,7 @@ def read_image(
 def read_voxels(
     path: StrPath, *, series: str | None = None, volume: int | None = None, max_bytes: int = MAX_BYTES
 ) -> tuple[Grid, Voxels]:
-    """Grid (LPS mm) and voxels (ni, nj, nk) of a file or DICOM folder, in the file's own number type.
-
-    Parameters and errors as in `read_image`, whose checks of the values are left out.
-    """
+    """Grid (LPS mm) and voxels (ni, nj, nk), unchecked, in the file's own number type; otherwise as `read_image`."""
     place = path_of(path)
     expect("series", series, str | None, "the end of a DICOM series' name")
     expect("volume", volume, int | np.integer | None, "the number of a volume, from 0")

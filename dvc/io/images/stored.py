@@ -47,10 +47,7 @@ class StoredVolume:
     components: int | None = None  # axis of ``layout`` along which a vector's components lie, where they are kept
 
     def load(self) -> Voxels:
-        """Read the voxels: (ni, nj, nk), vectors (ni, nj, nk, 3), in the stored number type where no scaling applies.
-
-        A file that is shorter or longer than its header says, or a damaged compressed stream, is refused.
-        """
+        """Voxels (ni, nj, nk), or vectors (ni, nj, nk, 3), in the stored number type where no scaling applies."""
         values = self._bytes().view(self.dtype).reshape(self.layout, order="F")
         if self.select is not None:
             values = values.take(self.select[1], axis=self.select[0])

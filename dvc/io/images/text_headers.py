@@ -27,10 +27,8 @@ for _name, _size in {"char": 1, "short": 2, "int": 4, "long long": 8, "longlong"
         _NRRD_TYPES |= {f"{_sign}{_form}": f"i{_size}" for _sign in ("", "signed ")}
         _NRRD_TYPES |= {f"{_sign}{_form}": f"u{_size}" for _sign in ("u", "unsigned ")}
 _TO_LPS = {
-    "left-posterior-superior": (1, 1, 1),
-    "right-anterior-superior": (-1, -1, 1),
-    "left-anterior-superior": (1, -1, 1),
-}
+    "left-posterior-superior": (1, 1, 1), "right-anterior-superior": (-1, -1, 1), "left-anterior-superior": (1, -1, 1),
+}  # fmt: skip
 _TO_LPS |= {"".join(word[0] for word in name.split("-")): signs for name, signs in _TO_LPS.items()}
 
 _META_TYPES = {

@@ -42,10 +42,7 @@ _KINDS = {
 
 
 def read_xplt(path: Path) -> RawMesh:
-    """Read a plot file: its regions are FEBio's parts, its field the last state's displacement.
-
-    Nodes have FEBio's numbers, where the file has them; else they are counted from 0.
-    """
+    """Read a plot file: regions are FEBio's parts; nodes have its numbers, or count from 0 where it gives none."""
     with damage_named(f"{path}: its sections"):
         data = path.read_bytes()
         if len(data) < 4 or struct.unpack_from("<I", data)[0] != _MAGIC:

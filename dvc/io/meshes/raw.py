@@ -64,10 +64,7 @@ class NumberedMesh:
         node_sets: Mapping[str, Iterable[int]] | None = None,
         at_nodes: Mapping[str, Mapping[int, list[float]]] | None = None,
     ) -> RawMesh:
-        """The mesh by indices: nodes in the file's order, cells grouped by kind.
-
-        Sets may name elements and nodes that were left out; an element or a field may not.
-        """
+        """The mesh by indices, cells grouped by kind; sets may name what was left out, elements and fields may not."""
         if not self.nodes:
             raise ImageFileError(f"{self.path} has no nodes: there is no mesh in it.")
 

@@ -23,10 +23,7 @@ _UNREADABLE = OSError, EOFError, zlib.error, zipfile.BadZipFile, ValueError, Key
 
 
 def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
-    """Write a displacement with strain discontinuities, LPS mm, whole or not at all.
-
-    Of the interfaces only the tissues' numbers are kept, from which the depths are computed again.
-    """
+    """Write a displacement with strain discontinuities, LPS mm; of interfaces only the tissues' numbers are kept."""
     borders = spline.borders
     content: dict[str, Any] = {
         "format": _FORMAT, "numbers": json.dumps(NUMBERS), "control": _rows_of(spline.control),

@@ -135,10 +135,7 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
 
 
 def rigid_from_elastix(parameters: Parameters) -> RigidMotion:
-    """Read an elastix EulerTransform from its parameter map alone (an initial transform is left out).
-
-    ``x = R (X - c) + c + t``, with ``R = Rz Rx Ry``, or ``Rz Ry Rx`` where ComputeZYX is "true".
-    """
+    """An EulerTransform without its initial one: x = R (X - c) + c + t; R = Rz Rx Ry, or Rz Ry Rx (ComputeZYX)."""
     _require(parameters, ("EulerTransform",))
     a, b, c, *shift = _numbers(parameters, "TransformParameters", 6)
     zyx = _word(parameters, "ComputeZYX", "false") == "true"
@@ -311,9 +308,8 @@ def _from_sitk(transform: Any) -> Deformation:
         raise InputError(f"a transform of the kind {transform.GetName()} is not read.")
     matrix = np.reshape(transform.GetMatrix(), (3, 3))
     shift = transform.GetTranslation() if hasattr(transform, "GetTranslation") else np.zeros(3)
-    if isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform):
-        return RigidMotion.about(np.array(transform.GetCenter()), matrix, np.array(shift))
-    return _about(np.array(transform.GetCenter()), matrix, np.array(shift))
+    rigid = isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform)
+    return (RigidMotion.about if rigid else _about)(np.array(transform.GetCenter()), matrix, np.array(shift))
 
 
 def _frame_beside(path: Path) -> str | None:

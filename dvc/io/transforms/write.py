@@ -28,8 +28,7 @@ def write_elastix_transform(folder: StrPath, bspline: BSpline, then: RigidMotion
     """Write ``x = R (X + u(X)) + t`` as a chain of elastix transform files that transformix reads; the last is for it.
 
     TransformParameters.0.txt holds the B-spline; TransformParameters.1.txt, where `then` (R, t) is given, the motion
-    that follows, with the first as its initial transform. transformix resamples moving images to `reference`, of either
-    handedness.
+    that follows, with the first as its initial transform. transformix resamples moving images to `reference`.
     """
     control = bspline.control
     image: dict[str, Sequence[Value]] = {
@@ -117,10 +116,9 @@ def _itk_part(displacement: Deformation, grid: Grid | None) -> sitk.Transform:
 
 
 def write_displacement_as_found(found: Deformation, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
-    """Write a displacement with its own gradient, and the motion `then` (R, t), to the files that hold its kind.
+    """Write a displacement with its own gradient, if a file can hold its kind, and the motion `then` (R, t).
 
-    A `BSpline` as elastix' text files (grid of transformix: `reference`); a `BorderedSpline` as a file of its own. Any
-    other kind has no such file: its displacement image must do.
+    A `BSpline` goes into elastix' text files (grid of transformix: `reference`), a `BorderedSpline` into one of ours.
     """
     match found:
         case BSpline():
