@@ -64,12 +64,21 @@ def write_image(path: StrPath, image: Image) -> None:
 
 
 def write_mask(path: StrPath, mask: Mask) -> None:
-    """Write a mask (ni, nj, nk), on its own grid, as 0 and 1 in 8 bits. Formats and errors as in `write_image`.
+    """Write a mask as 0 and 1, in 8 bits.
 
     Parameters
     ----------
     path : .nii, .nii.gz, .nrrd or .mha
+        Frames as in `write_image`.
     mask : Mask
+        Voxels (ni, nj, nk) on a grid of its own, LPS mm.
+
+    Raises
+    ------
+    InputError
+        If an argument is of another kind.
+    OutputError
+        If the file cannot be written; nothing is left under its name.
     """
     expect("mask", mask, Mask, "a dvc.Mask, such as dvc.Mask(grid, inside) of an array on a dvc.Grid")
     _write(path_of(path), mask.grid, mask.inside.view(np.uint8))
@@ -78,13 +87,19 @@ def write_mask(path: StrPath, mask: Mask) -> None:
 def write_labels(path: StrPath, labels: LabelMap) -> None:
     """Write a label map, and its names in a table beside it: stem and ``.csv``, columns label and name.
 
-    Formats and errors as in `write_image`.
-
     Parameters
     ----------
     path : .nii, .nii.gz, .nrrd or .mha
+        Frames as in `write_image`.
     labels : LabelMap
-        Labels (ni, nj, nk) below 2**31, written in 8, 16 or 32 bits, the fewest that hold them.
+        Labels (ni, nj, nk) on a grid in LPS mm, written in 8, 16 or 32 bits, the fewest that hold them.
+
+    Raises
+    ------
+    InputError
+        If an argument is of another kind.
+    OutputError
+        If a label is 2**31 or more, or a file cannot be written; nothing is left under its name.
     """
     expect("labels", labels, LabelMap, "a dvc.LabelMap, such as dvc.LabelMap(grid, labels, {1: 'fat'})")
     place, largest = path_of(path), int(labels.labels.max())

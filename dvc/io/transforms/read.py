@@ -50,7 +50,12 @@ def read_transform(path: StrPath) -> Deformation:
     """Read a transform file: elastix' TransformParameters (.txt), ITK's (.h5, .tfm, .mat, .txt), or ours (.npz).
 
     elastix' chain of initial transforms is followed, combined as each file says: "Compose" (T(x) = T1(T0(x))) or
-    "Add". An initial transform's name is looked for beside the file that names it.
+    "Add".
+
+    Parameters
+    ----------
+    path : path
+        The last file of a chain; the name of an initial transform is looked for beside the file that names it.
 
     Returns
     -------
