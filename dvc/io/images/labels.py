@@ -53,10 +53,7 @@ def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
         If it does not lie on ``grid``.
     """
     place = path_of(path)
-    own, labels = _integers(place)
-    counts = _counts(labels)
-    if not counts:
-        raise InputError(f"{place}: the mask is empty: all of its {labels.size} voxels are 0.")
+    own, labels, counts = _integers(place, "mask")
     if len(counts) > 1:
         names = _segment_names(place)
         listed = [f"{v}" + (f" ({names[v]})" if v in names else "") + f": {n} voxels" for v, n in counts.items()]
@@ -86,10 +83,7 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
     """
     place = path_of(path)
     expect("names", names, str | PathLike | Mapping | None, "a mapping such as {1: 'fat'}, or the file of a table")
-    grid, labels = _integers(place)
-    present = _counts(labels)
-    if not present:
-        raise InputError(f"{place}: the label map is empty: all of its {labels.size} voxels are 0.")
+    grid, labels, present = _integers(place, "label map")
     if min(present) < 0:
         raise InputError(f"{place}: labels must not be negative; found {_shortened([v for v in present if v < 0])}.")
     known = read_names(names) if isinstance(names, str | PathLike) else names
@@ -238,8 +232,8 @@ def _nearest(own: Grid, values: npt.NDArray[Any], grid: Grid) -> npt.NDArray[Any
     return fitted
 
 
-def _integers(path: Path) -> tuple[Grid, IntArray]:
-    """Grid and labels of a file whose values must be whole numbers, in whatever type they are stored."""
+def _integers(path: Path, what: str) -> tuple[Grid, IntArray, dict[int, int]]:
+    """Grid, labels and their counts of a file whose values must be whole numbers, in whatever type they are stored."""
     if path.is_dir():
         raise InputError(f"{path}: masks and labels are read from one file, not from a folder (DICOM). Convert it.")
     grid, voxels = read_voxels(path)
@@ -255,7 +249,10 @@ def _integers(path: Path) -> tuple[Grid, IntArray]:
             )
     elif int(voxels.max()) >= _LARGEST_LABEL:
         raise InputError(f"{rule} found {int(voxels.max())}. Number the labels anew.")
-    return grid, np.ascontiguousarray(voxels, dtype=np.int64)
+    labels = np.ascontiguousarray(voxels, dtype=np.int64)
+    if not (counts := _counts(labels)):
+        raise InputError(f"{path}: the {what} is empty: all of its {labels.size} voxels are 0.")
+    return grid, labels, counts
 
 
 def _counts(labels: npt.NDArray[Any]) -> dict[int, int]:

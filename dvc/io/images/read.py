@@ -89,7 +89,7 @@ def read_voxels(
     place = path_of(path)
     expect("series", series, str | None, "the end of a DICOM series' name")
     expect("volume", volume, int | np.integer | None, "the number of a volume, from 0")
-    expect("max_bytes", max_bytes, int | float, "a number of bytes")
+    expect("max_bytes", max_bytes, int | float | np.integer, "a number of bytes")
     if not place.exists():
         raise InputError(f"{place}: no such file or folder. Check the path.")
     if place.is_dir() or (_known_suffix(place.name) is None and is_dicom(place)):

@@ -45,7 +45,8 @@ _BYTE_ORDER = ("binarydatabyteordermsb", "elementbyteordermsb")
 
 def nrrd_fields(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     """Fields and key/value pairs of an NRRD header, and where it ends (bytes)."""
-    start = _header_start(path)
+    with path.open("rb") as file:
+        start = file.read(_HEADER_LIMIT)
     if not re.match(rb"NRRD000\d\r?\n", start):
         raise ImageFileError(f"{path}: not an NRRD file (no NRRD magic at its start). Export it again.")
     end = re.search(rb"\r?\n\r?\n", start)
@@ -196,7 +197,8 @@ def read_meta_header(path: Path, volume: int | None, max_bytes: int, vectors: bo
 
 def _meta_fields(path: Path) -> tuple[dict[str, str], int]:
     """Fields of a MetaImage header (names in lower case), and where it ends (bytes)."""
-    start = _header_start(path)
+    with path.open("rb") as file:
+        start = file.read(_HEADER_LIMIT)
     last = re.search(rb"^[ \t]*ElementDataFile[ \t]*=[^\r\n]*\r?\n?", start, re.MULTILINE)
     if last is None:
         raise ImageFileError(f"{path}: not a MetaImage file (its header has no ElementDataFile). Export it again.")
@@ -222,11 +224,6 @@ def _truth(path: Path, fields: Mapping[str, str], name: str, default: bool) -> b
     if word not in ("true", "t", "1", "false", "f", "0"):
         raise ImageFileError(f"{path}: the header's '{name}' is '{word}', neither True nor False: damaged.")
     return word in ("true", "t", "1")
-
-
-def _header_start(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(_HEADER_LIMIT)
 
 
 def _detached_file(path: Path, name: str) -> Path:

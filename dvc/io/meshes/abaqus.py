@@ -99,10 +99,8 @@ def _keywords(path: Path) -> Iterator[_Keyword]:
     if current is not None:
         if head or (current.name in _READ and not text.endswith(("\n", "\r"))):
             # The format has no mark of its end, and half a number would be another node.
-            where = f"after *{current.name} in line {current.line}"
-            raise ImageFileError(
-                f"{path} ends within a line, {where}, so it may be cut short. If it is whole, end its last line."
-            )
+            problem = f"it ends within a line, after *{current.name} in line {current.line}"
+            raise ImageFileError(f"{path} may be cut short: {problem}. If it is whole, end its last line.")
         yield current
 
 

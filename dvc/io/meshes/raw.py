@@ -72,15 +72,13 @@ class NumberedMesh:
             return ImageFileError(f"{self.path}: {whose} node {node}, which the file does not define.")
 
         index_of = {number: index for index, number in enumerate(self.nodes)}
-        rows: dict[str, list[list[int]]] = {}
-        numbers: dict[str, list[int]] = {}
+        blocks: dict[str, dict[int, list[int]]] = {}
         for number, (kind, nodes) in self.elements.items():
             missing = [node for node in nodes if node not in index_of]
             if missing:
                 raise undefined(f"element {number} uses", missing[0])
-            rows.setdefault(kind, []).append([index_of[node] for node in nodes])
-            numbers.setdefault(kind, []).append(number)
-        cell_of = {number: cell for cell, number in enumerate(n for group in numbers.values() for n in group)}
+            blocks.setdefault(kind, {})[number] = [index_of[node] for node in nodes]
+        cell_of = {number: cell for cell, number in enumerate(n for block in blocks.values() for n in block)}
         fields = {}
         for name, values in (at_nodes or {}).items():
             fields[name] = np.full((len(index_of), 3), np.nan)
@@ -92,7 +90,7 @@ class NumberedMesh:
             self.path,
             np.array(list(self.nodes.values()), dtype=np.float64),
             np.array(list(self.nodes), dtype=np.int64),
-            [(kind, np.array(block, dtype=np.int64)) for kind, block in rows.items()],
+            [(kind, np.array(list(block.values()), dtype=np.int64)) for kind, block in blocks.items()],
             {name: _known(members, cell_of) for name, members in regions.items()},
             {name: _known(members, index_of) for name, members in (node_sets or {}).items()},
             fields,
