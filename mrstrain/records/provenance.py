@@ -104,9 +104,9 @@ def without_folders(value: Any, home: Path) -> Any:
         return {key: without_folders(one, home) for key, one in value.items()}
     if isinstance(value, list | tuple):
         return [without_folders(one, home) for one in value]
-    if not isinstance(value, str):
+    if not isinstance(value, str | Path):
         return value
     place = Path(os.path.normpath(home / value))
     if not place.is_relative_to(home):
         return "a folder" if place.is_dir() else place.name
-    return place.relative_to(home).as_posix() if os.path.isabs(value) else value
+    return place.relative_to(home).as_posix() if os.path.isabs(value) else str(value)

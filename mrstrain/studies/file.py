@@ -1,35 +1,25 @@
 """The study file: one TOML file that names a subject's images, loads, tissues and models. Nothing in it is guessed."""
 
-from __future__ import annotations
-
 import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
+from mrstrain.options import modelling
 from mrstrain.options.comparison import ComparisonOptions
 from mrstrain.options.measurement import Frame, RegistrationOptions, SubjectFiles, Unit
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
-from mrstrain.options.modelling import (
-    MINUTE_S,
-    Finer,
-    Labelling,
-    MeshCoordinates,
-    Meshing,
-    PlateOptions,
-    SimulationOptions,
-)
 
 FILE = "study.toml"
 
 
 def _seconds(minutes: float | None) -> float | None:
-    return None if minutes is None else MINUTE_S * minutes
+    return None if minutes is None else modelling.MINUTE_S * minutes
 
 
 def as_folder(text: str) -> str:
@@ -88,7 +78,7 @@ class Load(_Part):
     shear_direction: Vector | None = None
 
 
-class Plate(PlateOptions):
+class Plate(modelling.PlateOptions):
     """The plate."""
 
     plate_normal: Vector = Field(default=(0.0, 0.0, -1.0), validation_alias="normal")
@@ -102,7 +92,7 @@ class Registering(RegistrationOptions):
     """What to align rigidly first."""
 
 
-class Mesh(Meshing, Labelling, MeshCoordinates):
+class Mesh(modelling.Meshing, modelling.Labelling, modelling.MeshCoordinates):
     """The mesh: made from the label map (or one of its own), or a file."""
 
     labels: Path | None = None
@@ -119,13 +109,13 @@ class Mesh(Meshing, Labelling, MeshCoordinates):
     """Frame of that mesh's coordinates."""
 
     @model_validator(mode="after")
-    def _of_a_file(self) -> Mesh:
+    def _of_a_file(self) -> Self:
         if self.file is None and (self.mesh_unit, self.mesh_frame) != ("mm", "LPS"):
             raise ValueError("unit and frame are those of a mesh made elsewhere, and no 'file' names one")
         return self
 
 
-class Models(SimulationOptions):
+class Models(modelling.SimulationOptions):
     """The models that are judged."""
 
     sets: Names = ()
@@ -164,6 +154,14 @@ class Study(_Part):
     def bone(self) -> str | None:
         """Name of the bone's label; None where the whole image is aligned on and none is named."""
         return self.images.bone_label or ("bone" if self.registration.align == "bone" else None)
+
+    @property
+    def directions(self) -> dict[str, tuple[Vector, Vector]]:
+        """Plate's outward normal and direction of shear under each load, LPS: its own, or those of the plate."""
+        return {
+            name: (load.plate_normal or self.plate.plate_normal, load.shear_direction or self.plate.shear_direction)
+            for name, load in self.loads.items()
+        }
 
     @property
     def subject_files(self) -> SubjectFiles:
@@ -205,7 +203,7 @@ def read_study(path: Path | str | Study) -> Study:
     try:
         study = Study(place=place.resolve().parent, **told)
     except ValidationError as wrong:
-        sentences = "\n".join(f"  {_sentence(one, told)}" for one in wrong.errors(include_url=False))
+        sentences = "\n".join(f"  {_sentence(one)}" for one in wrong.errors(include_url=False))
         raise InputError(f"{place}:\n{sentences}") from wrong
     if study.place not in study.out.resolve().parents:
         raise InputError(
@@ -217,18 +215,15 @@ def read_study(path: Path | str | Study) -> Study:
     return study
 
 
-def _sentence(error: Any, told: Mapping[str, Any]) -> str:
-    at: Sequence[str | int] = error["loc"]
-    names = [str(part) for part in at]
-    table = f"[{'.'.join(names[:-1])}] " if len(names) > 1 else ""
+def _sentence(error: Mapping[str, Any]) -> str:
+    *tables, key = map(str, error["loc"])
+    at = f"[{'.'.join(tables)}] '{key}'" if tables else f"'{key}'"
     if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = list(_fields_at(names[:-1]))
-        near = difflib.get_close_matches(names[-1], known, 1, 0.5)
+        known = _fields_at(tables)
+        near = difflib.get_close_matches(key, known, 1, 0.5)
         advice = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}."
-        return f"{table}'{names[-1]}' is no key here; {advice}"
-    if error["type"] in ("missing", "missing_argument"):
-        return f"{table}'{names[-1]}' is missing."
-    return f"{table}'{names[-1]}': {reason(error)}."
+        return f"{at} is no key here; {advice}"
+    return f"{at} is missing." if error["type"] in ("missing", "missing_argument") else f"{at}: {reason(error)}."
 
 
 def keys_of(table: type[BaseModel]) -> dict[str, FieldInfo]:
@@ -239,16 +234,7 @@ def keys_of(table: type[BaseModel]) -> dict[str, FieldInfo]:
 
 def _fields_at(names: Sequence[str]) -> list[str]:
     """Keys of the table at a path through the study's model."""
-    model: Any = Study
-    for name in names:
-        fields: dict[str, FieldInfo] = getattr(model, "model_fields", {})
-        model = Load if model is None or name not in fields else _model_of(fields[name].annotation)
-    return list(model._fields if issubclass(model, tuple) else keys_of(model))
-
-
-def _model_of(annotation: Any) -> Any:
-    """The model that a field holds; None for a table of models by name (the loads)."""
-    for kind in (annotation, *getattr(annotation, "__args__", ())):
-        if isinstance(kind, type) and issubclass(kind, BaseModel | Finer) and kind is not Load:
-            return kind
-    return None
+    if names[:2] == ["mesh", "finer"]:
+        return list(modelling.Finer._fields)
+    model: Any = Study if not names else Load if names[0] == "loads" else Study.model_fields[names[0]].annotation
+    return list(keys_of(model))

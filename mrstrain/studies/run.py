@@ -23,7 +23,6 @@ from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, run_all
 from mrstrain.studies.plan import KINDS, Stage, plan
 
 LOG = "study.log"
-_USUAL_VOXELS, _USUAL_CELLS = 2e6, 70e3
 _NOTHING = ("nothing",)  # may be run: every stage is taken as it is
 
 
@@ -58,7 +57,7 @@ class StudyRun:
                 continue
             if not outcome.complete:
                 details = () if outcome.record is None else outcome.record.result.lines
-                lines += [f"{name}: {outcome.status}. {outcome.reason}".rstrip(), *(f"    {line}" for line in details)]
+                lines += [str(outcome), *(f"    {line}" for line in details)]
             elif outcome.record is not None:
                 lines += [
                     f"{name}: {section.verdict.words}. {' '.join(section.verdict.reasons)}"
@@ -134,14 +133,16 @@ def run_studies(
     workers: int | None = None,
     progress: OnProgress | None = None,
 ) -> list[StudyRun]:
-    """Run several studies on one cluster, each as `run` does; what cannot be run is refused before any begins."""
+    """Run studies of different names on one cluster, each as `run` does; what cannot be run is refused before any."""
     if scheduler is not None and workers is not None:
         raise ParameterError(
             f"--workers {workers} is for this machine's cores; the scheduler at {scheduler} has workers of its own. "
             "Give one of the two."
         )
-    planned = _planned(studies, only, force)
-    total = _TotalProgress(progress or (lambda *_: None), sum(len(pipeline.stages) for pipeline, _ in planned))
+    named = {f"{study.study.name}: " if len(studies) > 1 else "": study for study in studies}
+    pipelines, to_do = _planned(named, only, force)
+    number = sum(len(pipeline.stages) for pipeline in pipelines.values())
+    total = _TotalProgress(progress or (lambda *_: None), f"{number} stages")
 
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
@@ -150,40 +151,45 @@ def run_studies(
 
     logs: dict[str, Log] = {}
     on_disk: dict[int, tuple[int, float]] = {}
-    prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
-    pipelines = {prefix: pipeline for prefix, (pipeline, _) in zip(prefixes, planned, strict=True)}
     with ExitStack() as stack:
-        for prefix, study, (pipeline, left) in zip(prefixes, studies, planned, strict=True):
+        for prefix, study in named.items():
             stack.enter_context(_alone(study.out))
-            voxels, cells = _sizes(study, left)
-            _refuse_small_disk(study, left, voxels, on_disk)
-            total.seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
+            if left := to_do[prefix]:
+                voxels, cells = sizes_of(study)
+                _refuse_small_disk(study, left, voxels, on_disk)
+                total.seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
             log = stack.enter_context(_log(study.out / LOG))
-            log(f"Study '{study.study.name}': {len(pipeline.stages)} stages, {len(left)} of them to do")
+            log(f"Study '{study.study.name}': {len(pipelines[prefix].stages)} stages, {len(left)} of them to do")
             logs[prefix] = total.also(log, prefix)
         run_all(pipelines, pool, logs)
         total.report(ALL, total.stages, 1.0)
-        runs = []
-        for prefix, study in zip(prefixes, studies, strict=True):
-            runs.append(StudyRun(study, pipelines[prefix].in_order()))
-            write_run_report(study.out / REPORT, study, runs[-1].outcomes)
-            logs[prefix](f"Report: {study.study.out}/{REPORT}")
+        runs = [StudyRun(study, pipelines[prefix].in_order()) for prefix, study in named.items()]
+        for prefix, one in zip(named, runs, strict=True):
+            write_run_report(one.study.out / REPORT, one.study, one.outcomes)
+            logs[prefix](f"Report: {one.study.study.out}/{REPORT}")
     return runs
 
 
-def _planned(studies: Sequence[Study], only: Sequence[str], force: Sequence[str]) -> list[tuple[Pipeline, list[Stage]]]:
-    """Pipeline of each study and the stages to do; what cannot be run is refused."""
-    stages_of = [plan(study) for study in studies]
-    for stages in stages_of:
+def _planned(
+    studies: Mapping[str, Study], only: Sequence[str], force: Sequence[str]
+) -> tuple[dict[str, Pipeline], dict[str, list[Stage]]]:
+    """Pipeline of each study and the stages to do; what cannot be run is refused, with all that is wrong."""
+    planned = {name: plan(study) for name, study in studies.items()}
+    for stages in planned.values():
         refuse_unknown(stages, only, force)
-    refuse_missing(stages_of)
-    pipelines = [
-        Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
-        for study, stages in zip(studies, stages_of, strict=True)
-    ]
-    to_do = [pipeline.to_do() for pipeline in pipelines]
-    refuse_wrong(studies, to_do)
-    return list(zip(pipelines, to_do, strict=True))
+    files = dict.fromkeys(path for stages in planned.values() for stage in stages for path in stage.files)
+    if missing := [path for path in files if not path.exists()]:
+        raise InputError("These files of the study are not there:\n" + "\n".join(f"  {path}" for path in missing))
+    pipelines = {
+        name: Pipeline(planned[name], Ledger(study.out, study.place), only=only, force=force)
+        for name, study in studies.items()
+    }
+    to_do = {name: pipeline.to_do() for name, pipeline in pipelines.items()}
+    # what would fail, hours later, for a reason that can be known beforehand
+    faults = [f"{one.study.name}: {wrong}" for name, one in studies.items() for wrong in wrong_with(one, to_do[name])]
+    if faults:
+        raise InputError("This cannot be run as it is (`mrstrain check` tells more):\n  " + "\n  ".join(faults))
+    return pipelines, to_do
 
 
 @dataclass(slots=True, eq=False)
@@ -191,13 +197,9 @@ class _TotalProgress:
     """Progress of all stages together, weighted by the seconds that each to be run is expected to take."""
 
     report: OnProgress
-    number: int
+    stages: str  # how many there are, in words
     seconds: dict[str, float] = field(default_factory=dict)
     ended_s: float = 0.0
-
-    @property
-    def stages(self) -> str:
-        return f"{self.number} stages"
 
     def also(self, log: Log, prefix: str) -> Log:
         """A log that reports progress as well, for each stage that a line says has ended."""
@@ -213,14 +215,6 @@ class _TotalProgress:
         return line
 
 
-def _sizes(study: Study, left: Sequence[Stage]) -> tuple[float, float]:
-    """Voxels and cells (`sizes_of`) that the costs of the stages to do depend on."""
-    try:
-        return sizes_of(study) if left else (0.0, 0.0)
-    except (InputError, OSError):
-        return _USUAL_VOXELS, _USUAL_CELLS  # the stages that read the file report what is wrong with it
-
-
 def _refuse_small_disk(
     study: Study, left: Sequence[Stage], voxels: float, on_disk: dict[int, tuple[int, float]]
 ) -> None:
@@ -228,8 +222,6 @@ def _refuse_small_disk(
 
     ``on_disk`` is updated: stages, and bytes, that the studies so far will write to each disk.
     """
-    if not left:
-        return
     disk = study.out.stat().st_dev
     stages, needed = on_disk.get(disk, (0, 0.0))
     stages, needed = stages + len(left), needed + sum(disk_bytes(stage, study, voxels) for stage in left)
@@ -252,7 +244,7 @@ def report(study: Path | str | Study) -> StudyRun:
 
 def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = ()) -> dict[str, str]:
     """What `run` would do with each stage (`Pipeline.forecast`); parameters and errors as in `run`."""
-    return _planned([read_study(study)], only, force)[0][0].forecast()
+    return _planned({"": read_study(study)}, only, force)[0][""].forecast()
 
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:
@@ -265,26 +257,6 @@ def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence
         forced = [stage for stage in stages if name in (stage.name, stage.kind)]
         if forced and not any({stage.name, stage.kind} & {*only} for stage in forced):
             raise InputError(f"--force {name} makes nothing anew: --only {', '.join(only)} leaves it out.")
-
-
-def refuse_missing(planned: Sequence[Sequence[Stage]]) -> None:
-    """Refuse studies with missing files, naming every missing file."""
-    files = dict.fromkeys(path for stages in planned for stage in stages for path in stage.files)
-    missing = [path for path in files if not path.exists()]
-    if missing:
-        raise InputError("These files of the study are not there:\n" + "\n".join(f"  {path}" for path in missing))
-
-
-def refuse_wrong(studies: Sequence[Study], todo: Sequence[Sequence[Stage]]) -> None:
-    """Refuse studies with a stage to do that would fail, hours later, for a reason that can be known beforehand."""
-    faults = {
-        study.study.name: wrong
-        for study, left in zip(studies, todo, strict=True)
-        if left and (wrong := wrong_with(study, left))
-    }
-    if faults:
-        lines = [f"{name}: {sentence}" for name, wrong in faults.items() for sentence in wrong]
-        raise InputError("This cannot be run as it is (`mrstrain check` tells more):\n  " + "\n  ".join(lines))
 
 
 @contextmanager

@@ -130,11 +130,12 @@ def test_a_simulated_load_needs_its_force(tmp_path):
 def test_a_load_has_the_plates_directions_or_its_own(tmp_path):
     text = WHOLE.replace("shear_n = 45.0", "shear_n = 45.0\nshear_direction = [1.0, 0.0, 0.0]")
     (found,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "simulate trebbi")
-    assert found.arguments["towards"] == {"Load2": ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0))}
+    usual = ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0))
+    assert found.arguments["towards"] == {"Load1": usual, "Load2": (usual[0], (1.0, 0.0, 0.0))}
     measured = {s.name: s.arguments["shear_direction"] for s in plan(read_study(tmp_path)) if s.kind == "register"}
     assert measured == {"register Load1": (0.0, -1.0, 0.0), "register Load2": (1.0, 0.0, 0.0)}
     (found,) = (s for s in plan(read_study(written(tmp_path, WHOLE))) if s.name == "simulate trebbi")
-    assert found.arguments["towards"] == {}
+    assert found.arguments["towards"] == {"Load1": usual, "Load2": usual}
 
 
 def test_weights_of_the_engine_and_the_plates_pivot_reach_their_stages(tmp_path):
@@ -190,7 +191,7 @@ def test_inputs_and_results_do_not_lie_in_one_another(tmp_path, old, new):
 def test_a_model_is_levelled_by_the_preset_that_measured(tmp_path):
     text = WHOLE + 'level = true\n[registration]\nparameters = ["mine.txt"]\n'
     (stage,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "level trebbi Load1")
-    assert stage.arguments["parameters"] == [str(tmp_path / "mine.txt")]
+    assert stage.arguments["parameters"] == (tmp_path / "mine.txt",)
     assert tmp_path / "mine.txt" in stage.files
 
 

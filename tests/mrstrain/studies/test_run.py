@@ -114,6 +114,7 @@ def test_a_disk_with_too_little_room_is_refused_before_anything_is_made(done, im
     one = 10**6 * int(re.search(said, str(refused.value))[1])
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 3 * one // 2))
     shutil.copytree(images, tmp_path / "other")
+    change(tmp_path / "other", ('name = "Heel', 'name = "Other heel'))
     with pytest.raises(OutputError, match="the results of 12 stages need"):  # room for one of two
         run_studies([read_study(tmp_path / name) for name in ("study", "other")])
     assert run(done[0]).complete  # where all is there already, none is needed
