@@ -137,6 +137,6 @@ def costs(
     if there is not None and needed > there / _GIB:
         fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
         smaller = "one stage alone is too large: crop the images, take a coarser mesh, or a larger machine."
-        advice = f"run with --workers {fitting}." if fitting else smaller
+        advice = f"run with workers={fitting} (--workers {fitting})." if fitting else smaller
         lines.append(f"CARE: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
     return lines

@@ -33,6 +33,11 @@ class StageOutcome:
         return f"{self.stage}: {self.status}. {self.reason}".rstrip()
 
     @property
+    def result(self) -> StageResult:
+        """Its result, an empty one where there is none."""
+        return StageResult(()) if self.record is None else self.record.result
+
+    @property
     def left_out(self) -> bool:
         """Whether it has no result only because it was not requested."""
         return not self.requested and self.status == "not run"
@@ -40,7 +45,7 @@ class StageOutcome:
     @property
     def complete(self) -> bool:
         """Whether there is a complete result that matches the study as it is now."""
-        return self.record is not None and self.record.result.complete and not self.reason
+        return self.record is not None and self.result.complete and not self.reason
 
     @property
     def status(self) -> str:
@@ -49,7 +54,13 @@ class StageOutcome:
             return "not run" if self.reason.startswith(_NOT_RUN) else "FAILED"
         if self.reason:
             return "OUT OF DATE"
-        return "in part" if not self.record.result.complete else "there already" if self.reused else "done"
+        return "in part" if not self.result.complete else "there already" if self.reused else "done"
+
+
+def left_out_of(outcomes: Mapping[str, StageOutcome]) -> list[str]:
+    """A sentence on the stages that have no result only because they were not requested, if there are any."""
+    names = [name for name, outcome in outcomes.items() if outcome.left_out]
+    return [f"Not asked for, and without a result: {', '.join(names)}."] if names else []
 
 
 class Pipeline:
@@ -168,7 +179,7 @@ class Pipeline:
             outcome = self._failed(stage, failure)
         self.outcomes[name] = outcome
         log(f"{name}: {outcome.status} after {seconds:.0f} s" + (f". {outcome.reason}" if outcome.reason else ""))
-        for line in () if outcome.record is None else outcome.record.result.lines:
+        for line in outcome.result.lines:
             log(f"    {line}")
 
     def _recorded(self, stage: Stage, result: StageResult | str, seconds: float) -> StageOutcome:

@@ -19,7 +19,7 @@ from mrstrain.studies.costs import disk_bytes, seconds_of, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
-from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, run_all
+from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, left_out_of, run_all
 from mrstrain.studies.plan import KINDS, Stage, plan
 
 LOG = "study.log"
@@ -42,11 +42,10 @@ class StudyRun:
     def verdicts(self) -> dict[str, Verdict]:
         """Verdict on each registration that has a result, by load."""
         return {
-            name.removeprefix("register "): section.verdict
+            name.removeprefix("register "): verdict
             for name, outcome in self.outcomes.items()
-            if outcome.record is not None and name.startswith("register ")
-            for section in outcome.record.result.sections
-            if section.verdict is not None
+            if name.startswith("register ")
+            for verdict in outcome.result.verdicts
         }
 
     def summary(self) -> list[str]:
@@ -56,23 +55,16 @@ class StudyRun:
             if outcome.left_out:
                 continue
             if not outcome.complete:
-                details = () if outcome.record is None else outcome.record.result.lines
-                lines += [str(outcome), *(f"    {line}" for line in details)]
-            elif outcome.record is not None:
-                lines += [
-                    f"{name}: {section.verdict.words}. {' '.join(section.verdict.reasons)}"
-                    for section in outcome.record.result.sections
-                    if section.verdict is not None and section.verdict.level != "trust" and name != "compare"
-                ]
-        comparison = self.outcomes.get("compare")
-        if comparison is not None and comparison.record is not None:
-            lines += comparison.record.result.lines
-        left_out = [name for name, outcome in self.outcomes.items() if outcome.left_out]
-        if left_out:
-            lines.append(f"Not asked for, and without a result: {', '.join(left_out)}.")
+                lines += [str(outcome), *(f"    {line}" for line in outcome.result.lines)]
+            elif name != "compare":
+                doubts = [verdict for verdict in outcome.result.verdicts if verdict.level != "trust"]
+                lines += [f"{name}: {verdict.words}. {' '.join(verdict.reasons)}" for verdict in doubts]
+        if comparison := self.outcomes.get("compare"):
+            lines += comparison.result.lines
         reused = sum(outcome.reused and outcome.record is not None for outcome in self.outcomes.values())
         return [
             *lines,
+            *left_out_of(self.outcomes),
             f"{len(self.outcomes)} stages, {reused} of them there already. Log: {self.study.out / LOG}",
             f"Report: {self.study.out / REPORT}",
         ]
@@ -136,8 +128,8 @@ def run_studies(
     """Run studies of different names on one cluster, each as `run` does; what cannot be run is refused before any."""
     if scheduler is not None and workers is not None:
         raise ParameterError(
-            f"--workers {workers} is for this machine's cores; the scheduler at {scheduler} has workers of its own. "
-            "Give one of the two."
+            f"workers={workers} (--workers {workers}) is for this machine's cores; the scheduler at {scheduler} has "
+            "workers of its own. Give one of the two."
         )
     named = {f"{study.study.name}: " if len(studies) > 1 else "": study for study in studies}
     pipelines, to_do = _planned(named, only, force)
@@ -226,7 +218,7 @@ def _refuse_small_disk(
     stages, needed = on_disk.get(disk, (0, 0.0))
     stages, needed = stages + len(left), needed + sum(disk_bytes(stage, study, voxels) for stage in left)
     on_disk[disk] = stages, needed
-    refuse_small_disk(study.out, needed, f"the results of {stages} stages need", "", "[study] out")
+    refuse_small_disk(study.out, needed, f"the results of {stages} stages need")
 
 
 def report(study: Path | str | Study) -> StudyRun:
@@ -256,7 +248,7 @@ def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence
     for name in force if only else ():
         forced = [stage for stage in stages if name in (stage.name, stage.kind)]
         if forced and not any({stage.name, stage.kind} & {*only} for stage in forced):
-            raise InputError(f"--force {name} makes nothing anew: --only {', '.join(only)} leaves it out.")
+            raise InputError(f"force ({name}) makes nothing anew: only ({', '.join(only)}) leaves it out.")
 
 
 @contextmanager

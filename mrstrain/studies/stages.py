@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dvc import Verdict
 from dvc.report.page import Section
 from dvc.worker import Worker
 
@@ -25,6 +26,11 @@ class StageResult:
     complete: bool = True  # everything was reached; False for a model that carried a part of its load
     retry: bool = False  # a part failed in a way that may not recur: it is run again next time
     timed_out: bool = False  # all that is missing is due to the time limit
+
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """The verdicts in its sections."""
+        return [section.verdict for section in self.sections if section.verdict is not None]
 
 
 def register(tell: Tell, *, load0: Path, load: Path, repeat: Sequence[Path], **options: Any) -> StageResult:

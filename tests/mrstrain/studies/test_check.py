@@ -223,7 +223,7 @@ def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, mo
         return [line for line in costs.costs(told, left, left, 256.0**3, 0.0, workers) if line.startswith("CARE")]
 
     assert care(12.0) == []  # three of 3.9 GiB
-    assert care(8.0) == ["CARE: this machine has 8.0 GiB of memory; run with --workers 2."]
+    assert care(8.0) == ["CARE: this machine has 8.0 GiB of memory; run with workers=2 (--workers 2)."]
     assert care(8.0, workers=2) == []
     assert "crop the images" in care(3.0)[0]
 
