@@ -136,13 +136,13 @@ class Section:
 def shown(value: Cell) -> str:
     """A table cell as people read it.
 
-    >>> [shown(v) for v in (0.123456, 1234.5, 12, float("nan"), None, "fat")]
-    ['0.123', '1234', '12', '–', '–', 'fat']
+    >>> [shown(v) for v in (0.123456, 1234.5, 12, -0.0, float("nan"), None, "fat")]
+    ['0.123', '1234', '12', '0', '–', '–', 'fat']
     """
     if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
         return "–"
     if isinstance(value, float | np.floating):
-        return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+        return f"{value:.0f}" if abs(value) >= 100 else f"{value:z.3g}"
     return str(value)
 
 

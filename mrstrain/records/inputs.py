@@ -70,7 +70,7 @@ def case_names(loads: Sequence[Path]) -> list[str]:
     if twice:
         raise InputError(
             f"Results are kept in a folder named after each loaded image, and {twice} would be used twice: "
-            "rename the files, or register them into different output folders (out)."
+            "rename the files, or register them into different folders (out)."
         )
     return names
 
@@ -82,8 +82,7 @@ def refuse_touching_inputs(out: Path, case_folders: Sequence[str], inputs: Seque
         for case in case_folders:
             if (out / case).resolve() in path.resolve().parents:
                 raise OutputError(
-                    f"{out / case} would be replaced, and the input {path} lies in it. Choose another output "
-                    "folder (out)."
+                    f"{out / case} would be replaced, and the input {path} lies in it. Choose another folder (out)."
                 )
 
 
@@ -97,7 +96,7 @@ def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") ->
     if free < needed:
         raise OutputError(
             f"{out}: {what} about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. Free some, choose "
-            f"another output folder (out){instead}."
+            f"another folder (out){instead}."
         )
 
 
@@ -110,6 +109,6 @@ def make_output(out: Path) -> None:
         probe.unlink(missing_ok=True)  # another run may have probed at the same time
     except OSError as error:
         raise OutputError(
-            f"{out}: results cannot be written here ({error.strerror or error}). Choose another output "
-            "folder (out), or change the folder's rights."
+            f"{out}: results cannot be written here ({error.strerror or error}). Choose another folder (out), or "
+            "change its rights."
         ) from error

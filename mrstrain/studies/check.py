@@ -98,6 +98,13 @@ class _Look:
                 self.wrong.append(str(error))
             return None
 
+    def tried_at(self, table: str, key: str, read: Callable[_P, object], *given: _P.args, **options: _P.kwargs) -> None:
+        """As `tried`, of a value whose place in the study file is told."""
+        try:
+            read(*given, **options)
+        except MrstrainError as error:
+            self.wrong.append(f"{self.study.at(table, key)}: {error}")
+
     def asked(self, *names_or_kinds: str) -> bool:
         """Whether a stage of these names or kinds is looked at."""
         return self.stages is None or any(stage.is_one_of(names_or_kinds) for stage in self.stages)
@@ -125,7 +132,7 @@ class _Look:
             self.wrong.append("[models] level = true needs an unloaded image without voxels that are NaN or infinite.")
         if asked("compare"):
             if labels is not None and (study.models.sets or study.models.results):
-                self.tried(check_bones, labels, study.mesh.bones)
+                self.tried_at("mesh", "bones", check_bones, labels, study.mesh.bones)
             if study.compare.thresholds is not None:
                 self.tried(read_thresholds, study.path(study.compare.thresholds))
         return reference, labels
@@ -169,7 +176,7 @@ class _Look:
         """Look at bone and masks, engine, parameters and error model."""
         subject, how = self.study.subject_files, self.study.registration.located(self.study.place)
         if subject.bone_label is not None and labels is not None:
-            self.tried(labels.region, subject.bone_label)
+            self.tried_at("images", "bone", labels.region, subject.bone_label)
         for mask in (subject.bone, subject.tissue):
             if mask is not None and reference is not None:
                 self.tried(read_mask, mask, reference.grid)
@@ -210,7 +217,8 @@ class _Look:
         chosen = [one for one in sets if one is not None and self.asked(f"simulate {one.name}", f"drive {one.name}")]
         steps = self.tried(load_steps, study) or {}
         if forceless := [name for name in study.loads if steps and name not in steps]:
-            self.notes.append(f"{', '.join(forceless)}: no force, so measured and not simulated.")
+            lacking = "; ".join(study.at(f"loads.{name}", "normal_n") for name in forceless)
+            self.notes.append(f"{', '.join(forceless)}: no force ({lacking}), so measured and not simulated.")
         contact = study.plate.model_dump(exclude={"plate_normal", "shear_direction"})
         made = {name: self.tried(Plate, *study.directions[name], **contact) for name in steps}
         plates = {name: plate for name, plate in made.items() if plate is not None}

@@ -45,7 +45,7 @@ class Cohort:
         """A few lines for a person."""
         lines = [f"{one.study.study.name}: not complete, see {one.study.out}" for one in self.ran if not one.complete]
         lines += [
-            f"{place}. {s.model}: {100 * s.mean:.2f} % ({100 * s.low:.2f} to {100 * s.high:.2f}), nearest in "
+            f"{place}. {s.model}: {100 * s.mean:z.2f} % ({100 * s.low:z.2f} to {100 * s.high:z.2f}), nearest in "
             f"{s.nearest_in} of {s.subjects} subjects"
             + ("" if place == 1 or s.differs_from_best else "; not told from the first")
             for place, s in enumerate(self.ranking, start=1)

@@ -1,12 +1,13 @@
 """The study file: one TOML file that names a subject's images, loads, tissues and models. Nothing in it is guessed."""
 
 import difflib
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
@@ -16,6 +17,7 @@ from mrstrain.options.measurement import Frame, RegistrationOptions, SubjectFile
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
 
 FILE = "study.toml"
+_MOST_FAULTS = 20
 
 
 def _seconds(minutes: float | None) -> float | None:
@@ -144,6 +146,11 @@ class Study(_Part):
     mesh: Mesh = Mesh()
     models: Models = Models()
     compare: ComparisonOptions = ComparisonOptions()
+    _lines: dict[tuple[str, str], int] = PrivateAttr(default_factory=dict)
+
+    def at(self, table: str, key: str) -> str:
+        """A key of a table, as messages name it: with its line in the file."""
+        return named(self._lines, table, key)[1]
 
     @property
     def out(self) -> Path:
@@ -185,26 +192,31 @@ class Study(_Part):
 def read_study(path: Path | str | Study) -> Study:
     """Read a study file (or a folder's ``study.toml``); a study that is read already is returned as it is.
 
-    InputError lists everything that is wrong in the file: unknown keys with the nearest known one, values of the wrong
-    kind, results outside the study's folder.
+    InputError lists everything that is wrong in the file, by line: what is no TOML; or missing values, unknown keys
+    with the nearest known one, and values of the wrong kind; or results outside the study's folder.
     """
     if isinstance(path, Study):
         return path
     place = Path(path)
     place = place / FILE if place.is_dir() else place
     try:
-        told = tomllib.loads(place.read_text(encoding="utf-8"))
+        text = place.read_text(encoding="utf-8")
+        told = tomllib.loads(text)
     except FileNotFoundError as missing:
         raise InputError(f"{place}: there is no study file; `mrstrain init FOLDER` writes one.") from missing
+    except tomllib.TOMLDecodeError as error:
+        raise InputError("\n  ".join([f"{place} is no TOML file:", *_faults(text.splitlines())])) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{place} is no TOML file ({error}).") from error
     if "place" in told:
         raise InputError(f"{place}: 'place' is no key of a study file; paths start from the file's own folder.")
+    lines = lines_of(text)
     try:
         study = Study(place=place.resolve().parent, **told)
     except ValidationError as wrong:
-        sentences = "\n".join(f"  {_sentence(one)}" for one in wrong.errors(include_url=False))
-        raise InputError(f"{place}:\n{sentences}") from wrong
+        sentences = sorted(_sentence(one, lines) for one in wrong.errors(include_url=False))
+        raise InputError("\n  ".join([f"{place}:", *(sentence for _, sentence in sentences)])) from wrong
+    study._lines = lines
     if study.place not in study.out.resolve().parents:
         raise InputError(
             f"{place}: [study] out = '{study.study.out}' does not lie below the study's own folder {study.place}; "
@@ -215,15 +227,64 @@ def read_study(path: Path | str | Study) -> Study:
     return study
 
 
-def _sentence(error: Mapping[str, Any]) -> str:
+def _faults(lines: list[str]) -> list[str]:
+    """The lines that are no TOML, each found with those before left out."""
+    faults = list[str]()
+    while len(faults) < _MOST_FAULTS:
+        try:
+            tomllib.loads("\n".join(lines))
+            break
+        except tomllib.TOMLDecodeError as error:
+            why, _, where = str(error).partition(" (at line ")
+            number = int(where.partition(",")[0] or 0)
+            if not number or not lines[number - 1]:
+                return faults or [str(error)]
+            faults.append(f"line {number}: {why}: {lines[number - 1].strip()}")
+            lines[number - 1] = ""
+    return faults
+
+
+def lines_of(text: str) -> dict[tuple[str, str], int]:
+    """Line of each table (its key is "") and key of a study file; behind a # only where it stands nowhere else."""
+    lines: dict[tuple[str, str], int] = {}
+    table = ""
+    for number, line in enumerate(text.splitlines(), start=1):
+        if head := re.match(r"[\s#]*\[([^\[\]=]+)\]", line):
+            table, key = _bare(head[1]), ""
+            lines.setdefault((table.partition(".")[0], ""), number)
+        elif given := re.match(r"[\s#]*([\w-]+)\s*=", line):
+            key = given[1]
+        else:
+            continue
+        if not line.lstrip().startswith("#") or (table, key) not in lines:
+            lines[table, key] = number
+    return lines
+
+
+def _bare(table: str) -> str:
+    return re.sub(r"[\s\"']", "", table)
+
+
+def named(lines: Mapping[tuple[str, str], int], table: str, key: str) -> tuple[int, str]:
+    """Line of a key, or else of its table (0 where neither is in the file), and how messages name it."""
+    at = _bare(table)
+    number = lines.get((at, key)) or lines.get((at, "")) or lines.get((key, "")) or 0
+    return number, (f"line {number}: " if number else "") + (
+        f"[{table}] '{key}'" if table and key else f"[{table}]" if table else f"'{key}'"
+    )
+
+
+def _sentence(error: Mapping[str, Any], lines: Mapping[tuple[str, str], int]) -> tuple[int, str]:
     *tables, key = map(str, error["loc"])
-    at = f"[{'.'.join(tables)}] '{key}'" if tables else f"'{key}'"
+    number, at = named(lines, ".".join(tables), key)
     if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _fields_at(tables)
         near = difflib.get_close_matches(key, known, 1, 0.5)
-        advice = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}."
-        return f"{at} is no key here; {advice}"
-    return f"{at} is missing." if error["type"] in ("missing", "missing_argument") else f"{at}: {reason(error)}."
+        return number, f"{at} is no key here; " + (
+            f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}."
+        )
+    missing = error["type"] in ("missing", "missing_argument")
+    return number, f"{at} is missing." if missing else f"{at}: {reason(error)}."
 
 
 def keys_of(table: type[BaseModel]) -> dict[str, FieldInfo]:

@@ -194,18 +194,19 @@ def _simulation(study: Study, one: str) -> Stage:
 def load_steps(study: Study) -> dict[str, LoadStep]:
     """The loads that are simulated: those with a force or a plate displacement along the normal.
 
-    InputError is raised if a load has only a shear, or force and displacement along one axis, or no load has any.
+    InputError is raised if loads have only a shear, or one force and displacement along one axis, or no load has any.
     """
-    steps = {}
+    steps, lacking = {}, list[str]()
     for name, load in study.loads.items():
         if (load.normal_n, load.normal_mm) != (None, None):
             steps[name] = LoadStep(name, load.normal_n, load.shear_n, load.normal_mm, load.shear_mm)
         elif (load.shear_n, load.shear_mm) != (None, None):
-            raise InputError(f"[loads.{name}] normal_n is missing: a plate that shears has to press.")
-    if not steps:
-        first = next(iter(study.loads))
-        raise InputError(f"[loads.{first}] normal_n is missing: no load has a force to simulate [models] sets under.")
-    return steps
+            lacking.append(name)
+    if steps and not lacking:
+        return steps
+    why = "A plate that shears has to press." if lacking else "No load has a force or travel to simulate sets under."
+    places = [study.at(f"loads.{name}", "normal_n") for name in lacking or study.loads]
+    raise InputError("\n  ".join([f"{why} In the study file normal_n (N) or normal_mm is missing:", *places]))
 
 
 def _driven(study: Study, one: str, name: str, measured: Mapping[str, str]) -> Stage:

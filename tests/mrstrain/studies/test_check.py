@@ -131,7 +131,8 @@ def test_a_label_map_to_mesh_that_lies_elsewhere_and_one_image_for_two_loads_are
     assert wrong(study, twice) == "Load2 is the image of Load1: every voxel is equal."
     forceless = (twice[0], twice[1].replace("normal_n = 2.0\n", ""))
     wrong(study, forceless)
-    assert "Load2: no force, so measured and not simulated." in check(study).notes
+    place = "line 12: [loads.Load2] 'normal_n'"
+    assert f"Load2: no force ({place}), so measured and not simulated." in check(study).notes
 
 
 def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
@@ -152,8 +153,8 @@ def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(stu
     tissues = LabelMap(GRID, np.ones(GRID.shape, dtype=np.int64), {1: "fat"})
     write_labels(study / "tissues.nii.gz", tissues)
     align, measured = ("[registration]", '[registration]\nalign = "image"'), ('"mine.toml", "friedman"', "")
-    assert "no region 'bone'" in wrong(study, measured)
-    assert "no 'bone'" in wrong(study, align)  # a comparison needs one
+    assert wrong(study, measured).startswith("line 4: [images] 'bone': The label map has no region 'bone'")
+    assert "line 16: [mesh] 'bones': The label map has no 'bone'" in wrong(study, align)  # a comparison needs one
     assert "no region 'sacrum'" in wrong(study, align, measured, ("labels =", 'bone = "sacrum"\nlabels ='))
     assert wrong(study, align, measured) == ""
     (stage,) = plan(read_study(study))

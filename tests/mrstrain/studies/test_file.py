@@ -85,6 +85,18 @@ def test_refused(tmp_path, old, new, words):
         read_study(written(tmp_path, WHOLE.replace(old, new)))
 
 
+def test_every_line_that_is_no_toml_is_told_and_what_is_wrong_stands_by_line(tmp_path):
+    text = WHOLE.replace("normal_n = 140", "normal_n =").replace("normal_n = 15.0", "normal_n = ...")
+    with pytest.raises(InputError, match=r"(?s)no TOML file:\n  line 9: .*normal_n =\n  line 12: .*normal_n = \.\.\."):
+        read_study(written(tmp_path, text))
+    text = WHOLE.replace('load0 = "', '# load0 = "').replace("shear_n = 45.0", 'shear_n = "45"')
+    text = text.replace('[study]\nname = "Heel"\n', "")
+    with pytest.raises(InputError) as told:
+        read_study(written(tmp_path, text))
+    places = [line.split("]")[0].strip() for line in str(told.value).splitlines()[1:]]
+    assert places == ["'study' is missing.", "line 3: [images", "line 11: [loads.Load2"]
+
+
 def test_no_file(tmp_path):
     with pytest.raises(InputError, match="mrstrain init"):
         read_study(tmp_path)
@@ -114,14 +126,16 @@ def test_chained_loads_wait_for_one_another(tmp_path):
 
 def test_a_simulated_load_needs_its_force(tmp_path):
     text = WHOLE.replace("normal_n = 15.0\n", "")
-    with pytest.raises(InputError, match=r"loads.Load2\] normal_n is missing"):
+    with pytest.raises(
+        InputError, match=r"(?s)plate that shears has to press.*\n  line 10: \[loads.Load2\] 'normal_n'"
+    ):
         plan(read_study(written(tmp_path, text)))
     alone = text.replace("shear_n = 45.0\n", "") + "level = true\n"
     stages = {stage.name: stage for stage in plan(read_study(written(tmp_path, alone)))}
     assert [load["name"] for load in stages["simulate trebbi"].arguments["loads"]] == ["Load1"]
     assert {name for name in stages if name.startswith("level trebbi")} == {"level trebbi Load1"}
     assert "register Load2" in stages  # measured all the same
-    with pytest.raises(InputError, match=r"loads.Load1\] normal_n is missing: no load has a force"):
+    with pytest.raises(InputError, match=r"(?s)No load has a force.*line 7: \[loads.Load1\].*line 9: \[loads.Load2\]"):
         plan(read_study(written(tmp_path, alone.replace("normal_n = 140\n", ""))))
     measured = text.replace('sets = ["trebbi", "luboz"]', "sets = []")
     assert [s.kind for s in plan(read_study(written(tmp_path, measured)))] == ["register", "register", "compare"]

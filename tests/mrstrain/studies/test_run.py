@@ -333,7 +333,7 @@ def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
     assert (told.images.labels, told.images.names) == (Path("tissues.nii.gz"), Path("tissues.csv"))
     assert list(told.loads) == ["Load1", "Load2"]
     assert told.loads["Load1"].normal_n is None  # forces are never guessed
-    assert any("normal_n is missing" in one for one in check(study).wrong)
+    assert any("'normal_n'" in one for one in check(study).wrong)
     assert told.models.results == ("ansys",)
     assert len(told.models.sets) == 6
     assert "friedman" not in told.models.sets
