@@ -9,7 +9,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_image, read_labels, read_mask
-from dvc.errors import InputError, MrstrainError
+from dvc.errors import MrstrainError
 from dvc.io.result_folder import REPEAT
 from dvc.measurement.subject import is_bones_name
 from dvc.trust.error_model import error_model_of
@@ -138,11 +138,8 @@ class _Look:
         return reference, labels
 
     def image(self, given: str | Path) -> Image:
-        """An image of the study; InputError where it is missing or damaged."""
-        place = self.study.path(given)
-        if not place.exists():
-            raise InputError(f"{place}: there is no such file.")
-        return read_image(place, allow_missing=self.study.images.allow_missing)
+        """An image of the study."""
+        return read_image(self.study.path(given), allow_missing=self.study.images.allow_missing)
 
     def labels(self, reference: Image | None) -> LabelMap | None:
         """The labels, on the unloaded image's grid."""

@@ -138,16 +138,15 @@ def _areas(out: Path) -> list[dict[str, str]]:
         return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
 
 
-def _judged(model: str) -> bool:
-    return model != NOTHING and not model.endswith(LEVELLED)
-
-
 def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str, dict[str, float]], list[str]]:
     """Model to subject to the area over all loads, over volume and range; and what is to be said of it.
 
     With the measurement's bias taken out where every subject's error is known, else as found for all.
     """
-    own = {subject: [row for row in rows if _judged(row["model"])] for subject, rows in areas.items()}
+    own = {
+        subject: [row for row in rows if row["model"] != NOTHING and not row["model"].endswith(LEVELLED)]
+        for subject, rows in areas.items()
+    }
     known = all(not np.isnan(float(row["estimate_ml"])) for rows in own.values() for row in rows)
     shares: dict[str, dict[str, float]] = {}
     loads = {subject: frozenset(row["load"] for row in rows) - {_TOTAL} for subject, rows in own.items()}

@@ -150,7 +150,7 @@ class Study(_Part):
 
     def at(self, table: str, key: str) -> str:
         """A key of a table, as messages name it: with its line in the file."""
-        return named(self._lines, table, key)[1]
+        return _named(self._lines, table, key)[1]
 
     @property
     def out(self) -> Path:
@@ -210,7 +210,7 @@ def read_study(path: Path | str | Study) -> Study:
         raise InputError(f"{place} is no TOML file ({error}).") from error
     if "place" in told:
         raise InputError(f"{place}: 'place' is no key of a study file; paths start from the file's own folder.")
-    lines = lines_of(text)
+    lines = _lines_of(text)
     try:
         study = Study(place=place.resolve().parent, **told)
     except ValidationError as wrong:
@@ -244,7 +244,7 @@ def _faults(lines: list[str]) -> list[str]:
     return faults
 
 
-def lines_of(text: str) -> dict[tuple[str, str], int]:
+def _lines_of(text: str) -> dict[tuple[str, str], int]:
     """Line of each table (its key is "") and key of a study file; behind a # only where it stands nowhere else."""
     lines: dict[tuple[str, str], int] = {}
     table = ""
@@ -265,7 +265,7 @@ def _bare(table: str) -> str:
     return re.sub(r"[\s\"']", "", table)
 
 
-def named(lines: Mapping[tuple[str, str], int], table: str, key: str) -> tuple[int, str]:
+def _named(lines: Mapping[tuple[str, str], int], table: str, key: str) -> tuple[int, str]:
     """Line of a key, or else of its table (0 where neither is in the file), and how messages name it."""
     at = _bare(table)
     number = lines.get((at, key)) or lines.get((at, "")) or lines.get((key, "")) or 0
@@ -276,7 +276,7 @@ def named(lines: Mapping[tuple[str, str], int], table: str, key: str) -> tuple[i
 
 def _sentence(error: Mapping[str, Any], lines: Mapping[tuple[str, str], int]) -> tuple[int, str]:
     *tables, key = map(str, error["loc"])
-    number, at = named(lines, ".".join(tables), key)
+    number, at = _named(lines, ".".join(tables), key)
     if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _fields_at(tables)
         near = difflib.get_close_matches(key, known, 1, 0.5)

@@ -14,7 +14,7 @@ from fe import published_names
 from mrstrain.comparison.model_files import ENDINGS
 from mrstrain.models.loads import LOADS
 from mrstrain.records.inputs import IMAGE_ENDINGS, image_stem
-from mrstrain.studies.file import FILE, lines_of, named
+from mrstrain.studies.file import FILE
 
 _UNLOADED = re.compile(r"load[ _-]?0|unloaded|no[ _-]?load|baseline", re.IGNORECASE)
 _AGAIN = re.compile(r"again|repeat|rescan|retest", re.IGNORECASE)
@@ -29,6 +29,7 @@ _ROLES = {
     "repeat": "the repeat scan", "load": "the load of that name",
 }  # fmt: skip
 _LOOKED_AT = 20
+_TO_FILL_IN = "# FILL IN"  # of lines in the template
 _TABLES = (".csv", ".txt", ".label", ".ctbl")
 
 
@@ -62,14 +63,9 @@ class NewStudy:
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
-        keys = [("images", key) for key in ("load0", "labels") if getattr(found, key) is None]
-        unnamed = found.labels is not None and found.names is None and not found.labels.endswith(".seg.nrrd")
-        keys += [("images", "names")] if unnamed else []
-        keys += [] if found.loads else [("loads.Load1", ""), ("loads.Load1", "image")]
-        keys += [(f"loads.{load}", "normal_n") for load in found.loads or ("Load1",)]
-        file = lines_of(self.path.read_text(encoding="utf-8"))
-        lines += [f"Study file: {self.path}. Put in what is not known, and take away the # before it:"]
-        lines += [f"    {named(file, *key)[1]}" for key in keys]
+        lines += [f"Study file: {self.path}. Fill in, and take away the # at the beginning of:"]
+        file = enumerate(self.path.read_text(encoding="utf-8").splitlines(), start=1)
+        lines += [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
         return [*lines, f"Then: mrstrain check {self.path.parent}"]
 
 

@@ -1,10 +1,11 @@
 """`run`: a study from its file to its report; finished stages are not repeated."""
 
-import logging
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -142,15 +143,17 @@ def run_studies(
         return cluster(total.report, [study.out for study in studies], scheduler=scheduler, workers=workers)
 
     logs: dict[str, Log] = {}
-    on_disk: dict[int, tuple[int, float]] = {}
+    needed: dict[int, list[float]] = defaultdict(list)  # bytes of the stages that write to each disk
     with ExitStack() as stack:
         for prefix, study in named.items():
             stack.enter_context(_alone(study.out))
             if left := to_do[prefix]:
                 voxels, cells = sizes_of(study)
-                _refuse_small_disk(study, left, voxels, on_disk)
+                of_disk = needed[study.out.stat().st_dev]
+                of_disk += [disk_bytes(stage, study, voxels) for stage in left]
+                refuse_small_disk(study.out, sum(of_disk), f"the results of {len(of_disk)} stages need")
                 total.seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
-            log = stack.enter_context(_log(study.out / LOG))
+            log = partial(_log, study.out / LOG)
             log(f"Study '{study.study.name}': {len(pipelines[prefix].stages)} stages, {len(left)} of them to do")
             logs[prefix] = total.also(log, prefix)
         run_all(pipelines, pool, logs)
@@ -207,20 +210,6 @@ class _TotalProgress:
         return line
 
 
-def _refuse_small_disk(
-    study: Study, left: Sequence[Stage], voxels: float, on_disk: dict[int, tuple[int, float]]
-) -> None:
-    """Refuse a run whose results would not fit, before any of it is made.
-
-    ``on_disk`` is updated: stages, and bytes, that the studies so far will write to each disk.
-    """
-    disk = study.out.stat().st_dev
-    stages, needed = on_disk.get(disk, (0, 0.0))
-    stages, needed = stages + len(left), needed + sum(disk_bytes(stage, study, voxels) for stage in left)
-    on_disk[disk] = stages, needed
-    refuse_small_disk(study.out, needed, f"the results of {stages} stages need")
-
-
 def report(study: Path | str | Study) -> StudyRun:
     """Write a study's report again from the existing results, without running anything; InputError without any."""
     study = read_study(study)
@@ -268,15 +257,7 @@ def _alone(out: Path) -> Iterator[None]:
         lock.release()
 
 
-@contextmanager
-def _log(path: Path) -> Iterator[Callable[[str], None]]:
-    """Append lines to a file, each with its time."""
-    logger = logging.Logger(f"mrstrain {path}")
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)sZ %(message)s", "%Y-%m-%dT%H:%M:%S"))
-    handler.formatter.converter = time.gmtime  # type: ignore[union-attr]
-    logger.addHandler(handler)
-    try:
-        yield logger.info
-    finally:
-        handler.close()
+def _log(path: Path, text: str) -> None:
+    """Append a line to a file, with its time."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S}Z {text}\n")
