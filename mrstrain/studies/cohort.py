@@ -109,7 +109,8 @@ def cohort(
     try:
         ranking = rank_over_subjects(shares)
     except InputError as none:
-        ranking, notes = (), [*notes, str(none)]
+        ranking = ()
+        notes.append(str(none))
     first = next(row for rows in areas.values() for row in rows)
     rows_of_all = ([subject, *row.values()] for subject, rows in areas.items() for row in rows)
     write_csv(target / "cohort.csv", ["subject", *first], rows_of_all)
@@ -175,11 +176,9 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
 
 
 def _sections(
-    ran: Mapping[str, StudyRun],
-    shares: Mapping[str, Mapping[str, float]],
-    ranking: Sequence[CohortRank],
+    ran: Mapping[str, StudyRun], shares: Mapping[str, Mapping[str, float]], ranking: Sequence[CohortRank],
     notes: Sequence[str],
-) -> list[Section]:
+) -> list[Section]:  # fmt: skip
     """The report's sections: the models over all subjects, and the state of each subject."""
     order = [s.model for s in ranking] or list(shares)
     ranked = Table(

@@ -42,18 +42,15 @@ def sizes_of(study: Study) -> tuple[float, float]:
     Usual numbers where a file cannot be read: the stages that read it report what is wrong with it.
     """
     try:
-        return _sizes(study)
+        reference, how = read_image(study.path(study.images.load0), allow_missing=True), study.mesh
+        voxels = float(np.prod(reference.grid.shape))
+        if not study.models.sets:
+            return voxels, 0.0
+        if how.file is not None:
+            return voxels, float(len(mesh_given(study).cells))
+        labels = read_labels(*labels_to_mesh(study))
     except (InputError, OSError):
         return _USUAL_VOXELS, _LEAST_CELLS
-
-
-def _sizes(study: Study) -> tuple[float, float]:
-    voxels = float(np.prod(read_image(study.path(study.images.load0), allow_missing=True).grid.shape))
-    if not study.models.sets:
-        return voxels, 0.0
-    if study.mesh.file is not None:
-        return voxels, float(len(mesh_given(study).cells))
-    labels, how = read_labels(*labels_to_mesh(study)), study.mesh
     soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in how.bones and n != 0])
     volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3
     return voxels, max(volume / (_SHAPE * how.edge_mm**3), _LEAST_CELLS)

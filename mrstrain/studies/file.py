@@ -18,6 +18,7 @@ from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, r
 
 FILE = "study.toml"
 _MOST_FAULTS = 20
+_UNQUOTED = str.maketrans("", "", " \"'")
 
 
 def _seconds(minutes: float | None) -> float | None:
@@ -250,7 +251,7 @@ def _lines_of(text: str) -> dict[tuple[str, str], int]:
     table = ""
     for number, line in enumerate(text.splitlines(), start=1):
         if head := re.match(r"[\s#]*\[([^\[\]=]+)\]", line):
-            table, key = _bare(head[1]), ""
+            table, key = head[1].translate(_UNQUOTED), ""
             lines.setdefault((table.partition(".")[0], ""), number)
         elif given := re.match(r"[\s#]*([\w-]+)\s*=", line):
             key = given[1]
@@ -261,13 +262,9 @@ def _lines_of(text: str) -> dict[tuple[str, str], int]:
     return lines
 
 
-def _bare(table: str) -> str:
-    return re.sub(r"[\s\"']", "", table)
-
-
 def _named(lines: Mapping[tuple[str, str], int], table: str, key: str) -> tuple[int, str]:
     """Line of a key, or else of its table (0 where neither is in the file), and how messages name it."""
-    at = _bare(table)
+    at = table.translate(_UNQUOTED)
     number = lines.get((at, key)) or lines.get((at, "")) or lines.get((key, "")) or 0
     return number, (f"line {number}: " if number else "") + (
         f"[{table}] '{key}'" if table and key else f"[{table}]" if table else f"'{key}'"
@@ -280,9 +277,8 @@ def _sentence(error: Mapping[str, Any], lines: Mapping[tuple[str, str], int]) ->
     if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         known = _fields_at(tables)
         near = difflib.get_close_matches(key, known, 1, 0.5)
-        return number, f"{at} is no key here; " + (
-            f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}."
-        )
+        advice = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}."
+        return number, f"{at} is no key here; {advice}"
     missing = error["type"] in ("missing", "missing_argument")
     return number, f"{at} is missing." if missing else f"{at}: {reason(error)}."
 

@@ -118,14 +118,9 @@ def run(
 
 
 def run_studies(
-    studies: Sequence[Study],
-    *,
-    only: Sequence[str] = (),
-    force: Sequence[str] = (),
-    scheduler: str | None = None,
-    workers: int | None = None,
-    progress: OnProgress | None = None,
-) -> list[StudyRun]:
+    studies: Sequence[Study], *, only: Sequence[str] = (), force: Sequence[str] = (), scheduler: str | None = None,
+    workers: int | None = None, progress: OnProgress | None = None,
+) -> list[StudyRun]:  # fmt: skip
     """Run studies of different names on one cluster, each as `run` does; what cannot be run is refused before any."""
     if scheduler is not None and workers is not None:
         raise ParameterError(
@@ -134,8 +129,8 @@ def run_studies(
         )
     named = {f"{study.study.name}: " if len(studies) > 1 else "": study for study in studies}
     pipelines, to_do = _planned(named, only, force)
-    number = sum(len(pipeline.stages) for pipeline in pipelines.values())
-    total = _TotalProgress(progress or (lambda *_: None), f"{number} stages")
+    stages = f"{sum(len(pipeline.stages) for pipeline in pipelines.values())} stages"
+    total = _TotalProgress(progress or (lambda *_: None), stages)
 
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
@@ -249,8 +244,9 @@ def _alone(out: Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout as taken:
-        advice = "Wait for its end, or give another [study] out."
-        raise OutputError(f"{out}: another run is at work here. {advice}") from taken
+        raise OutputError(
+            f"{out}: another run is at work here. Wait for its end, or give another [study] out."
+        ) from taken
     try:
         yield
     finally:
