@@ -139,11 +139,9 @@ def shown(value: Cell) -> str:
     >>> [shown(v) for v in (0.123456, 1234.5, 12, float("nan"), None, "fat")]
     ['0.123', '1234', '12', '–', '–', 'fat']
     """
-    if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
-        return "–"
-    if isinstance(value, float | np.floating):
-        return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
-    return str(value)
+    if isinstance(value, float | np.floating) and np.isfinite(value):
+        return f"{value:z.0f}" if abs(value) >= 100 else f"{value:z.3g}"
+    return "–" if value is None or isinstance(value, float | np.floating) else str(value)
 
 
 def record_lines(record: Mapping[str, object]) -> dict[str, str]:

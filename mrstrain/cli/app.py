@@ -3,7 +3,7 @@
 import logging
 import signal
 import sys
-from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from typing import Annotated
 
@@ -52,17 +52,14 @@ def doctor() -> None:
     """Is this machine fit to run mrstrain?"""
     from mrstrain.records.doctor import examine
 
-    def trial(what: str, module: str) -> Callable[[], str]:
-        def run() -> str:
-            from dvc.worker import Worker
+    def trial(what: str, module: str) -> str:
+        from dvc.worker import Worker
 
-            with Worker(threads=1) as worker:
-                return str(worker.run(f"trying {what}", import_module(module).self_test))
-
-        return run
+        with Worker(threads=1) as worker:
+            return str(worker.run(f"trying {what}", import_module(module).self_test))
 
     tried = {"itk-elastix": "dvc.registration.elastix.run", "pytetwild": "fe.meshing", "sparse solver": "fe.linear"}
-    findings = examine(trials={what: trial(what, module) for what, module in tried.items()})
+    findings = examine(trials={what: partial(trial, what, module) for what, module in tried.items()})
     for finding in findings:
         typer.echo(f"{'ok  ' if finding.ok else 'NOT '} {finding.what}: {finding.detail}")
         if not finding.ok and finding.advice:

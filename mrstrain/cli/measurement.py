@@ -23,10 +23,8 @@ def register(
 ) -> None:
     """Displacement and strain of loaded images against the unloaded one, with quality and a report."""
     carry_out(
-        lambda progress: mrstrain.register.with_options(
-            load0, loads, out=out, subject_files=subject_files, registration=registration, scans=scans, onto=onto,
-            running=running, progress=progress,
-        )
+        mrstrain.register.with_options, load0, loads, out=out, subject_files=subject_files, registration=registration,
+        scans=scans, onto=onto, running=running,
     )  # fmt: skip
 
 
@@ -34,8 +32,7 @@ def register(
 def strain(
     reference: Annotated[Path, typer.Argument(help="Unloaded image: gives the grid.")],
     deformation: Annotated[
-        Path,
-        typer.Argument(help="elastix transform .txt, ITK transform (.h5, .tfm), or a displacement image."),
+        Path, typer.Argument(help="elastix transform .txt, ITK transform (.h5, .tfm), or a displacement image.")
     ],
     out: Out,
     subject_files: SubjectFiles,
@@ -43,8 +40,5 @@ def strain(
     frame: FieldFrame = None,
 ) -> None:
     """Strain maps from a transform or displacement field that any tool has made."""
-    tell(
-        mrstrain.strain.with_options(
-            reference, deformation, out=out, subject_files=subject_files, frame=frame, onto=onto
-        )
-    )
+    given = mrstrain.strain.with_options
+    tell(given(reference, deformation, out=out, subject_files=subject_files, frame=frame, onto=onto))

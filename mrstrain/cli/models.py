@@ -1,25 +1,16 @@
 """The commands of the finite-element side. They parse, call one function, and print."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import mrstrain
-from mrstrain.cli.options import Out, carry_out, takes_options, tell
+from mrstrain.cli.options import Out, Workers, carry_out, takes_options, tell
+from mrstrain.options import modelling
 from mrstrain.options.comparison import ComparisonOn, ModelReading
 from mrstrain.options.measurement import Cores, EngineOptions, Seeded, SubjectFiles
-from mrstrain.options.modelling import (
-    Directions,
-    Followed,
-    Labelling,
-    LabelMapFile,
-    MaterialSets,
-    MeshCoordinates,
-    Meshing,
-    PlateOptions,
-    SimulationOptions,
-)
 
 LabelMap = Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")]
 Measured = Annotated[Path, typer.Argument(help="Results of register: a folder for each load, or one of these.")]
@@ -40,25 +31,25 @@ def mesh(
         Path,
         typer.Option(help="The mesh, ending in .vtu; with a .json and a .png beside it.", rich_help_panel="Output"),
     ],
-    labelling: Labelling,
-    meshing: Meshing,
+    labelling: modelling.Labelling,
+    meshing: modelling.Meshing,
 ) -> None:
     """Soft tissues of a label map as tetrahedra, with named tissues and surfaces (bone, skin, cut)."""
-    carry_out(
-        lambda progress: mrstrain.mesh.with_options(
-            labels, out=out, labelling=labelling, meshing=meshing,
-            watch=lambda share: progress("mesh", "meshing", share),
-        )
-    )  # fmt: skip
+    from mrstrain.records.progress import live
+
+    with live() as progress:
+        watch = partial(progress, "mesh", "meshing")
+        done = mrstrain.mesh.with_options(labels, out=out, labelling=labelling, meshing=meshing, watch=watch)
+    tell(done)
 
 
 @takes_options
 def simulate(
     mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra with facets 'bone' and 'skin'.")],
     out: Out,
-    simulation: SimulationOptions,
-    plate_options: PlateOptions,
-    coordinates: MeshCoordinates,
+    simulation: modelling.SimulationOptions,
+    plate_options: modelling.PlateOptions,
+    coordinates: modelling.MeshCoordinates,
     cores: Cores,
     load: Loads = None,
 ) -> None:
@@ -66,10 +57,8 @@ def simulate(
     from mrstrain.models.loads import loads_named
 
     carry_out(
-        lambda progress: mrstrain.simulate.with_options(
-            mesh, out=out, simulation=simulation, loads=loads_named(load), plate_options=plate_options,
-            coordinates=coordinates, cores=cores, progress=progress,
-        )
+        mrstrain.simulate.with_options, mesh, out=out, simulation=simulation, loads=loads_named(load),
+        plate_options=plate_options, coordinates=coordinates, cores=cores,
     )  # fmt: skip
 
 
@@ -81,9 +70,9 @@ def compare(
         typer.Argument(help="For each model a folder with a file for each load (Load1.vtu, .frd, .csv ...)."),
     ],
     out: Out,
-    labelling: LabelMapFile,
+    labelling: modelling.LabelMapFile,
     reading: ModelReading,
-    directions: Directions,
+    directions: modelling.Directions,
     comparison: ComparisonOn,
     to_image: Annotated[
         Path | None,
@@ -95,10 +84,8 @@ def compare(
 
     matrix = None if to_image is None else read_matrix(to_image)
     carry_out(
-        lambda progress: mrstrain.compare.with_options(
-            dvc, models, out=out, labelling=labelling, reading=reading, to_image=matrix, directions=directions,
-            comparison=comparison, progress=progress,
-        )
+        mrstrain.compare.with_options, dvc, models, out=out, labelling=labelling, reading=reading, to_image=matrix,
+        directions=directions, comparison=comparison,
     )  # fmt: skip
 
 
@@ -107,15 +94,11 @@ def drive(
     mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra; facets 'bone' do not move.")],
     dvc: Measured,
     out: Out,
-    material: MaterialSets,
-    coordinates: MeshCoordinates,
+    material: modelling.MaterialSets,
+    coordinates: modelling.MeshCoordinates,
 ) -> None:
     """A model whose outside goes where the measurement puts it: laws are judged apart from the plate."""
-    carry_out(
-        lambda progress: mrstrain.drive.with_options(
-            mesh, dvc, out=out, material=material, coordinates=coordinates, progress=progress
-        )
-    )
+    carry_out(mrstrain.drive.with_options, mesh, dvc, out=out, material=material, coordinates=coordinates)
 
 
 @takes_options
@@ -134,10 +117,8 @@ def level(
 ) -> None:
     """A model sent through the measurement itself (it moves the image, which is registered): like against like."""
     carry_out(
-        lambda progress: mrstrain.level.with_options(
-            load0, model, out=out, subject_files=subject_files, loads=load or (), engine=engine, reading=reading,
-            seeded=seeded, progress=progress,
-        )
+        mrstrain.level.with_options, load0, model, out=out, subject_files=subject_files, loads=load or (),
+        engine=engine, reading=reading, seeded=seeded,
     )  # fmt: skip
 
 
@@ -146,23 +127,18 @@ def converge(
     labels: LabelMap,
     out: Out,
     edge_mm: Annotated[list[float], typer.Option(help="Length of edges, mm; three or more.", rich_help_panel="Model")],
-    labelling: Labelling,
-    directions: Directions,
-    followed: Followed,
+    labelling: modelling.Labelling,
+    directions: modelling.Directions,
+    followed: modelling.Followed,
     load: Loads = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Simulations at once. Default: one for each core.", rich_help_panel="Advanced"),
-    ] = None,
+    workers: Workers = None,
 ) -> None:
     """The same loads on meshes of several sizes: percentiles of strain and plate travel, and what they tend to."""
     from mrstrain.models.loads import loads_named
 
     carry_out(
-        lambda progress: mrstrain.converge.with_options(
-            labels, edge_mm, out=out, labelling=labelling, followed=followed, loads=loads_named(load),
-            directions=directions, workers=workers, progress=progress,
-        )
+        mrstrain.converge.with_options, labels, edge_mm, out=out, labelling=labelling, followed=followed,
+        loads=loads_named(load), directions=directions, workers=workers,
     )  # fmt: skip
 
 
@@ -179,9 +155,7 @@ def fit(
         str | None, typer.Option(help="uniaxial, equibiaxial or 'pure shear', where the file has no column for it.")
     ] = None,
     nu: Annotated[float, typer.Option(help="Poisson's ratio to simulate with.")] = 0.4999,
-    tissue: Annotated[
-        str, typer.Option(help="Region that the law is for, in the material set that is written.")
-    ] = "fat",
+    tissue: Annotated[str, typer.Option(help="Region that the law is for, in the set that is written.")] = "fat",
 ) -> None:
     """Parameters of a material law from a stretch-stress curve, with 95 % intervals and the range of stability."""
     tell(mrstrain.fit(curve, law, out=out, test=test, nu=nu, tissue=tissue))

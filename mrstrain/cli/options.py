@@ -6,7 +6,7 @@ import operator
 from collections.abc import Callable
 from pathlib import Path
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ParamSpec, Protocol, Union, get_args, get_origin, get_type_hints
 
 import typer
 from pydantic.fields import FieldInfo
@@ -16,15 +16,17 @@ from mrstrain.options.door import models_of
 from mrstrain.options.measurement import Frame
 from mrstrain.options.model import Options, bare
 
-if TYPE_CHECKING:
-    from mrstrain.records.progress import OnProgress
-
+P = ParamSpec("P")
 Out = Annotated[Path, typer.Option(help="Folder for the results; made where it is missing.", rich_help_panel="Output")]
 FieldFrame = Annotated[
     Frame | None,
     typer.Option(
         help="Frame of a displacement image's components, where no JSON beside it tells.", rich_help_panel="Inputs"
     ),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(min=1, help="Jobs at once. Default: one for each core.", rich_help_panel="Advanced"),
 ]
 
 _GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
@@ -37,12 +39,12 @@ class Done(Protocol):
         """Summary, a few lines."""
 
 
-def carry_out(work: "Callable[[OnProgress], Done]", *, of_all: bool = False) -> None:
-    """Show live progress of what a command does, then `tell` it."""
+def carry_out(work: Callable[P, Done], *given: P.args, **options: P.kwargs) -> None:
+    """Call a function that takes ``progress``, show it live, then `tell` what was done."""
     from mrstrain.records.progress import live
 
-    with live(of_all=of_all) as progress:
-        done = work(progress)
+    with live() as progress:
+        done = work(*given, **options, progress=progress)  # type: ignore[arg-type]
     tell(done)
 
 

@@ -1,19 +1,27 @@
 """The commands of a whole study. They parse, call one function, and print."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import mrstrain
-from mrstrain.cli.options import Out, carry_out, tell
+from mrstrain.cli.options import Done, Out, P, Workers, tell
 
 StudyFile = Annotated[Path, typer.Argument(help="The study file, or its folder.")]
 Scheduler = Annotated[
     str | None, typer.Option(help="Address of a Dask scheduler to use, such as tcp://node1:8786; see docs/cluster.md.")
 ]
-Workers = Annotated[int | None, typer.Option(min=1, help="Stages at once. Default: one for each core.")]
+
+
+def _carry_out(work: Callable[P, Done], *given: P.args, **options: P.kwargs) -> None:
+    """As `carry_out`, for functions that report the progress of all stages together, too."""
+    from mrstrain.records.progress import live
+
+    with live(of_all=True) as progress:
+        done = work(*given, **options, progress=progress)  # type: ignore[arg-type]
+    tell(done)
 
 
 def init(
@@ -55,12 +63,7 @@ def run(
         for name, told in forecast(study, only=only or (), force=force or ()).items():
             typer.echo(f"{name}: {told}")
     else:
-        carry_out(
-            lambda progress: mrstrain.run(
-                study, only=only or (), force=force or (), scheduler=scheduler, workers=workers, progress=progress
-            ),
-            of_all=True,
-        )
+        _carry_out(mrstrain.run, study, only=only or (), force=force or (), scheduler=scheduler, workers=workers)
 
 
 def _refuse_idle(why: str, given: Mapping[str, object]) -> None:
@@ -79,10 +82,7 @@ def cohort(
     workers: Workers = None,
 ) -> None:
     """The studies of many subjects on one cluster: one table, one report, and the models ranked over all."""
-    carry_out(
-        lambda progress: mrstrain.cohort(studies, out=out, scheduler=scheduler, workers=workers, progress=progress),
-        of_all=True,
-    )
+    _carry_out(mrstrain.cohort, studies, out=out, scheduler=scheduler, workers=workers)
 
 
 def demo(
@@ -97,12 +97,6 @@ def demo(
     workers: Workers = None,
 ) -> None:
     """A heel phantom with known strain under four loads, taken through a whole study: error by tissue, and a report."""
-    from mrstrain.records.progress import live
     from mrstrain.studies.demo import demo as run
 
-    with live(of_all=True) as progress:
-        done = run(out, seed=seed, full=full, workers=workers, progress=progress)
-    for line in done.lines:
-        typer.echo(line)
-    if not done.complete:
-        raise typer.Exit(1)
+    _carry_out(run, out, seed=seed, full=full, workers=workers)

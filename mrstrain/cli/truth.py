@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import mrstrain
-from mrstrain.cli.options import FieldFrame, Out, carry_out, takes_options, tell
+from mrstrain.cli.options import FieldFrame, Out, Workers, carry_out, takes_options, tell
 from mrstrain.options.measurement import SubjectFiles
 from mrstrain.options.modelling import HeelShape
 
@@ -32,10 +32,8 @@ def phantom(
 
     edges = (spacing, spacing, spacing if slice_spacing is None else slice_spacing)
     carry_out(
-        lambda progress: mrstrain.phantom.with_options(
-            out, seed=seed, loads=load or tuple(LOADS), spacing_mm=edges, snr=None if no_noise else snr, shape=shape,
-            progress=progress,
-        )
+        mrstrain.phantom.with_options, out, seed=seed, loads=load or tuple(LOADS), spacing_mm=edges,
+        snr=None if no_noise else snr, shape=shape,
     )  # fmt: skip
 
 
@@ -72,9 +70,7 @@ def accuracy(
         list[int] | None,
         typer.Option(min=0, help="Heel; repeat for several. Default: 1 and 2. 9000 to 9999 are for published figures."),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Registrations at once. Default: one for each core.")
-    ] = None,
+    workers: Workers = None,
 ) -> None:
     """Error of a preset or engine on phantoms: by tissue, place, strain, noise, resolution. Goes on where it stopped.
 
@@ -89,6 +85,4 @@ def accuracy(
         conditions = tuple(((s, s, slice_spacing or s), r) for s in spacing or [0.8] for r in snr or [25.0])
     motions = motion or (*MOTIONS, *WAVES)
     cases = mrstrain.accuracy_cases(preset or (DEFAULT,), conditions, motions, seed or SEEDS)
-    carry_out(
-        lambda progress: mrstrain.accuracy(out, cases=cases, workers=workers, tell_plan=typer.echo, progress=progress)
-    )
+    carry_out(mrstrain.accuracy, out, cases=cases, workers=workers, tell_plan=typer.echo)

@@ -16,12 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
-# Distributions known to install a top-level package with one of our names.
-_RIVALS = {
-    "dvc": ("dvc", "Data Version Control"),
-    "configobj": ("validate", "ConfigObj"),
-    "validate": ("validate", ""),
-}
+# Distributions known to install a package with one of our names, and what else they are called.
+_RIVALS = {"dvc": ("dvc", " (Data Version Control)"), "configobj": ("validate", " (ConfigObj)")}
+_RIVALS["validate"] = ("validate", "")
 _NEEDED = (
     "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "meshio", "nibabel", "pydicom", "numba",
     "matplotlib", "jinja2", "lazy-loader", "rich", "typer", "loky", "distributed", "filelock", "pydantic", "pytetwild",
@@ -43,7 +40,7 @@ class ForeignPackageError(ImportError):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one check: what was checked, whether it meets the needs of a run, and what to do if it does not."""
+    """Result of one check: what was checked, whether it meets the needs of a run, and advice where it does not."""
 
     what: str
     ok: bool
@@ -59,7 +56,7 @@ def examine(
     A failed check does not stop the others. ``folder`` is to hold results: the disk of its nearest existing parent is
     checked. ``trials`` are short trial runs by name; each returns a line on how it went, or raises.
     """
-    findings = [_python(), _foreign(), *_packages(), _cores(), _memory(), _disk(Path(folder)), _temporary()]
+    findings = [_python(), _foreign(), *map(_package, _NEEDED), _cores(), _memory(), _disk(Path(folder)), _temporary()]
     return [*findings, *(_tried(what, trial) for what, trial in (trials or {}).items())]
 
 
@@ -85,10 +82,9 @@ def _foreign_packages() -> list[str]:
         except importlib.metadata.PackageNotFoundError:
             continue
         if _brings(rival, package):
-            called = f"{name} ({title})" if title else name
             reasons.append(
-                f"The distribution {called} {rival.version} is installed here, and its package {package!r} "
-                "has the name of one of mrstrain's."
+                f"The distribution {name}{title} {rival.version} is installed here, and its package {package!r} has "
+                "the name of one of mrstrain's."
             )
     for package in _OURS:
         try:
@@ -111,35 +107,26 @@ def _brings(distribution: importlib.metadata.Distribution, package: str) -> bool
 
 def _foreign() -> Finding:
     reasons = _foreign_packages()
-    if not reasons:
-        return Finding("package names", True, f"{', '.join(_OURS)} are mrstrain's own")
-    advice = "Install mrstrain in an environment of its own."
-    return Finding("package names", False, " ".join(reasons), advice)
+    detail = " ".join(reasons) or f"{', '.join(_OURS)} are mrstrain's own"
+    return Finding("package names", not reasons, detail, "Install mrstrain in an environment of its own.")
 
 
 def _python() -> Finding:
+    new, of_64_bits = sys.version_info[:2] >= _OLDEST_PYTHON, sys.maxsize > 2**32
     detail = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
-    if sys.version_info[:2] < _OLDEST_PYTHON:
-        return Finding("Python", False, detail, "Install Python 3.11 or newer.")
-    if sys.maxsize <= 2**32:
-        return Finding("Python", False, f"{detail}, 32 bit", "Install a 64-bit Python.")
-    return Finding("Python", True, detail)
+    detail += "" if of_64_bits else ", 32 bit"
+    return Finding("Python", new and of_64_bits, detail, "Install a 64-bit Python, 3.11 or newer.")
 
 
-def _packages() -> list[Finding]:
-    findings = []
-    for name in _NEEDED:
-        try:
-            version = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            wheels = "; wheels: Linux (glibc 2.28), macOS 15 on Apple silicon, Windows x64"
-            advice = f"pip install {name}{wheels if name == 'itk-elastix' else ''}"
-            findings.append(Finding(name, False, "not installed", advice))
-            continue
-        ok = name != "itk-elastix" or version.startswith(_ELASTIX)
-        advice = "" if ok else f"pip install 'itk-elastix=={_ELASTIX}*': parameters are checked against it."
-        findings.append(Finding(name, ok, version, advice))
-    return findings
+def _package(name: str) -> Finding:
+    ours = name == "itk-elastix"
+    try:
+        version = importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        wheels = "; wheels: Linux (glibc 2.28), macOS 15 on Apple silicon, Windows x64" if ours else ""
+        return Finding(name, False, "not installed", f"pip install {name}{wheels}")
+    advice = f"pip install 'itk-elastix=={_ELASTIX}*': parameters are checked against it."
+    return Finding(name, not ours or version.startswith(_ELASTIX), version, advice)
 
 
 def _cores() -> Finding:
@@ -154,11 +141,9 @@ def _memory() -> Finding:
     total = usable_memory_bytes()
     if total is None:
         return Finding("memory", True, "not known on this system")
-    detail = f"{total / _GIB:.1f} GiB"
-    if total < _LEAST_MEMORY_GIB * _GIB:
-        needed = f"A pair of 256 x 256 x 256 voxels takes up to {_LEAST_MEMORY_GIB:.0f} GiB"
-        return Finding("memory", False, detail, f"{needed}: crop the images, or use a larger machine.")
-    return Finding("memory", True, detail)
+    needed = f"A pair of 256 x 256 x 256 voxels takes up to {_LEAST_MEMORY_GIB:.0f} GiB"
+    advice = f"{needed}: crop the images, or use a larger machine."
+    return Finding("memory", total >= _LEAST_MEMORY_GIB * _GIB, f"{total / _GIB:.1f} GiB", advice)
 
 
 def usable_memory_bytes() -> int | None:
@@ -187,17 +172,12 @@ def _memory_bytes_windows() -> int | None:
 
 
 def _disk(folder: Path) -> Finding:
-    existing = folder.absolute()
-    while not existing.exists():
-        existing = existing.parent
-    free = shutil.disk_usage(existing).free
-    detail = f"{free / _GIB:.1f} GiB free for results"
-    if free < _LEAST_DISK_GIB * _GIB:
-        needed = f"Results of one loaded image take up to {_LEAST_DISK_GIB:.0f} GiB"
-        return Finding("disk", False, detail, f"{needed}: make room, or choose another folder.")
+    existing = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
     if not os.access(existing, os.W_OK):
         return Finding("disk", False, f"{existing} is not writable", "Choose another folder for the results.")
-    return Finding("disk", True, detail)
+    free, needed = shutil.disk_usage(existing).free, f"Results of one loaded image take up to {_LEAST_DISK_GIB:.0f} GiB"
+    advice = f"{needed}: make room, or choose another folder."
+    return Finding("disk", free >= _LEAST_DISK_GIB * _GIB, f"{free / _GIB:.1f} GiB free for results", advice)
 
 
 def _temporary() -> Finding:
@@ -213,6 +193,6 @@ def _temporary() -> Finding:
 def _tried(what: str, trial: Callable[[], str]) -> Finding:
     try:
         return Finding(f"trial of {what}", True, trial())
-    except Exception as error:  # a finding, which must not end the examination
+    except Exception as error:  # must not end the examination
         advice = "Reinstall mrstrain in an environment of its own; the line above is what the trial said."
         return Finding(f"trial of {what}", False, f"{type(error).__name__}: {error}", advice)

@@ -21,28 +21,26 @@ def read_subject(
     load0: Path | str, files: SubjectFiles, onto: MeshAndAxes | None = None, *, allow_missing: bool = False
 ) -> Subject:
     """Read the unloaded image, its masks, labels and mesh; refuse what does not fit together."""
-    onto = onto or MeshAndAxes()
-    reference = read_image(load0, allow_missing=allow_missing)
-    label_map = None
+    reference, onto = read_image(load0, allow_missing=allow_missing), onto or MeshAndAxes()
+    label_map, mesh = None, None
     if files.labels is not None:
         label_map = fit_mask(read_labels(files.labels, files.names), reference.grid, str(files.labels))
     elif files.names is not None or files.bone_label is not None:
-        raise InputError("--names and --bone-label speak of a label map: give it with --labels.")
+        raise InputError("names and bone_label speak of a label map: give it, too (labels).")
     if files.bone is not None and files.bone_label is not None:
-        raise InputError("Give the bone once: as a mask (--bone) or as a label of the map (--bone-label).")
+        raise InputError("Give the bone once: as a mask (bone) or as a label of the map (bone_label).")
     bone = None if files.bone is None else read_mask(files.bone, reference.grid)
     if files.bone_label is not None and label_map is not None:
         bone = label_map.region(files.bone_label)
     tissue = None if files.tissue is None else read_mask(files.tissue, reference.grid)
-    mesh = None
     if onto.mesh is not None:
         mesh = read_mesh(onto.mesh, unit=onto.mesh_unit, frame=onto.mesh_frame)
         if not reference.grid.contains(mesh.points_mm).any():
             low, high = mesh.bounds_mm
             raise InputError(
                 f"{onto.mesh}: no node lies in the unloaded image. The mesh spans {np.round(low, 1).tolist()} to "
-                f"{np.round(high, 1).tolist()} mm (LPS); the image: {reference.grid}. Check --mesh-unit and "
-                "--mesh-frame."
+                f"{np.round(high, 1).tolist()} mm (LPS); the image: {reference.grid}. Check mesh_unit and "
+                "mesh_frame."
             )
     normal, axes = plate_directions(onto.plate_normal, onto.shear_direction)
     given = {role: paths[0] for role, paths in {"load0": [Path(load0)], **files.files, **onto.files}.items()}
@@ -72,7 +70,7 @@ def case_names(loads: Sequence[Path]) -> list[str]:
     if twice:
         raise InputError(
             f"Results are kept in a folder named after each loaded image, and {twice} would be used twice: "
-            "rename the files, or register them into different --out folders."
+            "rename the files, or register them into different folders (out)."
         )
     return names
 
@@ -84,22 +82,21 @@ def refuse_touching_inputs(out: Path, case_folders: Sequence[str], inputs: Seque
         for case in case_folders:
             if (out / case).resolve() in path.resolve().parents:
                 raise OutputError(
-                    f"{out / case} would be replaced, and the input {path} lies in it. Choose another --out."
+                    f"{out / case} would be replaced, and the input {path} lies in it. Choose another folder (out)."
                 )
 
 
-def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "", option: str = "--out") -> None:
+def refuse_small_disk(out: Path, needed: float, what: str, instead: str = "") -> None:
     """Refuse an output folder, made or not yet made, on a disk with too little room for ``needed`` bytes.
 
-    The message says ``what`` needs them ("the set needs"), which ``option`` names the folder, and what can be done
-    ``instead`` of choosing another.
+    The message says ``what`` needs them ("the set needs"), and what can be done ``instead`` of choosing another.
     """
     there = next(place for place in (out.resolve(), *out.resolve().parents) if place.exists())
     free = shutil.disk_usage(there).free
     if free < needed:
         raise OutputError(
             f"{out}: {what} about {needed / 1e6:.0f} MB and the disk has {free / 1e6:.0f} MB left. Free some, choose "
-            f"another {option}{instead}."
+            f"another folder (out){instead}."
         )
 
 
@@ -112,6 +109,6 @@ def make_output(out: Path) -> None:
         probe.unlink(missing_ok=True)  # another run may have probed at the same time
     except OSError as error:
         raise OutputError(
-            f"{out}: results cannot be written here ({error.strerror or error}). Choose another --out, or change "
-            "the folder's rights."
+            f"{out}: results cannot be written here ({error.strerror or error}). Choose another folder (out), or "
+            "change its rights."
         ) from error

@@ -1,5 +1,6 @@
 """Progress for people: live bars with the time left in a terminal, a line now and then in a pipe."""
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -67,13 +68,11 @@ def _lines() -> OnProgress:
 
     def progress(case: str, stage: str, fraction: float) -> None:
         key, now = (case, stage), time.monotonic()
-        first = key not in began
         began.setdefault(key, now)
-        ended = fraction >= 1.0 and printed_at.get(key) != float("inf")
-        if not (first or ended or now - printed_at.get(key, now) >= _LINE_EVERY_S):
-            return
-        printed_at[key] = float("inf") if ended else now
-        _print(case, stage, fraction, now - began[key])
+        last = printed_at.get(key, -math.inf)
+        if last < math.inf and (fraction >= 1.0 or now - last >= _LINE_EVERY_S):
+            printed_at[key] = math.inf if fraction >= 1.0 else now
+            _print(case, stage, fraction, now - began[key])
 
     return progress
 

@@ -57,13 +57,6 @@ def versions() -> dict[str, str]:
     return here | distribution_versions()
 
 
-def machine() -> dict[str, object]:
-    """Kind of machine: processor, and the cores and memory that may be used."""
-    memory = usable_memory_bytes()
-    gib = None if memory is None else round(memory / 2**30, 1)
-    return {"processor": _processor(), "cores": usable_cores(), "memory_gib": gib}
-
-
 def _processor() -> str:
     try:  # on Linux, where `platform` does not know the name
         model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
@@ -84,14 +77,13 @@ def provenance(
         role: [{"name": p.name, "sha256": file_hash(p)} for p in ([given] if isinstance(given, Path) else given)]
         for role, given in inputs.items()
     }
+    memory = usable_memory_bytes()
+    gib = None if memory is None else round(memory / 2**30, 1)
     return {
-        "command": command,
-        "made_utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "versions": versions(),
-        "machine": machine(),
-        "inputs": files,
+        "command": command, "made_utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"), "versions": versions(),
+        "machine": {"processor": _processor(), "cores": usable_cores(), "memory_gib": gib}, "inputs": files,
         "parameters": dict(parameters),
-    }
+    }  # fmt: skip
 
 
 def without_folders(value: Any, home: Path) -> Any:
@@ -104,9 +96,9 @@ def without_folders(value: Any, home: Path) -> Any:
         return {key: without_folders(one, home) for key, one in value.items()}
     if isinstance(value, list | tuple):
         return [without_folders(one, home) for one in value]
-    if not isinstance(value, str):
+    if not isinstance(value, str | Path):
         return value
     place = Path(os.path.normpath(home / value))
     if not place.is_relative_to(home):
         return "a folder" if place.is_dir() else place.name
-    return place.relative_to(home).as_posix() if os.path.isabs(value) else value
+    return place.relative_to(home).as_posix() if os.path.isabs(value) else str(value)

@@ -9,20 +9,19 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_image, read_labels, read_mask
-from dvc.errors import InputError, MrstrainError
+from dvc.errors import MrstrainError
 from dvc.io.result_folder import REPEAT
 from dvc.measurement.subject import is_bones_name
 from dvc.trust.error_model import error_model_of
 from dvc.worker import usable_cores
-from fe import LoadStep, MaterialSet, Plate, Problem, check_loads, check_meshing, fixed_facets, material_set
+from fe import MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
 from mrstrain.comparison.model_files import Reading, model_files
 from mrstrain.measurement.engines import engine_of
-from mrstrain.options.model import Vector
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.pipeline import Pipeline
-from mrstrain.studies.plan import Stage, labels_to_mesh, load_steps, plan, towards
+from mrstrain.studies.plan import Stage, labels_to_mesh, load_steps, mesh_place, plan
 from validate import check_bones, check_overlap, read_thresholds
 
 _T = TypeVar("_T")
@@ -42,23 +41,6 @@ class Checked:
         return [*self.notes, *(f"WRONG: {one}" for one in self.wrong)] or ["Nothing is wrong."]
 
 
-@dataclass(slots=True)
-class _Findings:
-    """Results so far, as in `Checked`."""
-
-    wrong: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-    def tried(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
-        """Result of a function; None if it raises an error, which is noted once."""
-        try:
-            return read(*given, **options)
-        except (MrstrainError, OSError) as error:
-            if str(error) not in self.wrong:
-                self.wrong.append(str(error))
-            return None
-
-
 def check(study: Path | str, *, workers: int | None = None) -> Checked:
     """Read every input of a study, and tell all that is wrong and what a run will take.
 
@@ -74,202 +56,215 @@ def check(study: Path | str, *, workers: int | None = None) -> Checked:
     InputError
         If the study file itself cannot be read.
     """
-    told, found = read_study(study), _Findings()
-    reference, labels = _shared(told, found, None)
-    _loaded(told, found, reference)
+    told = read_study(study)
+    looked = _Look(told, None)
+    reference, labels = looked.at_shared()
+    looked.at_loaded(reference)
     if labels is not None and told.models.results:
-        found.tried(_foreign, told, found, labels)
-    planned = found.tried(plan, told)
-    if planned is not None and not found.wrong:
+        looked.tried(looked.at_results, labels)
+    planned = looked.tried(plan, told)
+    if planned is not None and not looked.wrong:
         left = Pipeline(planned, Ledger(told.out, told.place)).to_do()
-        found.notes += (
+        looked.notes += (
             costs(told, planned, left, *sizes_of(told), workers or usable_cores())
             if left
             else ["Everything is done already; a run only writes the report anew."]
         )
-    return Checked(tuple(found.wrong), tuple(found.notes))
+    return Checked(tuple(looked.wrong), tuple(looked.notes))
 
 
 def wrong_with(study: Study, stages: Sequence[Stage]) -> tuple[str, ...]:
     """What some of these stages would fail by, but for their loaded images: each keeps only its own load."""
-    found = _Findings()
-    _shared(study, found, stages)
-    return tuple(found.wrong)
+    looked = _Look(study, stages)
+    looked.at_shared()
+    return tuple(looked.wrong)
 
 
-def _shared(study: Study, found: _Findings, stages: Sequence[Stage] | None) -> tuple[Image | None, LabelMap | None]:
-    """Look at what some stages need, or all (None), but loaded images; give the unloaded one, and the labels on it."""
-    known = None if stages is None else {word for stage in stages for word in (stage.name, stage.kind)}
+@dataclass(slots=True)
+class _Look:
+    """A look at the inputs of some stages of a study, or of all (None): what was found so far, as in `Checked`."""
 
-    def asked(*names_or_kinds: str) -> bool:
-        return known is None or not known.isdisjoint(names_or_kinds)
+    study: Study
+    stages: Sequence[Stage] | None
+    wrong: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
-    reference = found.tried(_image, study, study.images.load0) if asked("register", "level") else None
-    if reference is not None:
-        found.notes.append(f"Load0: {reference.grid}")
-    labels = _labels(study, found, reference) if asked("register", "level", "compare") else None
-    every, own = asked("simulate", "drive", "compare"), towards(study)
-    shared = (study.plate.plate_normal, study.plate.shear_direction)
-    loads = [load for load in study.loads if every or asked(f"register {load}")]
-    for normal, shear in dict.fromkeys(own.get(load, shared) for load in loads):
-        found.tried(plate_axes, -np.asarray(normal), shear)
-    if asked("register", "level"):
-        _registration(study, found, reference, labels)
-    if study.models.sets and asked("mesh") and study.mesh.file is None:
-        _meshing(study, found)
-    if study.models.sets and asked("simulate", "drive"):
-        sets = [found.tried(material_set, study.set_given(name)) for name in study.models.sets]
-        chosen = [one for one in sets if one is not None and asked(f"simulate {one.name}", f"drive {one.name}")]
-        _simulations(study, found, reference, chosen)
-    if study.models.level and asked("level") and reference is not None and reference.missing.any():
-        found.wrong.append("[models] level = true needs an unloaded image without voxels that are NaN or infinite.")
-    if asked("compare"):
-        if labels is not None and (study.models.sets or study.models.results):
-            found.tried(check_bones, labels, study.mesh.bones)
-        if study.compare.thresholds is not None:
-            found.tried(read_thresholds, study.path(study.compare.thresholds))
-    return reference, labels
+    def tried(self, read: Callable[_P, _T], *given: _P.args, **options: _P.kwargs) -> _T | None:
+        """Result of a function; None if it raises an error, which is noted once."""
+        try:
+            return read(*given, **options)
+        except (MrstrainError, OSError) as error:
+            if str(error) not in self.wrong:
+                self.wrong.append(str(error))
+            return None
 
+    def tried_at(self, table: str, key: str, read: Callable[_P, object], *given: _P.args, **options: _P.kwargs) -> None:
+        """As `tried`, of a value whose place in the study file is told."""
+        try:
+            read(*given, **options)
+        except MrstrainError as error:
+            self.wrong.append(f"{self.study.at(table, key)}: {error}")
 
-def _labels(study: Study, found: _Findings, reference: Image | None) -> LabelMap | None:
-    """Check the labels; returns them on the unloaded image's grid."""
-    labels = found.tried(read_labels, study.path(study.images.labels), study.optional_path(study.images.names))
-    if labels is not None:
-        found.notes.append(f"Labels: {', '.join(labels.names.values())}")
+    def asked(self, *names_or_kinds: str) -> bool:
+        """Whether a stage of these names or kinds is looked at."""
+        return self.stages is None or any(stage.is_one_of(names_or_kinds) for stage in self.stages)
+
+    def at_shared(self) -> tuple[Image | None, LabelMap | None]:
+        """Look at all but loaded images; return the unloaded one, and the labels on its grid."""
+        study, asked = self.study, self.asked
+        reference = self.tried(self.image, study.images.load0) if asked("register", "level") else None
         if reference is not None:
-            labels = found.tried(fit_mask, labels, reference.grid, str(study.images.labels)) or labels
-    return labels
+            self.notes.append(f"Load0: {reference.grid}")
+        labels = self.labels(reference) if asked("register", "level", "compare") else None
+        every = asked("simulate", "drive", "compare")
+        own = [study.directions[load] for load in study.loads if every or asked(f"register {load}")]
+        for normal, shear in dict.fromkeys(own):
+            self.tried(plate_axes, -np.asarray(normal), shear)
+        if asked("register", "level"):
+            self.at_registration(reference, labels)
+        if study.models.sets and asked("mesh", "simulate", "drive"):
+            to_mesh = None if study.mesh.file else self.tried(read_labels, *labels_to_mesh(study))
+            if asked("mesh") and to_mesh is not None:
+                self.at_meshing(to_mesh)
+            if asked("simulate", "drive"):
+                self.at_simulations(reference, to_mesh)
+        if study.models.level and asked("level") and reference is not None and reference.missing.any():
+            self.wrong.append("[models] level = true needs an unloaded image without voxels that are NaN or infinite.")
+        if asked("compare"):
+            if labels is not None and (study.models.sets or study.models.results):
+                self.tried_at("mesh", "bones", check_bones, labels, study.mesh.bones)
+            if study.compare.thresholds is not None:
+                self.tried(read_thresholds, study.path(study.compare.thresholds))
+        return reference, labels
 
+    def image(self, given: str | Path) -> Image:
+        """An image of the study."""
+        return read_image(self.study.path(given), allow_missing=self.study.images.allow_missing)
 
-def _loaded(study: Study, found: _Findings, reference: Image | None) -> None:
-    """Look at the loaded images and the repeat scan."""
-    others: dict[str, str | Path] = {load: one.image for load, one in study.loads.items()}
-    if study.images.repeat is not None:
-        others[REPEAT] = study.images.repeat
-    hashes: dict[str, str] = {}
-    for name, other in others.items():
-        image = found.tried(_image, study, other)
-        if image is None:
-            continue
-        found.notes.append(f"{name}: {image.grid}")
-        same_grid = reference is not None and reference.grid.same_as(image.grid)
-        if reference is not None and same_grid and np.array_equal(reference.values, image.values, equal_nan=True):
-            found.wrong.append(f"{name} is the unloaded image: every voxel is equal.")
-        twin = hashes.setdefault(hashlib.sha256(image.values.tobytes()).hexdigest(), name)
-        if twin != name:
-            found.wrong.append(f"{name} is the image of {twin}: every voxel is equal.")
+    def labels(self, reference: Image | None) -> LabelMap | None:
+        """The labels, on the unloaded image's grid."""
+        images, path = self.study.images, self.study.path
+        labels = self.tried(read_labels, path(images.labels), self.study.optional_path(images.names))
+        if labels is not None:
+            self.notes.append(f"Labels: {', '.join(labels.names.values())}")
+            if reference is not None:
+                labels = self.tried(fit_mask, labels, reference.grid, str(images.labels)) or labels
+        return labels
 
+    def at_loaded(self, reference: Image | None) -> None:
+        """Look at the loaded images and the repeat scan."""
+        others: dict[str, str | Path] = {load: one.image for load, one in self.study.loads.items()}
+        if self.study.images.repeat is not None:
+            others[REPEAT] = self.study.images.repeat
+        hashes: dict[str, str] = {}
+        for name, other in others.items():
+            image = self.tried(self.image, other)
+            if image is None:
+                continue
+            self.notes.append(f"{name}: {image.grid}")
+            same_grid = reference is not None and reference.grid.same_as(image.grid)
+            if reference is not None and same_grid and np.array_equal(reference.values, image.values, equal_nan=True):
+                self.wrong.append(f"{name} is the unloaded image: every voxel is equal.")
+            twin = hashes.setdefault(hashlib.sha256(image.values.tobytes()).hexdigest(), name)
+            if twin != name:
+                self.wrong.append(f"{name} is the image of {twin}: every voxel is equal.")
 
-def _registration(study: Study, found: _Findings, reference: Image | None, labels: LabelMap | None) -> None:
-    """Look at bone and masks, engine, parameters and error model."""
-    subject, how = study.subject_files, study.registration.located(study.place)
-    if subject.bone_label is not None and labels is not None:
-        found.tried(labels.region, subject.bone_label)
-    for mask in (subject.bone, subject.tissue):
-        if mask is not None and reference is not None:
-            found.tried(read_mask, mask, reference.grid)
-    engine = found.tried(engine_of, how, labelled=True)
-    if engine is None:
-        return
-    own = how.error_model
-    model = error_model_of(engine.name) if own is None else found.tried(read_error_model, own)
-    if model is None:
-        found.notes.append(f"{engine.name} has no error model: results will have no intervals (`mrstrain accuracy`).")
-    elif model.preset != engine.name:
-        found.notes.append(
-            f"The error model is that of {model.preset}, and {engine.name} will be used: results will have no "
-            f"intervals (`mrstrain accuracy --preset {engine.name}` makes one)."
-        )
+    def at_registration(self, reference: Image | None, labels: LabelMap | None) -> None:
+        """Look at bone and masks, engine, parameters and error model."""
+        subject, how = self.study.subject_files, self.study.registration.located(self.study.place)
+        if subject.bone_label is not None and labels is not None:
+            self.tried_at("images", "bone", labels.region, subject.bone_label)
+        for mask in (subject.bone, subject.tissue):
+            if mask is not None and reference is not None:
+                self.tried(read_mask, mask, reference.grid)
+        engine = self.tried(engine_of, how, labelled=True)
+        if engine is None:
+            return
+        own = how.error_model
+        model = error_model_of(engine.name) if own is None else self.tried(read_error_model, own)
+        if model is None:
+            self.notes.append(
+                f"{engine.name} has no error model: results will have no intervals (`mrstrain accuracy`)."
+            )
+        elif model.preset != engine.name:
+            self.notes.append(
+                f"The error model is that of {model.preset}, and {engine.name} will be used: results will have no "
+                f"intervals (`mrstrain accuracy --preset {engine.name}` makes one)."
+            )
 
-
-def _simulations(study: Study, found: _Findings, reference: Image | None, sets: Sequence[MaterialSet]) -> None:
-    """Report what `simulate` would refuse."""
-    given, own = study.plate, towards(study)
-    by_direction: dict[tuple[Vector, Vector], list[LoadStep]] = {}
-    forced = found.tried(load_steps, study) or {}
-    for name, step in forced.items():
-        by_direction.setdefault(own.get(name, (given.plate_normal, given.shear_direction)), []).append(step)
-    forceless = [name for name in study.loads if forced and name not in forced]
-    if forceless:
-        found.notes.append(f"{', '.join(forceless)}: no force, so measured and not simulated.")
-    loads: list[tuple[Plate, list[LoadStep]]] = []
-    for directions, steps in by_direction.items():
-        plate = found.tried(Plate, *directions, given.gap_mm, given.taped, given.turns, given.pivot_mm)
-        if plate is not None:
-            found.tried(check_loads, plate, steps)
-            loads.append((plate, steps))
-    if study.mesh.file is None:
-        _on_labels(study, found, reference, sets)
-        return
-    mesh = found.tried(mesh_given, study, study.mesh.file)
-    if mesh is None:
-        return
-    if reference is not None:
-        found.tried(check_overlap, study.path(study.mesh.file), mesh, reference.grid)
-    for one in sets:
-        chosen = found.tried(one.for_regions, mesh.regions)
-        if chosen is None:
-            continue
-        for plate, steps in loads:
-            found.tried(Problem, mesh, chosen[0], plate, steps, fixed_facets(mesh, study.models.fixed))
-
-
-def _meshing(study: Study, found: _Findings) -> None:
-    """Check that the label map to be meshed has the regions that are named."""
-    labels = found.tried(read_labels, *labels_to_mesh(study))
-    if labels is not None:
-        how = study.mesh
-        found.tried(check_meshing, labels, how.edge_mm, how.bones, how.finer)
-        found.notes += [
+    def at_meshing(self, labels: LabelMap) -> None:
+        """Report what `mesh` would refuse of a label map, and bones that would be meshed."""
+        how = self.study.mesh
+        self.tried(check_meshing, labels, how.edge_mm, how.bones, how.finer)
+        self.notes += [
             f"CARE: {name} will be meshed as soft tissue, and is called as a bone is: [mesh] bones leaves it out."
-            for name in _soft(study, labels)
+            for name in self.soft(labels)
             if is_bones_name(name)
         ]
 
+    def soft(self, labels: LabelMap) -> list[str]:
+        """Names of the tissues that are meshed."""
+        there, bones = np.unique(labels.labels), self.study.mesh.bones
+        return [name for n, name in labels.names.items() if n != 0 and n in there and name not in bones]
 
-def _on_labels(study: Study, found: _Findings, reference: Image | None, sets: Sequence[MaterialSet]) -> None:
-    """Check that each set has a material for every meshed tissue, and that these lie where the images are."""
-    fixed = {name.casefold() for name in study.models.fixed}
-    unknown = fixed - {"bone", "cut"}
-    if unknown:
-        found.wrong.append(
-            f"[models] fixed: beside the bone's surface the cut may be fixed; got {', '.join(sorted(unknown))}."
-        )
-    labels = found.tried(read_labels, *labels_to_mesh(study))
-    if labels is None:
-        return
-    if reference is not None and study.mesh.labels is not None:
-        there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())
-        if there < _THERE:
-            found.wrong.append(
-                f"{study.path(study.mesh.labels)}: only {there:.0%} of what it labels lies in the unloaded image. A "
-                "mesh has to lie where the images are."
+    def at_simulations(self, reference: Image | None, labels: LabelMap | None) -> None:
+        """Report what `simulate` would refuse, on a mesh made elsewhere or of these labels."""
+        study = self.study
+        sets = [self.tried(material_set, study.set_given(name)) for name in study.models.sets]
+        chosen = [one for one in sets if one is not None and self.asked(f"simulate {one.name}", f"drive {one.name}")]
+        steps = self.tried(load_steps, study) or {}
+        if forceless := [name for name in study.loads if steps and name not in steps]:
+            lacking = "; ".join(study.at(f"loads.{name}", "normal_n") for name in forceless)
+            self.notes.append(f"{', '.join(forceless)}: no force ({lacking}), so measured and not simulated.")
+        contact = study.plate.model_dump(exclude={"plate_normal", "shear_direction"})
+        made = {name: self.tried(Plate, *study.directions[name], **contact) for name in steps}
+        plates = {name: plate for name, plate in made.items() if plate is not None}
+        pressed = [steps[name] for name in plates]
+        for step in pressed:
+            self.tried(check_loads, plates[step.name], [step])
+        if study.mesh.file is None:
+            self.at_tissues(reference, labels, chosen)
+            return
+        mesh = self.tried(mesh_given, study)
+        if mesh is None:
+            return
+        if reference is not None:
+            self.tried(check_overlap, mesh_place(study), mesh, reference.grid)
+        held = fixed_facets(mesh, study.models.fixed)
+        for one in chosen:
+            laws = self.tried(one.for_regions, mesh.regions)
+            if laws is not None and pressed:
+                self.tried(problems_of, mesh, laws[0], plates, pressed, held, study.models.element)
+
+    def at_tissues(self, reference: Image | None, labels: LabelMap | None, sets: Sequence[MaterialSet]) -> None:
+        """Check that each set has a material for every meshed tissue, and that these lie where the images are."""
+        fixed = {name.casefold() for name in self.study.models.fixed}
+        if unknown := fixed - {"bone", "cut"}:
+            self.wrong.append(
+                f"[models] fixed: beside the bone's surface the cut may be fixed; got {', '.join(sorted(unknown))}."
             )
-    soft = _soft(study, labels)
-    for one in sets:
-        found.tried(one.for_regions, soft)
-    if "cut" in fixed and "skin" not in {name.casefold() for name in soft}:
-        found.wrong.append(
-            "[models] fixed: 'cut' needs a tissue called skin in the label map, which tells it from the outer surface."
-        )
+        if labels is None:
+            return
+        if reference is not None and self.study.mesh.labels is not None:
+            there = float(reference.grid.contains(labels.grid.points(labels.labels > 0)).mean())
+            if there < _THERE:
+                self.wrong.append(
+                    f"{self.study.path(self.study.mesh.labels)}: only {there:.0%} of what it labels lies in the "
+                    "unloaded image. A mesh has to lie where the images are."
+                )
+        soft = self.soft(labels)
+        for one in sets:
+            self.tried(one.for_regions, soft)
+        if "cut" in fixed and "skin" not in {name.casefold() for name in soft}:
+            self.wrong.append(
+                "[models] fixed: 'cut' needs a tissue called skin in the label map, which tells it from the outer "
+                "surface."
+            )
 
-
-def _soft(study: Study, labels: LabelMap) -> list[str]:
-    """Names of the tissues that are meshed."""
-    numbers = np.unique(labels.labels)
-    return [name for n, name in labels.names.items() if n != 0 and n in numbers and name not in study.mesh.bones]
-
-
-def _image(study: Study, given: str | Path) -> Image:
-    place = study.path(given)
-    if not place.exists():
-        raise InputError(f"{place}: there is no such file.")
-    return read_image(place, allow_missing=study.images.allow_missing)
-
-
-def _foreign(study: Study, found: _Findings, labels: LabelMap) -> None:
-    """Read every result of another code."""
-    files, _ = model_files(list(study.loads), [study.path(p) for p in study.models.results], Reading())
-    for of in files.values():
-        for file in of:
-            found.tried(file.read, labels.grid)
+    def at_results(self, labels: LabelMap) -> None:
+        """Read every result of another code."""
+        study = self.study
+        files, _ = model_files(list(study.loads), [study.path(p) for p in study.models.results], Reading())
+        for of in files.values():
+            for file in of:
+                self.tried(file.read, labels.grid)

@@ -6,7 +6,7 @@ import queue
 import time
 import traceback
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from filelock import FileLock
 from dvc.errors import InputError, MrstrainError
 from dvc.software import software_key
 from dvc.worker import usable_cores
+from mrstrain.records.progress import OnProgress
 from mrstrain.studies import stages
 from mrstrain.studies.stages import StageResult
 
@@ -38,7 +39,7 @@ _SETTINGS = {
 class StageRunner:
     """Runs stages, several at once; made by `cluster`."""
 
-    def __init__(self, client: Client, watch: Callable[[str, str, float], None]) -> None:
+    def __init__(self, client: Client, watch: OnProgress) -> None:
         self._client = client
         self._topic = f"mrstrain-{uuid.uuid4().hex}"
         self._under_way: dict[Future[Any], str] = {}
@@ -74,7 +75,8 @@ class StageRunner:
         error = future.exception() if future.status == "error" else None
         if error is None:
             return name, f"The scheduler was lost, or ended it ({future.status}).", 0.0
-        return name, f"The worker that ran it was lost more than once ({error}). {_MEMORY}", 0.0
+        advice = "Most often memory runs short: use fewer workers, or machines with more."
+        return name, f"The worker that ran it was lost more than once ({error}). {advice}", 0.0
 
     @property
     def busy(self) -> bool:
@@ -82,16 +84,9 @@ class StageRunner:
         return bool(self._under_way)
 
 
-_MEMORY = "Most often memory runs short: use fewer --workers, or machines with more."
-
-
 @contextmanager
 def cluster(
-    watch: Callable[[str, str, float], None],
-    places: Sequence[Path],
-    *,
-    scheduler: str | None = None,
-    workers: int | None = None,
+    watch: OnProgress, places: Sequence[Path], *, scheduler: str | None = None, workers: int | None = None
 ) -> Iterator[StageRunner]:
     """A cluster of this machine's cores, or of the scheduler at an address (tcp://node1:8786); its stages end with it.
 
@@ -113,8 +108,9 @@ def cluster(
         try:
             client = Client(scheduler, timeout=_CONNECT_S)
         except (OSError, ValueError) as error:
-            advice = "Start one: see docs/cluster.md."
-            raise InputError(f"No Dask scheduler answers at {scheduler} ({error}). {advice}") from error
+            raise InputError(
+                f"No Dask scheduler answers at {scheduler} ({error}). Start one: see docs/cluster.md."
+            ) from error
         with client:
             try:
                 client.wait_for_workers(1, timeout=_WORKERS_S)
@@ -145,25 +141,16 @@ def _refuse_unfit(client: Client, address: str, places: Sequence[Path]) -> None:
             token.unlink(missing_ok=True)
     here = software_key("mrstrain").split(", ")
     for worker, (key, daemon, seen) in answers.items():
-        threads = client.nthreads().get(worker, 1)
-        if (there := key.split(", ")) != here:
-            theirs, ours = (", ".join(p for p in one if p not in rest) for one, rest in ((there, here), (here, there)))
-            raise InputError(
-                f"The worker {worker} has {theirs}; here is {ours}: start workers in the same environment as here."
-            )
-        if not seen:
-            raise InputError(
-                f"The worker {worker} does not see {places[0]}: a study has to lie on a disk that all share."
-            )
-        if threads > 1:
-            raise InputError(
-                f"The worker {worker} runs {threads} stages at once; each needs a process of its own: --nthreads 1."
-            )
-        if daemon:
-            raise InputError(
-                f"The worker {worker} may not start processes. Start workers with "
-                "DASK_DISTRIBUTED__WORKER__DAEMON=False in their environment."
-            )
+        threads, there = client.nthreads().get(worker, 1), key.split(", ")
+        theirs, ours = (", ".join(p for p in one if p not in rest) for one, rest in ((there, here), (here, there)))
+        for unfit, why in (
+            (there != here, f"has {theirs}; here is {ours}: start workers in the same environment as here."),
+            (not seen, f"does not see {places[0]}: a study has to lie on a disk that all share."),
+            (threads > 1, f"runs {threads} stages at once; each needs a process of its own: --nthreads 1."),
+            (daemon, "may not start processes: DASK_DISTRIBUTED__WORKER__DAEMON=False in its environment lets it."),
+        ):
+            if unfit:
+                raise InputError(f"The worker {worker} {why}")
 
 
 def _about(tokens: Sequence[str]) -> tuple[str, bool, bool]:

@@ -45,7 +45,7 @@ class Cohort:
         """A few lines for a person."""
         lines = [f"{one.study.study.name}: not complete, see {one.study.out}" for one in self.ran if not one.complete]
         lines += [
-            f"{place}. {s.model}: {100 * s.mean:.2f} % ({100 * s.low:.2f} to {100 * s.high:.2f}), nearest in "
+            f"{place}. {s.model}: {100 * s.mean:z.2f} % ({100 * s.low:z.2f} to {100 * s.high:z.2f}), nearest in "
             f"{s.nearest_in} of {s.subjects} subjects"
             + ("" if place == 1 or s.differs_from_best else "; not told from the first")
             for place, s in enumerate(self.ranking, start=1)
@@ -89,24 +89,36 @@ def cohort(
         raise InputError(f"The studies compare over different ranges of strain ([compare] strains): {sorted(ranges)}.")
     refuse_other_laws(read)
     ran = run_studies(read, scheduler=scheduler, workers=workers, progress=progress)
-    without = {one.study.study.name: why for one in ran if (why := _uncounted(one))}
-    areas = {name: _areas(one.study.out) for one in ran if (name := one.study.study.name) not in without}
+    by_name = dict(zip(names, ran, strict=True))
+    without = {name: why for name, one in by_name.items() if (why := _uncounted(one))}
+    areas = {name: _areas(one.study.out) for name, one in by_name.items() if name not in without}
     if not any(areas.values()):
         raise InputError(
             "No subject was compared with a model: " + "; ".join(line for r in ran for line in r.summary())
         )
     shares, notes = _shares(areas)
     notes = [f"{name} is not counted: {why}" for name, why in without.items()] + notes
-    notes += unlike([one.study for one in ran if one.study.study.name not in without])
-    notes += _doubts([one for one in ran if any(one.study.study.name in of for of in shares.values())])
+    notes += unlike([by_name[name].study for name in areas])
+    for name in dict.fromkeys(subject for of in shares.values() for subject in of):
+        verdicts = by_name[name].verdicts.items()
+        if doubtful := [load for load, verdict in verdicts if verdict.level == "distrust" and load != REPEAT]:
+            notes.append(
+                f"{name}: the registration of {', '.join(doubtful)} is not to be trusted, and counts in its areas and "
+                "in the ranking. Mend it, or leave this subject out."
+            )
     try:
         ranking = rank_over_subjects(shares)
     except InputError as none:
-        ranking, notes = (), [*notes, str(none)]
-    _write_tables(target, areas, ranking)
+        ranking = ()
+        notes.append(str(none))
+    first = next(row for rows in areas.values() for row in rows)
+    rows_of_all = ([subject, *row.values()] for subject, rows in areas.items() for row in rows)
+    write_csv(target / "cohort.csv", ["subject", *first], rows_of_all)
+    write_csv(target / "ranking.csv", [f.name for f in fields(CohortRank)], map(astuple, ranking))
     files = [Path(place) / FILE if Path(place).is_dir() else Path(place) for place in studies]
     write_json(target / PROVENANCE, record := provenance("cohort", {"studies": files}, {"subjects": names}))
-    _write_page(target / REPORT, ran, shares, ranking, notes, record)
+    sections = _sections(by_name, shares, ranking, notes)
+    write_report(target / REPORT, "Models over subjects", None, sections, [], record_lines(record))
     return Cohort(target, tuple(ran), ranking, tuple(notes))
 
 
@@ -127,30 +139,15 @@ def _areas(out: Path) -> list[dict[str, str]]:
         return [row for row in csv.DictReader(file) if row["tissue"] == ALL]
 
 
-def _doubts(ran: Sequence[StudyRun]) -> list[str]:
-    """Of each subject, the registrations that are not to be trusted and yet count in its areas."""
-    doubts = {
-        one.study.study.name: [load for load, v in one.verdicts.items() if v.level == "distrust" and load != REPEAT]
-        for one in ran
-    }
-    return [
-        f"{name}: the registration of {', '.join(loads)} is not to be trusted, and counts in its areas and in the "
-        "ranking. Mend it, or leave this subject out."
-        for name, loads in doubts.items()
-        if loads
-    ]
-
-
-def _judged(model: str) -> bool:
-    return model != NOTHING and not model.endswith(LEVELLED)
-
-
 def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str, dict[str, float]], list[str]]:
     """Model to subject to the area over all loads, over volume and range; and what is to be said of it.
 
     With the measurement's bias taken out where every subject's error is known, else as found for all.
     """
-    own = {subject: [row for row in rows if _judged(row["model"])] for subject, rows in areas.items()}
+    own = {
+        subject: [row for row in rows if row["model"] != NOTHING and not row["model"].endswith(LEVELLED)]
+        for subject, rows in areas.items()
+    }
     known = all(not np.isnan(float(row["estimate_ml"])) for rows in own.values() for row in rows)
     shares: dict[str, dict[str, float]] = {}
     loads = {subject: frozenset(row["load"] for row in rows) - {_TOTAL} for subject, rows in own.items()}
@@ -178,23 +175,11 @@ def _shares(areas: Mapping[str, Sequence[Mapping[str, str]]]) -> tuple[dict[str,
     return shares, notes
 
 
-def _write_tables(
-    target: Path, areas: Mapping[str, Sequence[Mapping[str, str]]], ranking: Sequence[CohortRank]
-) -> None:
-    first = next(row for rows in areas.values() for row in rows)
-    rows_of_all = ([subject, *row.values()] for subject, rows in areas.items() for row in rows)
-    write_csv(target / "cohort.csv", ["subject", *first], rows_of_all)
-    write_csv(target / "ranking.csv", [f.name for f in fields(CohortRank)], map(astuple, ranking))
-
-
-def _write_page(
-    path: Path,
-    ran: Sequence[StudyRun],
-    shares: Mapping[str, Mapping[str, float]],
-    ranking: Sequence[CohortRank],
+def _sections(
+    ran: Mapping[str, StudyRun], shares: Mapping[str, Mapping[str, float]], ranking: Sequence[CohortRank],
     notes: Sequence[str],
-    record: Mapping[str, object],
-) -> None:
+) -> list[Section]:  # fmt: skip
+    """The report's sections: the models over all subjects, and the state of each subject."""
     order = [s.model for s in ranking] or list(shares)
     ranked = Table(
         "Models over all subjects and loads, the nearest first",
@@ -210,17 +195,14 @@ def _write_page(
         "Intervals of the mean are over subjects (Student's t); those of the difference to the first, subject by "
         "subject, hold for all models at once (Tukey): a model is told from the first where it does not hold zero.",
     )  # fmt: skip
-    names = [one.study.study.name for one in ran]
     by_subject = Table(
-        "By subject, %",
-        ("subject", *order),
-        tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in names),
-    )
+        "By subject, %", ("subject", *order),
+        tuple((name, *(100 * shares[m][name] if name in shares[m] else None for m in order)) for name in ran),
+    )  # fmt: skip
     drawn = Picture.drawn("Distribution over subjects", over_subjects, shares, order)
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
-    for one in ran:
-        failed = [f"{o.stage}: {o.status}. {o.reason}" for o in one.outcomes.values() if o.record is None]
+    for name, one in ran.items():
+        failed = tuple(f"Not whole: {outcome}" for outcome in one.outcomes.values() if outcome.record is None)
         verdicts = list(one.verdicts.values())
-        verdict = worst(verdicts) if verdicts else None
-        sections.append(Section(one.study.study.name, verdict, paragraphs=tuple(f"Not whole: {why}" for why in failed)))
-    write_report(path, "Models over subjects", None, sections, [], record_lines(record))
+        sections.append(Section(name, worst(verdicts) if verdicts else None, paragraphs=failed))
+    return sections

@@ -1,19 +1,25 @@
 """What differs between the studies of a cohort, and would make the areas of its subjects unlike."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from dvc.errors import InputError
 from fe import BONE, MaterialSet, material_set
 from mrstrain.measurement.engines import engine_of
-from mrstrain.options.measurement import EngineOptions
 from mrstrain.options.modelling import MINUTE_S
 from mrstrain.records.provenance import file_hash
-from mrstrain.studies.file import Load, Study
+from mrstrain.studies.file import Study
 
 _ROUNDING = 1e-9  # of a law's numbers: kPa read as MPa
 _NAMED = 3  # values, and studies to a value, that are named one by one
+_COMPARED = {
+    "registration": ("align", "bending", "volume", "chain", "twin", "allow_unknown_parameters"),
+    "plate": ("taped", "turns", "gap_mm"),
+    "mesh": ("edge_mm", "finer", "bones"),
+    "models": ("element",),
+}
+"""Keys of the study file that are compared as they are; files, names and directions are each subject's own."""
 
 
 def refuse_other_laws(studies: Sequence[Study]) -> None:
@@ -41,91 +47,55 @@ def _same_laws(one: MaterialSet, other: MaterialSet) -> bool:
 
 
 def unlike(studies: Sequence[Study]) -> list[str]:
-    """A sentence for each way to register, mesh and solve, and each load and its force, in which subjects differ.
-
-    Files, names and directions are each subject's own.
-    """
-    told: dict[str, dict[str, str | float]] = {}
+    """A sentence for each way to register, mesh and solve, and each load and its force, in which subjects differ."""
+    told: dict[str, dict[str, object]] = {}
     for study in studies:
-        name = study.study.name
-        told.setdefault("[registration]", {})[name] = _registered(study)
-        if study.models.sets:
-            for part, how in (("[plate]", _plate(study)), ("[mesh]", _mesh(study)), ("[models]", _solved(study))):
-                told.setdefault(part, {})[name] = how
-        told.setdefault("[loads]", {})[name] = ", ".join(sorted(study.loads))
-        for load, of in study.loads.items():
-            for along, value in _pushed(of).items():
-                told.setdefault(f"[loads.{load}] {along}", {})[name] = value
+        for key, value in _compared(study).items():
+            told.setdefault(key, {})[study.study.name] = value
     return [
-        f"Subjects are not measured and simulated alike, {where} differs: {_listed(values)}."
-        for where, values in told.items()
+        f"Subjects are not measured and simulated alike, {key} differs: {_listed(values)}."
+        for key, values in told.items()
         if len(set(values.values())) > 1
     ]
 
 
-def _registered(study: Study) -> str:
-    how = study.registration.located(study.place)
-    said = [engine_of(how, labelled=True).name]
-    for name, value in how:
-        usual = type(how).model_fields[name].default
-        if name == "align":
-            said += ["aligned on the image"] if value == "image" else []
-        elif isinstance(value, bool):
-            said += [name] if value and not usual else []
-        elif value != usual and name not in EngineOptions.model_fields and name not in how.files:
-            said.append(f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}")
-    return " ".join([*said, *(f"{file.name} {file_hash(file)[:8]}" for file in how.paths)])
+def _compared(study: Study) -> dict[str, object]:
+    """What is compared of a study, by table and key of its file."""
+    how, models = study.registration.located(study.place), study.models
+    values: dict[str, object] = {"[registration] engine": engine_of(how, labelled=True).name}
+    values["[registration] files"] = ", ".join(f"{file.name} {file_hash(file)[:8]}" for file in how.paths)
+    for table, keys in _COMPARED.items() if models.sets else [("registration", _COMPARED["registration"])]:
+        if table != "mesh" or study.mesh.file is None:
+            values |= {f"[{table}] {key}": getattr(getattr(study, table), key) for key in keys}
+    if models.sets:
+        values["[mesh] file"] = "made elsewhere" if study.mesh.file else "made of the label map"
+        values["[models] fixed"] = tuple(sorted({name.casefold() for name in models.fixed} - {BONE}))
+        values["[models] limit_minutes"] = (models.limit_s or 0.0) / MINUTE_S
+    values["[loads]"] = tuple(sorted(study.loads))
+    for name, load in study.loads.items():
+        for key in ("normal_n", "normal_mm", "shear_n", "shear_mm"):  # no shear is a shear of nothing
+            values[f"[loads.{name}] {key}"] = getattr(load, key) or 0.0
+    return values
 
 
-def _plate(study: Study) -> str:
-    plate = study.plate
-    held = "taped" if plate.taped else "without friction"
-    return f"{held}{', turning' if plate.turns else ''}, {plate.gap_mm:g} mm away"
-
-
-def _mesh(study: Study) -> str:
-    how = study.mesh
-    if how.file is not None:
-        return "made elsewhere"
-    finer = "" if how.finer is None else f", {how.finer.edge_mm:g} mm in {how.finer.region}"
-    return f"edges of {how.edge_mm:g} mm{finer} without {', '.join(how.bones)}"
-
-
-def _solved(study: Study) -> str:
-    fixed = sorted({name.casefold() for name in study.models.fixed} - {BONE})
-    limit = (study.models.limit_s or 0.0) / MINUTE_S
-    return (
-        study.models.element
-        + (f" with {', '.join(fixed)} fixed" if fixed else "")
-        + (f", {limit:g} minutes at the most" if limit else "")
-    )
-
-
-def _pushed(load: Load) -> dict[str, str | float]:
-    """Forces (N) and travels (mm) along the normal and across it; no shear is a shear of nothing."""
-    told: dict[str, str | float] = {"along the normal": "nothing"}
-    if load.normal_n is not None:
-        told["along the normal"] = load.normal_n
-    elif load.normal_mm is not None:
-        told["along the normal"] = f"{load.normal_mm:g} mm"
-    told["across it"] = (load.shear_n or 0.0) if load.shear_mm is None else f"{load.shear_mm:g} mm"
-    return told
-
-
-def _listed(values: dict[str, str | float]) -> str:
+def _listed(values: Mapping[str, object]) -> str:
     """Values with the studies that have them; of many numbers their range."""
-    by_value: dict[str | float, list[str]] = {}
+    by_value: dict[object, list[str]] = {}
     for name, value in values.items():
         by_value.setdefault(value, []).append(name)
     numbers = [value for value in by_value if isinstance(value, float)]
     if len(by_value) > _NAMED and len(numbers) == len(by_value):
-        return f"from {min(numbers):g} to {max(numbers):g} N"
+        return f"from {min(numbers):g} to {max(numbers):g}"
     shown = [f"{_said(value)} in {_some(names)}" for value, names in by_value.items()]
     return "; ".join(shown[:_NAMED]) + (f"; and {len(shown) - _NAMED} more" if len(shown) > _NAMED else "")
 
 
-def _said(value: str | float) -> str:
-    return f"{value:g} N" if isinstance(value, float) else value
+def _said(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) and value else str(value or "none")
 
 
 def _some(names: list[str]) -> str:

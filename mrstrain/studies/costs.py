@@ -2,17 +2,17 @@
 
 import shutil
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from dvc import LabelMap, TetMesh, read_image, read_labels
+from dvc import TetMesh, read_image, read_labels
+from dvc.errors import InputError
 from dvc.registration.engine import Cost
 from fe import LoadStep, paths_of, read_tet_mesh
 from mrstrain.measurement.engines import engine_of
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.studies.file import Study
-from mrstrain.studies.plan import Stage, labels_to_mesh
+from mrstrain.studies.plan import Stage, labels_to_mesh, mesh_place
 
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
 _REGISTER_S, _MAPS_S_PER_MVOXEL = 35.0, 3.5  # beside what the engine takes (`Cost`)
@@ -32,28 +32,28 @@ _OTHER_GIB = 1.5
 _BYTES_VOXEL, _MB_MODEL = 40.0, 40.0
 _SHAPE = 0.1  # volume of a cell over its edge cubed, as meshes come out
 _LEAST_CELLS = 0.9 * _CELLS  # thin tissues get shorter edges than are asked for
+_USUAL_VOXELS = 2e6
 _GIB = 1024.0**3
 
 
-def cells_expected(labels: LabelMap, bones: Sequence[str], edge_mm: float) -> float:
-    """About how many cells the mesh of a label map's soft tissue will have."""
-    soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in bones and n != 0])
-    volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3
-    return max(volume / (_SHAPE * edge_mm**3), _LEAST_CELLS)
-
-
 def sizes_of(study: Study) -> tuple[float, float]:
-    """Voxels of the unloaded image, and about how many cells sets are simulated on; 0 without sets.
+    """Voxels of the unloaded image, and about how many cells sets are simulated on, 0 without sets.
 
-    InputError is raised if the image, the mesh or the label map to be meshed cannot be read.
+    Usual numbers where a file cannot be read: the stages that read it report what is wrong with it.
     """
-    voxels = float(np.prod(read_image(study.path(study.images.load0), allow_missing=True).grid.shape))
-    if not study.models.sets:
-        return voxels, 0.0
-    if study.mesh.file is not None:
-        return voxels, float(len(mesh_given(study, study.mesh.file).cells))
-    labels = read_labels(*labels_to_mesh(study))
-    return voxels, cells_expected(labels, study.mesh.bones, study.mesh.edge_mm)
+    try:
+        reference, how = read_image(study.path(study.images.load0), allow_missing=True), study.mesh
+        voxels = float(np.prod(reference.grid.shape))
+        if not study.models.sets:
+            return voxels, 0.0
+        if how.file is not None:
+            return voxels, float(len(mesh_given(study).cells))
+        labels = read_labels(*labels_to_mesh(study))
+    except (InputError, OSError):
+        return _USUAL_VOXELS, _LEAST_CELLS
+    soft = np.isin(labels.labels, [n for n, name in labels.names.items() if name not in how.bones and n != 0])
+    volume = float(np.count_nonzero(soft)) * labels.grid.voxel_volume_mm3
+    return voxels, max(volume / (_SHAPE * how.edge_mm**3), _LEAST_CELLS)
 
 
 def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
@@ -82,18 +82,16 @@ def gib_of(stage: Stage, study: Study, voxels: float, cells: float) -> float:
         cost = _cost(study)
         return _REGISTER_GIB + cost.gib + cost.gib_per_mvoxel * voxels / 1e6
     if stage.kind in ("simulate", "drive"):
-        times = _ELEMENT_GIB[study.models.element] if stage.kind == "simulate" else 1.0
+        times = _ELEMENT_GIB[study.models.element if stage.kind == "simulate" else "P1"]
         return _SIMULATE_GIB + times * _SIMULATE_GIB_PER_CELL * cells
     return _OTHER_GIB
 
 
 def disk_bytes(stage: Stage, study: Study, voxels: float) -> float:
     """About how much room the results of a stage take; parameters as in `seconds_of`."""
-    if stage.kind == "register":
-        return _BYTES_VOXEL * voxels
-    if stage.kind == "level":  # of one load
-        return _BYTES_VOXEL * voxels + 1e6 * _MB_MODEL
-    return 1e6 * _MB_MODEL * (1 if stage.kind == "mesh" else len(study.loads))
+    images = _BYTES_VOXEL * voxels if stage.kind in ("register", "level") else 0.0
+    models = {"register": 0, "level": 1, "mesh": 1}.get(stage.kind, len(study.loads))
+    return images + 1e6 * _MB_MODEL * models
 
 
 def _longest(left: Sequence[Stage], seconds: Sequence[float]) -> float:
@@ -104,9 +102,9 @@ def _longest(left: Sequence[Stage], seconds: Sequence[float]) -> float:
     return max(until.values())
 
 
-def mesh_given(study: Study, file: Path) -> TetMesh:
+def mesh_given(study: Study) -> TetMesh:
     """The mesh made elsewhere that a study names."""
-    return read_tet_mesh(study.path(file), unit=study.mesh.mesh_unit, frame=study.mesh.mesh_frame)
+    return read_tet_mesh(mesh_place(study), unit=study.mesh.mesh_unit, frame=study.mesh.mesh_frame)
 
 
 def _cost(study: Study) -> Cost:
@@ -136,6 +134,6 @@ def costs(
     if there is not None and needed > there / _GIB:
         fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
         smaller = "one stage alone is too large: crop the images, take a coarser mesh, or a larger machine."
-        advice = f"run with --workers {fitting}." if fitting else smaller
+        advice = f"run with workers={fitting} (--workers {fitting})." if fitting else smaller
         lines.append(f"CARE: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
     return lines

@@ -62,6 +62,10 @@ class Demonstration:
     lines: tuple[str, ...]
     complete: bool
 
+    def summary(self) -> list[str]:
+        """The lines."""
+        return list(self.lines)
+
 
 def demo(
     out: Path | str,
@@ -96,11 +100,13 @@ def _make(target: Path, seed: int, full: bool, progress: OnProgress | None) -> N
     if record.is_file():
         old = json.loads(record.read_text(encoding="utf-8"))["parameters"]["seed"]
         if old != seed:
-            raise OutputError(f"{target} holds the phantom of seed {old}; choose another --out for seed {seed}.")
+            raise OutputError(f"{target} holds the phantom of seed {old}; choose another folder (out) for seed {seed}.")
     else:
         own = sorted(p.name for p in target.iterdir()) if target.is_dir() else []
         if (target / FILE).exists() or any(name.startswith(("Load", "tissues", "calcaneus")) for name in own):
-            raise OutputError(f"{target} holds files that the demonstration would replace; choose another --out.")
+            raise OutputError(
+                f"{target} holds files that the demonstration would replace; choose another folder (out)."
+            )
         phantom(target, seed=seed, progress=progress)
     texts = {size: _text(seed, size) for size in (False, True)}
     study = target / FILE
@@ -132,18 +138,15 @@ def _errors(
         folder = done.study.out / REGISTRATION / load
         if load in known:
             errors[load] = known[load]
-            continue
-        if done.outcomes[f"register {load}"].record is None:
-            continue
-        valid = read_mask(folder / VALID).inside
-        errors[load] = errors_by_tissue(labels, under_load(heel, load), spline_in(folder), valid)
+        elif done.outcomes[f"register {load}"].record is not None:
+            valid = read_mask(folder / VALID).inside
+            errors[load] = errors_by_tissue(labels, under_load(heel, load), spline_in(folder), valid)
     return errors
 
 
 def _reached(outcome: StageOutcome) -> bool:
     """Whether a stage has a complete result, or one that only its time limit cut short."""
-    timed_out = outcome.record is not None and outcome.record.result.timed_out and not outcome.reason
-    return outcome.complete or timed_out
+    return outcome.complete or (outcome.result.timed_out and not outcome.reason)
 
 
 def _summary(errors: dict[str, tuple[TissueError, ...]], done: StudyRun) -> list[str]:
@@ -153,11 +156,11 @@ def _summary(errors: dict[str, tuple[TissueError, ...]], done: StudyRun) -> list
         "Error of the max. shear in fat (root mean square, of the true 95th percentile): "
         + ", ".join(f"{load} {e.shear_rmse:.3f} of {e.true_p95:.2f}" for load, e in fat.items()),
     ]
-    comparison = done.outcomes["compare"].record
-    if comparison is not None:
-        lines += [line for line in comparison.result.lines if line.startswith(("All loads", "Best match over"))]
+    lines += [
+        line for line in done.outcomes["compare"].result.lines if line.startswith(("All loads", "Best match over"))
+    ]
     for outcome in done.outcomes.values():
         if not outcome.complete:
-            partly = [] if outcome.record is None else [line for line in outcome.record.result.lines if "ONLY" in line]
+            partly = [line for line in outcome.result.lines if "ONLY" in line]
             lines.append(f"{outcome.stage}: {outcome.status}. {outcome.reason or ' '.join(partly)}")
     return [*lines, f"Report: {done.study.out / REPORT}"]

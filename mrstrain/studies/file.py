@@ -1,35 +1,28 @@
 """The study file: one TOML file that names a subject's images, loads, tissues and models. Nothing in it is guessed."""
 
-from __future__ import annotations
-
 import difflib
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
+from mrstrain.options import modelling
 from mrstrain.options.comparison import ComparisonOptions
 from mrstrain.options.measurement import Frame, RegistrationOptions, SubjectFiles, Unit
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
-from mrstrain.options.modelling import (
-    MINUTE_S,
-    Finer,
-    Labelling,
-    MeshCoordinates,
-    Meshing,
-    PlateOptions,
-    SimulationOptions,
-)
 
 FILE = "study.toml"
+_MOST_FAULTS = 20
+_UNQUOTED = str.maketrans("", "", " \"'")
 
 
 def _seconds(minutes: float | None) -> float | None:
-    return None if minutes is None else MINUTE_S * minutes
+    return None if minutes is None else modelling.MINUTE_S * minutes
 
 
 def as_folder(text: str) -> str:
@@ -88,7 +81,7 @@ class Load(_Part):
     shear_direction: Vector | None = None
 
 
-class Plate(PlateOptions):
+class Plate(modelling.PlateOptions):
     """The plate."""
 
     plate_normal: Vector = Field(default=(0.0, 0.0, -1.0), validation_alias="normal")
@@ -102,7 +95,7 @@ class Registering(RegistrationOptions):
     """What to align rigidly first."""
 
 
-class Mesh(Meshing, Labelling, MeshCoordinates):
+class Mesh(modelling.Meshing, modelling.Labelling, modelling.MeshCoordinates):
     """The mesh: made from the label map (or one of its own), or a file."""
 
     labels: Path | None = None
@@ -119,13 +112,13 @@ class Mesh(Meshing, Labelling, MeshCoordinates):
     """Frame of that mesh's coordinates."""
 
     @model_validator(mode="after")
-    def _of_a_file(self) -> Mesh:
+    def _of_a_file(self) -> Self:
         if self.file is None and (self.mesh_unit, self.mesh_frame) != ("mm", "LPS"):
             raise ValueError("unit and frame are those of a mesh made elsewhere, and no 'file' names one")
         return self
 
 
-class Models(SimulationOptions):
+class Models(modelling.SimulationOptions):
     """The models that are judged."""
 
     sets: Names = ()
@@ -154,6 +147,11 @@ class Study(_Part):
     mesh: Mesh = Mesh()
     models: Models = Models()
     compare: ComparisonOptions = ComparisonOptions()
+    _lines: dict[tuple[str, str], int] = PrivateAttr(default_factory=dict)
+
+    def at(self, table: str, key: str) -> str:
+        """A key of a table, as messages name it: with its line in the file."""
+        return _named(self._lines, table, key)[1]
 
     @property
     def out(self) -> Path:
@@ -164,6 +162,14 @@ class Study(_Part):
     def bone(self) -> str | None:
         """Name of the bone's label; None where the whole image is aligned on and none is named."""
         return self.images.bone_label or ("bone" if self.registration.align == "bone" else None)
+
+    @property
+    def directions(self) -> dict[str, tuple[Vector, Vector]]:
+        """Plate's outward normal and direction of shear under each load, LPS: its own, or those of the plate."""
+        return {
+            name: (load.plate_normal or self.plate.plate_normal, load.shear_direction or self.plate.shear_direction)
+            for name, load in self.loads.items()
+        }
 
     @property
     def subject_files(self) -> SubjectFiles:
@@ -187,26 +193,31 @@ class Study(_Part):
 def read_study(path: Path | str | Study) -> Study:
     """Read a study file (or a folder's ``study.toml``); a study that is read already is returned as it is.
 
-    InputError lists everything that is wrong in the file: unknown keys with the nearest known one, values of the wrong
-    kind, results outside the study's folder.
+    InputError lists everything that is wrong in the file, by line: what is no TOML; or missing values, unknown keys
+    with the nearest known one, and values of the wrong kind; or results outside the study's folder.
     """
     if isinstance(path, Study):
         return path
     place = Path(path)
     place = place / FILE if place.is_dir() else place
     try:
-        told = tomllib.loads(place.read_text(encoding="utf-8"))
+        text = place.read_text(encoding="utf-8")
+        told = tomllib.loads(text)
     except FileNotFoundError as missing:
         raise InputError(f"{place}: there is no study file; `mrstrain init FOLDER` writes one.") from missing
+    except tomllib.TOMLDecodeError as error:
+        raise InputError("\n  ".join([f"{place} is no TOML file:", *_faults(text.splitlines())])) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{place} is no TOML file ({error}).") from error
     if "place" in told:
         raise InputError(f"{place}: 'place' is no key of a study file; paths start from the file's own folder.")
+    lines = _lines_of(text)
     try:
         study = Study(place=place.resolve().parent, **told)
     except ValidationError as wrong:
-        sentences = "\n".join(f"  {_sentence(one, told)}" for one in wrong.errors(include_url=False))
-        raise InputError(f"{place}:\n{sentences}") from wrong
+        sentences = sorted(_sentence(one, lines) for one in wrong.errors(include_url=False))
+        raise InputError("\n  ".join([f"{place}:", *(sentence for _, sentence in sentences)])) from wrong
+    study._lines = lines
     if study.place not in study.out.resolve().parents:
         raise InputError(
             f"{place}: [study] out = '{study.study.out}' does not lie below the study's own folder {study.place}; "
@@ -217,18 +228,59 @@ def read_study(path: Path | str | Study) -> Study:
     return study
 
 
-def _sentence(error: Any, told: Mapping[str, Any]) -> str:
-    at: Sequence[str | int] = error["loc"]
-    names = [str(part) for part in at]
-    table = f"[{'.'.join(names[:-1])}] " if len(names) > 1 else ""
+def _faults(lines: list[str]) -> list[str]:
+    """The lines that are no TOML, each found with those before left out."""
+    faults = list[str]()
+    while len(faults) < _MOST_FAULTS:
+        try:
+            tomllib.loads("\n".join(lines))
+            break
+        except tomllib.TOMLDecodeError as error:
+            why, _, where = str(error).partition(" (at line ")
+            number = int(where.partition(",")[0] or 0)
+            if not number or not lines[number - 1]:
+                return faults or [str(error)]
+            faults.append(f"line {number}: {why}: {lines[number - 1].strip()}")
+            lines[number - 1] = ""
+    return faults
+
+
+def _lines_of(text: str) -> dict[tuple[str, str], int]:
+    """Line of each table (its key is "") and key of a study file; behind a # only where it stands nowhere else."""
+    lines: dict[tuple[str, str], int] = {}
+    table = ""
+    for number, line in enumerate(text.splitlines(), start=1):
+        if head := re.match(r"[\s#]*\[([^\[\]=]+)\]", line):
+            table, key = head[1].translate(_UNQUOTED), ""
+            lines.setdefault((table.partition(".")[0], ""), number)
+        elif given := re.match(r"[\s#]*([\w-]+)\s*=", line):
+            key = given[1]
+        else:
+            continue
+        if not line.lstrip().startswith("#") or (table, key) not in lines:
+            lines[table, key] = number
+    return lines
+
+
+def _named(lines: Mapping[tuple[str, str], int], table: str, key: str) -> tuple[int, str]:
+    """Line of a key, or else of its table (0 where neither is in the file), and how messages name it."""
+    at = table.translate(_UNQUOTED)
+    number = lines.get((at, key)) or lines.get((at, "")) or lines.get((key, "")) or 0
+    return number, (f"line {number}: " if number else "") + (
+        f"[{table}] '{key}'" if table and key else f"[{table}]" if table else f"'{key}'"
+    )
+
+
+def _sentence(error: Mapping[str, Any], lines: Mapping[tuple[str, str], int]) -> tuple[int, str]:
+    *tables, key = map(str, error["loc"])
+    number, at = _named(lines, ".".join(tables), key)
     if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        known = list(_fields_at(names[:-1]))
-        near = difflib.get_close_matches(names[-1], known, 1, 0.5)
+        known = _fields_at(tables)
+        near = difflib.get_close_matches(key, known, 1, 0.5)
         advice = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}."
-        return f"{table}'{names[-1]}' is no key here; {advice}"
-    if error["type"] in ("missing", "missing_argument"):
-        return f"{table}'{names[-1]}' is missing."
-    return f"{table}'{names[-1]}': {reason(error)}."
+        return number, f"{at} is no key here; {advice}"
+    missing = error["type"] in ("missing", "missing_argument")
+    return number, f"{at} is missing." if missing else f"{at}: {reason(error)}."
 
 
 def keys_of(table: type[BaseModel]) -> dict[str, FieldInfo]:
@@ -239,16 +291,7 @@ def keys_of(table: type[BaseModel]) -> dict[str, FieldInfo]:
 
 def _fields_at(names: Sequence[str]) -> list[str]:
     """Keys of the table at a path through the study's model."""
-    model: Any = Study
-    for name in names:
-        fields: dict[str, FieldInfo] = getattr(model, "model_fields", {})
-        model = Load if model is None or name not in fields else _model_of(fields[name].annotation)
-    return list(model._fields if issubclass(model, tuple) else keys_of(model))
-
-
-def _model_of(annotation: Any) -> Any:
-    """The model that a field holds; None for a table of models by name (the loads)."""
-    for kind in (annotation, *getattr(annotation, "__args__", ())):
-        if isinstance(kind, type) and issubclass(kind, BaseModel | Finer) and kind is not Load:
-            return kind
-    return None
+    if names[:2] == ["mesh", "finer"]:
+        return list(modelling.Finer._fields)
+    model: Any = Study if not names else Load if names[0] == "loads" else Study.model_fields[names[0]].annotation
+    return list(keys_of(model))

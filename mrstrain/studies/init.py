@@ -29,6 +29,7 @@ _ROLES = {
     "repeat": "the repeat scan", "load": "the load of that name",
 }  # fmt: skip
 _LOOKED_AT = 20
+_TO_FILL_IN = "# FILL IN"  # of lines in the template
 _TABLES = (".csv", ".txt", ".label", ".ctbl")
 
 
@@ -62,9 +63,10 @@ class NewStudy:
         lines += [f"Labels: {found.labels or 'NOT FOUND'}", f"Repeat scan: {found.repeat or 'none'}"]
         lines += [f"Results of other codes: {', '.join(found.results)}"] if found.results else []
         lines += [f"NOT USED: {name}, {why}" for name, why in found.unused.items()]
-        missing = not (found.load0 and found.loads and found.labels)
-        todo = "Put in what was not found, and the forces" if missing else "Put the forces in"
-        return [*lines, f"Study file: {self.path}. {todo}; then: mrstrain check {self.path.parent}"]
+        lines += [f"Study file: {self.path}. Fill in, and take away the # at the beginning of:"]
+        file = enumerate(self.path.read_text(encoding="utf-8").splitlines(), start=1)
+        lines += [f"    line {number}: {line.removeprefix('# ')}" for number, line in file if _TO_FILL_IN in line]
+        return [*lines, f"Then: mrstrain check {self.path.parent}"]
 
 
 def init(folder: Path | str, *, name: str = "Subject 01") -> NewStudy:

@@ -18,6 +18,8 @@ from mrstrain.records.provenance import file_hash, without_folders
 from mrstrain.studies.plan import Stage
 from mrstrain.studies.stages import StageResult
 
+_RECORD, _REASON = ".json", ".failed.txt"
+
 
 class StageRecord(BaseModel):
     """Record of a finished stage."""
@@ -71,12 +73,10 @@ class Ledger:
     def key(self, stage: Stage, made_from: Mapping[str, Any], built_on: Mapping[str, StageRecord]) -> str:
         """Hash of what a stage would be made from now; ``built_on`` are records of the stages that it reads."""
         content = {
-            "stage": stage.name,
-            "called": [path.name for path in stage.files],
-            **made_from,
+            "stage": stage.name, "called": [path.name for path in stage.files], **made_from,
             "built_on": {name: record.identity for name, record in sorted(built_on.items())},
             "software": software_key("mrstrain"),
-        }
+        }  # fmt: skip
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def _hash(self, path: Path) -> str:
@@ -91,43 +91,36 @@ class Ledger:
     def finished(self, stage: Stage) -> StageRecord | None:
         """The record of a stage whose files all exist, whatever it was made from; None for any other."""
         try:
-            record = StageRecord.model_validate_json(self._place(stage.name).read_bytes())
+            record = StageRecord.model_validate_json(self._file(stage, _RECORD).read_bytes())
         except (OSError, ValidationError):
             return None
-        intact = all(
-            (self.out / name).is_file() and (self.out / name).stat().st_size == size
-            for name, size in record.files.items()
-        )
-        return record if intact else None
+        sizes = ((self.out / name, size) for name, size in record.files.items())
+        return record if all(place.is_file() and place.stat().st_size == size for place, size in sizes) else None
 
-    def forget(self, stage: Stage, reason: str = "") -> None:
-        """Mark a stage as not finished, and note why; its files stay, so that it can resume."""
-        self._place(stage.name).unlink(missing_ok=True)
+    def clear(self, stage: Stage, reason: str = "", *, files: bool) -> None:
+        """Mark a stage as not finished, note why, and remove its files unless it is to resume from them."""
+        self._file(stage, _RECORD).unlink(missing_ok=True)
         self.folder.mkdir(parents=True, exist_ok=True)
         if reason:
-            write_whole(self._reason(stage.name), reason)
+            write_whole(self._file(stage, _REASON), reason)
         else:
-            self._reason(stage.name).unlink(missing_ok=True)
+            self._file(stage, _REASON).unlink(missing_ok=True)
+        for place in stage.gives if files else ():
+            if place.is_dir():
+                shutil.rmtree(place)
+            else:
+                place.unlink(missing_ok=True)
 
     def reason(self, stage: Stage) -> str:
         """Why a stage has no result; empty if it was never run."""
         try:
-            return self._reason(stage.name).read_text(encoding="utf-8")
+            return self._file(stage, _REASON).read_text(encoding="utf-8")
         except OSError:
             return ""
 
     def lock(self, stage: Stage) -> Path:
         """Lock file of a stage while it runs: a worker of a killed run may still be at work on a cluster."""
-        return self.folder / f"{stage.name}.lock"
-
-    def remove(self, stage: Stage, reason: str = "") -> None:
-        """Mark a stage as not finished and remove its files."""
-        self.forget(stage, reason)
-        for place in stage.gives:
-            if place.is_dir():
-                shutil.rmtree(place)
-            else:
-                place.unlink(missing_ok=True)
+        return self._file(stage, ".lock")
 
     def keep(
         self, stage: Stage, key: str, made_from: Mapping[str, Any], result: StageResult, seconds: float
@@ -135,21 +128,14 @@ class Ledger:
         """Record that a stage is finished."""
         made = [p for place in stage.gives for p in (sorted(place.rglob("*")) if place.is_dir() else [place])]
         files = {p.relative_to(self.out).as_posix(): p.stat().st_size for p in made if p.is_file()}
+        now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         record = StageRecord(
-            stage=stage.name,
-            key=key,
-            made_utc=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
-            seconds=round(seconds, 1),
-            files=files,
-            result=result,
+            stage=stage.name, key=key, made_utc=now, seconds=round(seconds, 1), files=files, result=result,
             made_from=dict(made_from),
-        )
+        )  # fmt: skip
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_whole(self._place(stage.name), record.model_dump_json())
+        write_whole(self._file(stage, _RECORD), record.model_dump_json())
         return record
 
-    def _place(self, name: str) -> Path:
-        return self.folder / f"{name}.json"
-
-    def _reason(self, name: str) -> Path:
-        return self.folder / f"{name}.failed.txt"
+    def _file(self, stage: Stage, ending: str) -> Path:
+        return self.folder / f"{stage.name}{ending}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set as AbstractSet
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mrstrain.studies.cluster import StageRunner
 
 Log = Callable[[str], None]
+_NOT_RUN = "Not run: "
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,14 @@ class StageOutcome:
     reused: bool = False  # the result existed already
     requested: bool = True  # the stage was among those that may be run
 
+    def __str__(self) -> str:
+        return f"{self.stage}: {self.status}. {self.reason}".rstrip()
+
+    @property
+    def result(self) -> StageResult:
+        """Its result, an empty one where there is none."""
+        return StageResult(()) if self.record is None else self.record.result
+
     @property
     def left_out(self) -> bool:
         """Whether it has no result only because it was not requested."""
@@ -36,16 +45,22 @@ class StageOutcome:
     @property
     def complete(self) -> bool:
         """Whether there is a complete result that matches the study as it is now."""
-        return self.record is not None and self.record.result.complete and not self.reason
+        return self.record is not None and self.result.complete and not self.reason
 
     @property
     def status(self) -> str:
         """Status in a word or two, for tables and the log."""
         if self.record is None:
-            return "not run" if self.reason.startswith("Not run") else "FAILED"
+            return "not run" if self.reason.startswith(_NOT_RUN) else "FAILED"
         if self.reason:
             return "OUT OF DATE"
-        return "in part" if not self.record.result.complete else "there already" if self.reused else "done"
+        return "in part" if not self.result.complete else "there already" if self.reused else "done"
+
+
+def left_out_of(outcomes: Mapping[str, StageOutcome]) -> list[str]:
+    """A sentence on the stages that have no result only because they were not requested, if there are any."""
+    names = [name for name, outcome in outcomes.items() if outcome.left_out]
+    return [f"Not asked for, and without a result: {', '.join(names)}."] if names else []
 
 
 class Pipeline:
@@ -64,25 +79,8 @@ class Pipeline:
         """Outcomes in the order of the stages."""
         return {stage.name: self.outcomes[stage.name] for stage in self.stages}
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the stages."""
-        return tuple(stage.name for stage in self.stages)
-
     def _requested(self, stage: Stage) -> bool:
-        return not self._only or _named(stage, self._only)
-
-    def _forced(self, stage: Stage) -> bool:
-        return _named(stage, self._force)
-
-    def _origin(
-        self, stage: Stage, records: Mapping[str, StageRecord]
-    ) -> tuple[Mapping[str, Any], str, Mapping[str, Any]]:
-        """Arguments of a stage, and key and origin (`Ledger.made_from`) of the result that it would have now."""
-        arguments = _arguments(stage, records.keys())
-        made_from = self.ledger.made_from(stage, arguments)
-        built_on = {name: records[name] for name in stage.before if name in records}
-        return arguments, self.ledger.key(stage, made_from, built_on), made_from
+        return not self._only or stage.is_one_of(self._only)
 
     def settle(self) -> list[tuple[Stage, Mapping[str, Any]]]:
         """Advance every stage as far as possible without work; return those to be run now, with their arguments."""
@@ -94,8 +92,7 @@ class Pipeline:
             try:
                 settled = self._settled(stage)
             except (OSError, MrstrainError) as failure:  # an input that is gone, or may not be read
-                reason = self.ledger.impersonal(str(failure), stage)
-                settled = StageOutcome(stage.name, None, reason, requested=self._requested(stage))
+                settled = replace(self._failed(stage, failure), requested=self._requested(stage))
             if isinstance(settled, StageOutcome):
                 self.outcomes[stage.name] = settled
             else:
@@ -104,22 +101,30 @@ class Pipeline:
 
     def _settled(self, stage: Stage) -> StageOutcome | Mapping[str, Any]:
         """Outcome of a stage that need not be run, or the arguments of one that has to be run now."""
-        records = {name: outcome.record for name, outcome in self.outcomes.items() if outcome.record is not None}
+        records = {name: record for name in stage.before if (record := self.outcomes[name].record) is not None}
         requested = self._requested(stage)
-        missing = _missing(stage, records.keys())
-        if missing:
-            return StageOutcome(stage.name, None, f"Not run: {missing}", requested=requested)
-        arguments, key, made_from = self._origin(stage, records)
-        kept = self.ledger.finished(stage)
+        if missing := _missing(stage, records):
+            return StageOutcome(stage.name, None, _NOT_RUN + missing, requested=requested)
+        listed = {
+            argument: [value for name, value in by_stage.items() if name in records]
+            for argument, by_stage in {**stage.some, **stage.perhaps}.items()
+        }
+        arguments = {**stage.arguments, **listed}
+        made_from, kept = self.ledger.made_from(stage, arguments), self.ledger.finished(stage)
+        key = self.ledger.key(stage, made_from, records)
         current = kept is not None and kept.key == key
-        if kept is None and not requested:
-            reason = self.ledger.reason(stage) or "Not run: it has no result, and is not among those asked for."
-        elif current or not requested:
+        reusable = kept is not None and current and not kept.result.retry and not stage.is_one_of(self._force)
+        if requested and not reusable:
+            self._keys[stage.name] = key, made_from
+            return arguments
+        if kept is None:
+            reason = self.ledger.reason(stage) or f"{_NOT_RUN}it has no result, and is not among those asked for."
+        else:
             reason = self._outdated_inputs(stage) if current else "Made from other inputs than the study names now."
-        if not requested or (kept is not None and current and not kept.result.retry and not self._forced(stage)):
-            return StageOutcome(stage.name, kept, reason, reused=True, requested=requested)
-        self._keys[stage.name] = key, made_from
-        return arguments
+        return StageOutcome(stage.name, kept, reason, reused=True, requested=requested)
+
+    def _failed(self, stage: Stage, why: object) -> StageOutcome:
+        return StageOutcome(stage.name, None, self.ledger.impersonal(str(why), stage))
 
     def _outdated_inputs(self, stage: Stage) -> str:
         """Which results that a stage reads are out of date, so that it is too; empty where none is."""
@@ -128,27 +133,20 @@ class Pipeline:
 
     def forecast(self) -> dict[str, str]:
         """What a run would do with each stage: "done already", "run", "left out", or "cannot be run" and why."""
-        forecast: dict[str, str] = {}
-        records: dict[str, StageRecord] = {}
-        available: set[str] = set()
-        for stage in self.stages:
-            record = self.ledger.finished(stage)
-            missing = _missing(stage, available)
-            if missing:
-                forecast[stage.name] = f"cannot be run: {missing}" if self._requested(stage) else "left out"
-                continue
-            if not self._requested(stage):
-                forecast[stage.name] = "left out"
-            elif record is None or self._forced(stage) or any(forecast[name] == "run" for name in stage.before):
-                forecast[stage.name] = "run"
-            else:
-                current = record.key == self._origin(stage, records)[1] and not record.result.retry
-                forecast[stage.name] = "done already" if current else "run"
-            if record is not None:
-                records[stage.name] = record
-            if record is not None or forecast[stage.name] == "run":
-                available.add(stage.name)
-        return forecast
+        trial = Pipeline(self.stages, self.ledger, only=self._only, force=self._force)
+        to_run = set()
+        while ready := trial.settle():
+            for stage, _ in ready:
+                anew = StageRecord(stage=stage.name, key="", made_utc="", seconds=0.0, files={}, result=StageResult(()))
+                trial.outcomes[stage.name] = StageOutcome(stage.name, anew)  # unlike any that others are built on
+                to_run.add(stage.name)
+        return {
+            name: "run" if name in to_run
+            else "left out" if not outcome.requested
+            else f"cannot be run: {outcome.reason.removeprefix(_NOT_RUN)}" if outcome.record is None
+            else "done already"
+            for name, outcome in trial.in_order().items()
+        }  # fmt: skip
 
     def to_do(self) -> list[Stage]:
         """The stages that a run would work on."""
@@ -161,13 +159,10 @@ class Pipeline:
         ready = self.settle()
         for name, outcome in self.outcomes.items():
             if name not in before:
-                log(f"{name}: {outcome.status}" + (f". {outcome.reason}" if outcome.reason else ""))
+                log(str(outcome))
         for stage, arguments in ready:
             try:
-                if stage.goes_on and not self._forced(stage):
-                    self.ledger.forget(stage)
-                else:
-                    self.ledger.remove(stage)
+                self.ledger.clear(stage, files=not stage.goes_on or stage.is_one_of(self._force))
                 for place in stage.gives:
                     place.parent.mkdir(parents=True, exist_ok=True)
             except (OSError, MrstrainError) as failure:
@@ -181,18 +176,18 @@ class Pipeline:
         try:
             outcome = self._recorded(stage, result, seconds)
         except (OSError, MrstrainError) as failure:
-            outcome = StageOutcome(name, None, self.ledger.impersonal(str(failure), stage))
+            outcome = self._failed(stage, failure)
         self.outcomes[name] = outcome
         log(f"{name}: {outcome.status} after {seconds:.0f} s" + (f". {outcome.reason}" if outcome.reason else ""))
-        for line in () if outcome.record is None else outcome.record.result.lines:
+        for line in outcome.result.lines:
             log(f"    {line}")
 
     def _recorded(self, stage: Stage, result: StageResult | str, seconds: float) -> StageOutcome:
         if isinstance(result, str):
-            reason = self.ledger.impersonal(result, stage)
+            failed = self._failed(stage, result)
             # what an earlier run or half of this one left is no result of these inputs
-            (self.ledger.forget if stage.goes_on else self.ledger.remove)(stage, reason)
-            return StageOutcome(stage.name, None, reason)
+            self.ledger.clear(stage, failed.reason, files=not stage.goes_on)
+            return failed
         result = replace(result, lines=tuple(self.ledger.impersonal(line, stage) for line in result.lines))
         record = self.ledger.keep(stage, *self._keys[stage.name], result, seconds)
         return StageOutcome(stage.name, record, self._outdated_inputs(stage))
@@ -204,6 +199,7 @@ def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Ma
     Pipelines and logs are given by the prefix that tells one study's stage names from another's; a log gets a line for
     each stage that ends. ``pool`` gives a context with a `StageRunner`, and is called only if there is work.
     """
+    prefixes = {prefix + stage.name: prefix for prefix, pipeline in pipelines.items() for stage in pipeline.stages}
     with ExitStack() as stack:
         runners: list[StageRunner] = []
 
@@ -215,35 +211,18 @@ def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Ma
         for prefix, pipeline in pipelines.items():
             pipeline.start(runner, logs[prefix], prefix)
         while runners and runners[0].busy:
-            full_name, result, seconds = runners[0].next()
-            prefix, name = next(
-                (p, full_name[len(p) :])
-                for p in pipelines
-                if full_name.startswith(p) and full_name[len(p) :] in pipelines[p].names
-            )
-            pipelines[prefix].end(name, result, seconds, logs[prefix])
+            name, result, seconds = runners[0].next()
+            prefix = prefixes[name]
+            pipelines[prefix].end(name.removeprefix(prefix), result, seconds, logs[prefix])
             pipelines[prefix].start(runner, logs[prefix], prefix)
 
 
-def _arguments(stage: Stage, available: AbstractSet[str]) -> Mapping[str, Any]:
-    """Arguments of a stage, with what the available stages that it may build on are listed with."""
-    chosen = {
-        argument: [value for name, value in by_stage.items() if name in available]
-        for argument, by_stage in {**stage.some, **stage.perhaps}.items()
-    }
-    return {**stage.arguments, **chosen}
-
-
-def _missing(stage: Stage, available: AbstractSet[str]) -> str:
+def _missing(stage: Stage, available: Collection[str]) -> str:
     """Which result that a stage requires is not available; empty where it can be run."""
     for name in stage.after:
         if name not in available:
             return f"{name} has no result."
     for by_stage in stage.some.values():
-        if available.isdisjoint(by_stage):
+        if not any(name in available for name in by_stage):
             return f"none of {', '.join(by_stage)} has a result."
     return ""
-
-
-def _named(stage: Stage, chosen: Sequence[str]) -> bool:
-    return stage.name in chosen or stage.kind in chosen

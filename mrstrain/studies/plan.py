@@ -11,7 +11,6 @@ from fe import BONE, LoadStep, material_set
 from mrstrain.comparison.drive import ENDING
 from mrstrain.comparison.model_files import files_named
 from mrstrain.options.measurement import EngineOptions
-from mrstrain.options.model import Vector
 from mrstrain.options.modelling import Directions, MeshCoordinates, Meshing, PlateOptions, SimulationOptions
 from mrstrain.studies.file import Study, as_folder
 from validate import LEVELLED
@@ -31,17 +30,21 @@ class Stage:
     """
 
     name: str  # its kind and object: "register Load1"
-    arguments: Mapping[str, Any]  # plain values
+    arguments: Mapping[str, Any]  # plain values and paths
     files: tuple[Path, ...]  # what it reads that no other stage makes, by content
     gives: tuple[Path, ...]  # everything that it makes: removed before it is made again
     after: tuple[str, ...] = ()  # stages that it cannot do without
-    some: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    perhaps: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    some: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    perhaps: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
         """One of KINDS."""
         return self.name.split(" ", 1)[0]
+
+    def is_one_of(self, chosen: Sequence[str]) -> bool:
+        """Whether its name or its kind is among those chosen."""
+        return self.name in chosen or self.kind in chosen
 
     @property
     def goes_on(self) -> bool:
@@ -62,26 +65,22 @@ def plan(study: Study) -> tuple[Stage, ...]:
     a forward-model comparison has no bone.
     """
     stages = _registrations(study)
-    loads = tuple(study.loads)
-    measured = {f"register {load}": load for load in loads}
-    models: dict[str, str] = {}
-    if study.models.sets:
-        meshed = _mesh(study)
-        stages += meshed
-        for one in study.models.sets:
-            simulated = _simulation(study, one, tuple(stage.name for stage in meshed))
-            folder = simulated.gives[0]
-            if str(folder) in models.values():
-                raise InputError(f"[models] two sets are called '{folder.name}'; each needs a name of its own.")
-            stages.append(simulated)
-            models[simulated.name] = str(folder)
-            if study.models.drive:
-                stages.append(_driven(study, one, folder.name, tuple(stage.name for stage in meshed), measured))
-                models[stages[-1].name] = str(stages[-1].gives[0])
-            if study.models.level:
-                for load in load_steps(study):
-                    stages.append(_levelled(study, folder, load))
-                    models[stages[-1].name] = str(folder) + LEVELLED
+    measured = {f"register {load}": load for load in study.loads}
+    models: dict[str, Path] = {}
+    if study.models.sets and study.mesh.file is None:
+        stages.append(_mesh(study))
+    for one in study.models.sets:
+        own = [_simulation(study, one)]
+        folder = own[0].gives[0]
+        if folder in models.values():
+            raise InputError(f"[models] two sets are called '{folder.name}'; each needs a name of its own.")
+        if study.models.drive:
+            own.append(_driven(study, one, folder.name, measured))
+        models |= {stage.name: stage.gives[0] for stage in own}
+        if study.models.level:
+            own += [_levelled(study, folder, load) for load in load_steps(study)]
+            models |= {stage.name: stage.gives[0].parent for stage in own if stage.kind == "level"}
+        stages += own
     if models or study.models.results:
         stages.append(_comparison(study, measured, models))
     _refuse_mixing(study, stages)
@@ -93,56 +92,52 @@ def _refuse_mixing(study: Study, stages: Sequence[Stage]) -> None:
     out = study.out.resolve()
     made: dict[Path, str] = {}
     for stage in stages:
-        for place in stage.gives:
-            real = place.resolve()
+        for real in (place.resolve() for place in stage.gives):
             if out not in real.parents:
                 raise InputError(f"{stage.name} would write to {real}, which is not below the results {out}.")
-            near = [other for other in made if other == real or other in real.parents or real in other.parents]
+            near = [name for other, name in made.items() if _one_in_the_other(real, other)]
             if near:
-                raise InputError(f"{stage.name} and {made[near[0]]} would both write to {real}: rename one.")
+                raise InputError(f"{stage.name} and {near[0]} would both write to {real}: rename one.")
             made[real] = stage.name
         for path in stage.files:
-            real = path.resolve()
-            if real == out or out in real.parents or real in out.parents:
+            if _one_in_the_other(path.resolve(), out):
                 raise InputError(
                     f"{path} is an input and lies in the folder of the results ({out}), or that in it: results would "
                     "replace it. Move it, or give another [study] out."
                 )
 
 
+def _one_in_the_other(one: Path, other: Path) -> bool:
+    return one.is_relative_to(other) or other.is_relative_to(one)
+
+
 def _registrations(study: Study) -> list[Stage]:
-    images = study.images
-    how, subject = study.registration.located(study.place), study.subject_files
-    load0 = study.path(images.load0)
-    shared: dict[str, Any] = {
-        "load0": str(load0), **subject.plain(), **how.plain(), **_directions(study),
-        "allow_missing": images.allow_missing, "seed": study.study.seed, "threads": 1,
+    images, how, subject = study.images, study.registration.located(study.place), study.subject_files
+    load0, folder = study.path(images.load0), study.out / REGISTRATION
+    shared = {
+        "load0": load0, **subject.model_dump(), **how.model_dump(), "allow_missing": images.allow_missing,
+        "seed": study.study.seed, "threads": 1,
     }  # fmt: skip
-    files = (load0, *subject.paths, *how.paths)
-    folder, own_directions = study.out / REGISTRATION, towards(study)
-
-    def one(load: str, image: str | Path, repeat: bool, after: str | None) -> Stage:
-        place = study.path(image)
-        more: dict[str, Any] = {
-            "load": str(place), "out": str(folder / load), "after": None if after is None else str(folder / after),
-            "chain": after is not None, "twin": how.twin and load != REPEAT,
-        }  # fmt: skip
-        if load in own_directions:
-            more["plate_normal"], more["shear_direction"] = own_directions[load]
-        waits = () if after is None else (f"register {after}",)
-        floor = {"repeat": {f"register {REPEAT}": str(folder / REPEAT)} if repeat else {}}
-        return Stage(f"register {load}", shared | more, (*files, place), (folder / load,), waits, {}, floor)
-
-    stages = [] if images.repeat is None else [one(REPEAT, images.repeat, False, None)]
+    places = {} if images.repeat is None else {REPEAT: study.path(images.repeat)}
+    places |= {name: study.path(load.image) for name, load in study.loads.items()}
+    stages: list[Stage] = []
     last: str | None = None
-    for name, load in study.loads.items():
-        stages.append(one(name, load.image, images.repeat is not None, last if how.chain else None))
-        last = name
+    for load, place in places.items():
+        normal, shear = study.directions.get(load, (study.plate.plate_normal, study.plate.shear_direction))
+        own = {
+            "load": place, "out": folder / load, "after": None if last is None else folder / last,
+            "chain": last is not None, "twin": how.twin and load != REPEAT, "plate_normal": normal,
+            "shear_direction": shear,
+        }  # fmt: skip
+        floor = {f"register {REPEAT}": folder / REPEAT} if load != REPEAT and images.repeat is not None else {}
+        stages.append(
+            Stage(
+                f"register {load}", shared | own, (load0, *subject.paths, *how.paths, place), (folder / load,),
+                () if last is None else (f"register {last}",), perhaps={"repeat": floor},
+            )
+        )  # fmt: skip
+        last = load if how.chain and load != REPEAT else None
     return stages
-
-
-def _directions(study: Study) -> dict[str, Vector]:
-    return study.plate.narrowed(Directions).model_dump()
 
 
 def mesh_place(study: Study) -> Path:
@@ -156,27 +151,32 @@ def labels_to_mesh(study: Study) -> tuple[Path, Path | None]:
     return study.path(of.labels or ""), study.optional_path(of.names)
 
 
-def _mesh(study: Study) -> list[Stage]:
-    if study.mesh.file is not None:
-        return []
+def _mesh(study: Study) -> Stage:
     labels, names = labels_to_mesh(study)
     arguments = {
-        "out": str(study.out / MESH), "labels": str(labels), **study.mesh.narrowed(Meshing).plain(),
-        "names": None if names is None else str(names), "bones": study.mesh.bones,
+        "out": study.out / MESH, "labels": labels, "names": names, "bones": study.mesh.bones,
+        **study.mesh.narrowed(Meshing).model_dump(),
     }  # fmt: skip
-    files = (labels,) if names is None else (labels, names)
-    return [Stage("mesh", arguments, files, ((study.out / MESH).parent,))]
+    return Stage("mesh", arguments, (labels,) if names is None else (labels, names), ((study.out / MESH).parent,))
 
 
-def _own(study: Study, one: str) -> tuple[Path, ...]:
-    own = [study.path(one)] if one.endswith(".toml") else []
-    if study.mesh.file is None:
-        return tuple(own)
-    mesh = study.path(study.mesh.file)
-    return (*own, mesh, *(p for p in (mesh.with_suffix(".json"),) if p.is_file()))  # names of regions stand beside it
+def _on_mesh(
+    study: Study, name: str, one: str, folder: Path, arguments: Mapping[str, Any], some: Mapping[str, Any]
+) -> Stage:
+    """A stage that computes with a material set on the mesh."""
+    files = [study.path(one)] if one.endswith(".toml") else []
+    if study.mesh.file is not None:
+        mesh = mesh_place(study)
+        files += [mesh, *(p for p in (mesh.with_suffix(".json"),) if p.is_file())]  # names of regions stand beside it
+    shared = {
+        "out": study.out / MODELS, "mesh": mesh_place(study), **study.mesh.narrowed(MeshCoordinates).model_dump(),
+        "sets": (study.set_given(one),),
+    }  # fmt: skip
+    after = ("mesh",) if study.mesh.file is None else ()
+    return Stage(name, {**arguments, **shared}, tuple(files), (folder,), after, some)
 
 
-def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
+def _simulation(study: Study, one: str) -> Stage:
     name = material_set(study.set_given(one)).name
     try:
         as_folder(name)
@@ -184,50 +184,34 @@ def _simulation(study: Study, one: str, meshed: tuple[str, ...]) -> Stage:
         raise InputError(f"The material set '{name}' of {one} needs {wrong}.") from wrong
     steps = load_steps(study)
     arguments = {
-        "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), **study.mesh.narrowed(MeshCoordinates).plain(),
-        **study.models.narrowed(SimulationOptions).plain(), **study.plate.narrowed(PlateOptions).model_dump(),
-        "sets": (study.set_given(one),), "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))),
-        "loads": [asdict(step) for step in steps.values()],
-        "towards": {name: of for name, of in towards(study).items() if name in steps},
+        **study.models.narrowed(SimulationOptions).model_dump(), **study.plate.narrowed(PlateOptions).model_dump(),
+        "fixed": tuple(dict.fromkeys((BONE, *study.models.fixed))), "loads": [asdict(step) for step in steps.values()],
+        "towards": {name: study.directions[name] for name in steps},
     }  # fmt: skip
-    return Stage(f"simulate {name}", arguments, _own(study, one), (study.out / MODELS / name,), meshed)
-
-
-def towards(study: Study) -> dict[str, tuple[Vector, Vector]]:
-    """Plate's normal and direction of shear of the loads that go in directions of their own."""
-    plate = study.plate
-    return {
-        name: (load.plate_normal or plate.plate_normal, load.shear_direction or plate.shear_direction)
-        for name, load in study.loads.items()
-        if load.plate_normal is not None or load.shear_direction is not None
-    }
+    return _on_mesh(study, f"simulate {name}", one, study.out / MODELS / name, arguments, {})
 
 
 def load_steps(study: Study) -> dict[str, LoadStep]:
     """The loads that are simulated: those with a force or a plate displacement along the normal.
 
-    InputError is raised if a load has only a shear, or force and displacement along one axis, or no load has any.
+    InputError is raised if loads have only a shear, or one force and displacement along one axis, or no load has any.
     """
-    steps = {}
+    steps, lacking = {}, list[str]()
     for name, load in study.loads.items():
-        if (load.normal_n, load.normal_mm) == (None, None):
-            if (load.shear_n, load.shear_mm) != (None, None):
-                raise InputError(f"[loads.{name}] normal_n is missing: a plate that shears has to press.")
-            continue
-        steps[name] = LoadStep(name, load.normal_n, load.shear_n, load.normal_mm, load.shear_mm)
-    if not steps:
-        first = next(iter(study.loads))
-        raise InputError(f"[loads.{first}] normal_n is missing: no load has a force to simulate [models] sets under.")
-    return steps
+        if (load.normal_n, load.normal_mm) != (None, None):
+            steps[name] = LoadStep(name, load.normal_n, load.shear_n, load.normal_mm, load.shear_mm)
+        elif (load.shear_n, load.shear_mm) != (None, None):
+            lacking.append(name)
+    if steps and not lacking:
+        return steps
+    why = "A plate that shears has to press." if lacking else "No load has a force or travel to simulate sets under."
+    places = [study.at(f"loads.{name}", "normal_n") for name in lacking or study.loads]
+    raise InputError("\n  ".join([f"{why} In the study file normal_n (N) or normal_mm is missing:", *places]))
 
 
-def _driven(study: Study, one: str, name: str, meshed: tuple[str, ...], measured: Mapping[str, str]) -> Stage:
-    arguments = {
-        "out": str(study.out / MODELS), "mesh": str(mesh_place(study)), "dvc": str(study.out / REGISTRATION),
-        "sets": (study.set_given(one),), **study.mesh.narrowed(MeshCoordinates).plain(),
-    }  # fmt: skip
-    gives = (study.out / MODELS / (name + ENDING),)
-    return Stage(f"drive {name}", arguments, _own(study, one), gives, meshed, {"loads": measured})
+def _driven(study: Study, one: str, name: str, measured: Mapping[str, str]) -> Stage:
+    folder, dvc = study.out / MODELS / (name + ENDING), {"dvc": study.out / REGISTRATION}
+    return _on_mesh(study, f"drive {name}", one, folder, dvc, {"loads": measured})
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:
@@ -236,32 +220,27 @@ def _levelled(study: Study, folder: Path, load: str) -> Stage:
     engine, subject = study.registration.located(study.place).narrowed(EngineOptions), study.subject_files
     load0 = study.path(study.images.load0)
     arguments = {
-        "load0": str(load0), **subject.plain(), **engine.plain(), "seed": study.study.seed,
-        "out": str(study.out / MODELS), "model": str(folder), "load": load,
+        "load0": load0, **subject.model_dump(), **engine.model_dump(), "seed": study.study.seed,
+        "out": study.out / MODELS, "model": folder, "load": load,
     }  # fmt: skip
     gives = (folder.with_name(folder.name + LEVELLED) / f"{load}.vtu",)
     own = (load0, *subject.paths, *engine.paths)
     return Stage(f"level {folder.name} {load}", arguments, own, gives, (f"simulate {folder.name}",))
 
 
-def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, str]) -> Stage:
+def _comparison(study: Study, measured: Mapping[str, str], models: Mapping[str, Path]) -> Stage:
     how = study.compare.located(study.place)
-    labels = study.path(study.images.labels)
-    names = study.optional_path(study.images.names)
+    labels, names = study.path(study.images.labels), study.optional_path(study.images.names)
     elsewhere = [study.path(place) for place in study.models.results]
-    taken = {Path(place).name for place in models.values()}
-    twice = [place.name for place in elsewhere if place.name in taken]
-    if twice:
+    taken = {place.name for place in models.values()}
+    if twice := [place.name for place in elsewhere if place.name in taken]:
         raise InputError(f"[models] a folder of results and a set are both called '{twice[0]}': rename the folder.")
     arguments = {
-        "dvc": str(study.out / REGISTRATION), "out": str(study.out / COMPARISON), "labels": str(labels),
-        "names": None if names is None else str(names), "bones": study.mesh.bones,
-        **_directions(study), "towards": towards(study), **how.plain(),
-        "elsewhere": [str(place) for place in elsewhere],
+        "dvc": study.out / REGISTRATION, "out": study.out / COMPARISON, "labels": labels, "names": names,
+        "bones": study.mesh.bones, **study.plate.narrowed(Directions).model_dump(), "towards": study.directions,
+        **how.model_dump(), "elsewhere": elsewhere,
     }  # fmt: skip
     named = [file for place in elsewhere if place.exists() for file in files_named(place)]
     files = [p for p in (labels, names, *how.paths, *elsewhere, *named) if p is not None]
-    some: dict[str, Mapping[str, str]] = {"loads": measured}
-    if models:
-        some["models"] = models
+    some = {"loads": measured} | ({"models": models} if models else {})
     return Stage("compare", arguments, tuple(files), (study.out / COMPARISON,), (), some)

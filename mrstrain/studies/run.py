@@ -1,10 +1,11 @@
 """`run`: a study from its file to its report; finished stages are not repeated."""
 
-import logging
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -19,11 +20,10 @@ from mrstrain.studies.costs import disk_bytes, seconds_of, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
-from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, run_all
+from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, left_out_of, run_all
 from mrstrain.studies.plan import KINDS, Stage, plan
 
 LOG = "study.log"
-_USUAL_VOXELS, _USUAL_CELLS = 2e6, 70e3
 _NOTHING = ("nothing",)  # may be run: every stage is taken as it is
 
 
@@ -43,11 +43,10 @@ class StudyRun:
     def verdicts(self) -> dict[str, Verdict]:
         """Verdict on each registration that has a result, by load."""
         return {
-            name.removeprefix("register "): section.verdict
+            name.removeprefix("register "): verdict
             for name, outcome in self.outcomes.items()
-            if outcome.record is not None and name.startswith("register ")
-            for section in outcome.record.result.sections
-            if section.verdict is not None
+            if name.startswith("register ")
+            for verdict in outcome.result.verdicts
         }
 
     def summary(self) -> list[str]:
@@ -57,23 +56,16 @@ class StudyRun:
             if outcome.left_out:
                 continue
             if not outcome.complete:
-                details = () if outcome.record is None else outcome.record.result.lines
-                lines += [f"{name}: {outcome.status}. {outcome.reason}".rstrip(), *(f"    {line}" for line in details)]
-            elif outcome.record is not None:
-                lines += [
-                    f"{name}: {section.verdict.words}. {' '.join(section.verdict.reasons)}"
-                    for section in outcome.record.result.sections
-                    if section.verdict is not None and section.verdict.level != "trust" and name != "compare"
-                ]
-        comparison = self.outcomes.get("compare")
-        if comparison is not None and comparison.record is not None:
-            lines += comparison.record.result.lines
-        left_out = [name for name, outcome in self.outcomes.items() if outcome.left_out]
-        if left_out:
-            lines.append(f"Not asked for, and without a result: {', '.join(left_out)}.")
+                lines += [str(outcome), *(f"    {line}" for line in outcome.result.lines)]
+            elif name != "compare":
+                doubts = [verdict for verdict in outcome.result.verdicts if verdict.level != "trust"]
+                lines += [f"{name}: {verdict.words}. {' '.join(verdict.reasons)}" for verdict in doubts]
+        if comparison := self.outcomes.get("compare"):
+            lines += comparison.result.lines
         reused = sum(outcome.reused and outcome.record is not None for outcome in self.outcomes.values())
         return [
             *lines,
+            *left_out_of(self.outcomes),
             f"{len(self.outcomes)} stages, {reused} of them there already. Log: {self.study.out / LOG}",
             f"Report: {self.study.out / REPORT}",
         ]
@@ -126,22 +118,19 @@ def run(
 
 
 def run_studies(
-    studies: Sequence[Study],
-    *,
-    only: Sequence[str] = (),
-    force: Sequence[str] = (),
-    scheduler: str | None = None,
-    workers: int | None = None,
-    progress: OnProgress | None = None,
-) -> list[StudyRun]:
-    """Run several studies on one cluster, each as `run` does; what cannot be run is refused before any begins."""
+    studies: Sequence[Study], *, only: Sequence[str] = (), force: Sequence[str] = (), scheduler: str | None = None,
+    workers: int | None = None, progress: OnProgress | None = None,
+) -> list[StudyRun]:  # fmt: skip
+    """Run studies of different names on one cluster, each as `run` does; what cannot be run is refused before any."""
     if scheduler is not None and workers is not None:
         raise ParameterError(
-            f"--workers {workers} is for this machine's cores; the scheduler at {scheduler} has workers of its own. "
-            "Give one of the two."
+            f"workers={workers} (--workers {workers}) is for this machine's cores; the scheduler at {scheduler} has "
+            "workers of its own. Give one of the two."
         )
-    planned = _planned(studies, only, force)
-    total = _TotalProgress(progress or (lambda *_: None), sum(len(pipeline.stages) for pipeline, _ in planned))
+    named = {f"{study.study.name}: " if len(studies) > 1 else "": study for study in studies}
+    pipelines, to_do = _planned(named, only, force)
+    stages = f"{sum(len(pipeline.stages) for pipeline in pipelines.values())} stages"
+    total = _TotalProgress(progress or (lambda *_: None), stages)
 
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
@@ -149,41 +138,48 @@ def run_studies(
         return cluster(total.report, [study.out for study in studies], scheduler=scheduler, workers=workers)
 
     logs: dict[str, Log] = {}
-    on_disk: dict[int, tuple[int, float]] = {}
-    prefixes = [f"{study.study.name}: " if len(studies) > 1 else "" for study in studies]
-    pipelines = {prefix: pipeline for prefix, (pipeline, _) in zip(prefixes, planned, strict=True)}
+    needed: dict[int, list[float]] = defaultdict(list)  # bytes of the stages that write to each disk
     with ExitStack() as stack:
-        for prefix, study, (pipeline, left) in zip(prefixes, studies, planned, strict=True):
+        for prefix, study in named.items():
             stack.enter_context(_alone(study.out))
-            voxels, cells = _sizes(study, left)
-            _refuse_small_disk(study, left, voxels, on_disk)
-            total.seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
-            log = stack.enter_context(_log(study.out / LOG))
-            log(f"Study '{study.study.name}': {len(pipeline.stages)} stages, {len(left)} of them to do")
+            if left := to_do[prefix]:
+                voxels, cells = sizes_of(study)
+                of_disk = needed[study.out.stat().st_dev]
+                of_disk += [disk_bytes(stage, study, voxels) for stage in left]
+                refuse_small_disk(study.out, sum(of_disk), f"the results of {len(of_disk)} stages need")
+                total.seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
+            log = partial(_log, study.out / LOG)
+            log(f"Study '{study.study.name}': {len(pipelines[prefix].stages)} stages, {len(left)} of them to do")
             logs[prefix] = total.also(log, prefix)
         run_all(pipelines, pool, logs)
         total.report(ALL, total.stages, 1.0)
-        runs = []
-        for prefix, study in zip(prefixes, studies, strict=True):
-            runs.append(StudyRun(study, pipelines[prefix].in_order()))
-            write_run_report(study.out / REPORT, study, runs[-1].outcomes)
-            logs[prefix](f"Report: {study.study.out}/{REPORT}")
+        runs = [StudyRun(study, pipelines[prefix].in_order()) for prefix, study in named.items()]
+        for prefix, one in zip(named, runs, strict=True):
+            write_run_report(one.study.out / REPORT, one.study, one.outcomes)
+            logs[prefix](f"Report: {one.study.study.out}/{REPORT}")
     return runs
 
 
-def _planned(studies: Sequence[Study], only: Sequence[str], force: Sequence[str]) -> list[tuple[Pipeline, list[Stage]]]:
-    """Pipeline of each study and the stages to do; what cannot be run is refused."""
-    stages_of = [plan(study) for study in studies]
-    for stages in stages_of:
+def _planned(
+    studies: Mapping[str, Study], only: Sequence[str], force: Sequence[str]
+) -> tuple[dict[str, Pipeline], dict[str, list[Stage]]]:
+    """Pipeline of each study and the stages to do; what cannot be run is refused, with all that is wrong."""
+    planned = {name: plan(study) for name, study in studies.items()}
+    for stages in planned.values():
         refuse_unknown(stages, only, force)
-    refuse_missing(stages_of)
-    pipelines = [
-        Pipeline(stages, Ledger(study.out, study.place), only=only, force=force)
-        for study, stages in zip(studies, stages_of, strict=True)
-    ]
-    to_do = [pipeline.to_do() for pipeline in pipelines]
-    refuse_wrong(studies, to_do)
-    return list(zip(pipelines, to_do, strict=True))
+    files = dict.fromkeys(path for stages in planned.values() for stage in stages for path in stage.files)
+    if missing := [path for path in files if not path.exists()]:
+        raise InputError("These files of the study are not there:\n" + "\n".join(f"  {path}" for path in missing))
+    pipelines = {
+        name: Pipeline(planned[name], Ledger(study.out, study.place), only=only, force=force)
+        for name, study in studies.items()
+    }
+    to_do = {name: pipeline.to_do() for name, pipeline in pipelines.items()}
+    # what would fail, hours later, for a reason that can be known beforehand
+    faults = [f"{one.study.name}: {wrong}" for name, one in studies.items() for wrong in wrong_with(one, to_do[name])]
+    if faults:
+        raise InputError("This cannot be run as it is (`mrstrain check` tells more):\n  " + "\n  ".join(faults))
+    return pipelines, to_do
 
 
 @dataclass(slots=True, eq=False)
@@ -191,13 +187,9 @@ class _TotalProgress:
     """Progress of all stages together, weighted by the seconds that each to be run is expected to take."""
 
     report: OnProgress
-    number: int
+    stages: str  # how many there are, in words
     seconds: dict[str, float] = field(default_factory=dict)
     ended_s: float = 0.0
-
-    @property
-    def stages(self) -> str:
-        return f"{self.number} stages"
 
     def also(self, log: Log, prefix: str) -> Log:
         """A log that reports progress as well, for each stage that a line says has ended."""
@@ -211,30 +203,6 @@ class _TotalProgress:
                 self.report(ALL, self.stages, round(self.ended_s / sum(self.seconds.values()), 9))
 
         return line
-
-
-def _sizes(study: Study, left: Sequence[Stage]) -> tuple[float, float]:
-    """Voxels and cells (`sizes_of`) that the costs of the stages to do depend on."""
-    try:
-        return sizes_of(study) if left else (0.0, 0.0)
-    except (InputError, OSError):
-        return _USUAL_VOXELS, _USUAL_CELLS  # the stages that read the file report what is wrong with it
-
-
-def _refuse_small_disk(
-    study: Study, left: Sequence[Stage], voxels: float, on_disk: dict[int, tuple[int, float]]
-) -> None:
-    """Refuse a run whose results would not fit, before any of it is made.
-
-    ``on_disk`` is updated: stages, and bytes, that the studies so far will write to each disk.
-    """
-    if not left:
-        return
-    disk = study.out.stat().st_dev
-    stages, needed = on_disk.get(disk, (0, 0.0))
-    stages, needed = stages + len(left), needed + sum(disk_bytes(stage, study, voxels) for stage in left)
-    on_disk[disk] = stages, needed
-    refuse_small_disk(study.out, needed, f"the results of {stages} stages need", "", "[study] out")
 
 
 def report(study: Path | str | Study) -> StudyRun:
@@ -252,7 +220,7 @@ def report(study: Path | str | Study) -> StudyRun:
 
 def forecast(study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = ()) -> dict[str, str]:
     """What `run` would do with each stage (`Pipeline.forecast`); parameters and errors as in `run`."""
-    return _planned([read_study(study)], only, force)[0][0].forecast()
+    return _planned({"": read_study(study)}, only, force)[0][""].forecast()
 
 
 def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence[str]) -> None:
@@ -264,27 +232,7 @@ def refuse_unknown(stages: Sequence[Stage], only: Sequence[str], force: Sequence
     for name in force if only else ():
         forced = [stage for stage in stages if name in (stage.name, stage.kind)]
         if forced and not any({stage.name, stage.kind} & {*only} for stage in forced):
-            raise InputError(f"--force {name} makes nothing anew: --only {', '.join(only)} leaves it out.")
-
-
-def refuse_missing(planned: Sequence[Sequence[Stage]]) -> None:
-    """Refuse studies with missing files, naming every missing file."""
-    files = dict.fromkeys(path for stages in planned for stage in stages for path in stage.files)
-    missing = [path for path in files if not path.exists()]
-    if missing:
-        raise InputError("These files of the study are not there:\n" + "\n".join(f"  {path}" for path in missing))
-
-
-def refuse_wrong(studies: Sequence[Study], todo: Sequence[Sequence[Stage]]) -> None:
-    """Refuse studies with a stage to do that would fail, hours later, for a reason that can be known beforehand."""
-    faults = {
-        study.study.name: wrong
-        for study, left in zip(studies, todo, strict=True)
-        if left and (wrong := wrong_with(study, left))
-    }
-    if faults:
-        lines = [f"{name}: {sentence}" for name, wrong in faults.items() for sentence in wrong]
-        raise InputError("This cannot be run as it is (`mrstrain check` tells more):\n  " + "\n  ".join(lines))
+            raise InputError(f"force ({name}) makes nothing anew: only ({', '.join(only)}) leaves it out.")
 
 
 @contextmanager
@@ -296,23 +244,16 @@ def _alone(out: Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout as taken:
-        advice = "Wait for its end, or give another [study] out."
-        raise OutputError(f"{out}: another run is at work here. {advice}") from taken
+        raise OutputError(
+            f"{out}: another run is at work here. Wait for its end, or give another [study] out."
+        ) from taken
     try:
         yield
     finally:
         lock.release()
 
 
-@contextmanager
-def _log(path: Path) -> Iterator[Callable[[str], None]]:
-    """Append lines to a file, each with its time."""
-    logger = logging.Logger(f"mrstrain {path}")
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)sZ %(message)s", "%Y-%m-%dT%H:%M:%S"))
-    handler.formatter.converter = time.gmtime  # type: ignore[union-attr]
-    logger.addHandler(handler)
-    try:
-        yield logger.info
-    finally:
-        handler.close()
+def _log(path: Path, text: str) -> None:
+    """Append a line to a file, with its time."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S}Z {text}\n")

@@ -1,4 +1,4 @@
-"""The stages of a study, each a function of plain values and files: what a worker runs, here or on another machine.
+"""The stages of a study, each a function of plain values and paths: what a worker runs, here or on another machine.
 
 Every function takes ``tell(stage, fraction)`` and what the plan gave it, writes its results whole, and returns what the
 study's report and log say of it.
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dvc import Verdict
 from dvc.report.page import Section
 from dvc.worker import Worker
 
@@ -26,24 +27,28 @@ class StageResult:
     retry: bool = False  # a part failed in a way that may not recur: it is run again next time
     timed_out: bool = False  # all that is missing is due to the time limit
 
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """The verdicts in its sections."""
+        return [section.verdict for section in self.sections if section.verdict is not None]
 
-def register(tell: Tell, *, out: str, load0: str, load: str, repeat: Sequence[str], **options: Any) -> StageResult:
+
+def register(tell: Tell, *, load0: Path, load: Path, repeat: Sequence[Path], **options: Any) -> StageResult:
     """One loaded image against the unloaded one; as `mrstrain.measurement.register_one.register_one`."""
     from mrstrain.measurement.register_one import register_one
 
-    after, floor = _path(options.pop("after")), _path(next(iter(repeat), None))
-    case = register_one(Path(load0), Path(load), out=Path(out), repeat=floor, after=after, tell=tell, **options)
+    case = register_one(load0, load, repeat=next(iter(repeat), None), tell=tell, **options)
     return StageResult(tuple(case.summary()), (case.section,))
 
 
-def mesh(tell: Tell, *, labels: str, **options: Any) -> StageResult:
+def mesh(tell: Tell, *, labels: Path, **options: Any) -> StageResult:
     """A label map's soft tissue as tetrahedra; as `mrstrain.mesh`."""
     from mrstrain.models.mesh import mesh as run
 
     return StageResult(tuple(run(labels, watch=lambda share: tell("meshing", share), **options).summary()))
 
 
-def simulate(tell: Tell, *, mesh: str, loads: Sequence[Mapping[str, Any]], **options: Any) -> StageResult:
+def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **options: Any) -> StageResult:
     """One material set under all loads; as `mrstrain.simulate`."""
     from fe import LoadStep
     from mrstrain.models.simulate import simulate as run
@@ -62,27 +67,24 @@ def simulate(tell: Tell, *, mesh: str, loads: Sequence[Mapping[str, Any]], **opt
     )
 
 
-def drive(tell: Tell, *, mesh: str, dvc: str, sets: Sequence[str], **options: Any) -> StageResult:
+def drive(tell: Tell, *, sets: Sequence[str], **options: Any) -> StageResult:
     """One material set whose outside goes where it was measured; as `mrstrain.drive`."""
     with Worker(threads=1) as worker:
-        done = worker.run(f"driving {sets[0]}", _driven, mesh, dvc, options | {"sets": sets})
+        return worker.run(f"driving {sets[0]}", _driven, {"sets": sets, **options})
+
+
+def _driven(options: dict[str, Any]) -> StageResult:
+    from mrstrain.comparison.drive import drive as run
+
+    done = run(options.pop("mesh"), options.pop("dvc"), threads=1, **options)
     return StageResult(tuple(done.summary()[:-1]), complete=done.complete)
 
 
-def _driven(mesh: str, dvc: str, options: Mapping[str, Any]) -> Any:
-    from mrstrain.comparison.drive import drive as run
-
-    return run(mesh, dvc, threads=1, **options)
-
-
-def level(tell: Tell, *, load0: str, model: str, load: str, **options: Any) -> StageResult:
+def level(tell: Tell, *, load0: Path, model: Path, load: str, **options: Any) -> StageResult:
     """One model's load sent through the measurement; as `mrstrain.level`."""
     from mrstrain.comparison.level import level as run
 
-    def told(_: str, stage: str, fraction: float) -> None:
-        tell(stage, fraction)
-
-    done = run(load0, model, loads=[load], threads=1, progress=told, **options)
+    done = run(load0, model, loads=[load], threads=1, progress=lambda _, *stage: tell(*stage), **options)
     return StageResult(tuple(done.summary()[:-1]))
 
 
@@ -98,7 +100,3 @@ def _compared(options: dict[str, Any]) -> StageResult:
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
     done = run(options.pop("dvc"), models, **options)
     return StageResult(tuple(done.summary()[:-1]), done.sections, done.closing)
-
-
-def _path(given: str | None) -> Path | None:
-    return None if given is None else Path(given)

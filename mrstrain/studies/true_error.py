@@ -52,17 +52,14 @@ def error_against_truth(study: Study, outcomes: Mapping[str, StageOutcome]) -> l
     rows = _rows(study.place / TABLE)
     if not rows:
         return []
-    known = [row for row in rows if row[_MADE] and row[_MADE] == _made(outcomes, row["load"])]
-    old = dict.fromkeys(row["load"] for row in rows if row not in known)
-    note = "Displacement in mm. The calcaneus and the ankle bones are rigid, so their true shear is zero."
-    if old:
-        note += f" Registered again since, so not known: {', '.join(old)}; run `mrstrain demo` to compute it."
-    table = Table(
-        "Error of max. shear and displacement, by load and tissue",
-        _COLUMNS,
-        tuple((row["load"], row["tissue"], *(float(row[key]) for key in _FIGURES)) for row in known),
-        note,
+    known = read_errors(study.place / TABLE, outcomes)
+    figures = tuple(
+        (load, one.tissue, *(getattr(one, key) for key in _FIGURES)) for load, of in known.items() for one in of
     )
+    note = "Displacement in mm. The calcaneus and the ankle bones are rigid, so their true shear is zero."
+    if old := dict.fromkeys(row["load"] for row in rows if row["load"] not in known):
+        note += f" Registered again since, so not known: {', '.join(old)}; run `mrstrain demo` to compute it."
+    table = Table("Error of max. shear and displacement, by load and tissue", _COLUMNS, figures, note)
     text = (
         "These images show a phantom whose strain is known at every point, so the measurement below can be compared "
         "with the truth. Real images have no such table: rely on the verdict, the intervals and the repeat scan. The "

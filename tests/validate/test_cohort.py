@@ -177,8 +177,8 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
     )
     notes = cohort(places, out=tmp_path / "unlike").notes
     begin = "Subjects are not measured and simulated alike, "
-    assert f"{begin}[loads.Load1] along the normal differs: nothing in Ada, Cy; 15 N in Ben." in notes
-    assert f"{begin}[registration] differs: gauss-newton-borders in Ada, Cy; heel-mr in Ben." in notes
+    assert f"{begin}[loads.Load1] normal_n differs: none in Ada, Cy; 15 in Ben." in notes
+    assert f"{begin}[registration] engine differs: gauss-newton-borders in Ada, Cy; heel-mr in Ben." in notes
     assert len([note for note in notes if note.startswith(begin)]) == 2  # a shear of nothing is none
 
     for place, mu in zip(places, (10, 10, 999), strict=True):
@@ -195,7 +195,7 @@ def test_what_is_unlike_between_subjects_is_told_and_one_name_for_two_laws_refus
     )
     notes = cohort(places[:2], out=tmp_path / "more").notes
     assert f"{begin}[loads] differs: Load1 in Ada; Load1, Load2 in Ben." in notes
-    assert f"{begin}[models] differs: P1 in Ada; P1, 5 minutes at the most in Ben." in notes
+    assert f"{begin}[models] limit_minutes differs: none in Ada; 5 in Ben." in notes
 
 
 def test_files_that_are_lacking_are_told_of_all_subjects_at_once(tmp_path):

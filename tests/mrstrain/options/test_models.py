@@ -214,10 +214,10 @@ def test_a_value_comes_from_the_study_file_to_its_stage(model: type[Options], fi
         more |= {"file": "mesh.vtu"} if model is MeshCoordinates else {"labels": "own.nii.gz"}
     stages = {one.name: one for one in plan(study_with(tmp_path, table, more))}
     got, usual = stages[stage].arguments[field], info.default
-    paths = [str(tmp_path / one) for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, Path)]
+    paths = [tmp_path / one for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, Path)]
     if paths:
-        assert ([got] if isinstance(got, str) else list(got)) == paths
-        assert all(Path(path) in stages[stage].files for path in paths)
+        assert ([got] if isinstance(got, Path) else list(got)) == paths
+        assert all(path in stages[stage].files for path in paths)
     elif field == "sets":
         assert got == (str(tmp_path / "name.toml"),)
     elif field == "fixed":

@@ -131,7 +131,8 @@ def test_a_label_map_to_mesh_that_lies_elsewhere_and_one_image_for_two_loads_are
     assert wrong(study, twice) == "Load2 is the image of Load1: every voxel is equal."
     forceless = (twice[0], twice[1].replace("normal_n = 2.0\n", ""))
     wrong(study, forceless)
-    assert "Load2: no force, so measured and not simulated." in check(study).notes
+    place = "line 12: [loads.Load2] 'normal_n'"
+    assert f"Load2: no force ({place}), so measured and not simulated." in check(study).notes
 
 
 def test_a_mesh_made_elsewhere_is_asked_as_simulate_asks(study):
@@ -152,8 +153,8 @@ def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(stu
     tissues = LabelMap(GRID, np.ones(GRID.shape, dtype=np.int64), {1: "fat"})
     write_labels(study / "tissues.nii.gz", tissues)
     align, measured = ("[registration]", '[registration]\nalign = "image"'), ('"mine.toml", "friedman"', "")
-    assert "no region 'bone'" in wrong(study, measured)
-    assert "no 'bone'" in wrong(study, align)  # a comparison needs one
+    assert wrong(study, measured).startswith("line 4: [images] 'bone': The label map has no region 'bone'")
+    assert "line 16: [mesh] 'bones': The label map has no 'bone'" in wrong(study, align)  # a comparison needs one
     assert "no region 'sacrum'" in wrong(study, align, measured, ("labels =", 'bone = "sacrum"\nlabels ='))
     assert wrong(study, align, measured) == ""
     (stage,) = plan(read_study(study))
@@ -223,7 +224,7 @@ def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, mo
         return [line for line in costs.costs(told, left, left, 256.0**3, 0.0, workers) if line.startswith("CARE")]
 
     assert care(12.0) == []  # three of 3.9 GiB
-    assert care(8.0) == ["CARE: this machine has 8.0 GiB of memory; run with --workers 2."]
+    assert care(8.0) == ["CARE: this machine has 8.0 GiB of memory; run with workers=2 (--workers 2)."]
     assert care(8.0, workers=2) == []
     assert "crop the images" in care(3.0)[0]
 

@@ -85,6 +85,18 @@ def test_refused(tmp_path, old, new, words):
         read_study(written(tmp_path, WHOLE.replace(old, new)))
 
 
+def test_every_line_that_is_no_toml_is_told_and_what_is_wrong_stands_by_line(tmp_path):
+    text = WHOLE.replace("normal_n = 140", "normal_n =").replace("normal_n = 15.0", "normal_n = ...")
+    with pytest.raises(InputError, match=r"(?s)no TOML file:\n  line 9: .*normal_n =\n  line 12: .*normal_n = \.\.\."):
+        read_study(written(tmp_path, text))
+    text = WHOLE.replace('load0 = "', '# load0 = "').replace("shear_n = 45.0", 'shear_n = "45"')
+    text = text.replace('[study]\nname = "Heel"\n', "")
+    with pytest.raises(InputError) as told:
+        read_study(written(tmp_path, text))
+    places = [line.split("]")[0].strip() for line in str(told.value).splitlines()[1:]]
+    assert places == ["'study' is missing.", "line 3: [images", "line 11: [loads.Load2"]
+
+
 def test_no_file(tmp_path):
     with pytest.raises(InputError, match="mrstrain init"):
         read_study(tmp_path)
@@ -114,14 +126,16 @@ def test_chained_loads_wait_for_one_another(tmp_path):
 
 def test_a_simulated_load_needs_its_force(tmp_path):
     text = WHOLE.replace("normal_n = 15.0\n", "")
-    with pytest.raises(InputError, match=r"loads.Load2\] normal_n is missing"):
+    with pytest.raises(
+        InputError, match=r"(?s)plate that shears has to press.*\n  line 10: \[loads.Load2\] 'normal_n'"
+    ):
         plan(read_study(written(tmp_path, text)))
     alone = text.replace("shear_n = 45.0\n", "") + "level = true\n"
     stages = {stage.name: stage for stage in plan(read_study(written(tmp_path, alone)))}
     assert [load["name"] for load in stages["simulate trebbi"].arguments["loads"]] == ["Load1"]
     assert {name for name in stages if name.startswith("level trebbi")} == {"level trebbi Load1"}
     assert "register Load2" in stages  # measured all the same
-    with pytest.raises(InputError, match=r"loads.Load1\] normal_n is missing: no load has a force"):
+    with pytest.raises(InputError, match=r"(?s)No load has a force.*line 7: \[loads.Load1\].*line 9: \[loads.Load2\]"):
         plan(read_study(written(tmp_path, alone.replace("normal_n = 140\n", ""))))
     measured = text.replace('sets = ["trebbi", "luboz"]', "sets = []")
     assert [s.kind for s in plan(read_study(written(tmp_path, measured)))] == ["register", "register", "compare"]
@@ -130,11 +144,12 @@ def test_a_simulated_load_needs_its_force(tmp_path):
 def test_a_load_has_the_plates_directions_or_its_own(tmp_path):
     text = WHOLE.replace("shear_n = 45.0", "shear_n = 45.0\nshear_direction = [1.0, 0.0, 0.0]")
     (found,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "simulate trebbi")
-    assert found.arguments["towards"] == {"Load2": ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0))}
+    usual = ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0))
+    assert found.arguments["towards"] == {"Load1": usual, "Load2": (usual[0], (1.0, 0.0, 0.0))}
     measured = {s.name: s.arguments["shear_direction"] for s in plan(read_study(tmp_path)) if s.kind == "register"}
     assert measured == {"register Load1": (0.0, -1.0, 0.0), "register Load2": (1.0, 0.0, 0.0)}
     (found,) = (s for s in plan(read_study(written(tmp_path, WHOLE))) if s.name == "simulate trebbi")
-    assert found.arguments["towards"] == {}
+    assert found.arguments["towards"] == {"Load1": usual, "Load2": usual}
 
 
 def test_weights_of_the_engine_and_the_plates_pivot_reach_their_stages(tmp_path):
@@ -190,7 +205,7 @@ def test_inputs_and_results_do_not_lie_in_one_another(tmp_path, old, new):
 def test_a_model_is_levelled_by_the_preset_that_measured(tmp_path):
     text = WHOLE + 'level = true\n[registration]\nparameters = ["mine.txt"]\n'
     (stage,) = (s for s in plan(read_study(written(tmp_path, text))) if s.name == "level trebbi Load1")
-    assert stage.arguments["parameters"] == [str(tmp_path / "mine.txt")]
+    assert stage.arguments["parameters"] == (tmp_path / "mine.txt",)
     assert tmp_path / "mine.txt" in stage.files
 
 

@@ -10,6 +10,7 @@ import pytest
 from pydantic import BaseModel
 
 from dvc.errors import InputError
+from mrstrain.studies.check import check
 from mrstrain.studies.file import Load, Study, keys_of, read_study
 from mrstrain.studies.init import init
 
@@ -81,9 +82,24 @@ def test_every_key_of_a_study_file_stands_in_it_with_its_default(tmp_path, names
 def test_init_of_an_empty_folder_says_what_is_missing(tmp_path):
     told = "\n".join(init(tmp_path).summary())
     assert "Load0: NOT FOUND" in told
-    with pytest.raises(InputError, match=r"\[images\] 'load0' is missing"):
+    lines = (tmp_path / "study.toml").read_text().splitlines()
+    places = re.findall(r"line (\d+): ((\S+) .*)$", told, re.MULTILINE)
+    assert [key for _, _, key in places] == ["load0", "labels", "names", "[loads.Load1]", "image", "normal_n"]
+    assert all(lines[int(number) - 1] == f"# {line}" for number, line, _ in places)
+    with pytest.raises(InputError, match=r"(?s)line 10: \[images\] 'load0' is missing.*line 11: \[images\] 'labels'"):
         read_study(tmp_path)
-    assert "Put in what was not found, and the forces" in told
+
+
+def test_every_force_that_is_to_be_put_in_is_told_with_its_line_by_init_and_by_check(tmp_path):
+    begun = init(folder_of(tmp_path, "Load0.nii.gz", "Load 1.nii.gz", "Load2.nii.gz", "tissues.nii.gz"))
+    lines = begun.path.read_text().splitlines()
+    first, second = (number for number, line in enumerate(lines, start=1) if line.startswith("# normal_n ="))
+    told = [line.strip().split(" = ")[0] for line in begun.summary()[-4:-1]]
+    assert told == ["line 12: names", f"line {first}: normal_n", f"line {second}: normal_n"]
+    assert 'force under "Load 1", N' in begun.summary()[-3]
+    places = [f"line {first}: [loads.Load 1] 'normal_n'", f"line {second}: [loads.Load2] 'normal_n'"]
+    (told,) = (one for one in check(tmp_path).wrong if "normal_n" in one)
+    assert [line.strip() for line in told.splitlines()[1:]] == places
 
 
 def test_dicom_folders_are_found_whatever_their_files_are_called(tmp_path):
@@ -94,10 +110,10 @@ def test_dicom_folders_are_found_whatever_their_files_are_called(tmp_path):
     assert begun.inputs.load0 == "Load0"
     assert begun.inputs.loads == {"Load1": "Load1", "Load2": "Load2"}
     assert "NOT USED: Load3, a folder without a DICOM image in it" in begun.summary()
-    assert "Put in what was not found" in begun.summary()[-1]  # the label map
+    assert any(": labels = " in line for line in begun.summary())
     (tmp_path / "study.toml").unlink()
     (tmp_path / "tissues.nii.gz").touch()
-    assert "Put the forces in" in init(tmp_path).summary()[-1]
+    assert not any(": labels = " in line for line in init(tmp_path).summary())
 
 
 def test_a_dicom_folder_may_hold_many_other_files(tmp_path):

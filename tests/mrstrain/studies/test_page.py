@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dvc.errors import MrstrainError, ParameterError
-from dvc.report.page import Section
+from dvc.report.page import Section, Table
 from dvc.trust.verdict import Verdict
 from mrstrain.cli.app import app
 from mrstrain.studies.file import Study, read_study
@@ -133,6 +133,14 @@ def test_registrations_alone_have_a_methods_text(study: Study) -> None:
     closing = (Section("Methods text", paragraphs=("All of it.",)),)
     page = page_of(study, ended(study, register_Load1=SOUND, compare=StageResult((), (), closing)))
     assert page.count("Methods text") == 1  # that of the comparison tells the registrations too
+
+
+def test_no_figure_of_the_report_is_a_negative_zero(study: Study) -> None:
+    table = Table("Travel", ("load", "mm"), (("Load1", round(-0.001, 2)), ("Load2", -0.25)))
+    page = page_of(study, ended(study, register_Load1=StageResult((), (Section("Load1", None, (table,)),))))
+    assert ">0</td>" in page
+    assert ">-0</td>" not in page
+    assert ">-0.25</td>" in page
 
 
 def test_the_error_of_a_phantom_stays_in_the_report_as_long_as_its_registration_does(study: Study) -> None:

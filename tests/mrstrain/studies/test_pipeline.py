@@ -184,8 +184,8 @@ def test_only_and_force(folder):
     ("only", "force", "says"),
     [
         (("registr",), (), "No stage is called 'registr'. There are: register a"),
-        (("register",), ("mesh",), "--force mesh makes nothing anew: --only register leaves it out"),
-        (("register a",), ("register b",), "--force register b makes nothing"),
+        (("register",), ("mesh",), r"force \(mesh\) makes nothing anew: only \(register\) leaves it out"),
+        (("register a",), ("register b",), r"force \(register b\) makes nothing"),
     ],
 )
 def test_what_no_stage_answers_to_is_refused(folder, only, force, says):

@@ -114,6 +114,7 @@ def test_a_disk_with_too_little_room_is_refused_before_anything_is_made(done, im
     one = 10**6 * int(re.search(said, str(refused.value))[1])
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 3 * one // 2))
     shutil.copytree(images, tmp_path / "other")
+    change(tmp_path / "other", ('name = "Heel', 'name = "Other heel'))
     with pytest.raises(OutputError, match="the results of 12 stages need"):  # room for one of two
         run_studies([read_study(tmp_path / name) for name in ("study", "other")])
     assert run(done[0]).complete  # where all is there already, none is needed
@@ -332,7 +333,7 @@ def test_init_writes_a_study_that_can_be_checked(images, tmp_path):
     assert (told.images.labels, told.images.names) == (Path("tissues.nii.gz"), Path("tissues.csv"))
     assert list(told.loads) == ["Load1", "Load2"]
     assert told.loads["Load1"].normal_n is None  # forces are never guessed
-    assert any("normal_n is missing" in one for one in check(study).wrong)
+    assert any("'normal_n'" in one for one in check(study).wrong)
     assert told.models.results == ("ansys",)
     assert len(told.models.sets) == 6
     assert "friedman" not in told.models.sets

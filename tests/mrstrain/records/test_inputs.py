@@ -1,0 +1,32 @@
+"""What a command was given: what is refused is named so that it serves Python and the command line."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc.errors import MrstrainError
+from dvc.images.image import Grid, Image
+from dvc.io.images.write import write_image
+from mrstrain.options.measurement import SubjectFiles
+from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_small_disk, refuse_touching_inputs
+from mrstrain.studies.run import run_studies
+
+
+def test_arguments_are_named_without_the_dashes_of_the_command_line(tmp_path: Path) -> None:
+    image = tmp_path / "Load0.nii.gz"
+    write_image(image, Image(Grid((4, 4, 4), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), np.arange(64.0).reshape(4, 4, 4)))
+    for refused, names in (
+        (lambda: read_subject(image, SubjectFiles(names=Path("t.csv"))), "names and bone_label"),
+        (lambda: case_names([image, tmp_path / "other" / "Load0.nii.gz"]), r"\(out\)"),
+        (lambda: refuse_touching_inputs(tmp_path, ["a"], [tmp_path / "a" / "b.nii"]), r"\(out\)"),
+        (lambda: refuse_small_disk(tmp_path, 1e30, "images need"), r"\(out\)"),
+        (lambda: make_output(image / "below"), r"\(out\)"),
+        (lambda: run_studies([], scheduler="tcp://n:1", workers=4), r"workers=4 \(--workers 4\)"),
+    ):
+        with pytest.raises(MrstrainError, match=names) as told:
+            refused()
+        assert "--" not in re.sub(r"\(--.*?\)", "", str(told.value))
