@@ -33,17 +33,15 @@ class Assembler:
         self._own = np.where(free, np.cumsum(free) - 1, -1)  # -1 where fixed
         self.own_equations = int(free.sum())
         self.size = self.own_equations + len(shared)
-        self._may_share = np.zeros(model.unknowns, dtype=bool)
-        for unknowns in shared.values():
-            self._may_share[unknowns] = True
         self.indptr, self.indices = self._pattern(shared)
         self._row_of = np.repeat(np.arange(self.size), np.diff(self.indptr))
         above = self.indices != self._row_of
         self._columns = [np.flatnonzero((self.indices == self.own_equations + n) & above) for n in range(len(shared))]
-        self._touched = self._may_share[self._cells].any(axis=1)
+        may_share = np.concatenate([np.empty(0, dtype=np.int64), *shared.values()])
+        self._touched = np.flatnonzero(np.isin(self._cells, may_share).any(axis=1))
         pairs = self._cells.shape[1] * (self._cells.shape[1] + 1) // 2
         self._places = np.empty((len(self._cells), pairs), dtype=np.int32)
-        self.equation = self._own.copy()
+        self.equation = self._own
         _locate(self._cells, self.equation, self.indptr, self.indices, np.arange(len(self._cells)), self._places)
 
     def share(self, followers: Mapping[int, IntArray]) -> None:
@@ -51,10 +49,9 @@ class Assembler:
         equation = self._own.copy()
         for number, unknowns in followers.items():
             equation[unknowns] = self.own_equations + number
-        if np.array_equal(equation, self.equation):
-            return
-        self.equation = equation
-        _locate(self._cells, equation, self.indptr, self.indices, np.flatnonzero(self._touched), self._places)
+        if not np.array_equal(equation, self.equation):
+            self.equation = equation
+            _locate(self._cells, equation, self.indptr, self.indices, self._touched, self._places)
 
     @property
     def force_equations(self) -> BoolArray:
@@ -110,8 +107,7 @@ class Assembler:
     def by_equation(self, by_unknown: FloatArray) -> FloatArray:
         """Sum of a quantity of the unknowns over each equation."""
         inside = self.equation >= 0
-        sums = np.bincount(self.equation[inside], weights=by_unknown[inside], minlength=self.size)
-        return sums.astype(np.float64)
+        return np.bincount(self.equation[inside], by_unknown[inside], self.size).astype(np.float64)
 
     def acting(self, state: FloatArray, directions: FloatArray) -> FloatArray:
         """The tangent times directions (unknowns, k), by unknown, as if each had its own equation."""
@@ -157,16 +153,11 @@ class Assembler:
         count, width = self._cells.shape
         cell = np.repeat(np.arange(count), width)
         meets = sparse.csr_matrix((np.ones(cell.size, dtype=np.int32), (cell, self._cells.ravel())))
-        rows, columns = [self._own], [np.arange(self.model.unknowns)]
-        for number, unknowns in shared.items():
-            rows.append(np.full(len(unknowns), self.own_equations + number))
-            columns.append(unknowns)
-        row, column = np.concatenate(rows), np.concatenate(columns)
+        rows = [self._own, *(np.full(len(unknowns), self.own_equations + n) for n, unknowns in shared.items())]
+        row, column = np.concatenate(rows), np.concatenate([np.arange(self.model.unknowns), *shared.values()])
         kept = row >= 0
-        stands = sparse.csr_matrix(
-            (np.ones(kept.sum(), dtype=np.int32), (row[kept], column[kept])), shape=(self.size, self.model.unknowns)
-        )
-        touches = stands @ meets.T
+        entries = np.ones(kept.sum(), dtype=np.int32), (row[kept], column[kept])
+        touches = sparse.csr_matrix(entries, shape=(self.size, self.model.unknowns)) @ meets.T
         coupled = sparse.triu(touches @ touches.T + sparse.identity(self.size, dtype=np.int32), format="csr")
         coupled.sort_indices()
         return coupled.indptr.astype(np.int32), coupled.indices.astype(np.int32)

@@ -178,8 +178,8 @@ class Solver:
     precision; and where that is not enough, in double until `forget`.
     """
 
-    def __init__(self, indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None) -> None:
-        self._new = partial(factors, indptr, indices, threads=threads, library=library)
+    def __init__(self, indptr: IntArray, indices: IntArray, *, threads: int = 1) -> None:
+        self._new = partial(factors, indptr, indices, threads=threads)
         self._factors = self._new(rough=True)
         self._began_rough = self._factors.rough
         self._upper = _ones(indptr, indices)
@@ -189,15 +189,12 @@ class Solver:
 
     def solve(self, data: FloatArray, right: FloatArray, tolerance: float) -> FloatArray:
         """Solve to a residual below ``tolerance`` times that of zero; 1e-8 if that takes a factorisation."""
-        if self._known:
-            solution = self._iterated(data, right, tolerance)
-            if solution is not None:
-                return solution
+        if self._known and (solution := self._iterated(data, right, tolerance)) is not None:
+            return solution
         if self._factors.rough:
             with suppress(SingularError):
                 self._factorise(data)
-                solution = self._iterated(data, right, _FINE)
-                if solution is not None:
+                if (solution := self._iterated(data, right, _FINE)) is not None:
                     return solution
             self._renew(rough=False)
         self._factorise(data)

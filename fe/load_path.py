@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import BoolArray, FloatArray
 from fe.assembly import Assembler
 from fe.descent import descend
-from fe.elements import Model, edges_of
+from fe.elements import Model
 from fe.linear import Solver
 from fe.load_step import PlateTarget
 from fe.newton import Imposed, Tolerance, equilibrium
@@ -61,13 +61,9 @@ class PlateState:
         return float(self.force_n[0]) / self.area_mm2 if self.area_mm2 > 0.0 else float("nan")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Increment:
-    """A converged increment, with all that it takes to go on from it."""
-
-    unknowns: FloatArray  # displacements along the plate's axes, and pressures
-    plate: PlateState
-    contact: ContactStatus
+_Increment = tuple[
+    FloatArray, PlateState, ContactStatus
+]  # what it takes to go on from one; unknowns as in `Checkpoint`
 
 
 class LoadPath:
@@ -78,13 +74,14 @@ class LoadPath:
     from.
     """
 
-    def __init__(self, model: Model, mesh: TetMesh, problem: Problem, threads: int, tolerance: Tolerance) -> None:
-        self.model, self.tolerance = model, tolerance
-        self.log: Callable[[str], None] = lambda _: None
-        self.is_over: Callable[[], bool] = lambda: False
+    def __init__(
+        self, model: Model, mesh: TetMesh, problem: Problem, threads: int, tolerance: Tolerance,
+        log: Callable[[str], None], is_over: Callable[[], bool],
+    ) -> None:  # fmt: skip
+        self.model, self.tolerance, self.log, self.is_over = model, tolerance, log, is_over
         self.on_converged: Callable[[], None] = lambda: None
-        held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in problem.fixed]))
-        touching = np.setdiff1d(_nodes_on(model, mesh, SKIN), held)
+        held = model.space.nodes_on(np.concatenate([mesh.facets[name] for name in problem.fixed]))
+        touching = np.setdiff1d(model.space.nodes_on(mesh.facets[SKIN]), held)
         self.contact = Contact(problem.plate, model.space.nodes_mm, touching)
         may_follow = {axis: 3 * touching + axis for axis in range(3)}
         self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), may_follow)
@@ -112,9 +109,8 @@ class LoadPath:
         start = np.array([self.contact.plate.gap_mm, 0.0, 0.0])
         for share in _ENOUGH:
             if target.displaced[0]:
-                part = start + share * (target.values - start)
-                part_target = PlateTarget(part, target.displaced).unsheared()
-                if part[0] > self.plate.displacement_mm[0] and not self.raise_to(part_target):
+                part = PlateTarget(start + share * (target.values - start), target.displaced).unsheared()
+                if part.values[0] > self.plate.displacement_mm[0] and not self.raise_to(part):
                     return False
             else:
                 self._push(share * target.values[0], target.values[0])
@@ -131,20 +127,18 @@ class LoadPath:
         """
         level, force, moment = self.increment, self.plate.force_n, self.plate.moment_nmm
         self.contact.status = replace(self.contact.status, turns=True)
-        gap_mm, level_mm = self.contact.plate.gap_mm, level.plate.displacement_mm[0]
+        gap_mm, level_mm = self.contact.plate.gap_mm, self.plate.displacement_mm[0]
         least_mm = gap_mm + _TIPPING * (level_mm - gap_mm)
         left, step = 1.0, 0.5
         while left > 0.0 and step > _LEAST_STEP and not self.is_over():
-            last = self.increment
             least = max(0.0, left - step)
-            if self._go(np.zeros(3, dtype=bool), force, least * moment):
-                if self.plate.displacement_mm[0] < least_mm:
-                    break
-                left, step = least, step * _GROWTH
-                self._log(f"{1.0 - left:.0%} released")
-            else:
-                self._back(last)
+            if not self._go(np.zeros(3, dtype=bool), force, least * moment):
                 step *= _SHRINK
+                continue
+            if self.plate.displacement_mm[0] < least_mm:
+                break
+            left, step = least, step * _GROWTH
+            self._log(f"{1.0 - left:.0%} released")
         if left > 0.0:
             self._back(level)
         return left == 0.0
@@ -163,13 +157,11 @@ class LoadPath:
         while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.is_over():
             step = min(step, largest)
             share = min(1.0, done + step)
-            last = self.increment
             if self._go(target.displaced, before + share * way, downhill=downhill):
                 done, step = share, step if downhill else step * _GROWTH
                 self._log(f"{done:.0%} of the way")
                 self.on_converged()
                 continue
-            self._back(last)
             step *= _SHRINK
             stays = self.contact.plate.taped and not self.contact.status.turns
             if step < _SOFT_STEP and stays and not (downhill or target.displaced.any()):
@@ -199,9 +191,9 @@ class LoadPath:
         """Find equilibrium at displacements (mm) along some of the plate's axes, and under forces (N) along the others.
 
         A plate that turns freely also takes up a moment (3,), N mm. ``downhill`` is by `fe.descent`: under forces
-        alone, and a plate that does not turn.
+        alone, and a plate that does not turn. Where it fails, all is as it was.
         """
-        contact = self.contact
+        contact, before = self.contact, self.contact.status
         contact.begin(self.state)
         equations = self.assembler.own_equations + np.arange(3)
         outside = np.zeros(self.assembler.size)
@@ -220,18 +212,19 @@ class LoadPath:
             converged = equilibrium(
                 self.assembler, self.solver, self.state, imposed, self.tolerance, self._changed, self.log, rotation
             )
-        if converged is None:
-            return False
-        moved = contact.displacement_mm(converged.state)
-        if np.abs(moved - [contact.plate.gap_mm, 0.0, 0.0]).max() > self.extent_mm:
+        start_mm = [contact.plate.gap_mm, 0.0, 0.0]
+        if converged and np.abs(contact.displacement_mm(converged.state) - start_mm).max() > self.extent_mm:
             self.log("the plate would have moved farther than the body is large")
+            converged = None
+        if converged is None:
+            contact.status = before
             return False
         self.state = converged.state
         self.iterations += converged.iterations
         self.plate = PlateState(
-            moved, contact.force_n(converged.forces),
+            contact.displacement_mm(self.state), contact.force_n(converged.forces),
             np.degrees(Rotation.from_matrix(contact.status.rotation).as_rotvec()),
-            contact.moment_nmm(converged.state, converged.forces), self._area_mm2(),
+            contact.moment_nmm(self.state, converged.forces), self._area_mm2(),
         )  # fmt: skip
         self.curve.append(self.plate)
         return True
@@ -256,36 +249,25 @@ class LoadPath:
         return touched
 
     @property
-    def increment(self) -> Increment:
+    def increment(self) -> _Increment:
         """The current increment."""
-        return Increment(self.state, self.plate, self.contact.status)
+        return self.state, self.plate, self.contact.status
 
-    def resume(self, where: Increment) -> None:
+    def resume(self, where: _Increment) -> None:
         """Go to an increment of this path, or of another on the same model; the curve stays as it is."""
-        self.state, self.plate, self.contact.status = where.unknowns, where.plate, where.contact
+        self.state, self.plate, self.contact.status = where
 
-    def _back(self, where: Increment) -> None:
+    def _back(self, where: _Increment) -> None:
         """Undo the steps since an increment."""
-        while self.curve[-1] is not where.plate:
+        while self.curve[-1] is not where[1]:
             self.curve.pop()
         self.resume(where)
 
     def _log(self, what: str) -> None:
-        plate = self.plate
-        moved, force, turn = (
-            ", ".join(f"{v:.3f}" for v in x) for x in (plate.displacement_mm, plate.force_n, plate.turn_deg)
-        )
+        at, nodes = self.plate, len(self.contact.held)
+        moved, force, turn = (", ".join(f"{v:.3f}" for v in x) for x in (at.displacement_mm, at.force_n, at.turn_deg))
         turned = f", turned {turn} degrees" if self.contact.status.turns else ""
-        nodes = len(self.contact.held)
         self.log(f"{what}: displacement {moved} mm, force {force} N, {nodes} nodes on the plate{turned}")
-
-
-def _nodes_on(model: Model, mesh: TetMesh, facets: str) -> IntArray:
-    """Displacement nodes on named facets; those in the middle of edges too."""
-    corners = np.unique(mesh.facets[facets])
-    if model.element.name != "P2":
-        return corners
-    return np.union1d(corners, model.space.middles(edges_of(mesh.facets[facets])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -337,16 +319,15 @@ class Loading:
         path.curve = path.curve[-1:]
         if earlier is not None:
             path.curve = list(earlier.curve)
-            path.resume(Increment(earlier.unknowns, earlier.curve[-1], earlier.contact))
+            path.resume((earlier.unknowns, earlier.curve[-1], earlier.contact))
             self._stages, self._counted = earlier.stages, path.iterations - earlier.iterations
         path.on_converged = lambda: on_converged(self.checkpoint(), float(np.clip(self._shares(), 0.0, 1.0).mean()))
 
     def run(self) -> bool:
         """Go to the target, normal first and then shear; whether it is reached."""
         path, target = self._path, self._target
-        stages: list[Callable[[], bool]] = [partial(path.raise_to, target)]
-        if self._first and target.sheared:
-            stages.insert(0, partial(path.raise_to, target.unsheared()))
+        goals = [target.unsheared(), target] if self._first and target.sheared else [target]
+        stages = [partial(path.raise_to, goal) for goal in goals]
         if self._first:
             stages.insert(0, partial(path.approach, target))
         for stage in stages[self._stages :]:

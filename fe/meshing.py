@@ -80,14 +80,9 @@ def check_meshing(
 
 
 def mesh_labels(
-    labels: LabelMap,
-    edge_mm: float,
-    *,
-    bones: Sequence[str] = ("bone",),
-    finer: tuple[str, float] | None = None,
-    limit_s: float = 3600.0,
-    watch: Callable[[float], None] = lambda _: None,
-) -> tuple[TetMesh, MeshQuality]:
+    labels: LabelMap, edge_mm: float, *, bones: Sequence[str] = ("bone",), finer: tuple[str, float] | None = None,
+    limit_s: float = 3600.0, watch: Callable[[float], None] = lambda _: None,
+) -> tuple[TetMesh, MeshQuality]:  # fmt: skip
     """Mesh the soft tissues of a label map.
 
     Parameters
@@ -221,13 +216,10 @@ def _lattice(labels: LabelMap, label: int, edge_mm: float, finer_mm: float) -> _
     from scipy.ndimage import distance_transform_edt
 
     grid = labels.grid
-    inside = np.nonzero(labels.labels)
+    inside, steps = np.argwhere(labels.labels), _REFINED_MM / grid.spacing_mm
     away = distance_transform_edt(labels.labels != label, sampling=grid.spacing_mm)
-    low, high = ([f(a) for a in inside] for f in (np.min, np.max))
-    axes = [
-        np.arange(lo - 2, hi + 3 + _REFINED_MM / s, _REFINED_MM / s)
-        for lo, hi, s in zip(low, high, grid.spacing_mm, strict=True)
-    ]
+    ends = inside.min(axis=0) - 2, inside.max(axis=0) + 3 + steps
+    axes = [np.arange(low, high, step) for low, high, step in zip(*ends, steps, strict=True)]
     at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     nearest = np.clip(np.round(at), 0, np.array(grid.shape) - 1).astype(int)
     distance = away[tuple(np.moveaxis(nearest, -1, 0))]

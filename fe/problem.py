@@ -70,13 +70,9 @@ class Problem:
 
 
 def problems_of(
-    mesh: TetMesh,
-    materials: Materials,
-    plate: Plate | Mapping[str, Plate],
-    loads: Sequence[LoadStep],
-    fixed: Sequence[str] = (BONE,),
-    element: str = "P1",
-) -> list[Problem]:
+    mesh: TetMesh, materials: Materials, plate: Plate | Mapping[str, Plate], loads: Sequence[LoadStep],
+    fixed: Sequence[str] = (BONE,), element: str = "P1",
+) -> list[Problem]:  # fmt: skip
     """A problem for each path that the loads lie on (`fe.load_step.paths_of`); ``plate`` may be one for each load."""
     plate_of = {load.name: plate if isinstance(plate, Plate) else plate[load.name] for load in loads}
     paths = paths_of(loads, {name: tuple(one.axes.round(9).ravel()) for name, one in plate_of.items()})

@@ -45,17 +45,12 @@ def fingerprint(problem: Problem, load_count: int) -> str:
 def write_checkpoint(path: Path, checkpoint: Checkpoint, made_from: str) -> None:
     """Write where a load came to, with the `fingerprint` of what it was made from."""
     at = checkpoint
-    arrays: dict[str, Any] = {
-        "made_from": made_from,
-        "counts": np.array([at.reached, at.stages, at.iterations, at.seconds]),
-        "unknowns": at.unknowns,
-    }
+    counts = np.array([at.reached, at.stages, at.iterations, at.seconds])
+    arrays: dict[str, Any] = {"made_from": made_from, "counts": counts, "unknowns": at.unknowns}
     arrays |= {name: getattr(at.contact, name) for name in _CONTACT}
     arrays |= {name: np.array([getattr(plate, name) for plate in at.curve]) for name in _PLATE}
-    content = io.BytesIO()
-    np.savez_compressed(content, **arrays)
     with whole_file(path) as part:
-        part.write_bytes(content.getvalue())
+        np.savez_compressed(part, **arrays)
 
 
 def read_checkpoint(path: Path, made_from: str) -> Checkpoint | None:

@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
+from itertools import chain
 from pathlib import Path
 
 import meshio
@@ -18,13 +19,18 @@ from fe.materials import Materials
 from fe.solution import LoadState
 
 _SHARES = (0.5, 0.9, 0.99)
-_AXES = ("normal", "shear", "third")
-_VECTORS = {
-    "displacement_mm": "travel_{}_mm",
-    "force_n": "force_{}_n",
-    "turn_deg": "turn_{}_deg",
-    "moment_nmm": "moment_{}_nmm",
-}  # vectors of a plate's state, and the columns of their components
+_FAR = 0.05  # det F of a patch further from the material law's than this is counted
+PLATE_VECTORS = {
+    "displacement_mm": "travel_mm",
+    "force_n": "force_n",
+    "turn_deg": "turn_deg",
+    "moment_nmm": "moment_nmm",
+}
+"""Vectors of a plate's state, and what files call them."""
+_COLUMNS = {
+    vector: [name.replace("_", f"_{axis}_") for axis in ("normal", "shear", "third")]
+    for vector, name in PLATE_VECTORS.items()
+}
 
 
 def cauchy_stress(state: LoadState, mesh: TetMesh, materials: Materials) -> FloatArray:
@@ -59,8 +65,8 @@ def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
     return np.asarray(np.bincount(nodes, np.repeat(mesh.volumes_mm3 * jacobian, 4)) / before)
 
 
-def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials, by: float) -> float:
-    """Share of the volume where det F of nodal patches differs by more than ``by`` from the material law's, 1 + p / K.
+def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials) -> float:
+    """Share of the volume where det F of nodal patches is more than 0.05 off the material law's, 1 + p / K.
 
     Mean over a cell's nodes. A material of low bulk modulus K may well give way; only the mesh's error is counted.
     """
@@ -69,7 +75,7 @@ def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials, by: 
         cells = mesh.regions[region]
         asked[cells] = state.pressure_mpa[cells] / law.bulk_modulus_mpa
     jacobian = np.linalg.det(np.eye(3) + state.gradients) - asked
-    off = np.abs(patch_volumes(mesh, jacobian) - 1.0)[mesh.cells].mean(axis=1) > by
+    off = np.abs(patch_volumes(mesh, jacobian) - 1.0)[mesh.cells].mean(axis=1) > _FAR
     return float(mesh.volumes_mm3[off].sum() / mesh.volumes_mm3.sum())
 
 
@@ -160,20 +166,18 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
     table = []
     for row in rows:
         load, reached, region, *numbers = astuple(row)
-        flat = [*numbers[:7], *row.above_ml, *numbers[8:]]
-        table.append([load, f"{reached:.4g}", region, *(f"{v:.6g}" for v in flat)])
+        table.append([load, f"{reached:.4g}", region, *numbers[:7], *row.above_ml, *numbers[8:]])
     write_csv(path, columns, table)
 
 
 def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
     """Write every converged increment: the plate's displacement, force, turn and moment along its axes, its contact."""
-    columns = [name.format(axis) for name in _VECTORS.values() for axis in _AXES]
     table = []
     for state in states:
         for at in state.curve:
-            values = np.concatenate([getattr(at, field) for field in _VECTORS] + [[at.area_mm2, at.pressure_mpa]])
+            values = np.concatenate([getattr(at, vector) for vector in _COLUMNS] + [[at.area_mm2, at.pressure_mpa]])
             table.append([state.load.name, *(f"{v:.8g}" for v in values)])
-    write_csv(path, ["load", *columns, "contact_area_mm2", "contact_pressure_mpa"], table)
+    write_csv(path, ["load", *chain(*_COLUMNS.values()), "contact_area_mm2", "contact_pressure_mpa"], table)
 
 
 def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
@@ -181,7 +185,7 @@ def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
     curves: dict[str, list[PlateState]] = {}
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            vectors = {k: np.array([float(row[n.format(axis)]) for axis in _AXES]) for k, n in _VECTORS.items()}
+            vectors = {vector: np.array([float(row[c]) for c in columns]) for vector, columns in _COLUMNS.items()}
             plate = PlateState(**vectors, area_mm2=float(row["contact_area_mm2"]))
             curves.setdefault(row["load"], []).append(plate)
     return curves

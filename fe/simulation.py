@@ -19,15 +19,14 @@ from fe.plate import Plate
 from fe.problem import Problem, problems_of
 from fe.published import MaterialSet
 from fe.result import RegionFigures
-from fe.simulation_files import PLATE_VECTORS, RECORD, read_parts
+from fe.simulation_files import RECORD, read_parts
 from fe.solution import LoadState, Observer, SolverOptions, solve
 from fe.surface_sets import BONE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_FAR = 0.05  # det F of a patch further from 1 than this is counted
-_MUCH = 0.05  # share of the volume above which that is noted
+_MUCH = 0.05  # share of the volume with det F of patches off above which that is noted
 _CROWD = 0.01  # share of a region's volume below det F `CROWDED` above which that is noted
 
 
@@ -124,11 +123,10 @@ class Simulation:
             if row.crowded_share > _CROWD
         ]
         for state in self.states:
-            if state.out_of_time and len(state.curve) > 1:
-                done = f"at {state.reached:.0%} of the load; given more, it goes on from there"
-                notes.append(f"{state.load.name}: its time was over {done}.")
-            elif state.out_of_time:
-                notes.append(f"{state.load.name}: its time was over before the first equilibrium.")
+            if state.out_of_time:
+                began = f"at {state.reached:.0%} of the load; given more, it goes on from there"
+                when = began if len(state.curve) > 1 else "before the first equilibrium"
+                notes.append(f"{state.load.name}: its time was over {when}.")
         notes += [
             f"{load.name} was not tried: the load before it was not reached."
             for load in self.loads
@@ -146,7 +144,7 @@ class Simulation:
         return [row for row in self.regions if row.load == state.load.name]
 
     def _share_off(self, state: LoadState) -> float:
-        return result.volume_share_off(self.mesh, state, self.materials.materials, _FAR)
+        return result.volume_share_off(self.mesh, state, self.materials.materials)
 
     def state(self, load: str) -> LoadState:
         """The state in which a load ended.
@@ -173,12 +171,12 @@ class Simulation:
         lines = []
         for state in self.states:
             shear = "; ".join(f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
-            force = f"{state.force_n[0]:.1f} N and {state.force_n[1]:.1f} N of shear"
+            (push, pull, _), (moved, along, _) = state.force_n, state.plate_displacement_mm
+            force = f"{push:.1f} N and {pull:.1f} N of shear"
             part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached ({force});"
-            moved = state.plate_displacement_mm
             lines.append(
-                f"{self.name}, {state.load.name}:{part} plate {moved[0]:.2f} mm in, {moved[1]:.2f} mm along; max. "
-                f"shear strain, median / 90th percentile: {shear}"
+                f"{self.name}, {state.load.name}:{part} plate {moved:.2f} mm in, {along:.2f} mm along; max. shear "
+                f"strain, median / 90th percentile: {shear}"
             )
         return "\n".join([*lines, *(f"{self.name}: {note}" for note in self.notes)])
 
@@ -197,13 +195,12 @@ class Simulation:
             plate = (round(float(v), 2) for v in (*state.plate_displacement_mm[:2], *state.force_n[:2]))
             shear = (f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
             rows.append((state.load.name, str(state.load), f"{state.reached:.0%}", *plate, *shear))
-        columns = ("load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N")
+        head = ("load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N")
         title = "Plate, and maximum shear strain of each tissue: median / 90th percentile"
-        table = Table(title, (*columns, *self.materials.materials), tuple(rows))
+        table = Table(title, (*head, *self.materials.materials), tuple(rows))
         picture = Picture("Maximum shear strain", "", png_bytes(self.plot()))
-        ended = sum(state.reached == 1.0 for state in self.states)
-        headline = f"{self.name}: {ended} of {len(self.loads)} loads reached"
-        return notebook_html(headline, picture, table, notes=self.notes)
+        ended = f"{sum(state.reached == 1.0 for state in self.states)} of {len(self.loads)} loads reached"
+        return notebook_html(f"{self.name}: {ended}", picture, table, notes=self.notes)
 
     def parameters(self) -> dict[str, object]:
         """Materials, loads and element as they are written to ``simulation.json``."""
@@ -282,7 +279,7 @@ class Simulation:
             "out_of_time": state.out_of_time,
             "stable_share": min(row.stable_share for row in self._rows(state)),
             "plate_axes_lps": state.plate_axes.tolist(),
-            **{key: getattr(plate, name).tolist() for name, key in PLATE_VECTORS.items()},
+            **{f"plate_{key}": getattr(plate, vector).tolist() for vector, key in result.PLATE_VECTORS.items()},
             "contact_area_mm2": plate.area_mm2,
             "contact_pressure_mpa": plate.pressure_mpa if plate.area_mm2 > 0.0 else None,
             "nodes_on_plate": len(state.on_plate),
@@ -316,16 +313,10 @@ class Simulation:
 
 
 def simulate(
-    mesh: TetMesh,
-    materials: MaterialSet | Materials,
-    plate: Plate | Mapping[str, Plate],
-    loads: Sequence[LoadStep],
-    *,
-    fixed: Sequence[str] = (BONE,),
-    element: str = "P1",
-    options: SolverOptions | None = None,
+    mesh: TetMesh, materials: MaterialSet | Materials, plate: Plate | Mapping[str, Plate], loads: Sequence[LoadStep],
+    *, fixed: Sequence[str] = (BONE,), element: str = "P1", options: SolverOptions | None = None,
     observer: Observer | None = None,
-) -> Simulation:
+) -> Simulation:  # fmt: skip
     """Simulate a rigid plate that presses and shears soft tissue.
 
     Parameters

@@ -1,8 +1,6 @@
 """Files of a simulation read back, and removed."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,22 +8,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh
-from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.mesh import outer_faces
 from fe.load_path import PlateState
 from fe.load_step import LoadStep
 from fe.materials import from_vector
 from fe.published import MaterialSet
-from fe.result import read_curve_csv, read_state
+from fe.result import PLATE_VECTORS, read_curve_csv, read_state
 from fe.solution import LoadState
 from fe.surface_sets import BONE, SKIN
 
 RECORD = "simulation.json"
-PLATE_VECTORS = {
-    "displacement_mm": "plate_travel_mm", "force_n": "plate_force_n", "turn_deg": "plate_turn_deg",
-    "moment_nmm": "plate_moment_nmm",
-}  # of a plate's state, and their keys in the record  # fmt: skip
 _TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
 
 
@@ -52,21 +45,26 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     if mesh is None:
         number = first.cell_data["region"][0]
         regions = {name: np.flatnonzero(number == int(n)) for n, name in given["region_numbers_in_vtu"].items()}
-        mesh = TetMesh(first.points, cells, regions, _surfaces(cells, u_mm, given["fixed"]))
+        faces, bone = outer_faces(cells), given["fixed"][0] if len(given["fixed"]) == 1 else BONE
+        still = (u_mm[faces] == 0.0).all(axis=(1, 2))
+        mesh = TetMesh(first.points, cells, regions, {bone: faces[still], SKIN: faces[~still]})
     elif not (np.array_equal(mesh.points_mm, first.points) and np.array_equal(mesh.cells, cells)):
         raise InputError(f"{place}: the mesh given is not the one that was simulated.")
     undeformed = first, np.zeros_like(first.points), np.zeros((len(cells), 3, 3)), np.zeros(len(cells))
-    states = []
+    skin, states = np.unique(mesh.facets[SKIN]), []
     for name, at in outcome.items():  # no file: its time was over before the first equilibrium
         _, u_mm, gradients, pressure_mpa = files.get(name, undeformed)
-        vectors = {name: np.array(at[key]) for name, key in PLATE_VECTORS.items()}
-        plate = PlateState(**vectors, area_mm2=at["contact_area_mm2"])
+        vectors = {vector: np.array(at[f"plate_{key}"]) for vector, key in PLATE_VECTORS.items()}
+        plate, axes = PlateState(**vectors, area_mm2=at["contact_area_mm2"]), np.array(at["plate_axes_lps"])
+        # The nodes on the plate are those of the skin that lie furthest along its normal.
+        towards = axes @ Rotation.from_rotvec(plate.turn_deg, degrees=True).as_matrix()[:, 0]
+        height = (mesh.points_mm + u_mm)[skin] @ towards
+        on_plate = np.sort(skin[np.argsort(height, kind="stable")[: at["nodes_on_plate"]]])
         state = LoadState(
-            loads[name], at["reached"], u_mm, pressure_mpa, gradients, np.empty(0, dtype=np.int64),
-            (*curves[name][:-1], plate), at["iterations"], at["seconds"],
-            out_of_time=at["out_of_time"], plate_axes=np.array(at["plate_axes_lps"]),
+            loads[name], at["reached"], u_mm, pressure_mpa, gradients, on_plate, (*curves[name][:-1], plate),
+            at["iterations"], at["seconds"], out_of_time=at["out_of_time"], plate_axes=axes,
         )  # fmt: skip
-        states.append(replace(state, on_plate=_on_plate(mesh, state, at["nodes_on_plate"])))
+        states.append(state)
     materials = {
         region: from_vector(law["law"], np.array(law["vector_mpa"]), law["bulk_modulus_mpa"])
         for region, law in given["laws"].items()
@@ -79,29 +77,12 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _surfaces(cells: IntArray, u_mm: FloatArray, fixed: Sequence[str]) -> dict[str, IntArray]:
-    """Outer faces, divided by whether their nodes moved."""
-    faces = outer_faces(cells)
-    still = (u_mm[faces] == 0.0).all(axis=(1, 2))
-    return {fixed[0] if len(fixed) == 1 else BONE: faces[still], SKIN: faces[~still]}
-
-
-def _on_plate(mesh: TetMesh, state: LoadState, count: int) -> IntArray:
-    """The nodes on the plate, ``count`` of them: those of the skin that lie furthest along its normal."""
-    assert state.plate_axes is not None
-    skin = np.unique(mesh.facets[SKIN])
-    towards = state.plate_axes @ Rotation.from_rotvec(state.plate.turn_deg, degrees=True).as_matrix()[:, 0]
-    height = (mesh.points_mm + state.u_mm)[skin] @ towards
-    return np.sort(skin[np.argsort(height, kind="stable")[:count]])
-
-
 def clear_simulation(folder: Path) -> None:
     """Remove what an earlier simulation wrote by its own list, so that nothing old stands beside what is new."""
     try:
         loads = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["outcome"])
     except (OSError, ValueError, KeyError, TypeError):
         return
-    of_loads = [f"{load}{ending}" for load in loads for ending in (".vtu", ".inp", ".feb")]
-    logs = [f"log-{load}.txt" for load in loads]
-    for name in (*of_loads, *logs, *_TABLES, RECORD):
+    of_loads = [name for load in loads for name in (f"{load}.vtu", f"{load}.inp", f"{load}.feb", f"log-{load}.txt")]
+    for name in (*of_loads, *_TABLES, RECORD):
         (folder / name).unlink(missing_ok=True)
