@@ -69,10 +69,7 @@ class Assembler:
         return np.flatnonzero(~used)
 
     def residual(self, state: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Internal forces by unknown and by equation, and the least det F, at a state.
-
-        N for displacements, volume defects in mm3 for pressures; NaN where det F <= 0.
-        """
+        """Forces (N; for pressures mm3) by unknown and by equation, and the least det F; NaN where det F <= 0."""
         by_unknown = np.zeros(self.model.unknowns)
         lowest = self._run(state, by_unknown, None)
         return by_unknown, self.by_equation(by_unknown), lowest
@@ -85,10 +82,7 @@ class Assembler:
         return data
 
     def held(self, data: FloatArray, right: FloatArray, equations: IntArray, moves: FloatArray) -> FloatArray:
-        """Prescribe the moves of shared equations: return the changed values, and change ``right`` in place.
-
-        Their columns go to the right-hand side, their diagonal becomes 1.
-        """
+        """The values with moves of shared equations prescribed: their diagonal is 1, their columns go to ``right``."""
         kept = data.copy()
         for equation, move in zip(equations, moves, strict=True):
             column = self._columns[equation - self.own_equations]
@@ -167,10 +161,7 @@ class Assembler:
 def _locate(
     cells: IntArray, equation: IntArray, indptr: IntArray, indices: IntArray, which: IntArray, places: IntArray
 ) -> None:
-    """Place of the entry of each pair of a cell's unknowns in the upper triangle.
-
-    -1 where one is fixed; -2 - place where the entry counts twice.
-    """
+    """Place in the upper triangle of each pair of a cell's unknowns; -1: one is fixed; -2 - place: it counts twice."""
     width = cells.shape[1]
     for n in prange(len(which)):
         cell, pair = which[n], 0

@@ -40,10 +40,7 @@ def write_figure(path: Path, figure: Figure) -> None:
 
 
 def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> Figure:
-    """Measured nominal stress (points) and the fitted material law (lines), by kind of test.
-
-    The line is dashed where Drucker's condition fails: simulations that reach this range are unreliable.
-    """
+    """Measured nominal stress (points) and the fitted law (lines; dashed: not stable, by Drucker), by kind of test."""
     figure, (axes,) = chart()
     for curve, colour in zip(curves, cycle(REGION_COLOURS), strict=False):
         low, high = fitted.reached[curve.mode]
@@ -205,10 +202,7 @@ def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
 
 
 def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[float], Limit]]) -> Figure:
-    """Quantities relative to their limits, over the size of the cells (cube root of their mean volume).
-
-    One that no longer depends on the mesh lies on the grey line.
-    """
+    """Quantities over their limits (1: the grey line), by the size of the cells, the cube root of their mean volume."""
     figure, (axes,) = chart()
     for (name, (values, limit)), colour in zip(curves.items(), cycle(REGION_COLOURS), strict=False):
         style = "-" if "travel" in name else "--"

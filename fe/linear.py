@@ -141,19 +141,17 @@ def factors(
 ) -> Factors:
     """A solver for symmetric matrices whose upper triangle has this pattern (CSR, sorted, with its whole diagonal).
 
-    ``threads`` are PARDISO's; ``library`` is pardiso, ngsolve or superlu, by default the fastest on this machine;
-    ``rough`` asks for single precision, where the library can.
+    ``threads`` and ``rough``, for single precision, are PARDISO's; ``library`` is the fastest here by default.
     """
-    chosen = library or _fastest()
-    if chosen == "pardiso":
+    if (chosen := library or _fastest()) == "pardiso":
         return _Pardiso(indptr, indices, threads, rough)
-    return _NGSolve(indptr, indices) if chosen == "ngsolve" else _SuperLU(indptr, indices)
+    return {"ngsolve": _NGSolve, "superlu": _SuperLU}[chosen](indptr, indices)
 
 
 def _fastest() -> str:
     if platform.machine().lower() in ("x86_64", "amd64"):
         return "pardiso"
-    return "ngsolve" if find_spec("ngsolve") is not None else "superlu"
+    return "ngsolve" if find_spec("ngsolve") else "superlu"
 
 
 def self_test() -> str:

@@ -61,17 +61,14 @@ class PlateState:
         return float(self.force_n[0]) / self.area_mm2 if self.area_mm2 > 0.0 else float("nan")
 
 
-_Increment = tuple[
-    FloatArray, PlateState, ContactStatus
-]  # what it takes to go on from one; unknowns as in `Checkpoint`
+_Increment = tuple[FloatArray, PlateState, ContactStatus]  # a converged one, with the unknowns of `Checkpoint`
 
 
 class LoadPath:
     """The body under a growing load, increment by increment; vectors along the plate's axes, ``mesh`` too.
 
-    ``curve`` is the plate at every converged increment so far, ``iterations`` counts Newton steps. ``log`` gets a line
-    for each step, ``is_over`` says whether to stop, ``on_converged`` is called at each increment that can be resumed
-    from.
+    ``curve`` is the plate at every converged increment so far. ``log`` gets a line for each step, ``is_over`` says
+    whether to stop, ``on_converged`` is called at each increment that can be resumed from.
     """
 
     def __init__(
@@ -88,9 +85,8 @@ class LoadPath:
         self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
         self.extent_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
         self.state = np.zeros(model.unknowns)
-        self._faces = mesh.facets[SKIN]
-        start_mm = np.array([problem.plate.gap_mm, 0.0, 0.0])
-        self.plate = PlateState(start_mm, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
+        self._faces, self._start_mm = mesh.facets[SKIN], np.array([problem.plate.gap_mm, 0.0, 0.0])
+        self.plate = PlateState(self._start_mm, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
         self.curve = [self.plate]
         self.iterations = 0
 
@@ -106,10 +102,10 @@ class LoadPath:
         """
         if not len(self.contact.held):
             self.contact.touch_first(self.state)
-        start = np.array([self.contact.plate.gap_mm, 0.0, 0.0])
         for share in _ENOUGH:
             if target.displaced[0]:
-                part = PlateTarget(start + share * (target.values - start), target.displaced).unsheared()
+                way = target.values - self._start_mm
+                part = PlateTarget(self._start_mm + share * way, target.displaced).unsheared()
                 if part.values[0] > self.plate.displacement_mm[0] and not self.raise_to(part):
                     return False
             else:
@@ -121,15 +117,11 @@ class LoadPath:
         return False
 
     def _let_go(self) -> bool:
-        """Remove the moment that kept the plate level, under its present force; whether that succeeded.
-
-        A plate that is held less sinks in further; one that comes back out instead tips over on too few nodes.
-        """
+        """Remove the moment that kept the plate level, under its force; False if it comes out, on too few nodes."""
         level, force, moment = self.increment, self.plate.force_n, self.plate.moment_nmm
         self.contact.status = replace(self.contact.status, turns=True)
-        gap_mm, level_mm = self.contact.plate.gap_mm, self.plate.displacement_mm[0]
-        least_mm = gap_mm + _TIPPING * (level_mm - gap_mm)
-        left, step = 1.0, 0.5
+        gap_mm, left, step = self.contact.plate.gap_mm, 1.0, 0.5
+        least_mm = gap_mm + _TIPPING * (self.plate.displacement_mm[0] - gap_mm)
         while left > 0.0 and step > _LEAST_STEP and not self.is_over():
             least = max(0.0, left - step)
             if not self._go(np.zeros(3, dtype=bool), force, least * moment):
@@ -212,8 +204,7 @@ class LoadPath:
             converged = equilibrium(
                 self.assembler, self.solver, self.state, imposed, self.tolerance, self._changed, self.log, rotation
             )
-        start_mm = [contact.plate.gap_mm, 0.0, 0.0]
-        if converged and np.abs(contact.displacement_mm(converged.state) - start_mm).max() > self.extent_mm:
+        if converged and np.abs(contact.displacement_mm(converged.state) - self._start_mm).max() > self.extent_mm:
             self.log("the plate would have moved farther than the body is large")
             converged = None
         if converged is None:
@@ -237,10 +228,9 @@ class LoadPath:
         return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
     def _changed(self, state: FloatArray, forces: FloatArray) -> bool:
-        if not self.contact.update(state, forces):
-            return False
-        self.assembler.share(self.contact.followers)
-        return True
+        if changed := self.contact.update(state, forces):
+            self.assembler.share(self.contact.followers)
+        return changed
 
     def _changed_on_the_way(self, state: FloatArray, forces: FloatArray) -> bool:
         """As `_changed`; what touches next does so from where it is now."""

@@ -66,10 +66,7 @@ def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
 
 
 def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials) -> float:
-    """Share of the volume where det F of nodal patches is more than 0.05 off the material law's, 1 + p / K.
-
-    Mean over a cell's nodes. A material of low bulk modulus K may well give way; only the mesh's error is counted.
-    """
+    """Share of the volume where det F of patches (mean of a cell's nodes) is over 0.05 off the law's, 1 + p / K."""
     asked = np.empty(len(mesh.cells))
     for region, law in materials.items():
         cells = mesh.regions[region]
@@ -145,8 +142,6 @@ def region_figures(mesh: TetMesh, state: LoadState, materials: Materials) -> lis
 def volume_percentiles(values: FloatArray, volumes: FloatArray, shares: Sequence[float]) -> tuple[float, ...]:
     """Values (n,) below which these shares of the volume lie.
 
-    Examples
-    --------
     >>> volume_percentiles(np.array([0.1, 0.3, 0.2]), np.array([1.0, 1.0, 2.0]), [0.5])
     (0.2,)
     """
