@@ -145,7 +145,7 @@ def factors(
     """
     if (chosen := library or _fastest()) == "pardiso":
         return _Pardiso(indptr, indices, threads, rough)
-    return {"ngsolve": _NGSolve, "superlu": _SuperLU}[chosen](indptr, indices)
+    return _NGSolve(indptr, indices) if chosen == "ngsolve" else _SuperLU(indptr, indices)
 
 
 def _fastest() -> str:

@@ -290,18 +290,13 @@ def _quality(mesh: TetMesh, labels: LabelMap, soft: dict[str, int]) -> MeshQuali
         (name, float(mesh.volumes_mm3[mesh.regions[name]].sum()) / 1000.0, voxel_ml * float((labels.labels == n).sum()))
         for name, n in soft.items()
     )
+    thin = []
+    for skin in mesh.regions:
+        if skin.casefold() == SKIN and SKIN in mesh.facets:
+            cells, beneath = mesh.cells[mesh.regions[skin]], np.delete(mesh.cells, mesh.regions[skin], axis=0)
+            across = [np.isin(cells, nodes).any(axis=1) for nodes in (mesh.facets[SKIN], beneath)]
+            thin.append((skin, float((across[0] & across[1]).mean())))
     return MeshQuality(
         len(mesh.cells), len(mesh.points_mm), float(angles.min()), float(angles.max()),
-        (float(low), float(middle), float(high)), volumes, _thin(mesh),
+        (float(low), float(middle), float(high)), volumes, tuple(thin),
     )  # fmt: skip
-
-
-def _thin(mesh: TetMesh) -> tuple[tuple[str, float], ...]:
-    """Share of the outer tissue's cells that reach from the outer surface to the tissue beneath."""
-    skin = next((name for name in mesh.regions if name.casefold() == SKIN), None)
-    if skin is None or SKIN not in mesh.facets:
-        return ()
-    beneath = np.setdiff1d(np.arange(len(mesh.cells)), mesh.regions[skin])
-    cells = mesh.cells[mesh.regions[skin]]
-    across = [np.isin(cells, nodes).any(axis=1) for nodes in (mesh.facets[SKIN], mesh.cells[beneath])]
-    return ((skin, float((across[0] & across[1]).mean())),)
