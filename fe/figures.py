@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -121,7 +122,7 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
     for spot in spots[len(panels) :]:
         spot.set_visible(False)
     shades = colormaps["viridis"].with_extremes(bad=_UNKNOWN)
-    how = {"cmap": shades, "norm": Normalize(0.0, largest), "edgecolors": "face", "linewidths": 0.2}
+    how: dict[str, Any] = {"cmap": shades, "norm": Normalize(0.0, largest), "edgecolors": "face", "linewidths": 0.2}
     for spot, panel, (cells, polygons) in zip(spots, panels, cuts, strict=False):
         drawn = PolyCollection(polygons, array=np.ma.masked_invalid(panel.max_shear[cells]), **how)
         spot.add_collection(drawn)

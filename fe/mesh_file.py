@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import meshio
 import numpy as np
@@ -19,12 +20,27 @@ _MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, besi
 
 
 def write_tet_mesh(
-    path: Path, mesh: TetMesh, about: dict[str, object], at_nodes: Mapping[str, FloatArray] | None = None
-) -> None:
-    """Write a mesh as VTU, LPS mm: tetrahedra and named triangles, numbered in ``region``.
+    path: Path | str, mesh: TetMesh, about: Mapping[str, object] = MappingProxyType({}),
+    at_nodes: Mapping[str, FloatArray] | None = None,
+) -> None:  # fmt: skip
+    """Write a mesh as VTU, LPS mm, with the names of its regions and facets in a JSON file beside it.
 
-    The names, and what is known ``about`` it, stand in a JSON file of the same name; ``at_nodes`` becomes point data.
+    Parameters
+    ----------
+    path : path
+        Ending in .vtu: tetrahedra, and the triangles of the facets, numbered in the array ``region``. The JSON file has
+        the same name; `read_tet_mesh` reads both.
+    about : mapping
+        What else is to stand in the JSON file, such as how the mesh was made.
+    at_nodes : mapping of name to (n,) or (n, k) float, optional
+        Point data, for ParaView.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
     """
+    place = Path(path)
     tissues = {name: number for number, name in enumerate(mesh.regions, start=1)}
     facets = {name: number for number, name in enumerate(mesh.facets, start=_FIRST_FACET)}
     number = np.zeros(len(mesh.cells), dtype=np.int64)
@@ -34,10 +50,10 @@ def write_tet_mesh(
     flat = np.repeat(list(facets.values()), [len(rows) for rows in mesh.facets.values()]).astype(np.int64)
     blocks = [("tetra", mesh.cells)] + ([("triangle", triangles)] if len(triangles) else [])
     numbers = [number] + ([flat] if len(triangles) else [])
-    with whole_file(path) as part:
+    with whole_file(place) as part:
         meshio.vtu.write(part, meshio.Mesh(mesh.points_mm, blocks, at_nodes, {"region": numbers}), binary=True)
     names = {str(number): name for named in (tissues, facets) for name, number in named.items()}
-    write_json(path.with_suffix(".json"), {"regions": names} | about)
+    write_json(place.with_suffix(".json"), {"regions": names, **about})
 
 
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:

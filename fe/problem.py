@@ -37,8 +37,9 @@ class Problem:
     Raises
     ------
     InputError
-        If a region has no material or a cell no region, a surface set is missing, tissue is joined to nothing that is
-        fixed, the plate comes from the wrong side, or a load cannot be brought onto tissue.
+        If an argument is of another kind, such as a file's path in place of a mesh; if a region has no material or a
+        cell no region, a surface set is missing, tissue is joined to nothing that is fixed, the plate comes from the
+        wrong side, or a load cannot be brought onto tissue.
     """
 
     mesh: TetMesh
@@ -51,6 +52,7 @@ class Problem:
     def __post_init__(self) -> None:
         formulation(self.element)
         mesh, fixed = self.mesh, self.fixed
+        check_kinds(mesh, self.plate, self.loads)
         if not fixed:
             raise InputError("No surface set is fixed: tissue that nothing holds cannot be pressed.")
         for name in (*fixed, SKIN):
@@ -73,10 +75,35 @@ def problems_of(
     mesh: TetMesh, materials: Materials, plate: Plate | Mapping[str, Plate], loads: Sequence[LoadStep],
     fixed: Sequence[str] = (BONE,), element: str = "P1",
 ) -> list[Problem]:  # fmt: skip
-    """A problem for each path that the loads lie on (`fe.load_step.paths_of`); ``plate`` may be one for each load."""
+    """A problem for each path that the loads lie on (`fe.paths_of`); ``plate`` may be one for each load, by its name.
+
+    Raises
+    ------
+    InputError
+        As `Problem`, or if a load has no plate.
+    """
+    check_kinds(mesh, plate, loads)
     plate_of = {load.name: plate if isinstance(plate, Plate) else plate[load.name] for load in loads}
     paths = paths_of(loads, {name: tuple(one.axes.round(9).ravel()) for name, one in plate_of.items()})
     return [Problem(mesh, materials, plate_of[path[0].name], path, fixed, element) for path in paths]
+
+
+def check_kinds(mesh: object, plate: object, loads: object) -> None:
+    """Refuse what is no mesh, plate or sequence of loads with an `InputError` that says what to give."""
+    if not isinstance(mesh, TetMesh):
+        raise _other_kind("The mesh", "a TetMesh, as fe.read_tet_mesh(path) or fe.mesh_labels gives it", mesh)
+    if not isinstance(loads, Sequence) or not all(isinstance(load, LoadStep) for load in loads):
+        odd = next((x for x in loads if not isinstance(x, LoadStep)), "") if isinstance(loads, Sequence) else loads
+        raise _other_kind("The loads", "a list of fe.LoadStep", odd)
+    by_load = plate if isinstance(plate, Mapping) else {load.name: plate for load in loads}
+    for load in loads:
+        if not isinstance(one := by_load.get(load.name), Plate):
+            raise _other_kind(f"{load.name}: the plate", "an fe.Plate, or a dict with one for each load's name", one)
+
+
+def _other_kind(what: str, wanted: str, given: object) -> InputError:
+    got = "nothing" if given is None else f"{given!r}" if isinstance(given, str) else f"a {type(given).__name__}"
+    return InputError(f"{what} must be {wanted}; got {got}.")
 
 
 def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
@@ -98,6 +125,8 @@ def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
 
 def check_materials(mesh: TetMesh, materials: Materials) -> None:
     """Refuse a mesh of which a cell has no material, or more than one, with an `InputError`."""
+    if not isinstance(materials, Mapping):
+        raise _other_kind("Materials", "a dict of region to material, as MaterialSet.for_regions gives it", materials)
     times = np.zeros(len(mesh.cells), dtype=int)
     for region in materials:
         if region not in mesh.regions:

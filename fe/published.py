@@ -115,6 +115,23 @@ def material_set(name: str | Path) -> MaterialSet:
     return known[str(name)]
 
 
+def as_material_set(given: object) -> MaterialSet:
+    """A set as it is, by its name or file, or of materials by region; `InputError` for anything else."""
+    if isinstance(given, MaterialSet):
+        return given
+    if isinstance(given, (str, Path)):
+        return material_set(given)
+    if isinstance(given, Mapping) and all(isinstance(material, Material) for material in given.values()):
+        return MaterialSet("materials", "", "", dict(given))
+    values = (
+        f" of {', '.join(sorted({type(v).__name__ for v in given.values()}))}" if isinstance(given, Mapping) else ""
+    )
+    raise InputError(
+        "Materials must be a set (fe.material_set), the name of a published one, or a dict of region to material, such "
+        f"as {{'fat': fe.Ogden.from_ansys(0.0034, 6.2)}}; got a {type(given).__name__}{values}."
+    )
+
+
 def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
     """Every set of a file, by name; the form is that of ``fe/published.toml``.
 

@@ -1,6 +1,7 @@
 """A simulation: what a material parameter set gave under its loads, as arrays, as files, as a picture."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -16,8 +17,8 @@ from fe.elements import CROWDED, DESCRIPTIONS
 from fe.load_step import LoadStep
 from fe.materials import MODES, Materials
 from fe.plate import Plate
-from fe.problem import Problem, problems_of
-from fe.published import MaterialSet
+from fe.problem import Problem, check_kinds, problems_of
+from fe.published import MaterialSet, as_material_set
 from fe.result import RegionFigures
 from fe.simulation_files import RECORD, read_parts
 from fe.solution import LoadState, Observer, SolverOptions, solve
@@ -226,13 +227,13 @@ class Simulation:
         }
 
     def write(self, folder: Path | str, *, record: Mapping[str, object] | None = None, fields: bool = True) -> None:
-        """Write it into an existing folder, as `mrstrain.simulate` does.
+        """Write it into a folder, as `mrstrain.simulate` does.
 
         Parameters
         ----------
         folder : path
-            Gets ``LOAD.vtu`` for each load, ``curve.csv`` (force and displacement of the plate), ``regions.csv``,
-            ``simulation.json`` and pictures.
+            Made if it is not there. Gets ``LOAD.vtu`` for each load, ``curve.csv`` (force and displacement of the
+            plate), ``regions.csv``, ``simulation.json`` and pictures.
         record : mapping, optional
             Provenance to stand in ``simulation.json``, with "parameters" that contain `parameters` and "fixed".
         fields : bool
@@ -246,6 +247,8 @@ class Simulation:
         from fe import figures
 
         place = Path(folder)
+        with suppress(OSError):  # that a file cannot be written says more
+            place.mkdir(parents=True, exist_ok=True)
         for state in self.states:
             if fields and len(state.curve) > 1:
                 result.write_state(place / f"{state.load.name}.vtu", self.mesh, state, self.materials.materials)
@@ -266,6 +269,8 @@ class Simulation:
             If one of the two does not have the constitutive model of a region.
         """
         given = self.mesh, self.materials.materials
+        with suppress(OSError):
+            Path(folder).mkdir(parents=True, exist_ok=True)
         for state in self.states:
             stem = Path(folder) / state.load.name
             write_calculix(Path(f"{stem}.inp"), *given, state, fixed=self.fixed, quadratic=True)
@@ -307,38 +312,54 @@ class Simulation:
         -----
         Plate states on the way to a load have the eight digits of ``curve.csv``; all else is as it was computed.
         """
-        read = cls(**read_parts(Path(folder), mesh))
-        derived = replace(read, remarks=()).notes
-        return replace(read, remarks=tuple(note for note in read.remarks if note not in derived))
+        return cls(**read_parts(Path(folder), mesh))
 
 
 def simulate(
-    mesh: TetMesh, materials: MaterialSet | Materials, plate: Plate | Mapping[str, Plate], loads: Sequence[LoadStep],
-    *, fixed: Sequence[str] = (BONE,), element: str = "P1", options: SolverOptions | None = None,
-    observer: Observer | None = None,
+    mesh: TetMesh, materials: MaterialSet | Materials | Path | str, plate: Plate | Mapping[str, Plate],
+    loads: Sequence[LoadStep], *, fixed: Sequence[str] = (BONE,), element: str = "P1",
+    options: SolverOptions | None = None, observer: Observer | None = None,
 ) -> Simulation:  # fmt: skip
     """Simulate a rigid plate that presses and shears soft tissue.
 
     Parameters
     ----------
     mesh : TetMesh
-        LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed.
-    materials : MaterialSet, or mapping of region to Material
-    plate : Plate, or mapping of load to Plate
+        Undeformed, LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed.
+    materials : MaterialSet, str, path, or mapping of region to Material
+        A set, the name of a published one or the path of a file with one (`fe.material_set`), or a material for each
+        region of the mesh.
+    plate : Plate, or mapping of load's name to Plate
     loads : sequence of LoadStep
         Those with the same normal force lie on one path, in the order of their shear (`fe.paths_of`).
     fixed : sequence of str
         Surface sets that do not move.
     element : {"P1", "MINI", "P2"}
-        As in `fe.elements`.
+        Linear, with a bubble, or quadratic; see `fe.elements`.
+    options : SolverOptions, optional
+        Threads, time limit and tolerance.
     observer : Observer, optional
         Receives the progress of each path.
+
+    Returns
+    -------
+    Simulation
+        For each load that was begun, ``state(name)`` has the displacement of the nodes (n, 3) mm and the displacement
+        gradient of the cells (m, 3, 3), both on the undeformed mesh in LPS; ``strain`` from it (Green-Lagrange); the
+        pressure (m,) MPa; and the plate's displacement (3,) mm and force (3,) N, along the normal force, the shear and
+        their cross product. `Simulation.regions` sums up strain, stress and volume by region.
 
     Raises
     ------
     InputError
-        As `fe.Problem`; before anything is computed.
+        As `fe.Problem` and `fe.material_set`; before anything is computed.
+
+    Notes
+    -----
+    A load that cannot be reached is no error: its state is the last converged increment, with ``reached`` below 1,
+    and `Simulation.complete` is False.
     """
-    chosen = materials if isinstance(materials, MaterialSet) else MaterialSet("materials", "", "", dict(materials))
+    check_kinds(mesh, plate, loads)
+    chosen = as_material_set(materials)
     problems = problems_of(mesh, chosen.for_regions(mesh.regions)[0], plate, loads, fixed, element)
     return Simulation.of(chosen, problems, [s for one in problems for s in solve(one, options, observer)])

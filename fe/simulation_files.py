@@ -34,7 +34,7 @@ _PLATE = [field.name for field in fields(PlateState)]
 
 
 def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
-    """What a `fe.Simulation` is made of, from its folder; all notes are among its remarks."""
+    """What a `fe.Simulation` is made of, from its folder."""
     try:
         return _parts(place, mesh)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as failure:
@@ -80,11 +80,12 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
         region: from_vector(law["law"], np.array(law["vector_mpa"]), law["bulk_modulus_mpa"])
         for region, law in given["laws"].items()
     }
+    of_loads = tuple(f"{name}{word}" for name in loads for word in (":", " was not tried"))  # derived anew, not remarks
     material_set = MaterialSet(given["set"], given["title"], given["source"], materials)
     return {
         "materials": material_set, "mesh": mesh, "paths": paths, "states": tuple(states),
         "fixed": tuple(given["fixed"]), "element": given["element"].split(":")[0], "turns": given["turns"],
-        "remarks": tuple(content["notes"]),
+        "remarks": tuple(note for note in content["notes"] if not note.startswith(of_loads)),
     }  # fmt: skip
 
 
