@@ -180,7 +180,7 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     curves : sequence of Curve
         All are fitted together, every point with the same weight.
     law : str
-        A name of `LAWS`.
+        A name of `LAWS`; case does not count.
     nu : float
         Poisson's ratio of the material made; the fit itself takes the tissue as incompressible.
 

@@ -186,7 +186,7 @@ def _terms(mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike) -> tuple[FloatArray, Flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NeoHooke(Material):
-    """Wbar = mu / 2 (I1bar - 3)."""
+    """Wbar = mu / 2 (I1bar - 3), mu the initial shear modulus, I1bar the first invariant of the isochoric F^T F."""
 
     law: ClassVar[str] = "neo-Hooke"
     named: ClassVar[Mapping[str, tuple[int, float]]] = {"mu": (POLYNOMIAL, 2.0)}
@@ -199,7 +199,10 @@ class NeoHooke(Material):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Yeoh(Material):
-    """Wbar = C10 (I1bar - 3) + C20 (I1bar - 3)^2 + C30 (I1bar - 3)^3; without C30 also called Isihara's."""
+    """Wbar = C10 (I1bar - 3) + C20 (I1bar - 3)^2 + C30 (I1bar - 3)^3; without C30 also called Isihara's.
+
+    C10 is half the initial shear modulus, I1bar the first invariant of the isochoric F^T F.
+    """
 
     law: ClassVar[str] = "Yeoh"
     named: ClassVar[Mapping[str, tuple[int, float]]] = {"C10": (0, 1.0), "C20": (1, 1.0), "C30": (2, 1.0)}

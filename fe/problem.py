@@ -92,9 +92,10 @@ def check_kinds(mesh: object, plate: object, loads: object) -> None:
     """Refuse what is no mesh, plate or sequence of loads with an `InputError` that says what to give."""
     if not isinstance(mesh, TetMesh):
         raise _other_kind("The mesh", "a TetMesh, as fe.read_tet_mesh(path) or fe.mesh_labels gives it", mesh)
-    if not isinstance(loads, Sequence) or not all(isinstance(load, LoadStep) for load in loads):
-        odd = next((x for x in loads if not isinstance(x, LoadStep)), "") if isinstance(loads, Sequence) else loads
-        raise _other_kind("The loads", "a list of fe.LoadStep", odd)
+    if not isinstance(loads, Sequence) or isinstance(loads, str):
+        raise _other_kind("The loads", "a list of fe.LoadStep", loads)
+    if odd := [load for load in loads if not isinstance(load, LoadStep)]:
+        raise _other_kind("The loads", "a list of fe.LoadStep", odd[0])
     by_load = plate if isinstance(plate, Mapping) else {load.name: plate for load in loads}
     for load in loads:
         if not isinstance(one := by_load.get(load.name), Plate):

@@ -117,7 +117,10 @@ class RegionFigures:
 
 
 def region_figures(mesh: TetMesh, state: LoadState, materials: Materials) -> list[RegionFigures]:
-    """Figures of each region under a load."""
+    """Figures of each region under a load, which sum up its strain, stress and volume.
+
+    ``materials`` are those of the mesh's regions, one for each; the rows are in their order.
+    """
     strain = state.strain
     stress = equivalent_stress(cauchy_stress(state, mesh, materials))
     rows = []
@@ -152,7 +155,10 @@ def volume_percentiles(values: FloatArray, volumes: FloatArray, shares: Sequence
 
 
 def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
-    """Write the figures of regions, a row for each load and region."""
+    """Write the figures of regions as CSV, a row for each load and region; strain without unit, MPa, mL.
+
+    `OutputError` if the file cannot be written.
+    """
     columns = [
         "load", "reached", "region", "volume_ml", *(f"max_shear_p{p}" for p in (50, 90, 99)),
         *(f"von_mises_p{p}_mpa" for p in (50, 90, 99)), *(f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS),

@@ -36,7 +36,10 @@ class SolverOptions:
 
 
 class Observer:
-    """Receives the progress of a solution; this one does nothing with it."""
+    """Receives the progress of a solution; this one does nothing with it.
+
+    Derive a class of your own, with the methods that are of interest, and give it to `solve` or `simulate`.
+    """
 
     def log(self, line: str) -> None:
         """Take a line for each step."""
@@ -118,6 +121,8 @@ def solve(
 
     Parameters
     ----------
+    options, observer : optional
+        Threads, time limit and tolerance; what receives the progress.
     earlier : sequence of Checkpoint
         Of the first loads, from an earlier solution of the same problem: they are not solved again. The last may have
         been on its way.
