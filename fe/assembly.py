@@ -231,23 +231,18 @@ def _elements(
         g, h = np.empty((nodes, 3)), np.empty((nodes, 3))
         F, U, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
         stress, direct, swapped = np.empty(3), np.empty((3, 3)), np.zeros((3, 3, 2))
-        block, half = np.empty((3, 3)), np.empty((3, 3))
+        block, half, one = np.empty((3, 3)), np.empty((3, 3)), np.eye(3)
         K = np.zeros((width, width))
         f = np.zeros(width)
         which = law[n]
         lowest[n] = np.inf
         for q in range(points):
             weight = weights[q] * volumes[n]
-            F[:, :] = 0.0
-            for i in range(3):
-                F[i, i] = 1.0
+            F[:, :] = one
             for a in range(nodes):
+                slope, way = tables[q, a], inverse[n]
                 for j in range(3):
-                    g[a, j] = (
-                        tables[q, a, 0] * inverse[n, 0, j]
-                        + tables[q, a, 1] * inverse[n, 1, j]
-                        + tables[q, a, 2] * inverse[n, 2, j]
-                    )
+                    g[a, j] = slope[0] * way[0, j] + slope[1] * way[1, j] + slope[2] * way[2, j]
                     for i in range(3):
                         F[i, j] += u[cells[n, a], i] * g[a, j]
             pq = 0.0
@@ -280,18 +275,12 @@ def _elements(
                 continue
             for a in range(nodes):
                 for b in range(a, nodes):
+                    left, right = h[a], h[b]
                     for i in range(3):
+                        d = direct[i]
                         for k in range(3):
-                            if i == k:
-                                block[i, i] = (
-                                    direct[i, 0] * h[a, 0] * h[b, 0]
-                                    + direct[i, 1] * h[a, 1] * h[b, 1]
-                                    + direct[i, 2] * h[a, 2] * h[b, 2]
-                                )
-                            else:
-                                block[i, k] = (
-                                    swapped[i, k, 0] * h[a, i] * h[b, k] + swapped[i, k, 1] * h[a, k] * h[b, i]
-                                )
+                            block[i, k] = swapped[i, k, 0] * left[i] * right[k] + swapped[i, k, 1] * left[k] * right[i]
+                        block[i, i] = d[0] * left[0] * right[0] + d[1] * left[1] * right[1] + d[2] * left[2] * right[2]
                     for i in range(3):
                         for k in range(3):
                             half[i, k] = block[i, 0] * U[k, 0] + block[i, 1] * U[k, 1] + block[i, 2] * U[k, 2]
@@ -313,8 +302,7 @@ def _elements(
                 value = mass / (bulk[which] - own[which]) + tau / shear[which] * (mass - volumes[n] / 16.0)
                 f[3 * nodes + c] -= value * p[pressure_cells[n, d]]
                 K[3 * nodes + c, 3 * nodes + d] -= value
-        for i in range(width):
-            forces[n, i] = f[i]
+        forces[n, :] = f
         if with_tangent:
             pair = 0
             for i in range(width):

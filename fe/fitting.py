@@ -196,17 +196,15 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     the same stress. Of optima that an F test at 5 % does not distinguish, one whose exponents are all positive is
     taken, and the rest are named.
 
-    Intervals are those of linearised regression with Student's t: they assume independent errors of the same standard
-    deviation at every point, and do not cover errors that a curve shares, such as a wrong area. Parameters in which
-    the stress is linear start at their best; Ogden exponents from the four best of the combinations of eight values.
+    Intervals are those of linearised regression with Student's t: errors are taken as independent and of one standard
+    deviation; what a curve's points share, such as a wrong area, is not covered. Ogden exponents start from the four
+    best of the combinations of eight values.
 
-    C10, half the initial shear modulus, is positive in any material law; a curve that is steep only at its end may
-    leave it open, and the best fit then has it below 0 as often as not. It is kept at a thousandth or more of that of
-    the neo-Hookean model which fits the same curves best. An interval reaches w below the lower, and w above the
-    higher, of the values with and without that bound, w being the half width without it; C10's ends at 0. So it
-    contains all of the usual interval that a material law can have, and covers the truth as often or more often.
-    Curves are refused that would have C10 so far below 0 that chance does it to less than one in 10,000 of the curves
-    of a true material law.
+    C10, half the initial shear modulus, is positive in any material law, but a curve that is steep only at its end may
+    leave it open. It is kept at a thousandth or more of that of the neo-Hookean model which fits the curves best. An
+    interval reaches w below the lower, and w above the higher, of the values with and without that bound, w being the
+    half width without it; C10's ends at 0. So it covers the truth at least as often. Curves are refused whose C10 is so
+    far below 0 as chance has it in less than one in 10,000 of the curves of a true material law.
     """
     sought, curves = _checked(curves, law, nu)
     count = len(sought.names)

@@ -29,19 +29,13 @@ class SingularError(MrstrainError, RuntimeError):
     """A matrix that cannot be factorised: a part of the model is free to move, or memory is short."""
 
 
-def _ones(indptr: IntArray, indices: IntArray) -> sparse.csr_matrix:
-    """A matrix of ones with this pattern."""
-    size = len(indptr) - 1
-    return sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
-
-
 class _Pardiso:
     def __init__(self, indptr: IntArray, indices: IntArray, threads: int, rough: bool) -> None:
         from pypardiso import PyPardisoSolver
 
         self.rough = rough
         self._kind = np.float32 if rough else np.float64
-        self._matrix = _ones(indptr, indices).astype(self._kind)
+        self._matrix = sparse.csr_matrix((np.ones(len(indices), self._kind), indices, indptr))
         self._solver = PyPardisoSolver(mtype=-2)  # real, symmetric, indefinite
         for number, value in _IN_SINGLE.items() if rough else ():
             self._solver.set_iparm(number, value)
@@ -111,7 +105,7 @@ class _SuperLU:
     rough = False
 
     def __init__(self, indptr: IntArray, indices: IntArray) -> None:
-        self._upper = _ones(indptr, indices)
+        self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr))
         self._factors: linalg.SuperLU | None = None
 
     def factorise(self, data: FloatArray) -> None:
@@ -180,7 +174,7 @@ class Solver:
         self._new = partial(factors, indptr, indices, threads=threads)
         self._factors = self._new(rough=True)
         self._began_rough = self._factors.rough
-        self._upper = _ones(indptr, indices)
+        self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr))
         self._diagonal = indptr[:-1]  # the first of each row
         self._known = False
         self.factorisations, self.steps = 0, 0
