@@ -19,10 +19,9 @@ _CHUNK = 16384  # cells whose matrices are in memory at once
 
 
 class Assembler:
-    """The sparse system of a model under changing constraints.
+    """The sparse system of a model under changing constraints; unknowns in ``fixed`` (f,) never change.
 
-    ``fixed`` (f,) are unknowns whose value never changes; ``shared`` maps each shared equation, numbered from 0, to the
-    unknowns that may ever follow it.
+    ``shared`` maps each shared equation, numbered from 0, to the unknowns that may ever follow it.
     """
 
     def __init__(self, model: Model, fixed: IntArray, shared: Mapping[int, IntArray]) -> None:

@@ -255,10 +255,13 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
         raise InputError(f"No material law '{law}' to fit; there are {', '.join(LAWS)}.")
     if not 0.0 <= nu <= HIGHEST_NU:
         raise InputError(f"Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {nu:g}.")
-    sought, curves = LAWS[named[law.lower()]], [_joined(mode, curves) for mode in dict.fromkeys(c.mode for c in curves)]
-    count = len(sought.names)
-    stress, stretch = (
-        np.concatenate([np.empty(0), *(getattr(c, part) for c in curves)]) for part in ("stress_mpa", "stretch")
+    sought, joined = LAWS[named[law.lower()]], []
+    for mode in dict.fromkeys(curve.mode for curve in curves):
+        mine = [curve for curve in curves if curve.mode == mode]
+        joined.append(Curve(mode, *(np.concatenate([getattr(c, a) for c in mine]) for a in ("stretch", "stress_mpa"))))
+    count, (stretch, stress) = (
+        len(sought.names),
+        np.hstack([np.empty((2, 0)), *([c.stretch, c.stress_mpa] for c in joined)]),
     )
     apart = len(np.unique(np.round(stretch[np.abs(stretch - 1.0) > 1e-6], 9)))
     if len(stress) < count + 2 or apart < count:
@@ -273,7 +276,7 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
         )
     if not stress.any():
         raise InputError("The stress is 0 at every point of the curves.")
-    return sought, curves
+    return sought, joined
 
 
 def _with_intervals(
@@ -309,12 +312,6 @@ def _r2(curves: Sequence[Curve], residual: FloatArray) -> dict[str, float]:
         spread = float(((curve.stress_mpa - curve.stress_mpa.mean()) ** 2).sum())
         r2[curve.mode] = 1.0 - float((left**2).sum()) / spread if spread > 0 else float("nan")
     return r2
-
-
-def _joined(mode: str, curves: Sequence[Curve]) -> Curve:
-    """All points of one kind of test."""
-    mine = [c for c in curves if c.mode == mode]
-    return Curve(mode, *(np.concatenate([getattr(c, part) for c in mine]) for part in ("stretch", "stress_mpa")))
 
 
 def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: FloatArray) -> list[FloatArray]:

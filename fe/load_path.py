@@ -95,14 +95,10 @@ class LoadPath:
         return np.where(target.displaced, self.plate.displacement_mm, self.plate.force_n)
 
     def approach(self, target: PlateTarget) -> bool:
-        """Touch, press on to a part of the normal load, and release a plate that turns; whether going on makes sense.
-
-        Until then it stays level, as a plate on a node or two would tip over; if it cannot be released there, it is
-        pressed further first.
-        """
+        """Touch, press on to a part of the normal load, release a plate that turns; whether going on makes sense."""
         if not len(self.contact.held):
             self.contact.touch_first(self.state)
-        for share in _ENOUGH:
+        for share in _ENOUGH:  # on a node or two it would tip over: level until released, at a larger share if need be
             if target.displaced[0]:
                 way = target.values - self._start_mm
                 part = PlateTarget(self._start_mm + share * way, target.displaced).unsheared()
@@ -136,13 +132,9 @@ class LoadPath:
         return left == 0.0
 
     def raise_to(self, target: PlateTarget) -> bool:
-        """Go on to the target, in steps as large as converge; whether it is reached.
-
-        Where Newton's method fails under forces, viscous descent takes over (`fe.descent`), with a taped plate that
-        does not turn. A displacement goes on in steps so small that nodes touch in their order.
-        """
+        """Go on to the target, in steps as large as converge; whether it is reached."""
         before = self.reached(target)
-        way = target.values - before
+        way = target.values - before  # displaced in steps so small that nodes touch in their order
         largest = _MOST_APPROACH_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
         done, step, downhill = 0.0, _FIRST_STEP, False
         least = min(_LEAST_STEP, 0.01 * largest)
@@ -156,6 +148,7 @@ class LoadPath:
                 continue
             step *= _SHRINK
             stays = self.contact.plate.taped and not self.contact.status.turns
+            # where Newton's method fails under forces, viscous descent takes over
             if step < _SOFT_STEP and stays and not (downhill or target.displaced.any()):
                 downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0

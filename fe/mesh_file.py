@@ -41,19 +41,16 @@ def write_tet_mesh(
         If a file cannot be written.
     """
     place = Path(path)
-    tissues = {name: number for number, name in enumerate(mesh.regions, start=1)}
-    facets = {name: number for number, name in enumerate(mesh.facets, start=_FIRST_FACET)}
-    number = np.zeros(len(mesh.cells), dtype=np.int64)
-    for name, cells in mesh.regions.items():
-        number[cells] = tissues[name]
-    triangles = np.concatenate([*mesh.facets.values(), np.empty((0, 3), dtype=np.int64)])
-    flat = np.repeat(list(facets.values()), [len(rows) for rows in mesh.facets.values()]).astype(np.int64)
-    blocks = [("tetra", mesh.cells)] + ([("triangle", triangles)] if len(triangles) else [])
-    numbers = [number] + ([flat] if len(triangles) else [])
+    blocks, numbers = [("tetra", mesh.cells)], [np.zeros(len(mesh.cells), dtype=np.int64)]
+    for number, cells in enumerate(mesh.regions.values(), start=1):
+        numbers[0][cells] = number
+    for number, rows in enumerate(mesh.facets.values(), start=_FIRST_FACET):
+        blocks.append(("triangle", rows))
+        numbers.append(np.full(len(rows), number))
     with whole_file(place) as part:
         meshio.vtu.write(part, meshio.Mesh(mesh.points_mm, blocks, at_nodes, {"region": numbers}), binary=True)
-    names = {str(number): name for named in (tissues, facets) for name, number in named.items()}
-    write_json(place.with_suffix(".json"), {"regions": names, **about})
+    names = [*enumerate(mesh.regions, start=1), *enumerate(mesh.facets, start=_FIRST_FACET)]
+    write_json(place.with_suffix(".json"), {"regions": {str(number): name for number, name in names}, **about})
 
 
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:

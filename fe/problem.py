@@ -23,16 +23,11 @@ class Problem:
 
     Attributes
     ----------
-    mesh : TetMesh
-        LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed; every cell in one
-        region.
+    mesh, plate, fixed, element
+        As in `fe.simulate`, with one plate; every cell of the mesh is in one region.
     materials : mapping of region to Material
     loads : sequence of LoadStep
         Reached one from the other. The first must press.
-    fixed : sequence of str
-        Surface sets that do not move.
-    element : {"P1", "MINI", "P2"}
-        As in `fe.elements`.
 
     Raises
     ------

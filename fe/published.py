@@ -64,8 +64,7 @@ class MaterialSet:
         >>> materials["muscle"] is materials["fat"], notes
         (True, ("friedman has no material law for muscle; fat's is used.",))
         """
-        by_region: dict[str, Material] = {}
-        notes = []
+        by_region, notes = dict[str, Material](), []
         if WHOLE in self.materials:
             return dict.fromkeys(regions, self.materials[WHOLE]), ()
         known = {tissue.casefold(): law for tissue, law in self.materials.items()}
@@ -123,12 +122,9 @@ def as_material_set(given: object) -> MaterialSet:
         return material_set(given)
     if isinstance(given, Mapping) and all(isinstance(material, Material) for material in given.values()):
         return MaterialSet("materials", "", "", dict(given))
-    values = (
-        f" of {', '.join(sorted({type(v).__name__ for v in given.values()}))}" if isinstance(given, Mapping) else ""
-    )
     raise InputError(
         "Materials must be a set (fe.material_set), the name of a published one, or a dict of region to material, such "
-        f"as {{'fat': fe.Ogden.from_ansys(0.0034, 6.2)}}; got a {type(given).__name__}{values}."
+        f"as {{'fat': fe.Ogden.from_ansys(0.0034, 6.2)}}; got {given!r:.80}."
     )
 
 

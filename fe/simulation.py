@@ -247,7 +247,7 @@ class Simulation:
         from fe import figures
 
         place = Path(folder)
-        with suppress(OSError):  # that a file cannot be written says more
+        with suppress(OSError):  # that the first file cannot be written says as much
             place.mkdir(parents=True, exist_ok=True)
         for state in self.states:
             if fields and len(state.curve) > 1:
