@@ -39,7 +39,7 @@ _FEBIO_OUTPUT = """<Output><plotfile type="febio">
 
 
 def write_calculix(
-    path: Path, mesh: TetMesh, materials: Materials, state: LoadState, *,
+    path: Path | str, mesh: TetMesh, materials: Materials, state: LoadState, *,
     fixed: Sequence[str] = (BONE,), quadratic: bool = False,
 ) -> None:  # fmt: skip
     """Write a CalculiX deck (.inp) of a state, mm, N and MPa, LPS.
@@ -61,7 +61,7 @@ def write_calculix(
     InputError
         For Hencky's law, which CalculiX does not have.
     """
-    write_whole(path, "\n".join(_deck(mesh, materials, state, fixed, quadratic)) + "\n")
+    write_whole(Path(path), "\n".join(_deck(mesh, materials, state, fixed, quadratic)) + "\n")
 
 
 def _deck(
@@ -128,7 +128,7 @@ def _calculix_law(region: str, law: Material) -> tuple[str, str]:
 
 
 def write_febio(
-    path: Path, mesh: TetMesh, materials: Materials, state: LoadState, *,
+    path: Path | str, mesh: TetMesh, materials: Materials, state: LoadState, *,
     fixed: Sequence[str] = (BONE,), quadratic: bool = False,
 ) -> None:  # fmt: skip
     """Write an FEBio 4 deck (.feb) of a state, mm, N and MPa, LPS; parameters as `write_calculix`.
@@ -170,9 +170,8 @@ def write_febio(
     data = _child(root, "MeshData")
     boundary = _child(root, "Boundary")
     still = _child(boundary, "bc", name="bone", type="zero displacement", node_set="bone")
-    for axis in "xyz":
-        _child(still, f"{axis}_dof", "1")
     for number, axis in enumerate("xyz"):
+        _child(still, f"{axis}_dof", "1")
         values = _child(data, "NodeData", name=f"u{axis}", node_set="plate", data_type="scalar")
         for local, u in enumerate(moved[:, number], start=1):
             _child(values, "node", f"{u:.12g}", lid=str(local))
@@ -183,7 +182,7 @@ def write_febio(
     root.extend(map(ElementTree.fromstring, (_FEBIO_LOADS, _FEBIO_OUTPUT)))
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding="unicode")
-    write_whole(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')
+    write_whole(Path(path), f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')
 
 
 def _child(parent: ElementTree.Element, tag: str, text: str | None = None, /, **attributes: str) -> ElementTree.Element:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -83,23 +84,20 @@ def problems_of(
     return [Problem(mesh, materials, plate_of[path[0].name], path, fixed, element) for path in paths]
 
 
-def check_kinds(mesh: object, plate: object, loads: object) -> None:
+def check_kinds(mesh: object, plate: object, loads: Any) -> None:
     """Refuse what is no mesh, plate or sequence of loads with an `InputError` that says what to give."""
-    if not isinstance(mesh, TetMesh):
-        raise _other_kind("The mesh", "a TetMesh, as fe.read_tet_mesh(path) or fe.mesh_labels gives it", mesh)
-    if not isinstance(loads, Sequence) or isinstance(loads, str):
-        raise _other_kind("The loads", "a list of fe.LoadStep", loads)
-    if odd := [load for load in loads if not isinstance(load, LoadStep)]:
-        raise _other_kind("The loads", "a list of fe.LoadStep", odd[0])
-    by_load = plate if isinstance(plate, Mapping) else {load.name: plate for load in loads}
+    _expect(TetMesh, mesh, "The mesh must be a TetMesh, as fe.read_tet_mesh(path) or fe.mesh_labels gives it")
+    _expect(Sequence, loads, "The loads must be a list of fe.LoadStep")
     for load in loads:
-        if not isinstance(one := by_load.get(load.name), Plate):
-            raise _other_kind(f"{load.name}: the plate", "an fe.Plate, or a dict with one for each load's name", one)
+        _expect(LoadStep, load, "The loads must be a list of fe.LoadStep")
+        one = plate.get(load.name) if isinstance(plate, Mapping) else plate
+        _expect(Plate, one, f"{load.name}: the plate must be an fe.Plate, or a dict with one for each load's name")
 
 
-def _other_kind(what: str, wanted: str, given: object) -> InputError:
-    got = "nothing" if given is None else f"{given!r}" if isinstance(given, str) else f"a {type(given).__name__}"
-    return InputError(f"{what} must be {wanted}; got {got}.")
+def _expect(kind: type, given: object, wanted: str) -> None:
+    if not isinstance(given, kind):
+        got = "nothing" if given is None else f"{given!r}" if isinstance(given, str) else f"a {type(given).__name__}"
+        raise InputError(f"{wanted}; got {got}.")
 
 
 def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
@@ -121,8 +119,7 @@ def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
 
 def check_materials(mesh: TetMesh, materials: Materials) -> None:
     """Refuse a mesh of which a cell has no material, or more than one, with an `InputError`."""
-    if not isinstance(materials, Mapping):
-        raise _other_kind("Materials", "a dict of region to material, as MaterialSet.for_regions gives it", materials)
+    _expect(Mapping, materials, "Materials must be a dict of region to material, as MaterialSet.for_regions gives it")
     times = np.zeros(len(mesh.cells), dtype=int)
     for region in materials:
         if region not in mesh.regions:

@@ -154,7 +154,7 @@ def volume_percentiles(values: FloatArray, volumes: FloatArray, shares: Sequence
     return tuple(float(v) for v in values[order][at])
 
 
-def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
+def write_regions_csv(path: Path | str, rows: Sequence[RegionFigures]) -> None:
     """Write the figures of regions as CSV, a row for each load and region; strain without unit, MPa, mL.
 
     `OutputError` if the file cannot be written.
@@ -168,7 +168,7 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
     for row in rows:
         load, reached, region, *numbers = astuple(row)
         table.append([load, f"{reached:.4g}", region, *numbers[:7], *row.above_ml, *numbers[8:]])
-    write_csv(path, columns, table)
+    write_csv(Path(path), columns, table)
 
 
 def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
@@ -192,7 +192,7 @@ def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
     return curves
 
 
-def write_state(path: Path, mesh: TetMesh, state: LoadState, materials: Materials) -> None:
+def write_state(path: Path | str, mesh: TetMesh, state: LoadState, materials: Materials) -> None:
     """Write a load's results as VTU: LPS mm and MPa, on the undeformed mesh (warp by ``displacement_mm``).
 
     At nodes: displacement, and det F of the patch around each. In cells: number of the region, F, Green-Lagrange
@@ -213,7 +213,7 @@ def write_state(path: Path, mesh: TetMesh, state: LoadState, materials: Material
     }
     point = {"displacement_mm": state.u_mm, "patch_jacobian": patch_volumes(mesh, strain.jacobian)}
     written = meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], point, {name: [v] for name, v in cell.items()})
-    with whole_file(path) as part:
+    with whole_file(Path(path)) as part:
         meshio.vtu.write(part, written, binary=True)
 
 

@@ -148,11 +148,13 @@ def test_notes_of_earlier_versions_are_shown_once(unreached: fe.Simulation, tmp_
     assert notes == ("weak has no material law for tendon; fat's is used.", *unreached.notes)
 
 
-def test_folders_are_made(simulation: fe.Simulation, tmp_path: Path) -> None:
+def test_folders_are_made_and_names_taken_as_text(simulation: fe.Simulation, tmp_path: Path) -> None:
     simulation.write(tmp_path / "a" / "b", fields=False)
     simulation.write_decks(str(tmp_path / "decks"))
     assert (tmp_path / "a" / "b" / "simulation.json").is_file()
     assert (tmp_path / "decks" / "pressed.feb").is_file()
+    fe.write_state(str(tmp_path / "state.vtu"), simulation.mesh, simulation.states[0], LAWS)
+    fe.write_regions_csv(str(tmp_path / "rows.csv"), simulation.regions)
     (tmp_path / "file").touch()
     with pytest.raises(fe.OutputError, match=r"file.c: cannot be|file.regions\.csv: cannot be written"):
         simulation.write(tmp_path / "file", fields=False)
