@@ -19,10 +19,9 @@ _CHUNK = 16384  # cells whose matrices are in memory at once
 
 
 class Assembler:
-    """The sparse system of a model under changing constraints.
+    """The sparse system of a model under changing constraints; unknowns in ``fixed`` (f,) never change.
 
-    ``fixed`` (f,) are unknowns whose value never changes; ``shared`` maps each shared equation, numbered from 0, to the
-    unknowns that may ever follow it.
+    ``shared`` maps each shared equation, numbered from 0, to the unknowns that may ever follow it.
     """
 
     def __init__(self, model: Model, fixed: IntArray, shared: Mapping[int, IntArray]) -> None:
@@ -33,17 +32,15 @@ class Assembler:
         self._own = np.where(free, np.cumsum(free) - 1, -1)  # -1 where fixed
         self.own_equations = int(free.sum())
         self.size = self.own_equations + len(shared)
-        self._may_share = np.zeros(model.unknowns, dtype=bool)
-        for unknowns in shared.values():
-            self._may_share[unknowns] = True
         self.indptr, self.indices = self._pattern(shared)
         self._row_of = np.repeat(np.arange(self.size), np.diff(self.indptr))
         above = self.indices != self._row_of
         self._columns = [np.flatnonzero((self.indices == self.own_equations + n) & above) for n in range(len(shared))]
-        self._touched = self._may_share[self._cells].any(axis=1)
+        may_share = np.concatenate([np.empty(0, dtype=np.int64), *shared.values()])
+        self._touched = np.flatnonzero(np.isin(self._cells, may_share).any(axis=1))
         pairs = self._cells.shape[1] * (self._cells.shape[1] + 1) // 2
         self._places = np.empty((len(self._cells), pairs), dtype=np.int32)
-        self.equation = self._own.copy()
+        self.equation = self._own
         _locate(self._cells, self.equation, self.indptr, self.indices, np.arange(len(self._cells)), self._places)
 
     def share(self, followers: Mapping[int, IntArray]) -> None:
@@ -51,10 +48,9 @@ class Assembler:
         equation = self._own.copy()
         for number, unknowns in followers.items():
             equation[unknowns] = self.own_equations + number
-        if np.array_equal(equation, self.equation):
-            return
-        self.equation = equation
-        _locate(self._cells, equation, self.indptr, self.indices, np.flatnonzero(self._touched), self._places)
+        if not np.array_equal(equation, self.equation):
+            self.equation = equation
+            _locate(self._cells, equation, self.indptr, self.indices, self._touched, self._places)
 
     @property
     def force_equations(self) -> BoolArray:
@@ -72,10 +68,7 @@ class Assembler:
         return np.flatnonzero(~used)
 
     def residual(self, state: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Internal forces by unknown and by equation, and the least det F, at a state.
-
-        N for displacements, volume defects in mm3 for pressures; NaN where det F <= 0.
-        """
+        """Forces (N; for pressures mm3) by unknown and by equation, and the least det F; NaN where det F <= 0."""
         by_unknown = np.zeros(self.model.unknowns)
         lowest = self._run(state, by_unknown, None)
         return by_unknown, self.by_equation(by_unknown), lowest
@@ -88,10 +81,7 @@ class Assembler:
         return data
 
     def held(self, data: FloatArray, right: FloatArray, equations: IntArray, moves: FloatArray) -> FloatArray:
-        """Prescribe the moves of shared equations: return the changed values, and change ``right`` in place.
-
-        Their columns go to the right-hand side, their diagonal becomes 1.
-        """
+        """The values with moves of shared equations prescribed: their diagonal is 1, their columns go to ``right``."""
         kept = data.copy()
         for equation, move in zip(equations, moves, strict=True):
             column = self._columns[equation - self.own_equations]
@@ -110,8 +100,7 @@ class Assembler:
     def by_equation(self, by_unknown: FloatArray) -> FloatArray:
         """Sum of a quantity of the unknowns over each equation."""
         inside = self.equation >= 0
-        sums = np.bincount(self.equation[inside], weights=by_unknown[inside], minlength=self.size)
-        return sums.astype(np.float64)
+        return np.bincount(self.equation[inside], by_unknown[inside], self.size).astype(np.float64)
 
     def acting(self, state: FloatArray, directions: FloatArray) -> FloatArray:
         """The tangent times directions (unknowns, k), by unknown, as if each had its own equation."""
@@ -157,16 +146,11 @@ class Assembler:
         count, width = self._cells.shape
         cell = np.repeat(np.arange(count), width)
         meets = sparse.csr_matrix((np.ones(cell.size, dtype=np.int32), (cell, self._cells.ravel())))
-        rows, columns = [self._own], [np.arange(self.model.unknowns)]
-        for number, unknowns in shared.items():
-            rows.append(np.full(len(unknowns), self.own_equations + number))
-            columns.append(unknowns)
-        row, column = np.concatenate(rows), np.concatenate(columns)
+        rows = [self._own, *(np.full(len(unknowns), self.own_equations + n) for n, unknowns in shared.items())]
+        row, column = np.concatenate(rows), np.concatenate([np.arange(self.model.unknowns), *shared.values()])
         kept = row >= 0
-        stands = sparse.csr_matrix(
-            (np.ones(kept.sum(), dtype=np.int32), (row[kept], column[kept])), shape=(self.size, self.model.unknowns)
-        )
-        touches = stands @ meets.T
+        entries = np.ones(kept.sum(), dtype=np.int32), (row[kept], column[kept])
+        touches = sparse.csr_matrix(entries, shape=(self.size, self.model.unknowns)) @ meets.T
         coupled = sparse.triu(touches @ touches.T + sparse.identity(self.size, dtype=np.int32), format="csr")
         coupled.sort_indices()
         return coupled.indptr.astype(np.int32), coupled.indices.astype(np.int32)
@@ -176,10 +160,7 @@ class Assembler:
 def _locate(
     cells: IntArray, equation: IntArray, indptr: IntArray, indices: IntArray, which: IntArray, places: IntArray
 ) -> None:
-    """Place of the entry of each pair of a cell's unknowns in the upper triangle.
-
-    -1 where one is fixed; -2 - place where the entry counts twice.
-    """
+    """Place in the upper triangle of each pair of a cell's unknowns; -1: one is fixed; -2 - place: it counts twice."""
     width = cells.shape[1]
     for n in prange(len(which)):
         cell, pair = which[n], 0
@@ -249,23 +230,18 @@ def _elements(
         g, h = np.empty((nodes, 3)), np.empty((nodes, 3))
         F, U, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
         stress, direct, swapped = np.empty(3), np.empty((3, 3)), np.zeros((3, 3, 2))
-        block, half = np.empty((3, 3)), np.empty((3, 3))
+        block, half, one = np.empty((3, 3)), np.empty((3, 3)), np.eye(3)
         K = np.zeros((width, width))
         f = np.zeros(width)
         which = law[n]
         lowest[n] = np.inf
         for q in range(points):
             weight = weights[q] * volumes[n]
-            F[:, :] = 0.0
-            for i in range(3):
-                F[i, i] = 1.0
+            F[:, :] = one
             for a in range(nodes):
+                slope, way = tables[q, a], inverse[n]
                 for j in range(3):
-                    g[a, j] = (
-                        tables[q, a, 0] * inverse[n, 0, j]
-                        + tables[q, a, 1] * inverse[n, 1, j]
-                        + tables[q, a, 2] * inverse[n, 2, j]
-                    )
+                    g[a, j] = slope[0] * way[0, j] + slope[1] * way[1, j] + slope[2] * way[2, j]
                     for i in range(3):
                         F[i, j] += u[cells[n, a], i] * g[a, j]
             pq = 0.0
@@ -298,18 +274,12 @@ def _elements(
                 continue
             for a in range(nodes):
                 for b in range(a, nodes):
+                    left, right = h[a], h[b]
                     for i in range(3):
+                        d = direct[i]
                         for k in range(3):
-                            if i == k:
-                                block[i, i] = (
-                                    direct[i, 0] * h[a, 0] * h[b, 0]
-                                    + direct[i, 1] * h[a, 1] * h[b, 1]
-                                    + direct[i, 2] * h[a, 2] * h[b, 2]
-                                )
-                            else:
-                                block[i, k] = (
-                                    swapped[i, k, 0] * h[a, i] * h[b, k] + swapped[i, k, 1] * h[a, k] * h[b, i]
-                                )
+                            block[i, k] = swapped[i, k, 0] * left[i] * right[k] + swapped[i, k, 1] * left[k] * right[i]
+                        block[i, i] = d[0] * left[0] * right[0] + d[1] * left[1] * right[1] + d[2] * left[2] * right[2]
                     for i in range(3):
                         for k in range(3):
                             half[i, k] = block[i, 0] * U[k, 0] + block[i, 1] * U[k, 1] + block[i, 2] * U[k, 2]
@@ -331,8 +301,7 @@ def _elements(
                 value = mass / (bulk[which] - own[which]) + tau / shear[which] * (mass - volumes[n] / 16.0)
                 f[3 * nodes + c] -= value * p[pressure_cells[n, d]]
                 K[3 * nodes + c, 3 * nodes + d] -= value
-        for i in range(width):
-            forces[n, i] = f[i]
+        forces[n, :] = f
         if with_tangent:
             pair = 0
             for i in range(width):

@@ -17,7 +17,7 @@ from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from fe.elements import Space, edges_of
 from fe.hyperelastic import OGDEN
-from fe.materials import Hencky, Material, Materials, NeoHooke, Ogden, Yeoh
+from fe.materials import Material, Materials, NeoHooke, Ogden, Yeoh
 from fe.solution import LoadState
 from fe.surface_sets import BONE
 
@@ -39,14 +39,9 @@ _FEBIO_OUTPUT = """<Output><plotfile type="febio">
 
 
 def write_calculix(
-    path: Path,
-    mesh: TetMesh,
-    materials: Materials,
-    state: LoadState,
-    *,
-    fixed: Sequence[str] = (BONE,),
-    quadratic: bool = False,
-) -> None:
+    path: Path | str, mesh: TetMesh, materials: Materials, state: LoadState, *,
+    fixed: Sequence[str] = (BONE,), quadratic: bool = False,
+) -> None:  # fmt: skip
     """Write a CalculiX deck (.inp) of a state, mm, N and MPa, LPS.
 
     Parameters
@@ -66,7 +61,7 @@ def write_calculix(
     InputError
         For Hencky's law, which CalculiX does not have.
     """
-    write_whole(path, "\n".join(_deck(mesh, materials, state, fixed, quadratic)) + "\n")
+    write_whole(Path(path), "\n".join(_deck(mesh, materials, state, fixed, quadratic)) + "\n")
 
 
 def _deck(
@@ -83,7 +78,7 @@ def _deck(
             yield f"{cell + 1}, " + ", ".join(str(n + 1) for n in space.cells[cell])
     for region, law in materials.items():
         yield f"*MATERIAL, NAME={_short('M', region, materials)}"
-        yield from _law(region, law)
+        yield from _calculix_law(region, law)
         yield f"*SOLID SECTION, ELSET={_short('E', region, materials)}, MATERIAL={_short('M', region, materials)}"
     held, on_plate, moved = _supports(mesh, space, state, fixed)
     for name, nodes in (("NBONE", held), ("NPLATE", on_plate)):
@@ -102,54 +97,40 @@ def _supports(
     mesh: TetMesh, space: Space, state: LoadState, fixed: Sequence[str]
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Nodes that are fixed, nodes on the plate, and how far those move; middles of edges go with their ends."""
-    held = np.concatenate([mesh.facets[name] for name in fixed])
-    bone, plate = (np.isin(np.arange(len(mesh.points_mm)), nodes) for nodes in (held, state.on_plate))
-    still, on_plate, moved = [np.flatnonzero(bone)], [np.flatnonzero(plate)], [state.u_mm[plate]]
+    held = space.nodes_on(np.concatenate([mesh.facets[name] for name in fixed]))
+    on_plate = np.sort(state.on_plate)
+    moved = state.u_mm[on_plate]
     if space.cells.shape[1] > 4:
         others = np.concatenate([rows for name, rows in mesh.facets.items() if name not in fixed])
-        faces = others[plate[others].all(axis=1)]
-        for facets, both, nodes in ((held, bone, still), (faces, plate, on_plate)):
-            ends = edges_of(facets)
-            ends = ends[both[ends].all(axis=1)]
-            nodes.append(space.middles(ends))
-            if nodes is on_plate:
-                moved.append(state.u_mm[ends].mean(axis=1))
-    return np.concatenate(still), np.concatenate(on_plate), np.concatenate(moved)
+        ends = edges_of(others[np.isin(others, on_plate).all(axis=1)])
+        on_plate = np.append(on_plate, space.middles(ends))
+        moved = np.concatenate([moved, state.u_mm[ends].mean(axis=1)])
+    return held, on_plate, moved
 
 
-def _law(region: str, law: Material) -> Iterator[str]:
-    d1 = 2.0 / law.bulk_modulus_mpa
-    c10, c20, c30 = law.vector[:3]
-    if isinstance(law, NeoHooke):
-        yield "*HYPERELASTIC, NEO HOOKE"
-        yield f"{c10:.12g}, {d1:.12g}"
-    elif isinstance(law, Yeoh):
-        yield "*HYPERELASTIC, YEOH"
-        yield f"{c10:.12g}, {c20:.12g}, {c30:.12g}, {d1:.12g}, {_UNUSED:g}, {_UNUSED:g}"
-    elif isinstance(law, Ogden):
-        pairs = law.vector[OGDEN:].reshape(-1, 2)
-        if len(pairs) > 3:
-            raise InputError(f"{region}: CalculiX takes Ogden models of up to three terms; this has {len(pairs)}.")
-        yield f"*HYPERELASTIC, OGDEN, N={len(pairs)}"
-        numbers = [*pairs.ravel(), d1, *[_UNUSED] * (len(pairs) - 1)]
-        yield ", ".join(f"{number:.12g}" for number in numbers)
-    else:
-        assert isinstance(law, Hencky)
+def _calculix_law(region: str, law: Material) -> tuple[str, str]:
+    polynomial, terms = law.vector[:OGDEN].tolist(), law.vector[OGDEN:].tolist()
+    d1, count = 2.0 / law.bulk_modulus_mpa, len(terms) // 2
+    if count > 3:
+        raise InputError(f"{region}: CalculiX takes Ogden models of up to three terms; this has {count}.")
+    forms = {
+        NeoHooke: ("NEO HOOKE", [polynomial[0], d1]),
+        Yeoh: ("YEOH", [*polynomial[:3], d1, _UNUSED, _UNUSED]),
+        Ogden: (f"OGDEN, N={count}", [*terms, d1, *[_UNUSED] * (count - 1)]),
+    }
+    if type(law) not in forms:
         raise InputError(
             f"{region}: CalculiX has no material law that is linear in logarithmic strain (its *ELASTIC is Saint "
             "Venant-Kirchhoff's, which collapses in compression); choose another set for a deck."
         )
+    kind, numbers = forms[type(law)]
+    return f"*HYPERELASTIC, {kind}", ", ".join(f"{number:.12g}" for number in numbers)
 
 
 def write_febio(
-    path: Path,
-    mesh: TetMesh,
-    materials: Materials,
-    state: LoadState,
-    *,
-    fixed: Sequence[str] = (BONE,),
-    quadratic: bool = False,
-) -> None:
+    path: Path | str, mesh: TetMesh, materials: Materials, state: LoadState, *,
+    fixed: Sequence[str] = (BONE,), quadratic: bool = False,
+) -> None:  # fmt: skip
     """Write an FEBio 4 deck (.feb) of a state, mm, N and MPa, LPS; parameters as `write_calculix`.
 
     The volume's energy is FEBio's pressure model "Abaqus", K / 2 (J - 1)^2, which is that of `fe.materials`. Written by
@@ -189,9 +170,8 @@ def write_febio(
     data = _child(root, "MeshData")
     boundary = _child(root, "Boundary")
     still = _child(boundary, "bc", name="bone", type="zero displacement", node_set="bone")
-    for axis in "xyz":
-        _child(still, f"{axis}_dof", "1")
     for number, axis in enumerate("xyz"):
+        _child(still, f"{axis}_dof", "1")
         values = _child(data, "NodeData", name=f"u{axis}", node_set="plate", data_type="scalar")
         for local, u in enumerate(moved[:, number], start=1):
             _child(values, "node", f"{u:.12g}", lid=str(local))
@@ -202,7 +182,7 @@ def write_febio(
     root.extend(map(ElementTree.fromstring, (_FEBIO_LOADS, _FEBIO_OUTPUT)))
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding="unicode")
-    write_whole(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')
+    write_whole(Path(path), f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n')
 
 
 def _child(parent: ElementTree.Element, tag: str, text: str | None = None, /, **attributes: str) -> ElementTree.Element:
@@ -213,15 +193,16 @@ def _child(parent: ElementTree.Element, tag: str, text: str | None = None, /, **
 
 def _febio_law(region: str, law: Material) -> tuple[str, dict[str, float]]:
     c10, c20, c30 = law.vector[:3].tolist()
-    if isinstance(law, NeoHooke):
-        return "Mooney-Rivlin", {"c1": c10, "c2": 0.0}
-    if isinstance(law, Yeoh):
-        return "Yeoh", {"c1": c10, "c2": c20, "c3": c30}
-    if isinstance(law, Ogden):  # c = 2 mu0, see Ogden.from_febio
-        pairs = law.vector[OGDEN:].reshape(-1, 2).tolist()
-        numbers = {f"c{n}": 2.0 * mu for n, (mu, _) in enumerate(pairs, start=1)}
-        return "Ogden", numbers | {f"m{n}": alpha for n, (_, alpha) in enumerate(pairs, start=1)}
-    raise InputError(f"{region}: no FEBio deck is written for {law.law}; choose another set.")
+    pairs = law.vector[OGDEN:].reshape(-1, 2).tolist()
+    numbers = {f"c{n}": 2.0 * mu for n, (mu, _) in enumerate(pairs, start=1)}  # c = 2 mu0, see Ogden.from_febio
+    forms = {
+        NeoHooke: ("Mooney-Rivlin", {"c1": c10, "c2": 0.0}),
+        Yeoh: ("Yeoh", {"c1": c10, "c2": c20, "c3": c30}),
+        Ogden: ("Ogden", numbers | {f"m{n}": alpha for n, (_, alpha) in enumerate(pairs, start=1)}),
+    }
+    if type(law) not in forms:
+        raise InputError(f"{region}: no FEBio deck is written for {law.law}; choose another set.")
+    return forms[type(law)]
 
 
 def _about(state: LoadState) -> tuple[str, ...]:

@@ -53,15 +53,9 @@ class _Step:
 
 
 def descend(
-    assembler: Assembler,
-    solver: Solver,
-    state: FloatArray,
-    outside: FloatArray,
-    tolerance: Tolerance,
-    changed: Callable[[FloatArray, FloatArray], bool] = lambda _state, _forces: False,
-    log: Callable[[str], None] = lambda _: None,
-    is_over: Callable[[], bool] = lambda: False,
-) -> Converged | None:
+    assembler: Assembler, solver: Solver, state: FloatArray, outside: FloatArray, tolerance: Tolerance,
+    changed: Callable[[FloatArray, FloatArray], bool], log: Callable[[str], None], is_over: Callable[[], bool],
+) -> Converged | None:  # fmt: skip
     """Find the equilibrium to which a body in a viscous medium moves under forces from ``outside`` (equations,), N.
 
     The rest as in `fe.newton.equilibrium`, but no unknown is prescribed; ``changed`` is called after every step, and

@@ -16,9 +16,10 @@ tissue, and may jump from one tissue to the next. Three choices of displacement:
 - ``P2``: quadratic (Taylor, Hood 1973); stable, second order in the strain, and expensive.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -48,18 +49,16 @@ class Element:
     weights: FloatArray  # (q,) shares of the cell's volume
     gradients: FloatArray  # (q, a, 3) of the displacement functions, by the reference coordinates (nodes 1, 2 and 3)
     pressure: FloatArray  # (q, 4) pressure functions
-    stabilisation: float = 0.0  # tau, no unit; 0 where the element needs none
-    own_volume: float = 0.0  # c, no unit
+    stabilisation: float = 0.0  # tau, no unit; only P1 needs it
+    own_volume: float = 0.0  # c, no unit; only P1 has it
 
 
-def element(name: str, stabilisation: float = 0.5, own_volume: float = 1.0) -> Element:
-    """An element by its name, P1, MINI or P2; ``stabilisation`` and ``own_volume`` are tau and c of P1."""
+def element(name: str) -> Element:
+    """An element by its name, P1, MINI or P2."""
     if name not in _MADE:
         raise InputError(f"No element '{name}'; there are {', '.join(_MADE)}.")
-    barycentric, weights = _MADE[name][1]
-    gradients = np.array([_MADE[name][0](b) for b in barycentric])
-    of_p1 = (stabilisation, own_volume) if name == "P1" else ()
-    return Element(name, weights, gradients, barycentric, *of_p1)
+    functions, (barycentric, weights), *constants = _MADE[name]
+    return Element(name, weights, np.array([functions(b) for b in barycentric]), barycentric, *constants)
 
 
 _LINEAR = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -93,19 +92,16 @@ _CENTRE = (0.25, 0.25, 0.25, 0.25)
 _A = 0.1381966011250105  # (5 - sqrt 5) / 20
 _B, _C, _D = 1.0 / 3.0, 1.0 / 11.0, 0.0665501535736643
 
-_MADE = {
-    "P1": (_p1, _points((1.0, _CENTRE))),
-    # Degree 5, 15 points: P. Keast 1986, doi:10.1016/0045-7825(86)90059-9
-    "MINI": (
-        _mini,
-        _points(
-            (0.1817020685825351, _CENTRE),
-            (0.0361607142857143, (0.0, _B, _B, _B)),
-            (0.0698714945161738, (8.0 * _C, _C, _C, _C)),
-            (0.0656948493683187, (_D, _D, 0.5 - _D, 0.5 - _D)),
-        ),
-    ),
-    # Degree 2, 4 points
+_KEAST = _points(
+    (0.1817020685825351, _CENTRE),
+    (0.0361607142857143, (0.0, _B, _B, _B)),
+    (0.0698714945161738, (8.0 * _C, _C, _C, _C)),
+    (0.0656948493683187, (_D, _D, 0.5 - _D, 0.5 - _D)),
+)  # degree 5, 15 points: P. Keast 1986, doi:10.1016/0045-7825(86)90059-9
+# Displacement functions, quadrature (of degree 2 for P2), and the constants tau and c of P1.
+_MADE: Mapping[str, tuple[Any, ...]] = {
+    "P1": (_p1, _points((1.0, _CENTRE)), 0.5, 1.0),
+    "MINI": (_mini, _KEAST),
     "P2": (_p2, _points((0.25, (_A, _A, _A, 1.0 - 3.0 * _A)))),
 }
 
@@ -137,19 +133,21 @@ class Space:
         known, numbered = np.unique(pairs, return_inverse=True)
         return cls(points, np.ascontiguousarray(cells), numbered.reshape(pairs.shape), len(known))
 
+    def nodes_on(self, faces: IntArray) -> IntArray:
+        """Displacement nodes (k,) on triangles (n, 3) of the mesh, rising; those in the middle of edges too."""
+        corners = np.unique(faces)
+        return np.append(corners, self.middles(edges_of(faces))) if self.cells.shape[1] == 10 else corners
+
     def middles(self, ends: IntArray) -> IntArray:
-        """The node in the middle of each edge (k, 2) of a quadratic mesh, given by its corners."""
+        """The node in the middle of each edge (k, 2) of a quadratic mesh, given by its corners in rising order."""
         known = np.sort(np.concatenate([self.cells[:, list(edge)] for edge in EDGES]), axis=1)
-        count = len(self.nodes_mm)
-        keys, first = np.unique(known[:, 0] * count + known[:, 1], return_index=True)
-        wanted = np.sort(ends, axis=1)
-        return np.asarray(
-            self.cells[:, 4:].T.ravel()[first][np.searchsorted(keys, wanted[:, 0] * count + wanted[:, 1])]
-        )
+        weights = np.array([len(self.nodes_mm), 1])
+        keys, first = np.unique(known @ weights, return_index=True)
+        return np.asarray(self.cells[:, 4:].T.ravel()[first][np.searchsorted(keys, ends @ weights)])
 
 
 def edges_of(faces: IntArray) -> IntArray:
-    """The edges (k, 2) of triangles (n, 3), each once."""
+    """The edges (k, 2) of triangles (n, 3), each once, corners in rising order."""
     return np.unique(np.sort(np.concatenate([faces[:, e] for e in ([0, 1], [1, 2], [0, 2])]), axis=1), axis=0)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -40,10 +41,7 @@ def write_figure(path: Path, figure: Figure) -> None:
 
 
 def stress_stretch(curves: Sequence[Curve], fitted: Fit) -> Figure:
-    """Measured nominal stress (points) and the fitted material law (lines), by kind of test.
-
-    The line is dashed where Drucker's condition fails: simulations that reach this range are unreliable.
-    """
+    """Measured nominal stress (points) and the fitted law (lines; dashed: not stable, by Drucker), by kind of test."""
     figure, (axes,) = chart()
     for curve, colour in zip(curves, cycle(REGION_COLOURS), strict=False):
         low, high = fitted.reached[curve.mode]
@@ -73,8 +71,7 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
     assert axes is not None
     panels, middle = [], _lowest_bone_point(mesh, axes)
     for state in states:
-        part = "" if state.reached == 1.0 else f" (ONLY {state.reached:.0%})"
-        title = f"{state.load.name}: {state.load}{part}"
+        title = f"{state.load.name}: {state.load}{'' if state.reached == 1.0 else f' (ONLY {state.reached:.0%})'}"
         panels.append(Slice(title, state.u_mm, state.strain.max_shear, _along_plate(mesh, state, axes, middle)))
     return slice_sheet(mesh, panels, axes, middle)
 
@@ -125,11 +122,9 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
     for spot in spots[len(panels) :]:
         spot.set_visible(False)
     shades = colormaps["viridis"].with_extremes(bad=_UNKNOWN)
+    how: dict[str, Any] = {"cmap": shades, "norm": Normalize(0.0, largest), "edgecolors": "face", "linewidths": 0.2}
     for spot, panel, (cells, polygons) in zip(spots, panels, cuts, strict=False):
-        drawn = PolyCollection(
-            polygons, array=np.ma.masked_invalid(panel.max_shear[cells]), cmap=shades, norm=Normalize(0.0, largest),
-            edgecolors="face", linewidths=0.2,
-        )  # fmt: skip
+        drawn = PolyCollection(polygons, array=np.ma.masked_invalid(panel.max_shear[cells]), **how)
         spot.add_collection(drawn)
         spot.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         if panel.face is not None:
@@ -140,8 +135,8 @@ def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_
             (0.01, 0.5, "left", "center", -axes[:, 1]), (0.99, 0.5, "right", "center", axes[:, 1]),
             (0.5, 0.01, "center", "bottom", -axes[:, 0]), (0.5, 0.99, "center", "top", axes[:, 0]),
         ):  # fmt: skip
-            how = {"transform": spot.transAxes, "weight": "bold", "color": INK, "ha": ha, "va": va} | FONT
-            spot.text(x, y, letters(direction), **how)
+            where = {"transform": spot.transAxes, "ha": ha, "va": va}
+            spot.text(x, y, letters(direction), weight="bold", color=INK, **where, **FONT)
     bar = figure.colorbar(drawn, ax=list(spots[: len(panels)]), shrink=0.8, extend="max")
     bar.set_label("max. shear strain", color=INK, **FONT)
     return figure
@@ -166,11 +161,9 @@ def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray)
     sides = height[mesh.cells] > 0.0
     cells = np.flatnonzero(sides.any(axis=1) & ~sides.all(axis=1))
     polygons = []
-    for cell in cells:
-        nodes, side = mesh.cells[cell], sides[cell]
-        above, below = nodes[side], nodes[~side]
+    for nodes, side in zip(mesh.cells[cells], sides[cells], strict=True):
         # around the section: two pairs of edges share a corner, so that the polygon does not cross itself
-        pairs = [(a, b) for a in above for b in below]
+        pairs = [(a, b) for a in nodes[side] for b in nodes[~side]]
         if len(pairs) == 4:
             pairs = [pairs[0], pairs[1], pairs[3], pairs[2]]
         share = [height[a] / (height[a] - height[b]) for a, b in pairs]
@@ -205,10 +198,7 @@ def mesh_slice(mesh: TetMesh, plate: Plate) -> Figure:
 
 
 def convergence(sizes_mm: Sequence[float], curves: Mapping[str, tuple[Sequence[float], Limit]]) -> Figure:
-    """Quantities relative to their limits, over the size of the cells (cube root of their mean volume).
-
-    One that no longer depends on the mesh lies on the grey line.
-    """
+    """Quantities over their limits (1: the grey line), by the size of the cells, the cube root of their mean volume."""
     figure, (axes,) = chart()
     for (name, (values, limit)), colour in zip(curves.items(), cycle(REGION_COLOURS), strict=False):
         style = "-" if "travel" in name else "--"

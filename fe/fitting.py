@@ -12,7 +12,7 @@ from scipy.stats import f as fisher, t as student
 
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
-from fe.hyperelastic import HENCKY, OGDEN
+from fe.hyperelastic import HENCKY, OGDEN, POLYNOMIAL
 from fe.materials import HIGHEST_NU, MODES, Hencky, Material, NeoHooke, Ogden, Yeoh, nominal_stress
 
 _EXPONENTS = (-16.0, -8.0, -4.0, -2.0, 2.0, 4.0, 8.0, 16.0)  # starts of an Ogden fit
@@ -21,11 +21,9 @@ _MOST = 60.0  # no curve determines an exponent beyond this
 _SOFTEST = 1e-3  # least C10 of a polynomial, relative to that of the neo-Hookean model that fits the curves best
 _ABSURD = 1e-4  # curves of a material with a positive modulus are refused less often than this
 _STRESS = {
-    "nominal_stress_kpa": (1e-3, False),
-    "nominal_stress_mpa": (1.0, False),
-    "true_stress_kpa": (1e-3, True),
-    "true_stress_mpa": (1.0, True),
-}
+    "nominal_stress_kpa": (1e-3, False), "nominal_stress_mpa": (1.0, False),
+    "true_stress_kpa": (1e-3, True), "true_stress_mpa": (1.0, True),
+}  # in MPa, and whether it is true  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,41 +141,33 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class _Law:
-    """A material law as the fit sees it: names of its parameters, their vector, and the material."""
+    """A material law as the fit sees it: its kind, names of its parameters, and their vector."""
 
+    made: type[Material]
     names: tuple[str, ...]
     vector: Callable[[FloatArray], FloatArray]
-    material: Callable[[FloatArray, float], Material]
     exponents: int = 0  # of the last parameters, those in which the stress is not linear
     bounded: bool = False  # the first parameter is kept positive, and the stress is linear in all
 
 
 def _polynomial(*names: str) -> _Law:
-    def material(values: FloatArray, nu: float) -> Material:
-        c10, c20, c30 = (*values.tolist(), 0.0)[:3]
-        return Yeoh.of(c10, c20, c30, nu)
-
-    return _Law(names, lambda values: np.append(values, np.zeros(OGDEN - len(values))), material, bounded=True)
+    return _Law(Yeoh, names, lambda values: np.append(values, np.zeros(OGDEN - len(values))), bounded=True)
 
 
 def _ogden(terms: int) -> _Law:
     numbers = [""] if terms == 1 else [str(q + 1) for q in range(terms)]
-    return _Law(
-        (*(f"mu{n}" for n in numbers), *(f"alpha{n}" for n in numbers)),
-        lambda values: np.append(np.zeros(OGDEN), np.column_stack([values[:terms], values[terms:]])),
-        lambda values, nu: Ogden.of(values[:terms], values[terms:], nu),
-        terms,
-    )
+    names = *(f"mu{n}" for n in numbers), *(f"alpha{n}" for n in numbers)
+    return _Law(Ogden, names, lambda values: np.append(np.zeros(OGDEN), values.reshape(2, -1).T), terms)
 
 
 LAWS: Mapping[str, _Law] = {
-    "neo-Hooke": _Law(("mu",), lambda v: 0.5 * v[0] * np.eye(OGDEN)[0], lambda v, nu: NeoHooke.of(float(v[0]), nu)),
+    "neo-Hooke": _Law(NeoHooke, ("mu",), lambda values: 0.5 * values[0] * np.eye(OGDEN)[POLYNOMIAL]),
     "Isihara": _polynomial("C10", "C20"),
     "Yeoh": _polynomial("C10", "C20", "C30"),
     "Ogden": _ogden(1),
     "Ogden-2": _ogden(2),
     "Ogden-3": _ogden(3),
-    "Hencky": _Law(("mu",), lambda v: v[0] * np.eye(OGDEN)[HENCKY], lambda v, nu: Hencky.of(float(v[0]), nu)),
+    "Hencky": _Law(Hencky, ("mu",), lambda values: values[0] * np.eye(OGDEN)[HENCKY]),
 }
 """Material laws that can be fitted. Isihara's is Yeoh's without C30."""
 
@@ -190,7 +180,7 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     curves : sequence of Curve
         All are fitted together, every point with the same weight.
     law : str
-        A name of `LAWS`.
+        A name of `LAWS`; case does not count.
     nu : float
         Poisson's ratio of the material made; the fit itself takes the tissue as incompressible.
 
@@ -206,17 +196,15 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
     the same stress. Of optima that an F test at 5 % does not distinguish, one whose exponents are all positive is
     taken, and the rest are named.
 
-    Intervals are those of linearised regression with Student's t: they assume independent errors of the same standard
-    deviation at every point, and do not cover errors that a curve shares, such as a wrong area. Parameters in which
-    the stress is linear start at their best; Ogden exponents from the four best of the combinations of eight values.
+    Intervals are those of linearised regression with Student's t: errors are taken as independent and of one standard
+    deviation; what a curve's points share, such as a wrong area, is not covered. Ogden exponents start from the four
+    best of the combinations of eight values.
 
-    C10, half the initial shear modulus, is positive in any material law; a curve that is steep only at its end may
-    leave it open, and the best fit then has it below 0 as often as not. It is kept at a thousandth or more of that of
-    the neo-Hookean model which fits the same curves best. An interval reaches w below the lower, and w above the
-    higher, of the values with and without that bound, w being the half width without it; C10's ends at 0. So it
-    contains all of the usual interval that a material law can have, and covers the truth as often or more often.
-    Curves are refused that would have C10 so far below 0 that chance does it to less than one in 10,000 of the curves
-    of a true material law.
+    C10, half the initial shear modulus, is positive in any material law, but a curve that is steep only at its end may
+    leave it open. It is kept at a thousandth or more of that of the neo-Hookean model which fits the curves best. An
+    interval reaches w below the lower, and w above the higher, of the values with and without that bound, w being the
+    half width without it; C10's ends at 0. So it covers the truth at least as often. Curves are refused whose C10 is so
+    far below 0 as chance has it in less than one in 10,000 of the curves of a true material law.
     """
     sought, curves = _checked(curves, law, nu)
     count = len(sought.names)
@@ -245,7 +233,7 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         raise InputError(f"{law}: these curves do not determine its parameters (singular); use a model with fewer.")
     values, parameters = _with_intervals(sought, best, deviations, curves, stress)
     try:
-        material = sought.material(values, nu)
+        material = sought.made(sought.vector(values), nu)
     except InputError as unusable:
         raise InputError(
             f"The best fit is no usable material law ({unusable}) Give points nearer to a stretch of 1, or fit one "
@@ -253,14 +241,11 @@ def fit(curves: Sequence[Curve], law: str, nu: float = 0.4999) -> Fit:
         ) from unusable
     residual = modelled(values) - stress
     return Fit(
-        material,
-        parameters,
-        _r2(curves, residual),
-        float(np.sqrt(np.mean(residual**2))),
-        tuple(sought.material(o.x, nu) for o in others),
-        {mode: material.stable_range(mode) for mode in MODES},
-        {c.mode: (float(min(1.0, c.stretch.min())), float(max(1.0, c.stretch.max()))) for c in curves},
-    )
+        material, parameters, _r2(curves, residual), float(np.sqrt(np.mean(residual**2))),
+        others=tuple(sought.made(sought.vector(o.x), nu) for o in others),
+        stable={mode: material.stable_range(mode) for mode in MODES},
+        reached={c.mode: (float(min(1.0, c.stretch.min())), float(max(1.0, c.stretch.max()))) for c in curves},
+    )  # fmt: skip
 
 
 def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[Curve]]:
@@ -270,10 +255,13 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
         raise InputError(f"No material law '{law}' to fit; there are {', '.join(LAWS)}.")
     if not 0.0 <= nu <= HIGHEST_NU:
         raise InputError(f"Poisson's ratio must lie between 0 and {HIGHEST_NU}, got {nu:g}.")
-    sought, curves = LAWS[named[law.lower()]], [_joined(mode, curves) for mode in dict.fromkeys(c.mode for c in curves)]
-    count = len(sought.names)
-    stress, stretch = (
-        np.concatenate([np.empty(0), *(getattr(c, part) for c in curves)]) for part in ("stress_mpa", "stretch")
+    sought, joined = LAWS[named[law.lower()]], []
+    for mode in dict.fromkeys(curve.mode for curve in curves):
+        mine = [curve for curve in curves if curve.mode == mode]
+        joined.append(Curve(mode, *(np.concatenate([getattr(c, a) for c in mine]) for a in ("stretch", "stress_mpa"))))
+    count, (stretch, stress) = (
+        len(sought.names),
+        np.hstack([np.empty((2, 0)), *([c.stretch, c.stress_mpa] for c in joined)]),
     )
     apart = len(np.unique(np.round(stretch[np.abs(stretch - 1.0) > 1e-6], 9)))
     if len(stress) < count + 2 or apart < count:
@@ -288,7 +276,7 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
         )
     if not stress.any():
         raise InputError("The stress is 0 at every point of the curves.")
-    return sought, curves
+    return sought, joined
 
 
 def _with_intervals(
@@ -319,17 +307,11 @@ def _with_intervals(
 
 def _r2(curves: Sequence[Curve], residual: FloatArray) -> dict[str, float]:
     """Share of the stress' variance that the material law explains, by kind of test."""
-    r2, ends = {}, np.cumsum([0, *(len(c.stress_mpa) for c in curves)])
-    for curve, first, last in zip(curves, ends, ends[1:], strict=False):
+    r2, ends = {}, np.cumsum([len(c.stress_mpa) for c in curves])
+    for curve, left in zip(curves, np.split(residual, ends[:-1]), strict=True):
         spread = float(((curve.stress_mpa - curve.stress_mpa.mean()) ** 2).sum())
-        r2[curve.mode] = 1.0 - float((residual[first:last] ** 2).sum()) / spread if spread > 0 else float("nan")
+        r2[curve.mode] = 1.0 - float((left**2).sum()) / spread if spread > 0 else float("nan")
     return r2
-
-
-def _joined(mode: str, curves: Sequence[Curve]) -> Curve:
-    """All points of one kind of test."""
-    mine = [c for c in curves if c.mode == mode]
-    return Curve(mode, *(np.concatenate([getattr(c, part) for c in mine]) for part in ("stretch", "stress_mpa")))
 
 
 def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: FloatArray) -> list[FloatArray]:
@@ -339,10 +321,8 @@ def _starts(law: _Law, modelled: Callable[[FloatArray], FloatArray], stress: Flo
     for exponents in itertools.combinations(_EXPONENTS, law.exponents):
         columns = np.column_stack([modelled(np.array([*unit, *exponents])) for unit in np.eye(linear)])
         moduli, *_ = np.linalg.lstsq(columns, stress, rcond=None)
-        cost = float(((columns @ moduli - stress) ** 2).sum())
-        starts.append((cost, np.array([*moduli, *exponents])))
-    starts.sort(key=lambda pair: pair[0])
-    return [start for _, start in starts[:4]]
+        starts.append((float(((columns @ moduli - stress) ** 2).sum()), np.array([*moduli, *exponents])))
+    return [start for _, start in sorted(starts, key=lambda pair: pair[0])[:4]]
 
 
 def _chosen(
@@ -350,17 +330,15 @@ def _chosen(
 ) -> tuple[OptimizeResult, tuple[OptimizeResult, ...]]:
     """The optimum to report, and those that the data do not distinguish from it."""
     ranked = sorted(optima, key=lambda o: o.cost)
-    freedom = points - len(law.names)
-    limit = ranked[0].cost * (1.0 + fisher.ppf(0.95, 1, freedom) / freedom)
     different: list[OptimizeResult] = []
+    freedom, exponents = points - len(law.names), slice(len(law.names) - law.exponents, None)
+    limit = ranked[0].cost * (1.0 + fisher.ppf(0.95, 1, freedom) / freedom)
     for optimum in ranked:
         near = [np.allclose(optimum.x, other.x, rtol=1e-3, atol=1e-9) for other in different]
         if optimum.cost <= limit and not any(near) and law.vector(optimum.x)[OGDEN::2].min(initial=0.0) >= 0.0:
             different.append(optimum)
-    different = different or ranked[:1]
-    exponents = slice(len(law.names) - law.exponents, None)
-    different.sort(key=lambda o: not (o.x[exponents] > 0.0).all())
-    return different[0], tuple(different[1:])
+    best, *others = sorted(different or ranked[:1], key=lambda o: not (o.x[exponents] > 0.0).all())
+    return best, tuple(others)
 
 
 def _deviations(values: FloatArray, jacobian: FloatArray, residual: FloatArray) -> FloatArray | None:

@@ -97,10 +97,7 @@ def least_stiffness(law: FloatArray, strains: FloatArray) -> FloatArray:
 
 @njit(cache=True, error_model="numpy")
 def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) -> float:
-    """F = U diag(s) V^T of a matrix (3, 3) with positive determinant; U, s and V are written, det F is returned.
-
-    Jacobi's rotations of F^T F. Where det F <= 0 nothing is written.
-    """
+    """Write U, s and V of F = U diag(s) V^T (3, 3) unless det F <= 0, by Jacobi's rotations of F^T F; return det F."""
     J = (
         F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
         - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
@@ -178,10 +175,7 @@ def principal_response(
 def stress_and_tangent(
     law: FloatArray, bulk: float, gradients: FloatArray, energy: FloatArray, stress: FloatArray, tangent: FloatArray
 ) -> None:
-    """Energy (n,), first Piola-Kirchhoff stress (n, 3, 3) and tangent dP/dF (n, 3, 3, 3, 3) for F (n, 3, 3), MPa.
-
-    The volume's part is bulk / 2 (J - 1)^2. Everything is NaN where det F <= 0.
-    """
+    """As `fe.materials.Material`, MPa; the volume's part is bulk / 2 (J - 1)^2, and all is NaN where det F <= 0."""
     U, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     principal, direct, swapped = np.empty(3), np.empty((3, 3)), np.zeros((3, 3, 2))
     for n in range(len(gradients)):

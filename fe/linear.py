@@ -29,19 +29,13 @@ class SingularError(MrstrainError, RuntimeError):
     """A matrix that cannot be factorised: a part of the model is free to move, or memory is short."""
 
 
-def _ones(indptr: IntArray, indices: IntArray) -> sparse.csr_matrix:
-    """A matrix of ones with this pattern."""
-    size = len(indptr) - 1
-    return sparse.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
-
-
 class _Pardiso:
     def __init__(self, indptr: IntArray, indices: IntArray, threads: int, rough: bool) -> None:
         from pypardiso import PyPardisoSolver
 
         self.rough = rough
         self._kind = np.float32 if rough else np.float64
-        self._matrix = _ones(indptr, indices).astype(self._kind)
+        self._matrix = sparse.csr_matrix((np.ones(len(indices), self._kind), indices, indptr))
         self._solver = PyPardisoSolver(mtype=-2)  # real, symmetric, indefinite
         for number, value in _IN_SINGLE.items() if rough else ():
             self._solver.set_iparm(number, value)
@@ -111,7 +105,7 @@ class _SuperLU:
     rough = False
 
     def __init__(self, indptr: IntArray, indices: IntArray) -> None:
-        self._upper = _ones(indptr, indices)
+        self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr))
         self._factors: linalg.SuperLU | None = None
 
     def factorise(self, data: FloatArray) -> None:
@@ -141,11 +135,9 @@ def factors(
 ) -> Factors:
     """A solver for symmetric matrices whose upper triangle has this pattern (CSR, sorted, with its whole diagonal).
 
-    ``threads`` are PARDISO's; ``library`` is pardiso, ngsolve or superlu, by default the fastest on this machine;
-    ``rough`` asks for single precision, where the library can.
+    ``threads`` and ``rough``, for single precision, are PARDISO's; ``library`` is the fastest here by default.
     """
-    chosen = library or _fastest()
-    if chosen == "pardiso":
+    if (chosen := library or _fastest()) == "pardiso":
         return _Pardiso(indptr, indices, threads, rough)
     return _NGSolve(indptr, indices) if chosen == "ngsolve" else _SuperLU(indptr, indices)
 
@@ -153,7 +145,7 @@ def factors(
 def _fastest() -> str:
     if platform.machine().lower() in ("x86_64", "amd64"):
         return "pardiso"
-    return "ngsolve" if find_spec("ngsolve") is not None else "superlu"
+    return "ngsolve" if find_spec("ngsolve") else "superlu"
 
 
 def self_test() -> str:
@@ -178,26 +170,23 @@ class Solver:
     precision; and where that is not enough, in double until `forget`.
     """
 
-    def __init__(self, indptr: IntArray, indices: IntArray, *, threads: int = 1, library: str | None = None) -> None:
-        self._new = partial(factors, indptr, indices, threads=threads, library=library)
+    def __init__(self, indptr: IntArray, indices: IntArray, *, threads: int = 1) -> None:
+        self._new = partial(factors, indptr, indices, threads=threads)
         self._factors = self._new(rough=True)
         self._began_rough = self._factors.rough
-        self._upper = _ones(indptr, indices)
+        self._upper = sparse.csr_matrix((np.ones(len(indices)), indices, indptr))
         self._diagonal = indptr[:-1]  # the first of each row
         self._known = False
         self.factorisations, self.steps = 0, 0
 
     def solve(self, data: FloatArray, right: FloatArray, tolerance: float) -> FloatArray:
         """Solve to a residual below ``tolerance`` times that of zero; 1e-8 if that takes a factorisation."""
-        if self._known:
-            solution = self._iterated(data, right, tolerance)
-            if solution is not None:
-                return solution
+        if self._known and (solution := self._iterated(data, right, tolerance)) is not None:
+            return solution
         if self._factors.rough:
             with suppress(SingularError):
                 self._factorise(data)
-                solution = self._iterated(data, right, _FINE)
-                if solution is not None:
+                if (solution := self._iterated(data, right, _FINE)) is not None:
                     return solution
             self._renew(rough=False)
         self._factorise(data)

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import BoolArray, FloatArray
 from fe.assembly import Assembler
 from fe.descent import descend
-from fe.elements import Model, edges_of
+from fe.elements import Model
 from fe.linear import Solver
 from fe.load_step import PlateTarget
 from fe.newton import Imposed, Tolerance, equilibrium
@@ -61,39 +61,32 @@ class PlateState:
         return float(self.force_n[0]) / self.area_mm2 if self.area_mm2 > 0.0 else float("nan")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Increment:
-    """A converged increment, with all that it takes to go on from it."""
-
-    unknowns: FloatArray  # displacements along the plate's axes, and pressures
-    plate: PlateState
-    contact: ContactStatus
+_Increment = tuple[FloatArray, PlateState, ContactStatus]  # a converged one, with the unknowns of `Checkpoint`
 
 
 class LoadPath:
     """The body under a growing load, increment by increment; vectors along the plate's axes, ``mesh`` too.
 
-    ``curve`` is the plate at every converged increment so far, ``iterations`` counts Newton steps. ``log`` gets a line
-    for each step, ``is_over`` says whether to stop, ``on_converged`` is called at each increment that can be resumed
-    from.
+    ``curve`` is the plate at every converged increment so far. ``log`` gets a line for each step, ``is_over`` says
+    whether to stop, ``on_converged`` is called at each increment that can be resumed from.
     """
 
-    def __init__(self, model: Model, mesh: TetMesh, problem: Problem, threads: int, tolerance: Tolerance) -> None:
-        self.model, self.tolerance = model, tolerance
-        self.log: Callable[[str], None] = lambda _: None
-        self.is_over: Callable[[], bool] = lambda: False
+    def __init__(
+        self, model: Model, mesh: TetMesh, problem: Problem, threads: int, tolerance: Tolerance,
+        log: Callable[[str], None], is_over: Callable[[], bool],
+    ) -> None:  # fmt: skip
+        self.model, self.tolerance, self.log, self.is_over = model, tolerance, log, is_over
         self.on_converged: Callable[[], None] = lambda: None
-        held = np.unique(np.concatenate([_nodes_on(model, mesh, name) for name in problem.fixed]))
-        touching = np.setdiff1d(_nodes_on(model, mesh, SKIN), held)
+        held = model.space.nodes_on(np.concatenate([mesh.facets[name] for name in problem.fixed]))
+        touching = np.setdiff1d(model.space.nodes_on(mesh.facets[SKIN]), held)
         self.contact = Contact(problem.plate, model.space.nodes_mm, touching)
         may_follow = {axis: 3 * touching + axis for axis in range(3)}
         self.assembler = Assembler(model, (3 * held[:, None] + np.arange(3)).ravel(), may_follow)
         self.solver = Solver(self.assembler.indptr, self.assembler.indices, threads=threads)
         self.extent_mm = float(np.ptp(model.space.nodes_mm, axis=0).max())
         self.state = np.zeros(model.unknowns)
-        self._faces = mesh.facets[SKIN]
-        start_mm = np.array([problem.plate.gap_mm, 0.0, 0.0])
-        self.plate = PlateState(start_mm, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
+        self._faces, self._start_mm = mesh.facets[SKIN], np.array([problem.plate.gap_mm, 0.0, 0.0])
+        self.plate = PlateState(self._start_mm, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
         self.curve = [self.plate]
         self.iterations = 0
 
@@ -102,19 +95,14 @@ class LoadPath:
         return np.where(target.displaced, self.plate.displacement_mm, self.plate.force_n)
 
     def approach(self, target: PlateTarget) -> bool:
-        """Touch, press on to a part of the normal load, and release a plate that turns; whether going on makes sense.
-
-        Until then it stays level, as a plate on a node or two would tip over; if it cannot be released there, it is
-        pressed further first.
-        """
+        """Touch, press on to a part of the normal load, release a plate that turns; whether going on makes sense."""
         if not len(self.contact.held):
             self.contact.touch_first(self.state)
-        start = np.array([self.contact.plate.gap_mm, 0.0, 0.0])
-        for share in _ENOUGH:
+        for share in _ENOUGH:  # on a node or two it would tip over: level until released, at a larger share if need be
             if target.displaced[0]:
-                part = start + share * (target.values - start)
-                part_target = PlateTarget(part, target.displaced).unsheared()
-                if part[0] > self.plate.displacement_mm[0] and not self.raise_to(part_target):
+                way = target.values - self._start_mm
+                part = PlateTarget(self._start_mm + share * way, target.displaced).unsheared()
+                if part.values[0] > self.plate.displacement_mm[0] and not self.raise_to(part):
                     return False
             else:
                 self._push(share * target.values[0], target.values[0])
@@ -125,53 +113,42 @@ class LoadPath:
         return False
 
     def _let_go(self) -> bool:
-        """Remove the moment that kept the plate level, under its present force; whether that succeeded.
-
-        A plate that is held less sinks in further; one that comes back out instead tips over on too few nodes.
-        """
+        """Remove the moment that kept the plate level, under its force; False if it comes out, on too few nodes."""
         level, force, moment = self.increment, self.plate.force_n, self.plate.moment_nmm
         self.contact.status = replace(self.contact.status, turns=True)
-        gap_mm, level_mm = self.contact.plate.gap_mm, level.plate.displacement_mm[0]
-        least_mm = gap_mm + _TIPPING * (level_mm - gap_mm)
-        left, step = 1.0, 0.5
+        gap_mm, left, step = self.contact.plate.gap_mm, 1.0, 0.5
+        least_mm = gap_mm + _TIPPING * (self.plate.displacement_mm[0] - gap_mm)
         while left > 0.0 and step > _LEAST_STEP and not self.is_over():
-            last = self.increment
             least = max(0.0, left - step)
-            if self._go(np.zeros(3, dtype=bool), force, least * moment):
-                if self.plate.displacement_mm[0] < least_mm:
-                    break
-                left, step = least, step * _GROWTH
-                self._log(f"{1.0 - left:.0%} released")
-            else:
-                self._back(last)
+            if not self._go(np.zeros(3, dtype=bool), force, least * moment):
                 step *= _SHRINK
+                continue
+            if self.plate.displacement_mm[0] < least_mm:
+                break
+            left, step = least, step * _GROWTH
+            self._log(f"{1.0 - left:.0%} released")
         if left > 0.0:
             self._back(level)
         return left == 0.0
 
     def raise_to(self, target: PlateTarget) -> bool:
-        """Go on to the target, in steps as large as converge; whether it is reached.
-
-        Where Newton's method fails under forces, viscous descent takes over (`fe.descent`), with a taped plate that
-        does not turn. A displacement goes on in steps so small that nodes touch in their order.
-        """
+        """Go on to the target, in steps as large as converge; whether it is reached."""
         before = self.reached(target)
-        way = target.values - before
+        way = target.values - before  # displaced in steps so small that nodes touch in their order
         largest = _MOST_APPROACH_MM / max(float(np.abs(way[target.displaced]).max(initial=0.0)), 1e-12)
         done, step, downhill = 0.0, _FIRST_STEP, False
         least = min(_LEAST_STEP, 0.01 * largest)
         while done < 1.0 and step > (_LEAST_DOWNHILL_STEP if downhill else least) and not self.is_over():
             step = min(step, largest)
             share = min(1.0, done + step)
-            last = self.increment
             if self._go(target.displaced, before + share * way, downhill=downhill):
                 done, step = share, step if downhill else step * _GROWTH
                 self._log(f"{done:.0%} of the way")
                 self.on_converged()
                 continue
-            self._back(last)
             step *= _SHRINK
             stays = self.contact.plate.taped and not self.contact.status.turns
+            # where Newton's method fails under forces, viscous descent takes over
             if step < _SOFT_STEP and stays and not (downhill or target.displaced.any()):
                 downhill, step = True, _DOWNHILL_STEP
         return done >= 1.0
@@ -199,9 +176,9 @@ class LoadPath:
         """Find equilibrium at displacements (mm) along some of the plate's axes, and under forces (N) along the others.
 
         A plate that turns freely also takes up a moment (3,), N mm. ``downhill`` is by `fe.descent`: under forces
-        alone, and a plate that does not turn.
+        alone, and a plate that does not turn. Where it fails, all is as it was.
         """
-        contact = self.contact
+        contact, before = self.contact, self.contact.status
         contact.begin(self.state)
         equations = self.assembler.own_equations + np.arange(3)
         outside = np.zeros(self.assembler.size)
@@ -220,18 +197,18 @@ class LoadPath:
             converged = equilibrium(
                 self.assembler, self.solver, self.state, imposed, self.tolerance, self._changed, self.log, rotation
             )
-        if converged is None:
-            return False
-        moved = contact.displacement_mm(converged.state)
-        if np.abs(moved - [contact.plate.gap_mm, 0.0, 0.0]).max() > self.extent_mm:
+        if converged and np.abs(contact.displacement_mm(converged.state) - self._start_mm).max() > self.extent_mm:
             self.log("the plate would have moved farther than the body is large")
+            converged = None
+        if converged is None:
+            contact.status = before
             return False
         self.state = converged.state
         self.iterations += converged.iterations
         self.plate = PlateState(
-            moved, contact.force_n(converged.forces),
+            contact.displacement_mm(self.state), contact.force_n(converged.forces),
             np.degrees(Rotation.from_matrix(contact.status.rotation).as_rotvec()),
-            contact.moment_nmm(converged.state, converged.forces), self._area_mm2(),
+            contact.moment_nmm(self.state, converged.forces), self._area_mm2(),
         )  # fmt: skip
         self.curve.append(self.plate)
         return True
@@ -244,10 +221,9 @@ class LoadPath:
         return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
     def _changed(self, state: FloatArray, forces: FloatArray) -> bool:
-        if not self.contact.update(state, forces):
-            return False
-        self.assembler.share(self.contact.followers)
-        return True
+        if changed := self.contact.update(state, forces):
+            self.assembler.share(self.contact.followers)
+        return changed
 
     def _changed_on_the_way(self, state: FloatArray, forces: FloatArray) -> bool:
         """As `_changed`; what touches next does so from where it is now."""
@@ -256,36 +232,25 @@ class LoadPath:
         return touched
 
     @property
-    def increment(self) -> Increment:
+    def increment(self) -> _Increment:
         """The current increment."""
-        return Increment(self.state, self.plate, self.contact.status)
+        return self.state, self.plate, self.contact.status
 
-    def resume(self, where: Increment) -> None:
+    def resume(self, where: _Increment) -> None:
         """Go to an increment of this path, or of another on the same model; the curve stays as it is."""
-        self.state, self.plate, self.contact.status = where.unknowns, where.plate, where.contact
+        self.state, self.plate, self.contact.status = where
 
-    def _back(self, where: Increment) -> None:
+    def _back(self, where: _Increment) -> None:
         """Undo the steps since an increment."""
-        while self.curve[-1] is not where.plate:
+        while self.curve[-1] is not where[1]:
             self.curve.pop()
         self.resume(where)
 
     def _log(self, what: str) -> None:
-        plate = self.plate
-        moved, force, turn = (
-            ", ".join(f"{v:.3f}" for v in x) for x in (plate.displacement_mm, plate.force_n, plate.turn_deg)
-        )
+        at, nodes = self.plate, len(self.contact.held)
+        moved, force, turn = (", ".join(f"{v:.3f}" for v in x) for x in (at.displacement_mm, at.force_n, at.turn_deg))
         turned = f", turned {turn} degrees" if self.contact.status.turns else ""
-        nodes = len(self.contact.held)
         self.log(f"{what}: displacement {moved} mm, force {force} N, {nodes} nodes on the plate{turned}")
-
-
-def _nodes_on(model: Model, mesh: TetMesh, facets: str) -> IntArray:
-    """Displacement nodes on named facets; those in the middle of edges too."""
-    corners = np.unique(mesh.facets[facets])
-    if model.element.name != "P2":
-        return corners
-    return np.union1d(corners, model.space.middles(edges_of(mesh.facets[facets])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -337,16 +302,15 @@ class Loading:
         path.curve = path.curve[-1:]
         if earlier is not None:
             path.curve = list(earlier.curve)
-            path.resume(Increment(earlier.unknowns, earlier.curve[-1], earlier.contact))
+            path.resume((earlier.unknowns, earlier.curve[-1], earlier.contact))
             self._stages, self._counted = earlier.stages, path.iterations - earlier.iterations
         path.on_converged = lambda: on_converged(self.checkpoint(), float(np.clip(self._shares(), 0.0, 1.0).mean()))
 
     def run(self) -> bool:
         """Go to the target, normal first and then shear; whether it is reached."""
         path, target = self._path, self._target
-        stages: list[Callable[[], bool]] = [partial(path.raise_to, target)]
-        if self._first and target.sheared:
-            stages.insert(0, partial(path.raise_to, target.unsheared()))
+        goals = [target.unsheared(), target] if self._first and target.sheared else [target]
+        stages = [partial(path.raise_to, goal) for goal in goals]
         if self._first:
             stages.insert(0, partial(path.approach, target))
         for stage in stages[self._stages :]:

@@ -41,19 +41,18 @@ class Material:
         As `fe.hyperelastic` takes it: C10, C20, C30, mu_H, then pairs mu_q (initial shear modulus), alpha_q; MPa.
     nu : float
         Poisson's ratio at small strain.
-    description : str
-        Model and parameters, in words.
 
     Raises
     ------
     InputError
-        If a number is not finite, nu is not in 0 <= nu <= 0.49999, or the initial shear modulus is not positive.
+        If a number is not finite, nu is not in 0 <= nu <= 0.49999, the initial shear modulus is not positive, or an
+        exponent is 0.
     """
 
     vector: FloatArray
     nu: float
-    description: str
     law: ClassVar[str] = "hyperelastic"
+    named: ClassVar[Mapping[str, tuple[int, float]]] = {}  # numbers by their names: places in the vector, and factors
 
     def __post_init__(self) -> None:
         vector = frozen(self.vector, np.float64)
@@ -69,6 +68,22 @@ class Material:
             raise InputError(
                 f"{self.description}: the initial shear modulus must be positive; it is {_kpa(self.shear_modulus_mpa)}."
             )
+
+        if not (np.abs(vector[OGDEN + 1 :: 2]) > 1e-6).all():
+            raise InputError("Ogden: an exponent of 0 has no meaning; Hencky's law is the limit.")
+
+    @property
+    def moduli_mpa(self) -> dict[str, float]:
+        """The numbers by which the law is known, by name, MPa; those of Ogden's terms stand in `vector`."""
+        return {name: factor * float(self.vector[place]) for name, (place, factor) in self.named.items()}
+
+    @property
+    def description(self) -> str:
+        """Model and parameters, in words."""
+        terms = self.vector[OGDEN:].reshape(-1, 2)
+        numbers = [f"{name} {_kpa(value)}" for name, value in self.moduli_mpa.items()]
+        numbers += ["; ".join(f"mu0 {_kpa(mu)}, alpha {alpha:g}" for mu, alpha in terms)] if len(terms) else []
+        return ", ".join([self.law, *numbers, f"nu {self.nu:g}"])
 
     @property
     def shear_modulus_mpa(self) -> float:
@@ -97,9 +112,9 @@ class Material:
         if gradients.ndim != 3 or gradients.shape[1:] != (3, 3):
             raise InputError(f"Deformation gradients have shape (n, 3, 3); got {gradients.shape}.")
         n = len(gradients)
-        energy, stress, tangent = np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3, 3, 3, 3))
-        stress_and_tangent(self.vector, self.bulk_modulus_mpa, gradients, energy, stress, tangent)
-        return energy, stress, tangent
+        response = np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3, 3, 3, 3))
+        stress_and_tangent(self.vector, self.bulk_modulus_mpa, gradients, *response)
+        return response
 
     def nominal_stress(self, stretch: npt.ArrayLike, mode: str = "uniaxial") -> FloatArray:
         """Force over undeformed area (n,), MPa, of the incompressible solid at stretches (n,) of a test in `MODES`.
@@ -119,9 +134,8 @@ class Material:
         tau is the Kirchhoff stress; False where det F <= 0.
         """
         gradients = np.asarray(F, dtype=np.float64)
-        stretches = np.linalg.svd(gradients, compute_uv=False)
         folded = np.linalg.det(gradients) <= 0.0
-        strains = np.log(np.where(folded[:, None], 1.0, stretches))
+        strains = np.log(np.where(folded[:, None], 1.0, np.linalg.svd(gradients, compute_uv=False)))
         return np.asarray(~folded & (least_stiffness(self.vector, strains) > 0.0))
 
     def stable_range(self, mode: str) -> tuple[float, float]:
@@ -132,9 +146,7 @@ class Material:
         >>> NeoHooke.of(mu_mpa=0.1).stable_range("uniaxial")
         (0.2, 5.0)
         """
-        _check_mode(mode)
-        axes = np.array(MODES[mode])
-        ends = []
+        axes, ends = _axes(mode), []
         for sign in (-1.0, 1.0):
             strains = sign * np.linspace(0.0, _SEARCHED, 2001)
             lost = np.flatnonzero(~(least_stiffness(self.vector, strains[:, None] * axes) > 0.0))
@@ -148,51 +160,57 @@ Materials = Mapping[str, Material]
 
 def nominal_stress(vector: FloatArray, stretch: FloatArray, mode: str) -> FloatArray:
     """As `Material.nominal_stress`, for a material law's vector alone."""
-    _check_mode(mode)
+    axes = _axes(mode)
     if not (stretch > 0.0).all():
         raise InputError("Stretches must be positive.")
-    axes = np.array(MODES[mode])
     loaded = np.count_nonzero(axes == 1.0)  # axes that carry the load
     return np.asarray(along(vector, np.log(stretch).ravel(), axes) / (loaded * stretch.ravel())).reshape(stretch.shape)
 
 
-def _check_mode(mode: str) -> None:
+def _axes(mode: str) -> FloatArray:
     if mode not in MODES:
         raise InputError(f"No test '{mode}'; there are {', '.join(MODES)}.")
+    return np.array(MODES[mode])
 
 
 def _kpa(value_mpa: float) -> str:
     return f"{1000.0 * value_mpa:.4g} kPa"
 
 
-def _check_terms(moduli: FloatArray, exponents: FloatArray) -> None:
+def _terms(mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    moduli, exponents = np.atleast_1d(mu_mpa).astype(float), np.atleast_1d(alpha).astype(float)
     if moduli.shape != exponents.shape or moduli.ndim != 1 or not len(moduli):
         raise InputError(f"Ogden: {moduli.size} moduli and {exponents.size} exponents; as many of each are needed.")
+    return moduli, exponents
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NeoHooke(Material):
-    """Wbar = mu / 2 (I1bar - 3)."""
+    """Wbar = mu / 2 (I1bar - 3), mu the initial shear modulus, I1bar the first invariant of the isochoric F^T F."""
 
     law: ClassVar[str] = "neo-Hooke"
+    named: ClassVar[Mapping[str, tuple[int, float]]] = {"mu": (POLYNOMIAL, 2.0)}
 
     @classmethod
     def of(cls, mu_mpa: float, nu: float = 0.4999) -> Self:
         """From the initial shear modulus, MPa."""
-        return cls(np.array([0.5 * mu_mpa, 0.0, 0.0, 0.0]), nu, f"neo-Hooke, mu {_kpa(mu_mpa)}, nu {nu:g}")
+        return cls(np.array([0.5 * mu_mpa, 0.0, 0.0, 0.0]), nu)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Yeoh(Material):
-    """Wbar = C10 (I1bar - 3) + C20 (I1bar - 3)^2 + C30 (I1bar - 3)^3; without C30 also called Isihara's."""
+    """Wbar = C10 (I1bar - 3) + C20 (I1bar - 3)^2 + C30 (I1bar - 3)^3; without C30 also called Isihara's.
+
+    C10 is half the initial shear modulus, I1bar the first invariant of the isochoric F^T F.
+    """
 
     law: ClassVar[str] = "Yeoh"
+    named: ClassVar[Mapping[str, tuple[int, float]]] = {"C10": (0, 1.0), "C20": (1, 1.0), "C30": (2, 1.0)}
 
     @classmethod
     def of(cls, c10_mpa: float, c20_mpa: float, c30_mpa: float = 0.0, nu: float = 0.4999) -> Self:
         """From the coefficients of the polynomial, MPa."""
-        description = f"Yeoh, C10 {_kpa(c10_mpa)}, C20 {_kpa(c20_mpa)}, C30 {_kpa(c30_mpa)}, nu {nu:g}"
-        return cls(np.array([c10_mpa, c20_mpa, c30_mpa, 0.0]), nu, description)
+        return cls(np.array([c10_mpa, c20_mpa, c30_mpa, 0.0]), nu)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,11 +222,12 @@ class Hencky(Material):
     """
 
     law: ClassVar[str] = "linear elastic (Hencky)"
+    named: ClassVar[Mapping[str, tuple[int, float]]] = {"mu": (HENCKY, 1.0)}
 
     @classmethod
     def of(cls, mu_mpa: float, nu: float = 0.4999) -> Self:
         """From the shear modulus, MPa: Young's modulus is 2 mu (1 + nu)."""
-        return cls(np.array([0.0, 0.0, 0.0, mu_mpa]), nu, f"linear elastic (Hencky), mu {_kpa(mu_mpa)}, nu {nu:g}")
+        return cls(np.array([0.0, 0.0, 0.0, mu_mpa]), nu)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -240,19 +259,13 @@ class Ogden(Material):
         InputError
             If there is not one exponent, other than 0, for each modulus.
         """
-        moduli, exponents = np.atleast_1d(shear_modulus_mpa).astype(float), np.atleast_1d(alpha).astype(float)
-        _check_terms(moduli, exponents)
-        if not (np.abs(exponents) > 1e-6).all():
-            raise InputError("Ogden: an exponent of 0 has no meaning; Hencky's law is the limit.")
-        pairs = "; ".join(f"mu0 {_kpa(m)}, alpha {a:g}" for m, a in zip(moduli, exponents, strict=True))
-        vector = np.concatenate([np.zeros(OGDEN), np.column_stack([moduli, exponents]).ravel()])
-        return cls(vector, nu, f"Ogden, {pairs}, nu {nu:g}")
+        pairs = np.column_stack(_terms(shear_modulus_mpa, alpha))
+        return cls(np.concatenate([np.zeros(OGDEN), pairs.ravel()]), nu)
 
     @classmethod
     def from_ansys(cls, mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike, nu: float = 0.4999) -> Self:
         """W = sum mu / alpha (sum l^alpha - 3), so mu0 = mu alpha / 2."""
-        numbers, exponents = np.atleast_1d(mu_mpa).astype(float), np.atleast_1d(alpha).astype(float)
-        _check_terms(numbers, exponents)
+        numbers, exponents = _terms(mu_mpa, alpha)
         return cls.of(0.5 * numbers * exponents, exponents, nu)
 
     @classmethod
@@ -269,5 +282,5 @@ class Ogden(Material):
 def from_vector(description: str, vector_mpa: FloatArray, bulk_modulus_mpa: float) -> Material:
     """A material from its description and numbers; Poisson's ratio, to ten digits, from the bulk modulus."""
     (made,) = (one for one in (NeoHooke, Yeoh, Hencky, Ogden) if description.startswith(f"{one.law},"))
-    mu, K = Material(vector_mpa, 0.0, description).shear_modulus_mpa, bulk_modulus_mpa
-    return made(vector_mpa, round((3.0 * K - 2.0 * mu) / (6.0 * K + 2.0 * mu), 10), description)
+    mu, K = Material(vector_mpa, 0.0).shear_modulus_mpa, bulk_modulus_mpa
+    return made(vector_mpa, round((3.0 * K - 2.0 * mu) / (6.0 * K + 2.0 * mu), 10))

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import meshio
 import numpy as np
@@ -19,25 +20,37 @@ _MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, besi
 
 
 def write_tet_mesh(
-    path: Path, mesh: TetMesh, about: dict[str, object], at_nodes: Mapping[str, FloatArray] | None = None
-) -> None:
-    """Write a mesh as VTU, LPS mm: tetrahedra and named triangles, numbered in ``region``.
+    path: Path | str, mesh: TetMesh, about: Mapping[str, object] = MappingProxyType({}),
+    at_nodes: Mapping[str, FloatArray] | None = None,
+) -> None:  # fmt: skip
+    """Write a mesh as VTU, LPS mm, with the names of its regions and facets in a JSON file beside it.
 
-    The names, and what is known ``about`` it, stand in a JSON file of the same name; ``at_nodes`` becomes point data.
+    Parameters
+    ----------
+    path : path
+        Ending in .vtu: tetrahedra, and the triangles of the facets, numbered in the array ``region``. The JSON file has
+        the same name; `read_tet_mesh` reads both.
+    about : mapping
+        What else is to stand in the JSON file, such as how the mesh was made.
+    at_nodes : mapping of name to (n,) or (n, k) float, optional
+        Point data, for ParaView.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
     """
-    tissues = {name: number for number, name in enumerate(mesh.regions, start=1)}
-    facets = {name: number for number, name in enumerate(mesh.facets, start=_FIRST_FACET)}
-    number = np.zeros(len(mesh.cells), dtype=np.int64)
-    for name, cells in mesh.regions.items():
-        number[cells] = tissues[name]
-    triangles = np.concatenate([*mesh.facets.values(), np.empty((0, 3), dtype=np.int64)])
-    flat = np.repeat(list(facets.values()), [len(rows) for rows in mesh.facets.values()]).astype(np.int64)
-    blocks = [("tetra", mesh.cells)] + ([("triangle", triangles)] if len(triangles) else [])
-    numbers = [number] + ([flat] if len(triangles) else [])
-    with whole_file(path) as part:
+    place = Path(path)
+    blocks, numbers = [("tetra", mesh.cells)], [np.zeros(len(mesh.cells), dtype=np.int64)]
+    for number, cells in enumerate(mesh.regions.values(), start=1):
+        numbers[0][cells] = number
+    for number, rows in enumerate(mesh.facets.values(), start=_FIRST_FACET):
+        blocks.append(("triangle", rows))
+        numbers.append(np.full(len(rows), number))
+    with whole_file(place) as part:
         meshio.vtu.write(part, meshio.Mesh(mesh.points_mm, blocks, at_nodes, {"region": numbers}), binary=True)
-    names = {str(number): name for named in (tissues, facets) for name, number in named.items()}
-    write_json(path.with_suffix(".json"), {"regions": names} | about)
+    names = [*enumerate(mesh.regions, start=1), *enumerate(mesh.facets, start=_FIRST_FACET)]
+    write_json(place.with_suffix(".json"), {"regions": {str(number): name for number, name in names}, **about})
 
 
 def read_tet_mesh(path: Path | str, *, unit: str = "mm", frame: str = "LPS") -> TetMesh:

@@ -80,14 +80,9 @@ def check_meshing(
 
 
 def mesh_labels(
-    labels: LabelMap,
-    edge_mm: float,
-    *,
-    bones: Sequence[str] = ("bone",),
-    finer: tuple[str, float] | None = None,
-    limit_s: float = 3600.0,
-    watch: Callable[[float], None] = lambda _: None,
-) -> tuple[TetMesh, MeshQuality]:
+    labels: LabelMap, edge_mm: float, *, bones: Sequence[str] = ("bone",), finer: tuple[str, float] | None = None,
+    limit_s: float = 3600.0, watch: Callable[[float], None] = lambda _: None,
+) -> tuple[TetMesh, MeshQuality]:  # fmt: skip
     """Mesh the soft tissues of a label map.
 
     Parameters
@@ -221,13 +216,10 @@ def _lattice(labels: LabelMap, label: int, edge_mm: float, finer_mm: float) -> _
     from scipy.ndimage import distance_transform_edt
 
     grid = labels.grid
-    inside = np.nonzero(labels.labels)
+    inside, steps = np.argwhere(labels.labels), _REFINED_MM / grid.spacing_mm
     away = distance_transform_edt(labels.labels != label, sampling=grid.spacing_mm)
-    low, high = ([f(a) for a in inside] for f in (np.min, np.max))
-    axes = [
-        np.arange(lo - 2, hi + 3 + _REFINED_MM / s, _REFINED_MM / s)
-        for lo, hi, s in zip(low, high, grid.spacing_mm, strict=True)
-    ]
+    ends = inside.min(axis=0) - 2, inside.max(axis=0) + 3 + steps
+    axes = [np.arange(low, high, step) for low, high, step in zip(*ends, steps, strict=True)]
     at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     nearest = np.clip(np.round(at), 0, np.array(grid.shape) - 1).astype(int)
     distance = away[tuple(np.moveaxis(nearest, -1, 0))]
@@ -298,18 +290,13 @@ def _quality(mesh: TetMesh, labels: LabelMap, soft: dict[str, int]) -> MeshQuali
         (name, float(mesh.volumes_mm3[mesh.regions[name]].sum()) / 1000.0, voxel_ml * float((labels.labels == n).sum()))
         for name, n in soft.items()
     )
+    thin = []
+    for skin in mesh.regions:
+        if skin.casefold() == SKIN and SKIN in mesh.facets:
+            cells, beneath = mesh.cells[mesh.regions[skin]], np.delete(mesh.cells, mesh.regions[skin], axis=0)
+            across = [np.isin(cells, nodes).any(axis=1) for nodes in (mesh.facets[SKIN], beneath)]
+            thin.append((skin, float((across[0] & across[1]).mean())))
     return MeshQuality(
         len(mesh.cells), len(mesh.points_mm), float(angles.min()), float(angles.max()),
-        (float(low), float(middle), float(high)), volumes, _thin(mesh),
+        (float(low), float(middle), float(high)), volumes, tuple(thin),
     )  # fmt: skip
-
-
-def _thin(mesh: TetMesh) -> tuple[tuple[str, float], ...]:
-    """Share of the outer tissue's cells that reach from the outer surface to the tissue beneath."""
-    skin = next((name for name in mesh.regions if name.casefold() == SKIN), None)
-    if skin is None or SKIN not in mesh.facets:
-        return ()
-    beneath = np.setdiff1d(np.arange(len(mesh.cells)), mesh.regions[skin])
-    cells = mesh.cells[mesh.regions[skin]]
-    across = [np.isin(cells, nodes).any(axis=1) for nodes in (mesh.facets[SKIN], mesh.cells[beneath])]
-    return ((skin, float((across[0] & across[1]).mean())),)

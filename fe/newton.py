@@ -61,15 +61,10 @@ class Imposed:
 
 
 def equilibrium(
-    assembler: Assembler,
-    solver: Solver,
-    state: FloatArray,
-    imposed: Imposed,
-    tolerance: Tolerance,
+    assembler: Assembler, solver: Solver, state: FloatArray, imposed: Imposed, tolerance: Tolerance,
     changed: Callable[[FloatArray, FloatArray], bool] = lambda _state, _forces: False,
-    log: Callable[[str], None] = lambda _: None,
-    rotation: Parallel | None = None,
-) -> Converged | None:
+    log: Callable[[str], None] = lambda _: None, rotation: Parallel | None = None,
+) -> Converged | None:  # fmt: skip
     """Find the state in which internal forces balance the external ones, from a first guess (unknowns,).
 
     ``changed(state, forces)`` is called once a state is near equilibrium, and again there: whether what the unknowns
@@ -89,8 +84,7 @@ def equilibrium(
             log(f"    {failure}")
             return None
         bound = np.inf if left.any() or iteration == 1 else _MOST_GROWTH * now.unbalanced_n
-        share = newton.best_share(now, step) if wandering >= _WANDERED else 1.0
-        before, now, share = now, *newton.searched(now, step, share, bound)
+        before, now, share = now, *newton.searched(now, step, bound, several=wandering >= _WANDERED)
         if not share:
             return None
         largest = float(np.abs((now.state - before.state)[:displacements]).max())
@@ -160,16 +154,17 @@ class _Newton:
         change, turn = step
         return self.at(self.rotation.ahead(now.state, share * change, share * turn))
 
-    def best_share(self, now: _Iterate, step: tuple[FloatArray, FloatArray]) -> float:
-        """The share of a step, among a few, that leaves the least imbalance."""
-        tried = {share: self.ahead(now, step, share) for share in _SHARES}
-        left = {share: at.unbalanced_n if at.lowest > LEAST_VOLUME else np.inf for share, at in tried.items()}
-        return min(_SHARES, key=lambda share: left[share])
-
     def searched(
-        self, now: _Iterate, step: tuple[FloatArray, FloatArray], share: float, bound_n: float
+        self, now: _Iterate, step: tuple[FloatArray, FloatArray], bound_n: float, *, several: bool
     ) -> tuple[_Iterate, float]:
-        """The iterate after a step, halved until no cell folds and the bound holds, and its share; 0 if none does."""
+        """The iterate after a step, halved until no cell folds and the bound holds, and its share; 0 if none does.
+
+        The first share is the whole step or, of ``several``, the one that leaves the least imbalance.
+        """
+        share = 1.0
+        if several:
+            tries = {share: self.ahead(now, step, share) for share in _SHARES}
+            share = min(tries, key=lambda s: tries[s].unbalanced_n if tries[s].lowest > LEAST_VOLUME else np.inf)
         while share >= _LEAST_SHARE:
             tried = self.ahead(now, step, share)
             if tried.lowest > LEAST_VOLUME and tried.unbalanced_n <= bound_n:

@@ -53,6 +53,12 @@ class Plate:
     axes : (3, 3)
         Columns are the plate's axes at the start, LPS: that of the normal force on the tissue, of shear, and their
         cross product.
+
+    Raises
+    ------
+    InputError
+        If a direction is not three finite numbers or is zero, or the two are parallel; if the gap is negative, the
+        pivot is no point, or a plate without tape turns.
     """
 
     normal: npt.ArrayLike

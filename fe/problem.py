@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -23,22 +24,18 @@ class Problem:
 
     Attributes
     ----------
-    mesh : TetMesh
-        LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed; every cell in one
-        region.
+    mesh, plate, fixed, element
+        As in `fe.simulate`, with one plate; every cell of the mesh is in one region.
     materials : mapping of region to Material
     loads : sequence of LoadStep
         Reached one from the other. The first must press.
-    fixed : sequence of str
-        Surface sets that do not move.
-    element : {"P1", "MINI", "P2"}
-        As in `fe.elements`.
 
     Raises
     ------
     InputError
-        If a region has no material or a cell no region, a surface set is missing, tissue is joined to nothing that is
-        fixed, the plate comes from the wrong side, or a load cannot be brought onto tissue.
+        If an argument is of another kind, such as a file's path in place of a mesh; if a region has no material or a
+        cell no region, a surface set is missing, tissue is joined to nothing that is fixed, the plate comes from the
+        wrong side, or a load cannot be brought onto tissue.
     """
 
     mesh: TetMesh
@@ -51,6 +48,7 @@ class Problem:
     def __post_init__(self) -> None:
         formulation(self.element)
         mesh, fixed = self.mesh, self.fixed
+        check_kinds(mesh, self.plate, self.loads)
         if not fixed:
             raise InputError("No surface set is fixed: tissue that nothing holds cannot be pressed.")
         for name in (*fixed, SKIN):
@@ -70,17 +68,36 @@ class Problem:
 
 
 def problems_of(
-    mesh: TetMesh,
-    materials: Materials,
-    plate: Plate | Mapping[str, Plate],
-    loads: Sequence[LoadStep],
-    fixed: Sequence[str] = (BONE,),
-    element: str = "P1",
-) -> list[Problem]:
-    """A problem for each path that the loads lie on (`fe.load_step.paths_of`); ``plate`` may be one for each load."""
+    mesh: TetMesh, materials: Materials, plate: Plate | Mapping[str, Plate], loads: Sequence[LoadStep],
+    fixed: Sequence[str] = (BONE,), element: str = "P1",
+) -> list[Problem]:  # fmt: skip
+    """A problem for each path that the loads lie on (`fe.paths_of`); ``plate`` may be one for each load, by its name.
+
+    Raises
+    ------
+    InputError
+        As `Problem`, or if a load has no plate.
+    """
+    check_kinds(mesh, plate, loads)
     plate_of = {load.name: plate if isinstance(plate, Plate) else plate[load.name] for load in loads}
     paths = paths_of(loads, {name: tuple(one.axes.round(9).ravel()) for name, one in plate_of.items()})
     return [Problem(mesh, materials, plate_of[path[0].name], path, fixed, element) for path in paths]
+
+
+def check_kinds(mesh: object, plate: object, loads: Any) -> None:
+    """Refuse what is no mesh, plate or sequence of loads with an `InputError` that says what to give."""
+    _expect(TetMesh, mesh, "The mesh must be a TetMesh, as fe.read_tet_mesh(path) or fe.mesh_labels gives it")
+    _expect(Sequence, loads, "The loads must be a list of fe.LoadStep")
+    for load in loads:
+        _expect(LoadStep, load, "The loads must be a list of fe.LoadStep")
+        one = plate.get(load.name) if isinstance(plate, Mapping) else plate
+        _expect(Plate, one, f"{load.name}: the plate must be an fe.Plate, or a dict with one for each load's name")
+
+
+def _expect(kind: type, given: object, wanted: str) -> None:
+    if not isinstance(given, kind):
+        got = "nothing" if given is None else f"{given!r}" if isinstance(given, str) else f"a {type(given).__name__}"
+        raise InputError(f"{wanted}; got {got}.")
 
 
 def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
@@ -102,6 +119,7 @@ def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
 
 def check_materials(mesh: TetMesh, materials: Materials) -> None:
     """Refuse a mesh of which a cell has no material, or more than one, with an `InputError`."""
+    _expect(Mapping, materials, "Materials must be a dict of region to material, as MaterialSet.for_regions gives it")
     times = np.zeros(len(mesh.cells), dtype=int)
     for region in materials:
         if region not in mesh.regions:

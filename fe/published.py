@@ -1,6 +1,7 @@
 """Material parameter sets, tissue by tissue: seven published ones, and the user's own in the same form."""
 
 import difflib
+import inspect
 import json
 import re
 import tomllib
@@ -21,26 +22,11 @@ WHOLE = "all"
 _INSTEAD = {"tendon": ("muscle", "fat"), "aponeurosis": ("muscle", "fat"), "muscle": ("fat",)}
 
 
-@dataclass(frozen=True, slots=True)
-class _Form:
-    """How a material law is written in a file: its constructor, and which of its numbers are stresses."""
-
-    made: Callable[..., Material]
-    stresses: tuple[str, ...]
-    plain: tuple[str, ...] = ("nu",)
-    optional: tuple[str, ...] = ()
-
-
-_LAWS: Mapping[str, _Form] = {
-    "neo-Hooke": _Form(NeoHooke.of, ("mu",)),
-    "Yeoh": _Form(Yeoh.of, ("c10", "c20", "c30"), optional=("c30",)),
-    "linear elastic": _Form(Hencky.of, ("mu",)),
-}
-_OGDEN: Mapping[str, _Form] = {
-    "ansys": _Form(Ogden.from_ansys, ("mu",), ("alpha", "nu")),
-    "abaqus": _Form(Ogden.from_abaqus, ("mu",), ("alpha", "nu")),
-    "febio": _Form(Ogden.from_febio, ("c",), ("m", "nu")),
-}
+_Constructor = Callable[..., Material]  # its parameters are the numbers that a file gives; stresses end in _mpa
+_LAWS: Mapping[str, _Constructor] = {"neo-Hooke": NeoHooke.of, "Yeoh": Yeoh.of, "linear elastic": Hencky.of}
+_OGDEN: Mapping[str, _Constructor] = {
+    "ansys": Ogden.from_ansys, "abaqus": Ogden.from_abaqus, "febio": Ogden.from_febio
+}  # by convention  # fmt: skip
 _TO_MPA = {"_mpa": 1.0, "_kpa": 1e-3}
 
 
@@ -78,8 +64,7 @@ class MaterialSet:
         >>> materials["muscle"] is materials["fat"], notes
         (True, ("friedman has no material law for muscle; fat's is used.",))
         """
-        by_region: dict[str, Material] = {}
-        notes = []
+        by_region, notes = dict[str, Material](), []
         if WHOLE in self.materials:
             return dict.fromkeys(regions, self.materials[WHOLE]), ()
         known = {tissue.casefold(): law for tissue, law in self.materials.items()}
@@ -129,6 +114,20 @@ def material_set(name: str | Path) -> MaterialSet:
     return known[str(name)]
 
 
+def as_material_set(given: object) -> MaterialSet:
+    """A set as it is, by its name or file, or of materials by region; `InputError` for anything else."""
+    if isinstance(given, MaterialSet):
+        return given
+    if isinstance(given, (str, Path)):
+        return material_set(given)
+    if isinstance(given, Mapping) and all(isinstance(material, Material) for material in given.values()):
+        return MaterialSet("materials", "", "", dict(given))
+    raise InputError(
+        "Materials must be a set (fe.material_set), the name of a published one, or a dict of region to material, such "
+        f"as {{'fat': fe.Ogden.from_ansys(0.0034, 6.2)}}; got {given!r:.80}."
+    )
+
+
 def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:
     """Every set of a file, by name; the form is that of ``fe/published.toml``.
 
@@ -174,15 +173,11 @@ def _key(name: str) -> str:
 
 def _numbers_of(law: Material) -> dict[str, object]:
     """The name and numbers of a material law as a file has them."""
-    c10, c20, c30, hencky = law.vector[:OGDEN].tolist()
-    mu, alpha = law.vector[OGDEN::2].tolist(), law.vector[OGDEN + 1 :: 2].tolist()
-    given: dict[type[Material], dict[str, object]] = {
-        NeoHooke: {"law": '"neo-Hooke"', "mu_mpa": 2.0 * c10},
-        Yeoh: {"law": '"Yeoh"', "c10_mpa": c10, "c20_mpa": c20, "c30_mpa": c30},
-        Hencky: {"law": '"linear elastic"', "mu_mpa": hencky},
-        Ogden: {"law": '"Ogden"', "convention": '"abaqus"', "mu_mpa": mu, "alpha": alpha},
-    }
-    return given[type(law)] | {"nu": law.nu}
+    numbers: dict[str, object] = {f"{name.lower()}_mpa": value for name, value in law.moduli_mpa.items()}
+    if isinstance(law, Ogden):
+        mu, alpha = law.vector[OGDEN::2].tolist(), law.vector[OGDEN + 1 :: 2].tolist()
+        numbers = {"convention": '"abaqus"', "mu_mpa": mu, "alpha": alpha}
+    return {"law": json.dumps(law.law.removesuffix(" (Hencky)"))} | numbers | {"nu": law.nu}
 
 
 @cache
@@ -214,32 +209,32 @@ def _law(where: str, given: object) -> Material:
     if not isinstance(given, dict):
         raise InputError(f"{where}: a tissue is a table with a material law and its numbers; got {given!r}.")
     law = given.get("law")
-    form = _form(where, law, given.get("convention"))
+    made = _constructor(where, law, given.get("convention"))
+    taken = inspect.signature(made).parameters
     values: dict[str, float | list[float]] = {}
     for key, value in given.items():
         if key in ("law", "convention"):
             continue
         bare, scale = next(((key.removesuffix(u), f) for u, f in _TO_MPA.items() if key.endswith(u)), (key, None))
-        if key in form.stresses:
-            raise InputError(f"{where}: '{key}' needs its unit: {key}_kpa or {key}_mpa.")
-        if bare not in (form.stresses if scale else form.plain):
-            wanted = ", ".join([f"{name}_kpa (or _mpa)" for name in form.stresses] + list(form.plain))
-            raise InputError(f"{where}: {law} has no '{key}'; it takes {wanted}.")
         argument = f"{bare}_mpa" if scale else bare
+        if f"{key}_mpa" in taken:
+            raise InputError(f"{where}: '{key}' needs its unit: {key}_kpa or {key}_mpa.")
+        if argument not in taken:
+            wanted = ", ".join(name.replace("_mpa", "_kpa (or _mpa)") for name in taken)
+            raise InputError(f"{where}: {law} has no '{key}'; it takes {wanted}.")
         if argument in values:
             raise InputError(f"{where}: '{bare}' is given twice.")
         values[argument] = _numbers(where, key, value, scale or 1.0, several=law == "Ogden" and bare != "nu")
-    needed = {f"{name}_mpa": f"{name}_kpa" for name in form.stresses} | {name: name for name in form.plain}
-    missing = [key for name, key in needed.items() if name not in values and key[:-4] not in form.optional]
+    missing = [name.replace("_mpa", "_kpa") for name in taken if name not in values and name != "c30_mpa"]
     if missing:
         raise InputError(f"{where}: {law} needs {', '.join(missing)}.")
     try:
-        return form.made(**values)
+        return made(**values)
     except InputError as refused:
         raise InputError(f"{where}: {refused}") from refused
 
 
-def _form(where: str, law: object, convention: object) -> _Form:
+def _constructor(where: str, law: object, convention: object) -> _Constructor:
     if law == "Ogden" and convention not in _OGDEN:
         raise InputError(
             f"{where}: an Ogden law needs convention = {' or '.join(map(repr, _OGDEN))}, the program that its numbers "

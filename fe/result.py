@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
+from itertools import chain
 from pathlib import Path
 
 import meshio
@@ -18,13 +19,18 @@ from fe.materials import Materials
 from fe.solution import LoadState
 
 _SHARES = (0.5, 0.9, 0.99)
-_AXES = ("normal", "shear", "third")
-_VECTORS = {
-    "displacement_mm": "travel_{}_mm",
-    "force_n": "force_{}_n",
-    "turn_deg": "turn_{}_deg",
-    "moment_nmm": "moment_{}_nmm",
-}  # vectors of a plate's state, and the columns of their components
+_FAR = 0.05  # det F of a patch further from the material law's than this is counted
+PLATE_VECTORS = {
+    "displacement_mm": "travel_mm",
+    "force_n": "force_n",
+    "turn_deg": "turn_deg",
+    "moment_nmm": "moment_nmm",
+}
+"""Vectors of a plate's state, and what files call them."""
+_COLUMNS = {
+    vector: [name.replace("_", f"_{axis}_") for axis in ("normal", "shear", "third")]
+    for vector, name in PLATE_VECTORS.items()
+}
 
 
 def cauchy_stress(state: LoadState, mesh: TetMesh, materials: Materials) -> FloatArray:
@@ -59,17 +65,14 @@ def patch_volumes(mesh: TetMesh, jacobian: FloatArray) -> FloatArray:
     return np.asarray(np.bincount(nodes, np.repeat(mesh.volumes_mm3 * jacobian, 4)) / before)
 
 
-def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials, by: float) -> float:
-    """Share of the volume where det F of nodal patches differs by more than ``by`` from the material law's, 1 + p / K.
-
-    Mean over a cell's nodes. A material of low bulk modulus K may well give way; only the mesh's error is counted.
-    """
+def volume_share_off(mesh: TetMesh, state: LoadState, materials: Materials) -> float:
+    """Share of the volume where det F of patches (mean of a cell's nodes) is over 0.05 off the law's, 1 + p / K."""
     asked = np.empty(len(mesh.cells))
     for region, law in materials.items():
         cells = mesh.regions[region]
         asked[cells] = state.pressure_mpa[cells] / law.bulk_modulus_mpa
     jacobian = np.linalg.det(np.eye(3) + state.gradients) - asked
-    off = np.abs(patch_volumes(mesh, jacobian) - 1.0)[mesh.cells].mean(axis=1) > by
+    off = np.abs(patch_volumes(mesh, jacobian) - 1.0)[mesh.cells].mean(axis=1) > _FAR
     return float(mesh.volumes_mm3[off].sum() / mesh.volumes_mm3.sum())
 
 
@@ -114,7 +117,10 @@ class RegionFigures:
 
 
 def region_figures(mesh: TetMesh, state: LoadState, materials: Materials) -> list[RegionFigures]:
-    """Figures of each region under a load."""
+    """Figures of each region under a load, which sum up its strain, stress and volume.
+
+    ``materials`` are those of the mesh's regions, one for each; the rows are in their order.
+    """
     strain = state.strain
     stress = equivalent_stress(cauchy_stress(state, mesh, materials))
     rows = []
@@ -139,8 +145,6 @@ def region_figures(mesh: TetMesh, state: LoadState, materials: Materials) -> lis
 def volume_percentiles(values: FloatArray, volumes: FloatArray, shares: Sequence[float]) -> tuple[float, ...]:
     """Values (n,) below which these shares of the volume lie.
 
-    Examples
-    --------
     >>> volume_percentiles(np.array([0.1, 0.3, 0.2]), np.array([1.0, 1.0, 2.0]), [0.5])
     (0.2,)
     """
@@ -150,8 +154,11 @@ def volume_percentiles(values: FloatArray, volumes: FloatArray, shares: Sequence
     return tuple(float(v) for v in values[order][at])
 
 
-def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
-    """Write the figures of regions, a row for each load and region."""
+def write_regions_csv(path: Path | str, rows: Sequence[RegionFigures]) -> None:
+    """Write the figures of regions as CSV, a row for each load and region; strain without unit, MPa, mL.
+
+    `OutputError` if the file cannot be written.
+    """
     columns = [
         "load", "reached", "region", "volume_ml", *(f"max_shear_p{p}" for p in (50, 90, 99)),
         *(f"von_mises_p{p}_mpa" for p in (50, 90, 99)), *(f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS),
@@ -160,20 +167,18 @@ def write_regions_csv(path: Path, rows: Sequence[RegionFigures]) -> None:
     table = []
     for row in rows:
         load, reached, region, *numbers = astuple(row)
-        flat = [*numbers[:7], *row.above_ml, *numbers[8:]]
-        table.append([load, f"{reached:.4g}", region, *(f"{v:.6g}" for v in flat)])
-    write_csv(path, columns, table)
+        table.append([load, f"{reached:.4g}", region, *numbers[:7], *row.above_ml, *numbers[8:]])
+    write_csv(Path(path), columns, table)
 
 
 def write_curve_csv(path: Path, states: Sequence[LoadState]) -> None:
     """Write every converged increment: the plate's displacement, force, turn and moment along its axes, its contact."""
-    columns = [name.format(axis) for name in _VECTORS.values() for axis in _AXES]
     table = []
     for state in states:
         for at in state.curve:
-            values = np.concatenate([getattr(at, field) for field in _VECTORS] + [[at.area_mm2, at.pressure_mpa]])
+            values = np.concatenate([getattr(at, vector) for vector in _COLUMNS] + [[at.area_mm2, at.pressure_mpa]])
             table.append([state.load.name, *(f"{v:.8g}" for v in values)])
-    write_csv(path, ["load", *columns, "contact_area_mm2", "contact_pressure_mpa"], table)
+    write_csv(path, ["load", *chain(*_COLUMNS.values()), "contact_area_mm2", "contact_pressure_mpa"], table)
 
 
 def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
@@ -181,13 +186,13 @@ def read_curve_csv(path: Path) -> dict[str, list[PlateState]]:
     curves: dict[str, list[PlateState]] = {}
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            vectors = {k: np.array([float(row[n.format(axis)]) for axis in _AXES]) for k, n in _VECTORS.items()}
+            vectors = {vector: np.array([float(row[c]) for c in columns]) for vector, columns in _COLUMNS.items()}
             plate = PlateState(**vectors, area_mm2=float(row["contact_area_mm2"]))
             curves.setdefault(row["load"], []).append(plate)
     return curves
 
 
-def write_state(path: Path, mesh: TetMesh, state: LoadState, materials: Materials) -> None:
+def write_state(path: Path | str, mesh: TetMesh, state: LoadState, materials: Materials) -> None:
     """Write a load's results as VTU: LPS mm and MPa, on the undeformed mesh (warp by ``displacement_mm``).
 
     At nodes: displacement, and det F of the patch around each. In cells: number of the region, F, Green-Lagrange
@@ -208,7 +213,7 @@ def write_state(path: Path, mesh: TetMesh, state: LoadState, materials: Material
     }
     point = {"displacement_mm": state.u_mm, "patch_jacobian": patch_volumes(mesh, strain.jacobian)}
     written = meshio.Mesh(mesh.points_mm, [("tetra", mesh.cells)], point, {name: [v] for name, v in cell.items()})
-    with whole_file(path) as part:
+    with whole_file(Path(path)) as part:
         meshio.vtu.write(part, written, binary=True)
 
 

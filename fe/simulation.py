@@ -1,6 +1,7 @@
 """A simulation: what a material parameter set gave under its loads, as arrays, as files, as a picture."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -16,18 +17,17 @@ from fe.elements import CROWDED, DESCRIPTIONS
 from fe.load_step import LoadStep
 from fe.materials import MODES, Materials
 from fe.plate import Plate
-from fe.problem import Problem, problems_of
-from fe.published import MaterialSet
+from fe.problem import Problem, check_kinds, problems_of
+from fe.published import MaterialSet, as_material_set
 from fe.result import RegionFigures
-from fe.simulation_files import PLATE_VECTORS, RECORD, read_parts
+from fe.simulation_files import RECORD, read_parts
 from fe.solution import LoadState, Observer, SolverOptions, solve
 from fe.surface_sets import BONE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_FAR = 0.05  # det F of a patch further from 1 than this is counted
-_MUCH = 0.05  # share of the volume above which that is noted
+_MUCH = 0.05  # share of the volume with det F of patches off above which that is noted
 _CROWD = 0.01  # share of a region's volume below det F `CROWDED` above which that is noted
 
 
@@ -124,11 +124,10 @@ class Simulation:
             if row.crowded_share > _CROWD
         ]
         for state in self.states:
-            if state.out_of_time and len(state.curve) > 1:
-                done = f"at {state.reached:.0%} of the load; given more, it goes on from there"
-                notes.append(f"{state.load.name}: its time was over {done}.")
-            elif state.out_of_time:
-                notes.append(f"{state.load.name}: its time was over before the first equilibrium.")
+            if state.out_of_time:
+                began = f"at {state.reached:.0%} of the load; given more, it goes on from there"
+                when = began if len(state.curve) > 1 else "before the first equilibrium"
+                notes.append(f"{state.load.name}: its time was over {when}.")
         notes += [
             f"{load.name} was not tried: the load before it was not reached."
             for load in self.loads
@@ -146,7 +145,7 @@ class Simulation:
         return [row for row in self.regions if row.load == state.load.name]
 
     def _share_off(self, state: LoadState) -> float:
-        return result.volume_share_off(self.mesh, state, self.materials.materials, _FAR)
+        return result.volume_share_off(self.mesh, state, self.materials.materials)
 
     def state(self, load: str) -> LoadState:
         """The state in which a load ended.
@@ -173,12 +172,12 @@ class Simulation:
         lines = []
         for state in self.states:
             shear = "; ".join(f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
-            force = f"{state.force_n[0]:.1f} N and {state.force_n[1]:.1f} N of shear"
+            (push, pull, _), (moved, along, _) = state.force_n, state.plate_displacement_mm
+            force = f"{push:.1f} N and {pull:.1f} N of shear"
             part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached ({force});"
-            moved = state.plate_displacement_mm
             lines.append(
-                f"{self.name}, {state.load.name}:{part} plate {moved[0]:.2f} mm in, {moved[1]:.2f} mm along; max. "
-                f"shear strain, median / 90th percentile: {shear}"
+                f"{self.name}, {state.load.name}:{part} plate {moved:.2f} mm in, {along:.2f} mm along; max. shear "
+                f"strain, median / 90th percentile: {shear}"
             )
         return "\n".join([*lines, *(f"{self.name}: {note}" for note in self.notes)])
 
@@ -197,13 +196,12 @@ class Simulation:
             plate = (round(float(v), 2) for v in (*state.plate_displacement_mm[:2], *state.force_n[:2]))
             shear = (f"{row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
             rows.append((state.load.name, str(state.load), f"{state.reached:.0%}", *plate, *shear))
-        columns = ("load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N")
+        head = ("load", "asked", "reached", "plate in, mm", "along, mm", "force, N", "shear, N")
         title = "Plate, and maximum shear strain of each tissue: median / 90th percentile"
-        table = Table(title, (*columns, *self.materials.materials), tuple(rows))
+        table = Table(title, (*head, *self.materials.materials), tuple(rows))
         picture = Picture("Maximum shear strain", "", png_bytes(self.plot()))
-        ended = sum(state.reached == 1.0 for state in self.states)
-        headline = f"{self.name}: {ended} of {len(self.loads)} loads reached"
-        return notebook_html(headline, picture, table, notes=self.notes)
+        ended = f"{sum(state.reached == 1.0 for state in self.states)} of {len(self.loads)} loads reached"
+        return notebook_html(f"{self.name}: {ended}", picture, table, notes=self.notes)
 
     def parameters(self) -> dict[str, object]:
         """Materials, loads and element as they are written to ``simulation.json``."""
@@ -229,13 +227,13 @@ class Simulation:
         }
 
     def write(self, folder: Path | str, *, record: Mapping[str, object] | None = None, fields: bool = True) -> None:
-        """Write it into an existing folder, as `mrstrain.simulate` does.
+        """Write it into a folder, as `mrstrain.simulate` does.
 
         Parameters
         ----------
         folder : path
-            Gets ``LOAD.vtu`` for each load, ``curve.csv`` (force and displacement of the plate), ``regions.csv``,
-            ``simulation.json`` and pictures.
+            Made if it is not there. Gets ``LOAD.vtu`` for each load, ``curve.csv`` (force and displacement of the
+            plate), ``regions.csv``, ``simulation.json`` and pictures.
         record : mapping, optional
             Provenance to stand in ``simulation.json``, with "parameters" that contain `parameters` and "fixed".
         fields : bool
@@ -249,6 +247,8 @@ class Simulation:
         from fe import figures
 
         place = Path(folder)
+        with suppress(OSError):  # that the first file cannot be written says as much
+            place.mkdir(parents=True, exist_ok=True)
         for state in self.states:
             if fields and len(state.curve) > 1:
                 result.write_state(place / f"{state.load.name}.vtu", self.mesh, state, self.materials.materials)
@@ -269,6 +269,8 @@ class Simulation:
             If one of the two does not have the constitutive model of a region.
         """
         given = self.mesh, self.materials.materials
+        with suppress(OSError):
+            Path(folder).mkdir(parents=True, exist_ok=True)
         for state in self.states:
             stem = Path(folder) / state.load.name
             write_calculix(Path(f"{stem}.inp"), *given, state, fixed=self.fixed, quadratic=True)
@@ -282,7 +284,7 @@ class Simulation:
             "out_of_time": state.out_of_time,
             "stable_share": min(row.stable_share for row in self._rows(state)),
             "plate_axes_lps": state.plate_axes.tolist(),
-            **{key: getattr(plate, name).tolist() for name, key in PLATE_VECTORS.items()},
+            **{f"plate_{key}": getattr(plate, vector).tolist() for vector, key in result.PLATE_VECTORS.items()},
             "contact_area_mm2": plate.area_mm2,
             "contact_pressure_mpa": plate.pressure_mpa if plate.area_mm2 > 0.0 else None,
             "nodes_on_plate": len(state.on_plate),
@@ -310,44 +312,54 @@ class Simulation:
         -----
         Plate states on the way to a load have the eight digits of ``curve.csv``; all else is as it was computed.
         """
-        read = cls(**read_parts(Path(folder), mesh))
-        derived = replace(read, remarks=()).notes
-        return replace(read, remarks=tuple(note for note in read.remarks if note not in derived))
+        return cls(**read_parts(Path(folder), mesh))
 
 
 def simulate(
-    mesh: TetMesh,
-    materials: MaterialSet | Materials,
-    plate: Plate | Mapping[str, Plate],
-    loads: Sequence[LoadStep],
-    *,
-    fixed: Sequence[str] = (BONE,),
-    element: str = "P1",
-    options: SolverOptions | None = None,
-    observer: Observer | None = None,
-) -> Simulation:
+    mesh: TetMesh, materials: MaterialSet | Materials | Path | str, plate: Plate | Mapping[str, Plate],
+    loads: Sequence[LoadStep], *, fixed: Sequence[str] = (BONE,), element: str = "P1",
+    options: SolverOptions | None = None, observer: Observer | None = None,
+) -> Simulation:  # fmt: skip
     """Simulate a rigid plate that presses and shears soft tissue.
 
     Parameters
     ----------
     mesh : TetMesh
-        LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed.
-    materials : MaterialSet, or mapping of region to Material
-    plate : Plate, or mapping of load to Plate
+        Undeformed, LPS mm, with the surface set "skin", which the plate may touch, and those that are fixed.
+    materials : MaterialSet, str, path, or mapping of region to Material
+        A set, the name of a published one or the path of a file with one (`fe.material_set`), or a material for each
+        region of the mesh.
+    plate : Plate, or mapping of load's name to Plate
     loads : sequence of LoadStep
         Those with the same normal force lie on one path, in the order of their shear (`fe.paths_of`).
     fixed : sequence of str
         Surface sets that do not move.
     element : {"P1", "MINI", "P2"}
-        As in `fe.elements`.
+        Linear, with a bubble, or quadratic; see `fe.elements`.
+    options : SolverOptions, optional
+        Threads, time limit and tolerance.
     observer : Observer, optional
         Receives the progress of each path.
+
+    Returns
+    -------
+    Simulation
+        For each load that was begun, ``state(name)`` has the displacement of the nodes (n, 3) mm and the displacement
+        gradient of the cells (m, 3, 3), both on the undeformed mesh in LPS; ``strain`` from it (Green-Lagrange); the
+        pressure (m,) MPa; and the plate's displacement (3,) mm and force (3,) N, along the normal force, the shear and
+        their cross product. `Simulation.regions` sums up strain, stress and volume by region.
 
     Raises
     ------
     InputError
-        As `fe.Problem`; before anything is computed.
+        As `fe.Problem` and `fe.material_set`; before anything is computed.
+
+    Notes
+    -----
+    A load that cannot be reached is no error: its state is the last converged increment, with ``reached`` below 1,
+    and `Simulation.complete` is False.
     """
-    chosen = materials if isinstance(materials, MaterialSet) else MaterialSet("materials", "", "", dict(materials))
+    check_kinds(mesh, plate, loads)
+    chosen = as_material_set(materials)
     problems = problems_of(mesh, chosen.for_regions(mesh.regions)[0], plate, loads, fixed, element)
     return Simulation.of(chosen, problems, [s for one in problems for s in solve(one, options, observer)])

@@ -1,36 +1,40 @@
-"""Files of a simulation read back, and removed."""
+"""Files of a simulation: read back, resumed from after an interruption, and removed."""
 
+import hashlib
+import io
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvc import TetMesh
-from dvc.arrays import FloatArray, IntArray
+from dvc.atomic_files import whole_file
 from dvc.errors import InputError
 from dvc.mesh import outer_faces
-from fe.load_path import PlateState
+from dvc.software import software_key
+from fe.load_path import Checkpoint, PlateState
 from fe.load_step import LoadStep
 from fe.materials import from_vector
+from fe.plate import ContactStatus
+from fe.problem import Problem
 from fe.published import MaterialSet
-from fe.result import read_curve_csv, read_state
+from fe.result import PLATE_VECTORS, read_curve_csv, read_state
 from fe.solution import LoadState
 from fe.surface_sets import BONE, SKIN
 
 RECORD = "simulation.json"
-PLATE_VECTORS = {
-    "displacement_mm": "plate_travel_mm", "force_n": "plate_force_n", "turn_deg": "plate_turn_deg",
-    "moment_nmm": "plate_moment_nmm",
-}  # of a plate's state, and their keys in the record  # fmt: skip
+ENDING = ".restart.npz"
 _TABLES = ("regions.csv", "curve.csv", "slices.png", "force_travel.png")
+_CONTACT = [field.name for field in fields(ContactStatus)]
+_PLATE = [field.name for field in fields(PlateState)]
 
 
 def read_parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
-    """What a `fe.Simulation` is made of, from its folder; all notes are among its remarks."""
+    """What a `fe.Simulation` is made of, from its folder."""
     try:
         return _parts(place, mesh)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as failure:
@@ -52,47 +56,37 @@ def _parts(place: Path, mesh: TetMesh | None) -> dict[str, Any]:
     if mesh is None:
         number = first.cell_data["region"][0]
         regions = {name: np.flatnonzero(number == int(n)) for n, name in given["region_numbers_in_vtu"].items()}
-        mesh = TetMesh(first.points, cells, regions, _surfaces(cells, u_mm, given["fixed"]))
+        faces, bone = outer_faces(cells), given["fixed"][0] if len(given["fixed"]) == 1 else BONE
+        still = (u_mm[faces] == 0.0).all(axis=(1, 2))
+        mesh = TetMesh(first.points, cells, regions, {bone: faces[still], SKIN: faces[~still]})
     elif not (np.array_equal(mesh.points_mm, first.points) and np.array_equal(mesh.cells, cells)):
         raise InputError(f"{place}: the mesh given is not the one that was simulated.")
     undeformed = first, np.zeros_like(first.points), np.zeros((len(cells), 3, 3)), np.zeros(len(cells))
-    states = []
+    skin, states = np.unique(mesh.facets[SKIN]), []
     for name, at in outcome.items():  # no file: its time was over before the first equilibrium
         _, u_mm, gradients, pressure_mpa = files.get(name, undeformed)
-        vectors = {name: np.array(at[key]) for name, key in PLATE_VECTORS.items()}
-        plate = PlateState(**vectors, area_mm2=at["contact_area_mm2"])
+        vectors = {vector: np.array(at[f"plate_{key}"]) for vector, key in PLATE_VECTORS.items()}
+        plate, axes = PlateState(**vectors, area_mm2=at["contact_area_mm2"]), np.array(at["plate_axes_lps"])
+        # The nodes on the plate are those of the skin that lie furthest along its normal.
+        towards = axes @ Rotation.from_rotvec(plate.turn_deg, degrees=True).as_matrix()[:, 0]
+        height = (mesh.points_mm + u_mm)[skin] @ towards
+        on_plate = np.sort(skin[np.argsort(height, kind="stable")[: at["nodes_on_plate"]]])
         state = LoadState(
-            loads[name], at["reached"], u_mm, pressure_mpa, gradients, np.empty(0, dtype=np.int64),
-            (*curves[name][:-1], plate), at["iterations"], at["seconds"],
-            out_of_time=at["out_of_time"], plate_axes=np.array(at["plate_axes_lps"]),
+            loads[name], at["reached"], u_mm, pressure_mpa, gradients, on_plate, (*curves[name][:-1], plate),
+            at["iterations"], at["seconds"], out_of_time=at["out_of_time"], plate_axes=axes,
         )  # fmt: skip
-        states.append(replace(state, on_plate=_on_plate(mesh, state, at["nodes_on_plate"])))
+        states.append(state)
     materials = {
         region: from_vector(law["law"], np.array(law["vector_mpa"]), law["bulk_modulus_mpa"])
         for region, law in given["laws"].items()
     }
+    of_loads = tuple(f"{name}{word}" for name in loads for word in (":", " was not tried"))  # derived anew, not remarks
     material_set = MaterialSet(given["set"], given["title"], given["source"], materials)
     return {
         "materials": material_set, "mesh": mesh, "paths": paths, "states": tuple(states),
         "fixed": tuple(given["fixed"]), "element": given["element"].split(":")[0], "turns": given["turns"],
-        "remarks": tuple(content["notes"]),
+        "remarks": tuple(note for note in content["notes"] if not note.startswith(of_loads)),
     }  # fmt: skip
-
-
-def _surfaces(cells: IntArray, u_mm: FloatArray, fixed: Sequence[str]) -> dict[str, IntArray]:
-    """Outer faces, divided by whether their nodes moved."""
-    faces = outer_faces(cells)
-    still = (u_mm[faces] == 0.0).all(axis=(1, 2))
-    return {fixed[0] if len(fixed) == 1 else BONE: faces[still], SKIN: faces[~still]}
-
-
-def _on_plate(mesh: TetMesh, state: LoadState, count: int) -> IntArray:
-    """The nodes on the plate, ``count`` of them: those of the skin that lie furthest along its normal."""
-    assert state.plate_axes is not None
-    skin = np.unique(mesh.facets[SKIN])
-    towards = state.plate_axes @ Rotation.from_rotvec(state.plate.turn_deg, degrees=True).as_matrix()[:, 0]
-    height = (mesh.points_mm + state.u_mm)[skin] @ towards
-    return np.sort(skin[np.argsort(height, kind="stable")[:count]])
 
 
 def clear_simulation(folder: Path) -> None:
@@ -101,7 +95,53 @@ def clear_simulation(folder: Path) -> None:
         loads = list(json.loads((folder / RECORD).read_text(encoding="utf-8"))["outcome"])
     except (OSError, ValueError, KeyError, TypeError):
         return
-    of_loads = [f"{load}{ending}" for load in loads for ending in (".vtu", ".inp", ".feb")]
-    logs = [f"log-{load}.txt" for load in loads]
-    for name in (*of_loads, *logs, *_TABLES, RECORD):
+    of_loads = [name for load in loads for name in (f"{load}.vtu", f"{load}.inp", f"{load}.feb", f"log-{load}.txt")]
+    for name in (*of_loads, *_TABLES, RECORD):
         (folder / name).unlink(missing_ok=True)
+
+
+def fingerprint(problem: Problem, load_count: int) -> str:
+    """A hash of all that the first loads of a problem depend on, solver and libraries (`dvc.software`) included."""
+    mesh, plate = problem.mesh, problem.plate
+    digest = hashlib.sha256()
+
+    def add(*things: object) -> None:
+        for thing in things:
+            digest.update(thing.tobytes() if isinstance(thing, np.ndarray) else f"{thing!r};".encode())
+
+    add(mesh.points_mm, mesh.cells)
+    for named in (mesh.regions, mesh.facets):
+        for name, rows in named.items():
+            add(name, rows)
+    for region, material in problem.materials.items():
+        add(region, material.vector, material.nu)
+    add(plate.axes, plate.gap_mm, plate.taped, plate.turns, np.asarray(plate.pivot_mm, dtype=np.float64))
+    add(*(astuple(load)[1:] for load in problem.loads[:load_count]))
+    add(tuple(problem.fixed), problem.element, software_key("fe"))
+    return digest.hexdigest()
+
+
+def write_checkpoint(path: Path, checkpoint: Checkpoint, made_from: str) -> None:
+    """Write where a load came to, with the `fingerprint` of what it was made from."""
+    at = checkpoint
+    counts = np.array([at.reached, at.stages, at.iterations, at.seconds])
+    arrays: dict[str, Any] = {"made_from": made_from, "counts": counts, "unknowns": at.unknowns}
+    arrays |= {name: getattr(at.contact, name) for name in _CONTACT}
+    arrays |= {name: np.array([getattr(plate, name) for plate in at.curve]) for name in _PLATE}
+    with whole_file(path) as part:
+        np.savez_compressed(part, **arrays)
+
+
+def read_checkpoint(path: Path, made_from: str) -> Checkpoint | None:
+    """Where a load came to; None if there is no such file, it is damaged, or was made from something else."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes())) as file:
+            if str(file["made_from"]) != made_from:
+                return None
+            reached, stages, iterations, seconds = file["counts"].tolist()
+            nodes, places, rotation, turns = (file[name] for name in _CONTACT)
+            curve = [PlateState(*at) for at in zip(*(file[name] for name in _PLATE), strict=True)]
+            contact = ContactStatus(nodes, places, rotation, bool(turns))
+            return Checkpoint(reached, int(stages), tuple(curve), int(iterations), seconds, file["unknowns"], contact)
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        return None

@@ -36,7 +36,10 @@ class SolverOptions:
 
 
 class Observer:
-    """Receives the progress of a solution; this one does nothing with it."""
+    """Receives the progress of a solution; this one does nothing with it.
+
+    Derive a class of your own, with the methods that are of interest, and give it to `solve` or `simulate`.
+    """
 
     def log(self, line: str) -> None:
         """Take a line for each step."""
@@ -111,15 +114,15 @@ class LoadState:
 
 
 def solve(
-    problem: Problem,
-    options: SolverOptions | None = None,
-    observer: Observer | None = None,
+    problem: Problem, options: SolverOptions | None = None, observer: Observer | None = None,
     earlier: Sequence[Checkpoint] = (),
-) -> list[LoadState]:
+) -> list[LoadState]:  # fmt: skip
     """Press and shear soft tissue with a rigid plate, along one path of loads.
 
     Parameters
     ----------
+    options, observer : optional
+        Threads, time limit and tolerance; what receives the progress.
     earlier : sequence of Checkpoint
         Of the first loads, from an earlier solution of the same problem: they are not solved again. The last may have
         been on its way.
@@ -135,8 +138,10 @@ def solve(
     turned = TetMesh(mesh.points_mm @ axes, mesh.cells, mesh.regions, mesh.facets)
     model = Model.of(turned, problem.materials, element(problem.element))
     deadline = time.monotonic() + options.limit_s
-    path = LoadPath(model, turned, problem, options.threads, options.tolerance)
-    path.log, path.is_over = observer.log, (lambda: time.monotonic() > deadline)
+    path = LoadPath(
+        model, turned, problem, options.threads, options.tolerance, observer.log, (lambda: time.monotonic() > deadline)
+    )
+    u_count, node_count = 3 * len(model.space.nodes_mm), len(mesh.points_mm)
     states: list[LoadState] = []
     try:
         for number, load in enumerate(loads):
@@ -149,24 +154,16 @@ def solve(
             loading = Loading(path, load.target, before, dict(enumerate(earlier)).get(number), on_converged)
             complete = loading.run()
             observer.progress((number + 1.0) / len(loads))
-            states.append(_load_state(load, loading.checkpoint(), problem, path, not complete and path.is_over()))
-            observer.ended(states[-1])
+            at, held = loading.checkpoint(), path.contact.held
+            state = LoadState(
+                load, at.reached, at.unknowns[:u_count].reshape(-1, 3)[:node_count] @ axes.T,
+                model.pressures(at.unknowns).mean(axis=1), axes @ model.gradients(at.unknowns) @ axes.T,
+                held[held < node_count], at.curve, at.iterations, at.seconds, at, not complete and path.is_over(), axes,
+            )  # fmt: skip
+            states.append(state)
+            observer.ended(state)
             if not complete:
                 break
     finally:
         path.solver.close()
     return states
-
-
-def _load_state(
-    load: LoadStep, checkpoint: Checkpoint, problem: Problem, path: LoadPath, out_of_time: bool
-) -> LoadState:
-    """The state in which a load ended, turned from the plate's axes to LPS."""
-    model, axes, count = path.model, problem.plate.axes, len(problem.mesh.points_mm)
-    u = checkpoint.unknowns[: 3 * len(model.space.nodes_mm)].reshape(-1, 3)[:count]
-    held = path.contact.held
-    return LoadState(
-        load, checkpoint.reached, u @ axes.T, model.pressures(checkpoint.unknowns).mean(axis=1),
-        axes @ model.gradients(checkpoint.unknowns) @ axes.T, held[held < count], checkpoint.curve,
-        checkpoint.iterations, checkpoint.seconds, checkpoint, out_of_time, axes,
-    )  # fmt: skip

@@ -9,6 +9,6 @@ BONE, SKIN, CUT = "bone", "skin", "cut"
 
 
 def fixed_facets(mesh: TetMesh, beside: Sequence[str]) -> tuple[str, ...]:
-    """The bone's facets and others beside them, as the mesh spells them."""
+    """Names of the facets that do not move: the bone's and those ``beside`` it, as the mesh spells them."""
     spelt = {name.casefold(): name for name in mesh.facets} | {name: name for name in mesh.facets}
     return tuple(dict.fromkeys([BONE, *(spelt.get(name, spelt.get(name.casefold(), name)) for name in beside)]))

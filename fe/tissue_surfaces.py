@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dvc import LabelMap
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import FloatArray, IntArray
 from dvc.errors import MrstrainError
 from dvc.mesh import FACES, signed_volumes
 
@@ -62,13 +62,6 @@ def borders_of(labels: LabelMap) -> Borders:
 
 def labels_at(borders: Borders, points_mm: FloatArray) -> IntArray:
     """Label of the tissue that encloses each point (n, 3) LPS mm; 0 outside all."""
-    enclosing = np.zeros(len(points_mm), dtype=np.int64)
-    for label in np.unique(borders.sides[borders.sides > 0]):
-        enclosing[_inside(borders, int(label), points_mm)] = label
-    return enclosing
-
-
-def _inside(borders: Borders, label: int, points_mm: FloatArray) -> BoolArray:
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
@@ -80,14 +73,17 @@ def _inside(borders: Borders, label: int, points_mm: FloatArray) -> BoolArray:
         data.SetPoints(points)
         return data
 
-    triangles = borders.triangles[(borders.sides == label).any(axis=1)]
-    surface, cells = points_of(borders.points_mm), vtkCellArray()
-    starts = np.arange(0, 3 * len(triangles) + 1, 3)
-    cells.SetData(numpy_to_vtkIdTypeArray(starts, deep=True), numpy_to_vtkIdTypeArray(triangles.ravel(), deep=True))
-    surface.SetPolys(cells)
-    enclosed = vtkSelectEnclosedPoints(input_data=points_of(points_mm), surface_data=surface, tolerance=1e-9)
-    enclosed.Update()
-    return np.asarray(vtk_to_numpy(enclosed.GetOutput().GetPointData().GetArray("SelectedPoints")).astype(bool))
+    enclosing = np.zeros(len(points_mm), dtype=np.int64)
+    for label in np.unique(borders.sides[borders.sides > 0]):
+        triangles = borders.triangles[(borders.sides == label).any(axis=1)]
+        starts, corners = np.arange(0, 3 * len(triangles) + 1, 3), triangles.ravel()
+        surface, cells = points_of(borders.points_mm), vtkCellArray()
+        cells.SetData(numpy_to_vtkIdTypeArray(starts, deep=True), numpy_to_vtkIdTypeArray(corners, deep=True))
+        surface.SetPolys(cells)
+        within = vtkSelectEnclosedPoints(input_data=points_of(points_mm), surface_data=surface, tolerance=1e-9)
+        within.Update()
+        enclosing[vtk_to_numpy(within.GetOutput().GetPointData().GetArray("SelectedPoints")) > 0] = label
+    return enclosing
 
 
 def with_volumes(

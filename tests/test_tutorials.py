@@ -15,12 +15,10 @@ from sybil.parsers.markdown import PythonCodeBlockParser
 
 from dvc.io.images.labels import read_labels
 from dvc.io.images.write import write_mask, write_vectors
-from fe import write_tet_mesh
 from mrstrain.cli.app import app
 from mrstrain.studies.file import read_study
 from mrstrain.truth.phantom import phantom
 from phantoms import Heel, under_load
-from tests.fe.test_simulate import dome
 from tests.quick import QUICK
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -108,7 +106,6 @@ def test_dvc_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_fe_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
     follow("python/fe.md", tmp_path, monkeypatch)
 
 
@@ -152,7 +149,6 @@ def test_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_tet_mesh(tmp_path / "dome.vtu", dome((3, 4, 4)), {})
     follow("tutorials/material.md", tmp_path, monkeypatch)
 
 

@@ -14,7 +14,7 @@ import fe
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.worker import Worker, each_in_workers, usable_cores
-from fe.restart import ENDING, fingerprint, read_checkpoint, write_checkpoint
+from fe.simulation_files import ENDING, fingerprint, read_checkpoint, write_checkpoint
 from mrstrain.models.loads import LOADS
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores

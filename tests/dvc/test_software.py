@@ -25,7 +25,7 @@ import fe.assembly
 import phantoms.mri
 from dvc.software import distribution_versions, software_key
 from fe import Problem
-from fe.restart import fingerprint
+from fe.simulation_files import fingerprint
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.plan import Stage
 from mrstrain.truth.accuracy import _finished, _key

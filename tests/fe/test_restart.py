@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from dvc.mesh import TetMesh
 from fe import Checkpoint, LoadState, LoadStep, NeoHooke, Plate, Problem, write_tet_mesh
-from fe.restart import fingerprint, read_checkpoint, write_checkpoint
+from fe.simulation_files import fingerprint, read_checkpoint, write_checkpoint
 from mrstrain.cli.app import app
 from mrstrain.studies import stages
 from tests.fe.solving import Notebook, solved

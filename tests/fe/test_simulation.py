@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -137,8 +138,54 @@ def test_what_is_no_simulation_is_refused(simulation: fe.Simulation, tmp_path: P
         fe.Simulation.read(tmp_path)
 
 
-def test_materials_may_be_given_by_region() -> None:
-    soft = {"skin": FAT, "fat": FAT}
-    done = fe.simulate(dome((2, 3, 3)), soft, fe.Plate(DOWN, ALONG), [fe.LoadStep("a", normal_mm=0.2)])
+def test_notes_of_earlier_versions_are_shown_once(unreached: fe.Simulation, tmp_path: Path) -> None:
+    """They are derived from the states, in the words of today, and only what was assumed is taken from the file."""
+    replace(unreached, remarks=("weak has no material law for tendon; fat's is used.",)).write(tmp_path)
+    record = json.loads((tmp_path / "simulation.json").read_text())
+    record["notes"] += ["never was not tried: another wording.", "pressed: det F is off what the law asks for."]
+    (tmp_path / "simulation.json").write_text(json.dumps(record))
+    notes = fe.Simulation.read(tmp_path).notes
+    assert notes == ("weak has no material law for tendon; fat's is used.", *unreached.notes)
+
+
+def test_folders_are_made_and_names_taken_as_text(simulation: fe.Simulation, tmp_path: Path) -> None:
+    simulation.write(tmp_path / "a" / "b", fields=False)
+    simulation.write_decks(str(tmp_path / "decks"))
+    assert (tmp_path / "a" / "b" / "simulation.json").is_file()
+    assert (tmp_path / "decks" / "pressed.feb").is_file()
+    fe.write_state(str(tmp_path / "state.vtu"), simulation.mesh, simulation.states[0], LAWS)
+    fe.write_regions_csv(str(tmp_path / "rows.csv"), simulation.regions)
+    (tmp_path / "file").touch()
+    with pytest.raises(fe.OutputError, match=r"file.c: cannot be|file.regions\.csv: cannot be written"):
+        simulation.write(tmp_path / "file", fields=False)
+
+
+def test_materials_may_be_given_by_region_or_by_the_name_of_their_set() -> None:
+    soft, given = {"skin": FAT, "fat": FAT}, (fe.Plate(DOWN, ALONG), [fe.LoadStep("a", normal_mm=0.2)])
+    done = fe.simulate(dome((2, 3, 3)), soft, *given)
     assert done.complete
     assert done.materials.materials == soft
+    named = fe.simulate(dome((2, 3, 3)), "luboz", *given)
+    assert (named.name, named.complete) == ("luboz", True)
+
+
+@pytest.mark.parametrize(
+    ("argument", "given", "said"),
+    [
+        (0, "heel.vtu", r"The mesh must be a TetMesh, as fe\.read_tet_mesh\(path\) .*got 'heel\.vtu'"),
+        (0, np.zeros((4, 3)), "The mesh must be a TetMesh.*got a ndarray"),
+        (1, "trebi", "No material set 'trebi'; the nearest is 'trebbi'"),
+        (1, {"fat": "trebbi"}, r"Materials must be .*fe\.Ogden.*got {'fat': 'trebbi'}"),
+        (1, 0.0034, "Materials must be a set .*got 0.0034"),
+        (2, (DOWN, ALONG), r"pressed: the plate must be an fe\.Plate, .*got a tuple"),
+        (2, {"other": fe.Plate(DOWN, ALONG)}, "pressed: the plate must be .*one for each load's name; got nothing"),
+        (3, LOADS[0], r"The loads must be a list of fe\.LoadStep; got a LoadStep"),
+        (3, [{"name": "pressed", "normal_n": 2.0}], r"The loads must be a list of fe\.LoadStep; got a dict"),
+        (3, "pressed", "The loads must be .*got 'p"),
+    ],
+)
+def test_what_is_of_another_kind_is_refused_with_what_to_give(argument: int, given: object, said: str) -> None:
+    arguments: list[object] = [dome((2, 3, 3)), LAWS, fe.Plate(DOWN, ALONG), LOADS[:1]]
+    arguments[argument] = given
+    with pytest.raises(InputError, match=said):
+        fe.simulate(*arguments)  # type: ignore[arg-type]
