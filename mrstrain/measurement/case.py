@@ -1,12 +1,13 @@
-"""A load that was measured and written, and the report of a series of them."""
+"""Loads that were measured and written: each a case, together a series with its report."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from dvc import Measurement, Verdict
+from dvc.atomic_files import write_json
+from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.report.page import Section, record_lines, write_report
 from dvc.trust.verdict import worst
 
@@ -20,7 +21,7 @@ class Case:
     lines: tuple[str, ...]
 
     @classmethod
-    def of(cls, measurement: Measurement, folder: Path, record: Mapping[str, object]) -> Case:
+    def of(cls, measurement: Measurement, folder: Path, record: Mapping[str, object]) -> Self:
         """Write a measurement, with its provenance; its folder is there whole or not at all."""
         return cls(folder, measurement.write(folder, record), tuple(measurement.summary()))
 
@@ -68,11 +69,41 @@ _CLOSING = (
 )
 
 
-def write_series_report(
-    path: Path, sections: Sequence[Section], failures: Mapping[str, str], record: Mapping[str, object]
-) -> None:
-    """Write the report of a series, one self-contained page."""
-    told = [*sections]
-    told += [Section(name, Verdict("distrust", (f"Not registered. {reason}",))) for name, reason in failures.items()]
-    verdict = worst([s.verdict for s in told if s.verdict is not None])
-    write_report(path, "Strain from MR image pairs", verdict, told, _CLOSING, record_lines(record))
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Result of `register` and of `strain`.
+
+    Attributes
+    ----------
+    out : Path
+        Folder of all results; ``report.html`` is in it.
+    cases : tuple of Case
+        The measured loads, in the order given; the repeat scan last, if there is one.
+    failures : dict
+        Name of each load that could not be registered, and why.
+    """
+
+    out: Path
+    cases: tuple[Case, ...]
+    failures: dict[str, str]
+
+    @classmethod
+    def of(cls, out: Path, cases: tuple[Case, ...], failures: dict[str, str], record: Mapping[str, object]) -> Self:
+        """Write the provenance of a series and its report, one self-contained page."""
+        told = [case.section for case in cases]
+        told += [Section(name, Verdict("distrust", (f"Not registered. {why}",))) for name, why in failures.items()]
+        verdict = worst([s.verdict for s in told if s.verdict is not None])
+        write_json(out / PROVENANCE, record)
+        write_report(out / REPORT, "Strain from MR image pairs", verdict, told, _CLOSING, record_lines(record))
+        return cls(out, cases, failures)
+
+    @property
+    def complete(self) -> bool:
+        """Whether no load failed."""
+        return not self.failures
+
+    def summary(self) -> list[str]:
+        """Summary, a few lines."""
+        lines = [line for case in self.cases for line in case.summary()]
+        lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
+        return [*lines, f"Report: {self.out / REPORT}"]

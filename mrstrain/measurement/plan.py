@@ -6,17 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc import (
-    Deformation,
-    Evidence,
-    Image,
-    Measurement,
-    Registration,
-    Settings,
-    Subject,
-    register as register_pair,
-    tissue_mask,
-)
+import dvc
+from dvc import Deformation, Evidence, Image, Measurement, Registration, Settings, Subject, tissue_mask
 from dvc.errors import InputError, MrstrainError
 from dvc.images.noise import signal_to_noise
 from dvc.measurement.error_bars import TwinCheck
@@ -29,6 +20,7 @@ from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
 
 Tell = Callable[[str, float], None]
+_Files = Mapping[str, Path | list[Path]]
 _SETTINGS = {*EngineOptions.model_fields, "align", "bending", "volume", "allow_unknown_parameters", "error_model"}
 """Options of a registration that its record has as settings, or by the file's hash."""
 _FOLDED = 1e-3
@@ -58,7 +50,7 @@ class Plan:
     ) -> Registered:
         """Register a loaded image, or a repeat scan, and the pair's twin."""
         of, how = self.subject, self.settings.of_repeat() if is_repeat else self.settings
-        found = register_pair(
+        found = dvc.register(
             of.reference, loaded, bone=of.bone, tissue=of.tissue, labels=of.labels, settings=how, start=start,
             worker=worker, progress=tell,
         )  # fmt: skip
@@ -76,27 +68,21 @@ class Plan:
 
 
 def record_of(
-    subject: Subject,
-    files: Mapping[str, list[Path]],
-    settings: Settings,
-    how: RegistrationOptions,
-    more: Mapping[str, object],
+    subject: Subject, files: _Files, settings: Settings, how: RegistrationOptions, more: Mapping[str, object]
 ) -> dict[str, object]:
     """What a registration is made from; ``more`` are parameters beside those of the registration."""
-    return provenance(
-        "register",
-        {**subject.files, **files, "error_model": how.files.get("error_model", [])},
-        {
-            "align": settings.align_on,
-            "seed": settings.seed,
-            "threads": settings.threads,
-            "plate_normal_lps": subject.plate_normal.tolist(),
-            "engine": settings.engine.family,
-            **settings.engine.record(),
-            **{name: value for name, value in how.plain().items() if name not in _SETTINGS},
-            **more,
-        },
-    )
+    parameters = {
+        "align": settings.align_on,
+        "seed": settings.seed,
+        "threads": settings.threads,
+        "plate_normal_lps": subject.plate_normal.tolist(),
+        "engine": settings.engine.family,
+        **settings.engine.record(),
+        **{name: value for name, value in how.plain().items() if name not in _SETTINGS},
+        **more,
+    }
+    given: _Files = {**subject.files, **files, "error_model": how.files.get("error_model", [])}
+    return provenance("register", given, parameters)
 
 
 def _twin_check(
@@ -113,7 +99,7 @@ def _twin_check(
         acquisition = Acquisition(found.settings.seed, found.loaded.grid, noise_factor=_noisier(found))
         twin = synthetic_warp(found.reference, tissue, found.total, acquisition, near=near, beyond_missing=True).image
         tell("making the twin", 1.0)
-        again = register_pair(
+        again = dvc.register(
             found.reference, twin, bone=subject.bone, tissue=tissue, labels=subject.labels, settings=found.settings,
             start=start, worker=worker, progress=lambda stage, fraction: tell(f"twin: {stage}", fraction),
         )  # fmt: skip

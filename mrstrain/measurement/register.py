@@ -1,64 +1,34 @@
-"""`register`: images in, a folder of strain maps and a report out."""
+"""`register`: images in, a folder of strain maps and a report out; `register_one` is the part of it in a study."""
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from dvc import Deformation, Engine, Evidence, Image, Mask, Settings, read_error_model, read_image, read_landmarks
-from dvc.atomic_files import write_json
+from dvc import Deformation, Engine, Evidence, Image, Settings, read_error_model, read_image, read_landmarks
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
-from dvc.io.result_folder import PROVENANCE, REPEAT, REPORT
+from dvc.io.result_folder import QUALITY, REPEAT, spline_in
 from dvc.registration.align import without_motion
 from dvc.registration.engines import DEFAULT
 from dvc.registration.register import refuse_one_image_twice
 from dvc.trust.error_model import error_model_of
-from dvc.trust.quality import NoiseFloor
+from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers, usable_cores
-from mrstrain.measurement.case import Case, write_series_report
+from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.plan import Plan, Registered, record_of
 from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
+from mrstrain.options.model import Flag
 from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_small_disk, refuse_touching_inputs
+from mrstrain.records.progress import OnProgress
 
-Told = Callable[[str, str, float], None]
 _BESIDE = ("repeat", "landmarks", "start")  # files that are recorded beside the loads
 _BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plate's axes
-
-
-@dataclass(frozen=True, slots=True)
-class Series:
-    """Result of `register`.
-
-    Attributes
-    ----------
-    out : Path
-        Folder of all results; ``report.html`` is in it.
-    cases : tuple of Case
-        The registered loads, in the order given; the repeat scan last, if there is one.
-    failures : dict
-        Name of each load that could not be registered, and why.
-    """
-
-    out: Path
-    cases: tuple[Case, ...]
-    failures: dict[str, str]
-
-    @property
-    def complete(self) -> bool:
-        """Whether no load failed."""
-        return not self.failures
-
-    def summary(self) -> list[str]:
-        """Summary, a few lines."""
-        lines = [line for case in self.cases for line in case.summary()]
-        lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
-        return [*lines, f"Report: {self.out / REPORT}"]
 
 
 @door
@@ -72,7 +42,7 @@ def register(
     scans: Scans,
     onto: MeshAndAxes,
     running: Running,
-    progress: Told | None = None,
+    progress: OnProgress | None = None,
 ) -> Series:
     """Register loaded images to the unloaded one and write displacement, strain, quality and a report.
 
@@ -114,7 +84,8 @@ def register(
     model = None if registration.error_model is None else read_error_model(registration.error_model)
     points = None if scans.landmarks is None else read_landmarks(scans.landmarks)[:2]
     subject = replace(subject, tissue=subject.body())
-    begun_at = _first_guess(scans, {"bone": subject.bone, "image": subject.tissue, "none": None}[align])
+    held = {"bone": subject.bone, "image": subject.tissue, "none": None}[align]  # its rigid motion is found by aligning
+    start = None if scans.start is None else without_motion(read_any(scans.start, scans.start_frame), held)[0]
     refuse_one_image_twice(
         [(str(path), image) for path, image in zip((load0, *paths), (subject.reference, *images.values()), strict=True)]
     )
@@ -124,22 +95,61 @@ def register(
     at_once, threads = _shares(running, 1 if chain else len(cases))
     settings = Settings(chosen, align, running.seed, threads)
     model = model or error_model_of(chosen.name)
-    record = record_of(
-        subject,
-        {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}},
-        settings,
-        registration,
-        {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
-        | {"shear_direction_lps": onto.plain()["shear_direction"]}
-        | {"mesh_unit": onto.mesh_unit, "mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing},
-    )
+    files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}}
+    more: dict[str, object] = {"start_frame": scans.start_frame, "bone_label": subject_files.bone_label}
+    more |= {"shear_direction_lps": onto.plain()["shear_direction"], "mesh_unit": onto.mesh_unit}
+    more |= {"mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing}
+    record = record_of(subject, files, settings, registration, more)
     plan = Plan(subject, settings, Evidence(points, error_model=model), record, twin)
-    run = _Run(target, plan, images, begun_at, progress or (lambda *_: None))
+    run = _Run(target, plan, images, start, progress or (lambda *_: None))
     run.all(at_once, chain)
-    finished = run.finished()
-    write_json(target / PROVENANCE, record)
-    write_series_report(target / REPORT, [case.section for case in finished], run.failures, record)
-    return Series(target, finished, run.failures)
+    return Series.of(target, run.finished(), run.failures, record)
+
+
+class InSeries(Running):
+    """How one load is registered within its series, and the results that it builds on."""
+
+    repeat: Path | None = None
+    """Folder of the repeat scan's results: the noise floor."""
+    after: Path | None = None
+    """Folder of the load whose result is the start of this one's."""
+    allow_missing: Flag = False
+    """Leave NaN or infinite voxels out instead of refusing the image."""
+
+
+@door
+def register_one(
+    load0: Path,
+    load: Path,
+    *,
+    out: Path,
+    subject_files: SubjectFiles,
+    registration: RegistrationOptions,
+    onto: MeshAndAxes,
+    series: InSeries,
+    tell: Callable[[str, float], None] = lambda *_: None,
+) -> Case:
+    """Register one loaded image by itself, as `register` does it in a series, for a study's worker of its own.
+
+    A folder ``out`` that is called "repeat" is that of a repeat scan. ``tell(stage, fraction)`` reports progress. Other
+    parameters, and errors, are those of `register`.
+    """
+    how, missing = registration, series.allow_missing
+    subject = read_subject(load0, subject_files, onto, allow_missing=missing)
+    loaded = read_image(load, allow_missing=missing)
+    chosen = engine_of(how, labelled=True)
+    settings = Settings(chosen, how.align, series.seed, series.threads or 1)
+    model = error_model_of(chosen.name) if how.error_model is None else read_error_model(how.error_model)
+    floor = None if series.repeat is None else read_noise_floor(series.repeat / QUALITY)
+    start = None if series.after is None else spline_in(series.after)
+    more = {"allow_missing": missing, "bone_label": subject_files.bone_label}
+    more["shear_direction_lps"] = onto.plain()["shear_direction"]
+    chained = how.model_copy(update={"chain": series.after is not None})
+    record = record_of(subject, {"loads": [load]}, settings, chained, more)
+    plan = Plan(replace(subject, tissue=subject.body()), settings, Evidence(error_model=model), record, how.twin)
+    with Worker(settings.threads) as worker:
+        done = plan.register(loaded, start, worker, tell, is_repeat=out.name == REPEAT)
+    return plan.write(out, done, floor)[0]
 
 
 def _places(loads: list[Path], scans: Scans) -> dict[str, Path]:
@@ -166,11 +176,6 @@ def _check_start(scans: Scans, engine: Engine) -> None:
         )
 
 
-def _first_guess(scans: Scans, held: Mask | None) -> Deformation | None:
-    """Deformation that the loads start from, without the rigid motion of the mask that is aligned on."""
-    return None if scans.start is None else without_motion(read_any(scans.start, scans.start_frame), held)[0]
-
-
 def _shares(running: Running, loads: int) -> tuple[int, int]:
     """Loads at once, and threads of each."""
     cores = usable_cores()
@@ -181,7 +186,9 @@ def _shares(running: Running, loads: int) -> tuple[int, int]:
 class _Run:
     """The loads of one series: registered in worker processes, each written as soon as it is finished."""
 
-    def __init__(self, out: Path, plan: Plan, images: dict[str, Image], start: Deformation | None, tell: Told) -> None:
+    def __init__(
+        self, out: Path, plan: Plan, images: dict[str, Image], start: Deformation | None, tell: OnProgress
+    ) -> None:
         self.out, self.plan, self.images, self.start, self._tell = out, plan, images, start, tell
         self.cases: dict[str, Case] = {}
         self.failures: dict[str, str] = {}

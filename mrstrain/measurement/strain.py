@@ -1,14 +1,10 @@
 """`strain`: strain maps from a transform or displacement field that any tool has made."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
-from dvc import Deformation, Measurement, Subject, read_displacement, read_transform
-from dvc.atomic_files import write_json
+from dvc import Deformation, Measurement, read_displacement, read_transform
 from dvc.errors import InputError
-from dvc.io.result_folder import PROVENANCE, REPORT
-from mrstrain.measurement.case import Case, write_series_report
+from mrstrain.measurement.case import Case, Series
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, MeshAndAxes, SubjectFiles
 from mrstrain.records.inputs import case_names, make_output, read_subject, refuse_touching_inputs
@@ -27,29 +23,6 @@ def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
     return read_displacement(source, frame=frame)
 
 
-def read_deformation(
-    subject: Subject, deformation: Path, *, frame: str | None, command: str, parameters: Mapping[str, object]
-) -> tuple[Deformation, dict[str, object]]:
-    """Read a deformation of a subject's unloaded image from the file of any tool, with its provenance.
-
-    It maps points of the reference to points of the loaded image, LPS mm.
-    """
-    whole = read_any(deformation, frame)
-    return whole, provenance(command, {**subject.files, "deformation": deformation}, {"frame": frame, **parameters})
-
-
-@dataclass(frozen=True, slots=True)
-class Strained:
-    """Result of `strain`: the folder and the case in it."""
-
-    out: Path
-    case: Case
-
-    def summary(self) -> list[str]:
-        """Summary, a few lines."""
-        return [*self.case.summary(), f"Report: {self.out / REPORT}"]
-
-
 @door
 def strain(
     reference: Path | str,
@@ -59,7 +32,7 @@ def strain(
     subject_files: SubjectFiles,
     frame: Frame | None = None,
     onto: MeshAndAxes,
-) -> Strained:
+) -> Series:
     """Strain maps of a deformation that another tool measured.
 
     Parameters
@@ -80,18 +53,17 @@ def strain(
     target, source = Path(out), Path(deformation)
     subject = read_subject(reference, subject_files, onto)
     parameters = {
+        "frame": frame,
         "bone_label": subject_files.bone_label,
         "plate_normal_lps": subject.plate_normal.tolist(),
         "shear_direction_lps": onto.plain()["shear_direction"],
         "mesh_unit": onto.mesh_unit,
         "mesh_frame": onto.mesh_frame,
     }
-    whole, record = read_deformation(subject, source, frame=frame, command="strain", parameters=parameters)
+    total = read_any(source, frame)
+    record = provenance("strain", {**subject.files, "deformation": source}, parameters)
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"
     refuse_touching_inputs(target, [name], [source, *subject.files.values()])
-    measured = Measurement.from_deformation(whole, subject, name=name)
+    measured = Measurement.from_deformation(total, subject, name=name)
     make_output(target)
-    case = Case.of(measured, target / name, record)
-    write_json(target / PROVENANCE, record)
-    write_series_report(target / REPORT, [case.section], {}, record)
-    return Strained(target, case)
+    return Series.of(target, (Case.of(measured, target / name, record),), {}, record)

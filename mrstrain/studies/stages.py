@@ -34,8 +34,8 @@ class StageResult:
 
 
 def register(tell: Tell, *, load0: Path, load: Path, repeat: Sequence[Path], **options: Any) -> StageResult:
-    """One loaded image against the unloaded one; as `mrstrain.measurement.register_one.register_one`."""
-    from mrstrain.measurement.register_one import register_one
+    """One loaded image against the unloaded one; as `mrstrain.measurement.register.register_one`."""
+    from mrstrain.measurement.register import register_one
 
     case = register_one(load0, load, repeat=next(iter(repeat), None), tell=tell, **options)
     return StageResult(tuple(case.summary()), (case.section,))

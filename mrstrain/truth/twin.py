@@ -6,10 +6,11 @@ from pathlib import Path
 from dvc import Measurement, write_image
 from dvc.atomic_files import write_json
 from dvc.io.result_folder import PROVENANCE
-from mrstrain.measurement.strain import read_deformation
+from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, SubjectFiles
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
 
 _TRUTH = Path("truth") / "twin"
@@ -69,13 +70,13 @@ def twin(
     target, source = Path(out), Path(deformation)
     subject = read_subject(load0, subject_files)
     subject = replace(subject, tissue=subject.body())
-    recorded = {"bone_label": subject_files.bone_label, "seed": seed}
-    whole, record = read_deformation(subject, source, frame=frame, command="twin", parameters=recorded)
+    total = read_any(source, frame)
+    parameters = {"frame": frame, "bone_label": subject_files.bone_label, "seed": seed}
+    record = provenance("twin", {**subject.files, "deformation": source}, parameters)
     refuse_touching_inputs(target, [str(_TRUTH), _IMAGE], [source, *subject.files.values()])
-    measured = Measurement.from_deformation(whole, subject, name=_TRUTH.name)
+    measured = Measurement.from_deformation(total, subject, name=_TRUTH.name)
     make_output(target)
-    acquisition = Acquisition(seed)
-    made = synthetic_warp(subject.reference, subject.body(), whole, acquisition, near=measured.bone_motion)
+    made = synthetic_warp(subject.reference, subject.body(), total, Acquisition(seed), near=measured.bone_motion)
     write_image(target / _IMAGE, made.image)
     (target / _TRUTH).parent.mkdir(exist_ok=True)
     measured.write(target / _TRUTH, record)

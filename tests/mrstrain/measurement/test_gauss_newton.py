@@ -22,8 +22,7 @@ from dvc.registration.gauss_newton.fit import USUAL_BENDING, USUAL_VOLUME
 from dvc.registration.gauss_newton.with_interfaces import USUAL_SKIN
 from dvc.registration.register import Settings
 from mrstrain.measurement.engines import engine_of
-from mrstrain.measurement.register import register as run
-from mrstrain.measurement.register_one import register_one
+from mrstrain.measurement.register import register as run, register_one
 from mrstrain.options.measurement import RegistrationOptions
 from phantoms import Heel, scan
 
@@ -154,7 +153,7 @@ def test_a_repeat_scan_is_smoothed_no_more_than_a_load(written, tmp_path, monkey
         used[float(loaded.values[0, 0, 0])] = settings.engine
         raise RegistrationError("enough")
 
-    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", never)
+    monkeypatch.setattr("mrstrain.measurement.plan.dvc.register", never)
     load0, load1 = read_image(written / "Load0.nii.gz"), read_image(written / "Load1.nii.gz")
     for number, name in ((1.0, "Load1"), (2.0, "again")):
         values = load1.values.copy()
@@ -185,7 +184,7 @@ def test_a_load_of_a_chain_starts_from_the_result_before_it(written, tmp_path, m
         begun_at.append(start)
         raise RegistrationError("enough")
 
-    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", never)
+    monkeypatch.setattr("mrstrain.measurement.plan.dvc.register", never)
     before = written / "out" / "Load1"
     for after in (before, None):
         with pytest.raises(RegistrationError, match="enough"):

@@ -31,8 +31,7 @@ from dvc.registration.gauss_newton.with_interfaces import USUAL_SKIN
 from dvc.registration.register import Settings, register
 from dvc.worker import Worker
 from mrstrain.measurement.engines import engine_of
-from mrstrain.measurement.register import register as run
-from mrstrain.measurement.register_one import register_one
+from mrstrain.measurement.register import register as run, register_one
 from mrstrain.measurement.strain import read_any, strain
 from mrstrain.options.measurement import RegistrationOptions
 from phantoms import Heel, distances_mm, labels_of, random_foot_motion, scan, sliding
@@ -200,7 +199,7 @@ def test_a_study_begins_a_load_where_the_one_before_ended(pad, out, monkeypatch)
         used.update(given)
         raise RegistrationError("enough")
 
-    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", never)
+    monkeypatch.setattr("mrstrain.measurement.plan.dvc.register", never)
     more = {"labels": pad.folder / "tissues.nrrd", "names": pad.folder / "tissues.csv", "bone_label": "bone"}
     with pytest.raises(RegistrationError, match="enough"):
         register_one(

@@ -82,7 +82,7 @@ class Spy:
 def spy(monkeypatch, scans, tiny_pair) -> Spy:
     control = control_grid(tiny_pair.reference.grid, np.full(3, 8.0))
     one = Spy(scans, BSpline(control, spline_through(tiny_pair.deformation, control)), [], [], {})
-    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", one.register)
+    monkeypatch.setattr("mrstrain.measurement.plan.dvc.register", one.register)
 
     def written(_plan: Plan, folder: Path, _done: Registered, _floor: NoiseFloor | None) -> tuple[Case, None]:
         return Case(folder, Section(folder.name, Verdict("trust")), ()), None

@@ -60,7 +60,7 @@ def test_the_bones_motion_is_taken_out_of_it_and_a_repeat_scan_has_none(small_pa
         begun[float(loaded.values[0, 0, 0])] = start
         raise RegistrationError("enough")
 
-    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", never)
+    monkeypatch.setattr("mrstrain.measurement.plan.dvc.register", never)
     monkeypatch.setattr("mrstrain.measurement.strain.read_transform", lambda _: Composed([rising, foot]))
     (tmp_path / "theirs.h5").write_bytes(b"")
     given = {"bone": tmp_path / "bone.nii.gz", "start": tmp_path / "theirs.h5", "repeat": tmp_path / "again.nii.gz"}

@@ -164,7 +164,7 @@ def test_without_a_bone_the_whole_image_is_aligned_on_and_models_are_refused(stu
         asked.update(bone=bone, on=settings.align_on)
         raise RegistrationError("enough")
 
-    monkeypatch.setattr("mrstrain.measurement.plan.register_pair", never)
+    monkeypatch.setattr("mrstrain.measurement.plan.dvc.register", never)
     body = np.zeros(GRID.shape, dtype=bool)
     body[2:-2, 2:-2, 2:-2] = True
     monkeypatch.setattr("dvc.measurement.subject.tissue_mask", lambda _: body)
