@@ -1,5 +1,5 @@
 from . import figures
-from .accuracy_run import RIGID, AccuracyCase, ErrorSamples, distances_mm, measure_run, motion_named
+from .accuracy_run import RIGID, AccuracyCase, ErrorSamples, distances_mm, measure_run
 from .anatomy import FAT_SIGNAL, TISSUES, Heel
 from .bodies import EllipsoidUnion
 from .error_model import CoverageRow, coverage_rows, fit_error_model
@@ -30,6 +30,7 @@ from .heel import (
     labels_of,
     labels_to_mesh,
     misdrawn,
+    motion_named,
     pressed,
     random_foot_motion,
     scan,

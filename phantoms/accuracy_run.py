@@ -1,7 +1,5 @@
 """One run of an accuracy study: a phantom pair is made, registered, and compared with the truth voxel by voxel."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile
@@ -10,6 +8,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -17,31 +16,26 @@ from dvc import Image, LabelMap, Mask, Registration, RigidMotion, Settings, Stra
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.atomic_files import whole_file
 from dvc.deformation.protocol import Motion
-from dvc.errors import InputError
 from dvc.images.noise import signal_to_noise
 from dvc.images.resample import shows
 from dvc.trust.error_model import to_surface_mm
 from dvc.worker import Worker
 from phantoms.anatomy import Heel
 from phantoms.heel import (
-    LOADS,
     covering,
     heel_grid,
     labels_of,
     misdrawn,
-    pressed,
+    motion_named,
     random_foot_motion,
     scan,
-    sliding,
-    swelling,
-    under_load,
+    wavelength_of,
 )
 from phantoms.motions import ShearWave
 
 RIGID = ("bone", "ankle")
 _STRIDE = 2  # neighbouring voxels are strongly correlated: one in eight is kept
 _LAGS = 8
-_WAVE_PEAK = 0.2
 _FORMAT = 2
 
 
@@ -89,7 +83,7 @@ class AccuracyCase:
     @property
     def wavelength_mm(self) -> float | None:
         """Wavelength of a shear wave, mm; None for another motion."""
-        return float(self.motion.removeprefix("wave-")) if self.motion.startswith("wave-") else None
+        return wavelength_of(self.motion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,52 +137,27 @@ class ErrorSamples:
 
     def write(self, path: Path, key: str) -> None:
         """Write to a file (npz) atomically; ``key`` is the hash of what the run was made from."""
-        head = {"format": _FORMAT, "key": key, "case": asdict(self.case)} | {n: getattr(self, n) for n in _NUMBERS}
-        arrays = {n: getattr(self, n) for n in _ARRAYS}
+        numbers, arrays = ({name: getattr(self, name) for name in names} for names in (_NUMBERS, _ARRAYS))
+        head = {"format": _FORMAT, "key": key, "case": asdict(self.case)} | numbers
         with whole_file(path) as part, part.open("wb") as file:
             np.savez_compressed(file, head=np.array(json.dumps(head)), **arrays)
 
     @classmethod
-    def read(cls, path: Path, key: Callable[[AccuracyCase], str]) -> ErrorSamples | None:
+    def read(cls, path: Path, key: Callable[[AccuracyCase], str]) -> Self | None:
         """Read what `write` wrote; None where the file is missing, damaged, or its key is not that of its case."""
         try:
             with np.load(io.BytesIO(path.read_bytes())) as file:
                 head = json.loads(str(file["head"]))
-                if head["format"] != _FORMAT:
-                    return None
                 case = AccuracyCase(**head["case"] | {"spacing_mm": tuple(head["case"]["spacing_mm"])})
-                if head["key"] != key(case):
+                if head["format"] != _FORMAT or head["key"] != key(case):
                     return None
-                numbers = {n: head[n] for n in _NUMBERS}
-                return cls(case=case, **numbers, **{n: file[n] for n in _ARRAYS})
+                return cls(case=case, **{n: head[n] for n in _NUMBERS}, **{n: file[n] for n in _ARRAYS})
         except (OSError, KeyError, ValueError, zipfile.BadZipFile):
             return None
 
 
 _NUMBERS = ("estimated_snr", "seconds", "unknown", "folded")
 _ARRAYS = tuple(f.name for f in fields(ErrorSamples) if f.name not in ("case", *_NUMBERS))
-
-
-def motion_named(heel: Heel, name: str) -> Motion | None:
-    """Motion of a heel's tissue by its name (see `AccuracyCase`); None for "still", InputError for an unknown name."""
-    if name == "still":
-        return None
-    named = {"smooth": pressed, "sliding": lambda heel: sliding(heel, 4.0), "swelling": swelling}
-    if name in named:
-        return named[name](heel)
-    if name in LOADS:
-        return under_load(heel, name)
-    if name.startswith("wave-"):
-        try:
-            wavelength = float(name.removeprefix("wave-"))
-        except ValueError:
-            wavelength = float("nan")
-        # Along the foot, varying across the pad's thickness; each heel has a phase of its own.
-        phase = float(np.random.default_rng([heel.seed, 4]).uniform(0.0, 2.0 * np.pi))
-        return ShearWave(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), wavelength, _WAVE_PEAK, phase)
-    raise InputError(
-        f"No motion '{name}'; there are still, smooth, sliding, swelling, {', '.join(LOADS)} and wave-L (L in mm)."
-    )
 
 
 def measure_run(
@@ -230,12 +199,11 @@ def measure_run(
 
 def _phantom_pair(case: AccuracyCase) -> tuple[Image, Image, LabelMap, Motion | None]:
     """Both images of a case, the label map that the registration is given, and the true motion (None: no strain)."""
-    heel = Heel(case.seed)
-    grid = heel_grid(case.spacing_mm)
+    heel, grid = Heel(case.seed), heel_grid(case.spacing_mm)
     motion = motion_named(heel, case.motion)
     # Each case has noise, bias field and foot motion of its own, the same for all presets.
     number = zlib.crc32(f"{case.motion} {case.spacing_mm} {case.snr}".encode())
-    foot = RigidMotion.identity() if case.wavelength_mm is not None else random_foot_motion(case.seed, number)
+    foot = random_foot_motion(case.seed, number) if case.wavelength_mm is None else RigidMotion.identity()
     exact = labels_of(heel, grid)
     reference = scan(heel, grid, snr=case.snr, number=number)
     loaded_grid = covering(grid, foot.apply(exact.region("bone").points()))

@@ -1,9 +1,8 @@
 """Rounded bodies in closed form: ellipsoids merged by a smooth minimum."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numba import njit, prange
@@ -61,7 +60,7 @@ class EllipsoidUnion:
     @classmethod
     def of(
         cls, ellipsoids: Sequence[tuple[Sequence[float], Sequence[float], Sequence[float]]], sharpness: float = 5.0
-    ) -> EllipsoidUnion:
+    ) -> Self:
         """Merge ellipsoids, each given by centre (mm), semi-axes (mm) and turns about x, y, z (degrees)."""
         from scipy.spatial.transform import Rotation
 

@@ -4,10 +4,8 @@ A flow carries every point along a stationary velocity v for one unit of time. I
 the default. The inverse follows the same velocity backwards.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numba import njit, prange
@@ -314,6 +312,6 @@ class Flow:
         """u(X) (n, 3) mm and H = F - I (n, 3, 3) of the discrete map at points X (n, 3) LPS mm."""
         return self._follow(points_mm, True)
 
-    def inverse(self) -> Flow:
+    def inverse(self) -> Self:
         """Return the backward flow."""
         return replace(self, plate_mm=-self.plate_mm)

@@ -1,8 +1,10 @@
 """A heel under a plate: its motions under Load1 to Load4, and its MR images, with exactly known strain."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
@@ -15,6 +17,7 @@ from dvc.errors import InputError
 from phantoms.anatomy import FAT_SIGNAL, TISSUES, Heel
 from phantoms.bodies import EllipsoidUnion
 from phantoms.flow import Border, Flow
+from phantoms.motions import ShearWave
 from phantoms.mri import acquire, sampled_by
 
 LOADS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
@@ -26,16 +29,17 @@ Chosen for the max. shear of finite-element models of the heel under 140 N, 15 N
 90th percentile of about .20 / .40, .05 / .09, .13 / .35, .06 / .13 in the fat around the calcaneus.
 """
 
-_PRESS_MM = 7.5
-_SHEAR_MM = 5.0
-_SLIDE = 0.1
+_PRESS_MM, _SHEAR_MM, _SLIDE = 7.5, 5.0, 0.1
+_WAVE_PEAK = 0.2
 _CENTRE_MM = np.array([0.0, 0.0, -6.0])
+_CONTACT_MM = (0.0, 15.0, -47.0)  # of the plate and the sole, at size 1
 _MARGIN_MM = 4.0
 _FIELD_MM = (100.8, 112.0, 105.6)
 _FINEST_MM, _COARSEST_MM, _LARGEST = 0.3, 4.0, 512
-_CHUNK = 300_000
-_COARSE = 4
+_CHUNK, _COARSE = 300_000, 4
 _STIFF = ("bone", "ankle", "skin")
+_Triple = tuple[float, float, float]
+_Window = tuple[_Triple, _Triple]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,8 +108,7 @@ def heel_pair(
     """
     if not 0.0 <= load <= 1.5:
         raise InputError(f"The load must lie between 0 and 1.5; got {load}.")
-    heel = Heel(seed)
-    grid = centred_grid(shape, spacing_mm)
+    heel, grid = Heel(seed), centred_grid(shape, spacing_mm)
     foot = foot_motion or default_foot_motion()
     flow = pressed(heel, load) if motion is None else motion
     labels = labels_of(heel, grid)
@@ -204,14 +207,15 @@ def under_plate(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
 
     Its bones are constrained. Both displacements are those of a heel of size 1 and scale with the heel.
     """
-    return Flow(
-        heel.size * np.array([0.0, -shear_mm, press_mm]),
-        pivot_mm=heel.size * np.array([0.0, 15.0, -47.0]),
-        rest=_around_bones(heel),
-        centre_mm=heel.size * np.array([0.0, 14.0, -50.0]),
-        width_mm=heel.size * np.array([51.0, 58.0, 31.0]),
-        steps=max(3, int(np.ceil(1.1 * np.hypot(press_mm, shear_mm)))),
-    )
+    steps = max(3, int(np.ceil(1.1 * np.hypot(press_mm, shear_mm))))
+    window = (0.0, 14.0, -50.0), (51.0, 58.0, 31.0)
+    return _flow(heel, (0.0, -shear_mm, press_mm), _CONTACT_MM, _around_bones(heel), window, steps=steps)
+
+
+def _flow(heel: Heel, plate: _Triple, pivot: _Triple, rest: Border, window: _Window, **more: Any) -> Flow:
+    """Flow whose plate displacement, pivot, and window (centre and width), mm, are those of a heel of size 1."""
+    plate_mm, pivot_mm, centre_mm, width_mm = (heel.size * np.array(at) for at in (plate, pivot, *window))
+    return Flow(plate_mm, pivot_mm, rest, centre_mm, width_mm, **more)
 
 
 def _around_bones(heel: Heel) -> Border:
@@ -226,16 +230,11 @@ def sliding(heel: Heel, shear_mm: float) -> Flow:
     Strain is discontinuous at both interfaces: fat is sheared right up to them. ``shear_mm`` is roughly the
     displacement in the middle of the pad of a heel of size 1, and scales with the heel.
     """
-    return Flow(
-        heel.size * np.array([0.0, _SLIDE * shear_mm, 0.0]),
-        # far above the pad, where the potential is then nearly uniform, so that tissue circulates around it
-        pivot_mm=heel.size * np.array([0.0, 14.0, 50.0]),
-        rest=Border(heel.skeleton, ramp=0.6, order=2),
-        skin=Border(heel.flesh, ramp=0.2, order=2),
-        centre_mm=heel.size * np.array([1.0, 15.0, -32.0]),
-        width_mm=heel.size * np.array([22.0, 26.0, 17.0]),
-        steps=max(3, int(np.ceil(1.25 * shear_mm))),
-    )
+    # The pivot is far above the pad, where the potential is then nearly uniform, so that tissue circulates around it.
+    pivot, window = (0.0, 14.0, 50.0), ((1.0, 15.0, -32.0), (22.0, 26.0, 17.0))
+    rest, skin = Border(heel.skeleton, ramp=0.6, order=2), Border(heel.flesh, ramp=0.2, order=2)
+    steps = max(3, int(np.ceil(1.25 * shear_mm)))
+    return _flow(heel, (0.0, _SLIDE * shear_mm, 0.0), pivot, rest, window, skin=skin, steps=steps)
 
 
 def swelling(heel: Heel) -> Flow:
@@ -244,14 +243,8 @@ def swelling(heel: Heel) -> Flow:
     Bones are constrained, and volume does not change in or at them. Tissue below the calcaneus is carried forward and
     slightly down, which compresses the tissue in front of it and expands that behind and above it.
     """
-    return Flow(
-        heel.size * np.array([0.0, -2.4, -0.8]),
-        pivot_mm=heel.size * np.array([0.0, 15.0, -47.0]),
-        rest=_around_bones(heel),
-        centre_mm=heel.size * np.array([0.0, 8.0, -40.0]),
-        width_mm=heel.size * np.array([15.0, 14.0, 15.0]),
-        keeps_volume=False,
-    )
+    window = (0.0, 8.0, -40.0), (15.0, 14.0, 15.0)
+    return _flow(heel, (0.0, -2.4, -0.8), _CONTACT_MM, _around_bones(heel), window, keeps_volume=False)
 
 
 def under_load(heel: Heel, load: str) -> Motion:
@@ -260,6 +253,37 @@ def under_load(heel: Heel, load: str) -> Motion:
         raise InputError(f"No load '{load}'; there are {', '.join(LOADS)}.")
     press, shear, slide = LOADS[load]
     return Composed([sliding(heel, slide), under_plate(heel, press_mm=press, shear_mm=shear)])
+
+
+_MOTIONS: Mapping[str, Callable[[Heel], Motion | None]] = {
+    "still": lambda _: None,
+    "smooth": pressed,
+    "sliding": partial(sliding, shear_mm=4.0),
+    "swelling": swelling,
+    **{load: partial(under_load, load=load) for load in LOADS},
+}
+
+
+def motion_named(heel: Heel, name: str) -> Motion | None:
+    """Motion of a heel's tissue by its name (see `AccuracyCase`); None for "still", InputError for an unknown name."""
+    if name in _MOTIONS:
+        return _MOTIONS[name](heel)
+    wavelength = wavelength_of(name)
+    if wavelength is None:
+        raise InputError(f"No motion '{name}'; there are {', '.join(_MOTIONS)} and wave-L (L in mm).")
+    # Along the foot, varying across the pad's thickness; each heel has a phase of its own.
+    phase = float(np.random.default_rng([heel.seed, 4]).uniform(0.0, 2.0 * np.pi))
+    return ShearWave(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), wavelength, _WAVE_PEAK, phase)
+
+
+def wavelength_of(motion: str) -> float | None:
+    """L, mm, of a motion named wave-L, NaN where that is no number; None for another motion."""
+    if not motion.startswith("wave-"):
+        return None
+    try:
+        return float(motion.removeprefix("wave-"))
+    except ValueError:
+        return float("nan")
 
 
 def octants(heel: Heel, grid: Grid, motion: Motion | None, foot_motion: RigidMotion) -> FloatArray:
@@ -304,8 +328,7 @@ def centred_grid(shape: tuple[int, int, int], spacing_mm: float | Sequence[float
     spacing = np.asarray(spacing_mm, dtype=np.float64)
     if spacing.shape not in {(), (3,)}:
         raise InputError(f"Voxel spacing must be one length or three, mm; got {spacing_mm}.")
-    spacing = np.broadcast_to(spacing, (3,))
-    return Grid(shape, spacing, _CENTRE_MM - 0.5 * (np.array(shape) - 1) * spacing)
+    return Grid(shape, np.broadcast_to(spacing, 3), _CENTRE_MM - 0.5 * (np.array(shape) - 1) * spacing)
 
 
 def heel_grid(spacing_mm: float | Sequence[float], size: float = 1.0) -> Grid:

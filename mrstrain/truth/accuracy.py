@@ -4,34 +4,25 @@ import hashlib
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-import phantoms
 from dvc import engine_named
-from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError, MrstrainError
-from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import OnProgress
-from mrstrain.records.provenance import provenance
-from mrstrain.truth.accuracy_page import write_accuracy_report
+from mrstrain.truth.accuracy_study import AccuracyStudy
 from phantoms import AccuracyCase, ErrorSamples, Heel, heel_grid, measure_run, motion_named
 
 MOTIONS = ("still", "smooth", "sliding", "Load1", "Load2", "Load3", "Load4")
 WAVES = tuple(f"wave-{length}" for length in (6, 8, 10, 12, 16, 20, 24, 48))
 CONDITIONS: tuple[tuple[tuple[float, float, float], float], ...] = (
-    ((0.8, 0.8, 0.8), 25.0),
-    ((0.8, 0.8, 0.8), 12.0),
-    ((0.8, 0.8, 0.8), 50.0),
-    ((1.2, 1.2, 1.2), 25.0),
-    ((0.8, 0.8, 1.6), 25.0),
+    *(((0.8, 0.8, 0.8), snr) for snr in (25.0, 12.0, 50.0)),
+    *((spacing, 25.0) for spacing in ((1.2, 1.2, 1.2), (0.8, 0.8, 1.6))),
 )
 """Voxel size (mm) and signal-to-noise ratio of the default study."""
 SEEDS = (1, 2)
@@ -40,44 +31,6 @@ LABELS_OFF = (0, 1, -1)
 """Voxels by which bones and skin are too large in the label maps, in turn, for the engine that relies on them."""
 
 _MEGABYTES = 5.0  # measured for one run's samples at 0.8 mm
-
-
-@dataclass(frozen=True, slots=True)
-class AccuracyStudy:
-    """Result of `accuracy`.
-
-    Attributes
-    ----------
-    out : Path
-        Folder of ``errors.csv``, ``zero_strain.csv``, ``resolution.csv``, ``coverage.csv``, an error model of each
-        preset and ``report.html``.
-    errors, floors, resolution : tuple of rows
-        Rows of the tables.
-    failures : dict
-        Name of each case without a result, and why.
-    """
-
-    out: Path
-    errors: tuple[phantoms.ErrorRow, ...]
-    floors: tuple[phantoms.FloorRow, ...]
-    resolution: tuple[phantoms.ResolutionRow, ...]
-    failures: dict[str, str]
-
-    @property
-    def complete(self) -> bool:
-        """Whether no case failed."""
-        return not self.failures
-
-    def summary(self) -> list[str]:
-        """Summary, a few lines."""
-        lines = [
-            f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {r.motion}, {r.tissue}: max. shear RMSE "
-            f"{r.shear_rmse:.4f}, bias {r.shear_bias:+.4f}; displacement RMSE {r.u_rmse_mm:.3f} mm"
-            for r in self.errors
-            if r.by == "all" and r.tissue == "fat"
-        ]
-        lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
-        return [*lines, f"Report: {self.out / REPORT}"]
 
 
 def accuracy_cases(
@@ -149,8 +102,7 @@ def accuracy(
         )
     for case in wanted:
         _check(case)
-    target = Path(out)
-    folder = target / "runs"
+    target, folder = Path(out), Path(out) / "runs"
     runs = _finished(folder)
     _refuse_one_name_for_two([*(run.case for run in runs.values()), *wanted])
     missing = [case for case in wanted if case.name not in runs]
@@ -166,7 +118,7 @@ def accuracy(
     failures = _measure_all(missing, at_once, folder, runs, progress or (lambda *_: None))
     if not runs:
         raise MrstrainError("No case could be measured. " + " ".join(f"{n}: {r}" for n, r in failures.items()))
-    return _write(target, [runs[name] for name in sorted(runs)], failures)
+    return AccuracyStudy.of(target, [runs[name] for name in sorted(runs)], failures)
 
 
 def _finished(folder: Path) -> dict[str, ErrorSamples]:
@@ -199,19 +151,15 @@ def _check(case: AccuracyCase) -> None:
     if not 1.0 <= case.snr <= 1000.0:
         raise InputError(f"The SNR must lie between 1 and 1000; got {case.snr}.")
     motion = motion_named(Heel(case.seed), case.motion)
-    if motion is None:
-        return
     points = np.random.default_rng(0).uniform([-32, -50, -44], [32, 44, 40], (2000, 3))
-    _, H = motion.evaluate(points)
-    lowest = float(np.linalg.det(H + np.eye(3)).min())
+    lowest = 1.0 if motion is None else float(np.linalg.det(motion.evaluate(points)[1] + np.eye(3)).min())
     if not lowest > 0.0:
         raise InputError(f"The motion '{case.motion}' folds (det F = {lowest:.2f}); no image can show it.")
 
 
 def _key(case: AccuracyCase) -> str:
     """Hash of what a run depends on besides its case: preset and software."""
-    text = engine_named(case.preset).text
-    return hashlib.sha256(f"{text}; {software_key('phantoms')}".encode()).hexdigest()
+    return hashlib.sha256(f"{engine_named(case.preset).text}; {software_key('phantoms')}".encode()).hexdigest()
 
 
 def _measure_all(
@@ -239,44 +187,3 @@ def _measure_all(
 
     each_in_workers(cases, measure_one, at_once=at_once, threads=1)
     return failures
-
-
-def _write(target: Path, runs: Sequence[ErrorSamples], failures: dict[str, str]) -> AccuracyStudy:
-    errors, floors, resolution = (
-        tuple(phantoms.error_rows(runs)),
-        tuple(phantoms.floor_rows(runs)),
-        tuple(phantoms.resolution_rows(runs)),
-    )
-    study, coverage = AccuracyStudy(target, errors, floors, resolution, failures), phantoms.coverage_rows(runs)
-    tables: tuple[tuple[str, type[Any], Sequence[Any]], ...] = (
-        ("errors", phantoms.ErrorRow, errors),
-        ("zero_strain", phantoms.FloorRow, floors),
-        ("resolution", phantoms.ResolutionRow, resolution),
-        ("coverage", phantoms.CoverageRow, coverage),
-        ("runs", phantoms.RunRow, phantoms.run_rows(runs)),
-    )
-    for name, kind, rows in tables:
-        write_csv(target / f"{name}.csv", [f.name for f in fields(kind)], map(astuple, rows))
-    presets = {preset: engine_named(preset).text for preset in dict.fromkeys(r.case.preset for r in runs)}
-    for preset, text in presets.items():
-        some = [r for r in runs if r.case.preset == preset and r.case.keeps_volume and r.case.wavelength_mm is None]
-        if some:
-            model = phantoms.fit_error_model(some, text, _source(some))
-            model.write(target / f"error_model_{Path(preset).stem}.json")
-    seconds = {r.case.name: round(r.seconds, 1) for r in runs}
-    parameters = {"cases": list(seconds), "failures": failures, "presets": presets, "seconds_of_registration": seconds}
-    record = provenance("accuracy", {}, parameters)
-    write_json(target / PROVENANCE, record)
-    write_accuracy_report(target / REPORT, errors, floors, resolution, coverage, failures, record)
-    return study
-
-
-def _source(runs: Sequence[ErrorSamples]) -> str:
-    """A sentence on the registrations that an error model is fitted to."""
-    seeds = sorted({r.case.seed for r in runs})
-    motions = ", ".join(dict.fromkeys(r.case.motion for r in runs))
-    source = f"{len(runs)} registrations of phantom heels, seeds {seeds}, motions {motions}"
-    if any(r.case.labels_off for r in runs):
-        off = ", ".join(f"{by:+d}" for by in sorted({r.case.labels_off for r in runs}))
-        source += f", bones and skin in label maps too large by {off} voxels"
-    return source

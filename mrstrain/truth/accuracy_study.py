@@ -1,13 +1,19 @@
-"""The report of an accuracy study: tables, figures, and how to read them."""
+"""Result of an accuracy study: its tables, an error model of each preset, and a report that says how to read them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass, fields
 from operator import attrgetter
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Self, TypeVar
 
+import phantoms
+from dvc import engine_named
+from dvc.atomic_files import write_csv, write_json
+from dvc.io.result_folder import PROVENANCE, REPORT
 from dvc.report.page import Picture, Section, Table, record_lines, write_report
 from dvc.trust.error_model import POOLED
-from phantoms import CoverageRow, ErrorRow, FloorRow, ResolutionRow, figures, wavelength_recovered
+from mrstrain.records.provenance import provenance
+from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow, figures, wavelength_recovered
 
 _R = TypeVar("_R", ErrorRow, ResolutionRow)
 _CLOSING = (
@@ -31,25 +37,94 @@ _CLOSING = (
 )
 
 
-def write_accuracy_report(
-    path: Path,
-    errors: Sequence[ErrorRow],
-    floors: Sequence[FloorRow],
-    resolution: Sequence[ResolutionRow],
-    coverage: Sequence[CoverageRow],
-    failures: Mapping[str, str],
-    record: Mapping[str, object],
-) -> None:
-    """Write the report of an accuracy study, one self-contained page."""
-    sections = [_condition_section(*of_one) for of_one in _by_condition(errors, floors)]
-    if resolution:
-        sections.append(_resolution_section(floors, resolution))
-    if coverage:
-        sections.append(_coverage_section(coverage))
-    if failures:
-        table = Table("Failures", ("case", "reason"), tuple(failures.items()))
-        sections.append(Section("Without a result", tables=(table,)))
-    write_report(path, "Accuracy of registration presets", None, sections, _CLOSING, record_lines(record))
+@dataclass(frozen=True, slots=True)
+class AccuracyStudy:
+    """Result of `accuracy`.
+
+    Attributes
+    ----------
+    out : Path
+        Folder of ``errors.csv``, ``zero_strain.csv``, ``resolution.csv``, ``coverage.csv``, an error model of each
+        preset and ``report.html``.
+    errors, floors, resolution, coverage : tuple of rows
+        Rows of the tables.
+    failures : dict
+        Name of each case without a result, and why.
+    """
+
+    out: Path
+    errors: tuple[ErrorRow, ...]
+    floors: tuple[FloorRow, ...]
+    resolution: tuple[ResolutionRow, ...]
+    coverage: tuple[CoverageRow, ...]
+    failures: dict[str, str]
+
+    @classmethod
+    def of(cls, out: Path, runs: Sequence[ErrorSamples], failures: dict[str, str]) -> Self:
+        """Make the tables of all runs, and write them with error models, provenance and a self-contained report."""
+        errors, floors = tuple(phantoms.error_rows(runs)), tuple(phantoms.floor_rows(runs))
+        resolution, coverage = tuple(phantoms.resolution_rows(runs)), tuple(phantoms.coverage_rows(runs))
+        tables: dict[str, tuple[type[Any], Sequence[Any]]] = {
+            "errors": (ErrorRow, errors),
+            "zero_strain": (FloorRow, floors),
+            "resolution": (ResolutionRow, resolution),
+            "coverage": (CoverageRow, coverage),
+            "runs": (phantoms.RunRow, phantoms.run_rows(runs)),
+        }
+        for name, (kind, rows) in tables.items():
+            write_csv(out / f"{name}.csv", [f.name for f in fields(kind)], map(astuple, rows))
+        presets = {preset: engine_named(preset).text for preset in dict.fromkeys(r.case.preset for r in runs)}
+        for preset, text in presets.items():
+            some = [r for r in runs if r.case.preset == preset and r.case.keeps_volume and r.case.wavelength_mm is None]
+            if some:
+                model = phantoms.fit_error_model(some, text, _source(some))
+                model.write(out / f"error_model_{Path(preset).stem}.json")
+        seconds = {r.case.name: round(r.seconds, 1) for r in runs}
+        about = {"cases": list(seconds), "failures": failures, "presets": presets, "seconds_of_registration": seconds}
+        record = provenance("accuracy", {}, about)
+        write_json(out / PROVENANCE, record)
+        study = cls(out, errors, floors, resolution, coverage, failures)
+        title = "Accuracy of registration presets"
+        write_report(out / REPORT, title, None, study._sections(), _CLOSING, record_lines(record))
+        return study
+
+    @property
+    def complete(self) -> bool:
+        """Whether no case failed."""
+        return not self.failures
+
+    def summary(self) -> list[str]:
+        """Summary, a few lines."""
+        lines = [
+            f"{r.preset}, {r.voxel_mm} mm, SNR {r.snr:g}, {r.motion}, {r.tissue}: max. shear RMSE "
+            f"{r.shear_rmse:.4f}, bias {r.shear_bias:+.4f}; displacement RMSE {r.u_rmse_mm:.3f} mm"
+            for r in self.errors
+            if r.by == "all" and r.tissue == "fat"
+        ]
+        lines += [f"{name}: FAILED. {reason}" for name, reason in self.failures.items()]
+        return [*lines, f"Report: {self.out / REPORT}"]
+
+    def _sections(self) -> list[Section]:
+        sections = [_condition_section(*of_one) for of_one in _by_condition(self.errors, self.floors)]
+        if self.resolution:
+            sections.append(_resolution_section(self.floors, self.resolution))
+        if self.coverage:
+            sections.append(_coverage_section(self.coverage))
+        if self.failures:
+            table = Table("Failures", ("case", "reason"), tuple(self.failures.items()))
+            sections.append(Section("Without a result", tables=(table,)))
+        return sections
+
+
+def _source(runs: Sequence[ErrorSamples]) -> str:
+    """A sentence on the registrations that an error model is fitted to."""
+    seeds = sorted({r.case.seed for r in runs})
+    motions = ", ".join(dict.fromkeys(r.case.motion for r in runs))
+    source = f"{len(runs)} registrations of phantom heels, seeds {seeds}, motions {motions}"
+    if any(r.case.labels_off for r in runs):
+        off = ", ".join(f"{by:+d}" for by in sorted({r.case.labels_off for r in runs}))
+        source += f", bones and skin in label maps too large by {off} voxels"
+    return source
 
 
 def _named(row: ResolutionRow | CoverageRow) -> tuple[str, str, float]:
