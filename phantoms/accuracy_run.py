@@ -110,8 +110,6 @@ class ErrorSamples:
         Mean of the absolute values of the six components of the measured Green-Lagrange strain.
     true_slope, slope : (n,)
         H_dn = d . (grad u) n of a shear wave, true and measured; zero for another motion.
-    voxel : (n, 3)
-        Index on the grid of the unloaded image.
     correlation, lag_mm : (lags,)
         Autocorrelation of the error of the maximum shear strain in soft tissue, and its distances: multiples of two
         voxels' longest edge, along the axes that have it, mm.
@@ -131,7 +129,6 @@ class ErrorSamples:
     mean_abs_strain: Float32Array
     true_slope: Float32Array
     slope: Float32Array
-    voxel: IntArray
     correlation: FloatArray
     lag_mm: FloatArray
 
@@ -158,6 +155,7 @@ class ErrorSamples:
 
 _NUMBERS = ("estimated_snr", "seconds", "unknown", "folded")
 _ARRAYS = tuple(f.name for f in fields(ErrorSamples) if f.name not in ("case", *_NUMBERS))
+SAMPLED = _ARRAYS[:-2]  # with a value for each sample: all but the autocorrelation and its lags
 
 
 def measure_run(
@@ -248,7 +246,6 @@ def _sampled_errors(
         mean_abs_strain=single(np.abs(components).mean(axis=1)),
         true_slope=single(np.einsum("i,nij,j->n", d, true_H, n)),
         slope=single(np.einsum("i,nij,j->n", d, H, n)),
-        voxel=np.argwhere(sampled)[known].astype(np.int64),
         correlation=correlation,
         lag_mm=lag_mm,
     )

@@ -60,17 +60,10 @@ _OUTLINE = (
     ((0.0, 1.0, 62.0), (25.0, 34.5, 78.0), (0.0, 0.0, 0.0)),  # ankle and leg
     ((1.0, -46.0, -2.5), (29.0, 74.0, 30.5), (5.0, 0.0, 0.0)),  # midfoot
 )
-_OUTLINE_NAMES = ("heel", "leg", "midfoot")
-_SOLE = {"heel", "midfoot"}
+_OF_SOLE = (True, False, True)  # which parts of the outline move with the pad's thickness
 _PAD_MM = 18.0
 _SHARP = {"bone": 5.0, "ankle": 8.0, "muscle": 8.0, "outline": 3.5, "flesh": 3.5}
-_RANGES = {
-    "size": (0.7, 1.3),
-    "pad_mm": (10.0, 26.0),
-    "skin_mm": (1.0, 4.0),
-    "cortex_mm": (0.5, 3.0),
-    "lobule_mm": (2.0, 12.0),
-}
+_RANGES = dict(size=(0.7, 1.3), pad_mm=(10.0, 26.0), skin_mm=(1.0, 4.0), cortex_mm=(0.5, 3.0), lobule_mm=(2.0, 12.0))
 _Triple = tuple[float, float, float]
 
 
@@ -126,23 +119,15 @@ class Heel:
         random = np.random.default_rng([self.seed, 1])
 
         def vary(shapes: tuple[tuple[_Triple, _Triple, _Triple], ...], jitter: float) -> list[Any]:
-            return [
-                (
-                    np.add(centre, jitter * random.uniform(-1.0, 1.0, 3)),
-                    np.multiply(axes, 1.0 + 0.02 * random.uniform(-1.0, 1.0, 3)),
-                    turns,
-                )
-                for centre, axes, turns in shapes
-            ]
+            drawn = ((centre, axes, turns, random.uniform(-1.0, 1.0, (2, 3))) for centre, axes, turns in shapes)
+            return [(np.add(c, jitter * r[0]), np.multiply(a, 1.0 + 0.02 * r[1]), turns) for c, a, turns, r in drawn]
 
         bones = {"bone": vary(_CALCANEUS, 0.6), "ankle": vary(_ANKLE_BONES, 0.6)}
         varied = bones | {"muscle": vary(_MUSCLES, 0.6), "outline": vary(_OUTLINE, 0.4)}
         # Only the sole moves with the pad's thickness: half in the centre, half in the semi-axis leaves the top alone.
-        lower = np.array([0.0, 0.0, 0.5 * (self.pad_mm - _PAD_MM)])
-        varied["outline"] = [
-            (centre - lower, axes + lower, turns) if name in _SOLE else (centre, axes, turns)
-            for name, (centre, axes, turns) in zip(_OUTLINE_NAMES, varied["outline"], strict=True)
-        ]
+        lower = np.outer(_OF_SOLE, [0.0, 0.0, 0.5 * (self.pad_mm - _PAD_MM)])
+        outline = zip(varied["outline"], lower, strict=True)
+        varied["outline"] = [(centre - down, axes + down, turns) for (centre, axes, turns), down in outline]
         # The skin's inner surface: the same shapes with semi-axes shorter by its thickness, which is that exactly at
         # their ends and a little less between.
         skin = self.skin_mm / self.size

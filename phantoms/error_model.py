@@ -202,9 +202,8 @@ def _with_prior(own: FloatArray, prior: FloatArray) -> FloatArray:
 
 def _correlation_mm(runs: Sequence[ErrorSamples]) -> float:
     """Distance at which the mean autocorrelation of the error falls to 1/e, mm."""
-    mean = np.mean([r.correlation for r in runs], axis=0)
+    values = np.concatenate([[1.0], np.mean([r.correlation for r in runs], axis=0)])
     lags = np.concatenate([[0.0], runs[0].lag_mm])
-    values = np.concatenate([[1.0], mean])
     below = np.flatnonzero(values < np.exp(-1.0))
     if not len(below):
         return float(lags[-1])

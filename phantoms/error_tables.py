@@ -12,7 +12,7 @@ from dvc import Deformation, LabelMap, StrainField, evaluate_on_grid
 from dvc.arrays import BoolArray, IntArray
 from dvc.errors import GeometryError
 from dvc.trust.error_model import POOLED
-from phantoms.accuracy_run import RIGID, ErrorSamples
+from phantoms.accuracy_run import RIGID, SAMPLED, ErrorSamples
 from phantoms.anatomy import TISSUES
 
 SOFT = tuple(name for name in TISSUES.values() if name not in RIGID)
@@ -71,10 +71,9 @@ def errors_by_tissue(
     GeometryError
         If ``where`` is not on the labels' grid.
     """
-    if where.shape != labels.grid.shape:
-        raise GeometryError(
-            f"The voxels to compare have shape {where.shape}; the labels' grid has {labels.grid.shape}."
-        )
+    shape = labels.grid.shape
+    if where.shape != shape:
+        raise GeometryError(f"The voxels to compare have shape {where.shape}; the labels' grid has {shape}.")
     inside = where & (labels.labels > 0)
     true_u, true_H = evaluate_on_grid(truth, labels.grid, inside)
     u, H = evaluate_on_grid(measured, labels.grid, inside)
@@ -86,20 +85,13 @@ def errors_by_tissue(
         kept = (labels.labels[inside] == number) & strain.valid
         if not kept.any():
             continue
-        rows.append(
-            TissueError(
-                tissue=tissue,
-                voxels=int(np.count_nonzero(kept)),
-                true_p50=float(np.median(true.max_shear[kept])),
-                true_p95=float(np.percentile(true.max_shear[kept], 95)),
-                shear_rmse=float(np.sqrt(np.mean(error[kept] ** 2))),
-                shear_bias=float(error[kept].mean()),
-                shear_error_p95=float(np.percentile(np.abs(error[kept]), 95)),
-                u_p50_mm=float(np.median(distance[kept])),
-                u_p95_mm=float(np.percentile(distance[kept], 95)),
-                folded=int(np.count_nonzero(strain.jacobian[kept] <= 0)),
-            )
-        )
+        shear, off, length = true.max_shear[kept], error[kept], distance[kept]
+        of_true = np.median(shear), np.percentile(shear, 95)
+        of_shear = np.sqrt(np.mean(off**2)), off.mean(), np.percentile(np.abs(off), 95)
+        of_u = np.median(length), np.percentile(length, 95)
+        figures: list[Any] = [float(value) for value in (*of_true, *of_shear, *of_u)]
+        figures.append(int(np.count_nonzero(strain.jacobian[kept] <= 0)))
+        rows.append(TissueError(tissue, len(shear), *figures))
     return tuple(rows)
 
 
@@ -283,11 +275,7 @@ def of_tissue(numbers: IntArray, name: str) -> BoolArray:
 
 def _pooled(runs: Sequence[ErrorSamples]) -> _Pool:
     """Samples of several runs, one after the other, by the names of `ErrorSamples`."""
-    names = (
-        "tissue", "to_bone_mm", "to_border_mm", "true_shear", "shear", "u_error_mm", "mean_abs_strain", "true_slope",
-        "slope",
-    )  # fmt: skip
-    return {name: np.concatenate([getattr(run, name) for run in runs]) for name in names} if runs else {}
+    return {name: np.concatenate([getattr(run, name) for run in runs]) for name in SAMPLED} if runs else {}
 
 
 def _bins(pool: _Pool, of_tissue: BoolArray) -> Iterator[tuple[tuple[str, float, float], BoolArray]]:

@@ -32,7 +32,7 @@ def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
             bias.append(float(np.average([r.shear_bias for r in of_bin], weights=weight)))
         if not at:
             continue
-        colour = REGION_COLOURS[number % len(REGION_COLOURS)]
+        colour = REGION_COLOURS[number]
         axes.plot(at, rmse, color=colour, marker=_MARKS[number], linewidth=1.8, label=tissue)
         axes.plot(at, bias, color=colour, linestyle="--", marker=".", linewidth=1.2)
     axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)

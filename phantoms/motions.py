@@ -3,8 +3,6 @@
 Frame LPS, lengths in mm, reference configuration.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -183,7 +181,7 @@ class Bending:
         F[:, 2, 2] = 1.0
         return (moved - local) @ A.T, A @ F @ A.T - np.eye(3)
 
-    def inverse(self) -> _Straightening:
+    def inverse(self) -> "_Straightening":
         """The map back: the arc made straight."""
         return _Straightening(self)
 

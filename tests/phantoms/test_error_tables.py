@@ -55,7 +55,6 @@ def samples(
         mean_abs_strain=np.full(count, 0.02, dtype=np.float32),
         true_slope=slope,
         slope=np.float32(0.8) * slope,
-        voxel=np.zeros((count, 3), dtype=np.int64),
         correlation=np.exp(-np.arange(1.0, 9.0) / 2.0),
         lag_mm=1.6 * np.arange(1.0, 9.0),
     )
