@@ -74,8 +74,7 @@ def sampled_by(grid: Grid) -> Grid:
     if (parts == 1).all():
         return grid
     i, j, k = (int(n) for n in np.array(grid.shape) * parts)
-    first = grid.points_at(0.5 / parts - 0.5)
-    return Grid((i, j, k), grid.spacing_mm / parts, first, grid.direction)
+    return Grid((i, j, k), grid.spacing_mm / parts, grid.points_at(0.5 / parts - 0.5), grid.direction)
 
 
 def _octants(signal: Callable[[FloatArray], FloatArray], grid: Grid) -> FloatArray:

@@ -5,6 +5,7 @@ it like texture. It is therefore removed before the warp and drawn anew afterwar
 `synthetic_warp`.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,12 +21,9 @@ from dvc.images.noise import noise_sd
 from dvc.images.resample import fill_missing
 from phantoms.mri import rician, sensitivity
 
-_TOLERANCE_MM = 1e-7
-_ROUNDS = 60
-_CHUNK = 200_000
-_MARGIN_MM = 12.0
-_RIM_VOXELS = 2
-_FEW = 1000
+_TOLERANCE_MM, _ROUNDS = 1e-7, 60
+_MARGIN_MM, _RIM_VOXELS = 12.0, 2
+_CHUNK, _FEW = 200_000, 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +190,10 @@ def _denoised(image: Image, tissue: Mask, sigma: float) -> Image:
 def _warped(clean: Image, tissue: Mask, motion: Deformation, near: RigidMotion, grid: Grid) -> Float32Array:
     """The clean image at the material points of a grid's voxels, (ni, nj, nk); zero outside the tissue."""
     coefficients = spline_filter(clean.values.astype(np.float64), order=3, mode="mirror")
-    back = _known_inverse(motion)
+    back = None
+    if isinstance(motion, Motion):
+        with suppress(InputError):  # a composition with a part that has no closed inverse
+            back = motion.inverse()
     # Newton's method starts at the voxel whose deformed position is nearest; one voxel in eight is close enough.
     thin = np.zeros_like(tissue.inside)
     thin[::2, ::2, ::2] = tissue.inside[::2, ::2, ::2]
@@ -216,25 +217,15 @@ def _warped(clean: Image, tissue: Mask, motion: Deformation, near: RigidMotion, 
     return np.maximum(out, 0.0).reshape(grid.shape)
 
 
-def _known_inverse(motion: Deformation) -> Deformation | None:
-    try:
-        return motion.inverse() if isinstance(motion, Motion) else None
-    except InputError:  # a composition with a part that has no closed inverse
-        return None
-
-
 def _near(tissue: Mask, points_mm: FloatArray, near: RigidMotion) -> BoolArray:
     """Which points (n, 3) may show tissue: those within 30 mm of its bounding box, moved rigidly."""
-    X = near.inverse().apply(points_mm)
-    inside = tissue.points()
-    low, high = inside.min(axis=0) - 30.0, inside.max(axis=0) + 30.0
-    return np.asarray(((low <= X) & (high >= X)).all(axis=1))
+    X, inside = near.inverse().apply(points_mm), tissue.points()
+    return np.asarray(((inside.min(axis=0) - 30.0 <= X) & (inside.max(axis=0) + 30.0 >= X)).all(axis=1))
 
 
 def _in_mask(tissue: Mask, points_mm: FloatArray) -> BoolArray:
     """Which points (n, 3) lie in the mask, by nearest voxel."""
     at = np.rint(tissue.grid.indices_of(points_mm)).astype(np.int64)
     shape = np.array(tissue.grid.shape)
-    known = np.all((at >= 0) & (at < shape), axis=1)
     held = tissue.inside[tuple(np.clip(at, 0, shape - 1).T)]
-    return np.asarray(known & held)
+    return np.asarray(held & np.all((at >= 0) & (at < shape), axis=1))

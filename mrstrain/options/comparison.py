@@ -25,10 +25,7 @@ class ModelReading(Options):
 def _rising(strains: tuple[float, float]) -> tuple[float, float]:
     from validate import check_range
 
-    try:
-        check_range(strains)
-    except ValueError as wrong:
-        raise ValueError(str(wrong)) from wrong
+    check_range(strains)
     return strains
 
 

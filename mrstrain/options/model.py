@@ -25,21 +25,9 @@ class Cli:
     times: float = 1.0  # factor from the option's unit to the field's
 
 
-def _number(given: Any) -> Any:
-    """A number of NumPy as Python's; anything else as it is, for the check that follows."""
-    return float(given) if not isinstance(given, bool) and isinstance(given, numbers.Real) else given
-
-
-def _whole(given: Any) -> Any:
-    return int(given) if not isinstance(given, bool) and isinstance(given, numbers.Integral) else given
-
-
-def _listed(given: Any) -> object:
-    return given.tolist() if hasattr(given, "tolist") else given
-
-
-def _text(given: object) -> object:
-    return fspath(given) if isinstance(given, PathLike) else given
+def _of_numpy(kind: type, own: type) -> BeforeValidator:
+    """A number of NumPy as Python's own; anything else as it is, for the check that follows."""
+    return BeforeValidator(lambda v: own(v) if isinstance(v, kind) and not isinstance(v, bool) else v)
 
 
 def _once(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -48,15 +36,14 @@ def _once(names: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
-Real = Annotated[float, BeforeValidator(_number), Strict(), Field(allow_inf_nan=False)]
+Real = Annotated[float, _of_numpy(numbers.Real, float), Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[Real, Field(gt=0.0)]
 NotNegative = Annotated[Real, Field(ge=0.0)]
-Count = Annotated[int, BeforeValidator(_whole), Strict(), Field(ge=1)]
+Count = Annotated[int, _of_numpy(numbers.Integral, int), Strict(), Field(ge=1)]
 Flag = Annotated[bool, Strict()]
-Vector = Annotated[tuple[Real, Real, Real], BeforeValidator(_listed)]
-Text = Annotated[str, BeforeValidator(_text)]
+Vector = Annotated[tuple[Real, Real, Real], BeforeValidator(lambda v: v.tolist() if hasattr(v, "tolist") else v)]
+Text = Annotated[str, BeforeValidator(lambda v: fspath(v) if isinstance(v, PathLike) else v)]
 Names = Annotated[tuple[Text, ...], AfterValidator(_once)]
-
 
 _M = TypeVar("_M", bound="Options")
 
@@ -91,7 +78,9 @@ class Options(BaseModel):
 
     def located(self, folder: Path) -> Self:
         """The same options with every path relative to a folder."""
-        return self.model_copy(update={name: _located(value, folder) for name, value in self if _paths(value)})
+        there = {name: tuple(folder / path for path in paths) for name, paths in self.files.items()}
+        lone = {name: at[0] for name, at in there.items() if not isinstance(getattr(self, name), tuple)}
+        return self.model_copy(update=there | lone)
 
     @property
     def files(self) -> dict[str, list[Path]]:
@@ -114,10 +103,6 @@ class Options(BaseModel):
 
 def _paths(value: Any) -> list[Path]:
     return [one for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, Path)]
-
-
-def _located(value: Any, folder: Path) -> Any:
-    return tuple(folder / one for one in value) if isinstance(value, tuple) else folder / value
 
 
 def reason(error: Mapping[str, Any]) -> str:

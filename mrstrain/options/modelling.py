@@ -11,6 +11,10 @@ from mrstrain.options.model import Cli, Flag, Names, NotNegative, Options, Posit
 MINUTE_S = 60.0
 
 
+def _limit(told: str) -> Cli:
+    return Cli("--limit-minutes", told, "Advanced", times=MINUTE_S)
+
+
 class Labelling(Options):
     """What a label map's labels are."""
 
@@ -46,9 +50,7 @@ class Meshing(Options):
     """Length of edges wanted, mm; beyond four voxels these set it."""
     finer: Finer | None = None
     """Another edge length in one region, such as --finer skin 1."""
-    limit_s: Annotated[
-        Positive, Cli("--limit-minutes", "Time after which meshing is given up.", "Advanced", times=MINUTE_S)
-    ] = 3600.0
+    limit_s: Annotated[Positive, _limit("Time after which meshing is given up.")] = 3600.0
     """Time after which meshing is given up, s."""
 
 
@@ -130,12 +132,6 @@ class SimulationOptions(MaterialSets):
     decks: Annotated[Flag, Cli(panel="Output")] = False
     """Also write each load for CalculiX and FEBio."""
     limit_s: Annotated[
-        Positive | None,
-        Cli(
-            "--limit-minutes",
-            "Time after which a path of loads ends where it stands. Default: none.",
-            "Advanced",
-            times=MINUTE_S,
-        ),
+        Positive | None, _limit("Time after which a path of loads ends where it stands. Default: none.")
     ] = None
     """Time after which a set's path of loads ends at its last equilibrium, s; with more it goes on from there."""
