@@ -19,7 +19,7 @@ from dvc.trust.quality import NoiseFloor, read_noise_floor
 from dvc.worker import Worker, each_in_workers, usable_cores
 from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
-from mrstrain.measurement.plan import Plan, Registered, record_of
+from mrstrain.measurement.plan import Plan, record_of
 from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import MeshAndAxes, RegistrationOptions, Running, Scans, SubjectFiles
@@ -74,7 +74,7 @@ def register(
     given = [p for of in (subject_files, registration, scans, onto) for p in of.paths]
     refuse_touching_inputs(target, cases, [Path(load0), *paths, *given])
     subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
-    align, chain, twin = registration.align, registration.chain, registration.twin
+    align = registration.align
     if align == "bone" and subject.bone is None:
         raise InputError(
             "Aligning on the bone needs it: give --bone, or --bone-label with --labels, or another --align."
@@ -92,7 +92,7 @@ def register(
     needed = (_BYTES_PER_VOXEL + chosen.cost.bytes_per_voxel) * int(np.prod(subject.reference.grid.shape)) * len(cases)
     refuse_small_disk(target, needed, f"the results of {len(cases)} images need", " or fewer loads")
     make_output(target)
-    at_once, threads = _shares(running, 1 if chain else len(cases))
+    at_once, threads = _shares(running, 1 if registration.chain else len(cases))
     settings = Settings(chosen, align, running.seed, threads)
     model = model or error_model_of(chosen.name)
     files = {"loads": paths[: len(loads)], **{role: scans.files.get(role, []) for role in _BESIDE}}
@@ -100,9 +100,9 @@ def register(
     more |= {"shear_direction_lps": onto.plain()["shear_direction"], "mesh_unit": onto.mesh_unit}
     more |= {"mesh_frame": onto.mesh_frame, "allow_missing": scans.allow_missing}
     record = record_of(subject, files, settings, registration, more)
-    plan = Plan(subject, settings, Evidence(points, error_model=model), record, twin)
+    plan = Plan(subject, settings, Evidence(points, error_model=model), record, registration.twin)
     run = _Run(target, plan, images, start, progress or (lambda *_: None))
-    run.all(at_once, chain)
+    run.all(at_once, registration.chain)
     return Series.of(target, run.finished(), run.failures, record)
 
 
@@ -204,13 +204,17 @@ class _Run:
         def one(name: str, worker: Worker) -> None:
             is_repeat = name == REPEAT
             start = None if is_repeat else last[-1] if chain and last else self.start
+            told = partial(self._told, name)
             try:
-                told = partial(self._told, name)
                 done = self.plan.register(self.images[name], start, worker, told, is_repeat=is_repeat)
                 if not is_repeat:
                     last.append(done.found.displacement)
                     self._floor_known.wait()
-                self._write(name, done)
+                with self._writing:
+                    told("strain and figures", 0.0)
+                    self.cases[name], floor = self.plan.write(self.out / name, done, self._floor)
+                    self._floor = floor if is_repeat else self._floor
+                    told("strain and figures", 1.0)
             except MrstrainError as error:
                 self.failures[name] = str(error)
             finally:
@@ -226,15 +230,6 @@ class _Run:
             reasons = " ".join(f"{name}: {reason}" for name, reason in self.failures.items())
             raise RegistrationError(f"No load could be registered. {reasons}")
         return tuple(self.cases[name] for name in self.images if name in self.cases)
-
-    def _write(self, name: str, done: Registered) -> None:
-        stage = "strain and figures"
-        with self._writing:
-            self._told(name, stage, 0.0)
-            self.cases[name], floor = self.plan.write(self.out / name, done, self._floor)
-            if done.is_repeat:
-                self._floor = floor
-            self._told(name, stage, 1.0)
 
     def _told(self, case: str, stage: str, fraction: float) -> None:
         with self._telling:

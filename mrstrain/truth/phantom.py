@@ -21,8 +21,9 @@ from mrstrain.records.provenance import provenance
 from phantoms import LOADS, Heel, covering, heel_grid, labels_of, labels_to_mesh, random_foot_motion, scan, under_load
 
 _BYTES_PER_VOXEL = 12  # measured: files of one load, image and truth
-_STAGE = "images and truth"
 _REPEAT = 100  # acquisition number of the repeat scan
+_Motions = Mapping[str, Motion]
+_Record = dict[str, object]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +84,7 @@ def phantom(
     heel = Heel(seed, **dict(shape))
     grid = heel_grid(spacing_mm, heel.size)
     if snr is not None and not 1.0 <= snr <= 1000.0:
-        raise InputError(
-            f"The SNR must lie between 1 and 1000; got {snr}; or None (--no-noise) for images without noise."
-        )
+        raise InputError(f"`snr` must lie between 1 and 1000, or be None for images without noise; got {snr}.")
     motions = {load: under_load(heel, load) for load in loads}
     if not motions:
         raise InputError(f"Name at least one load out of {', '.join(LOADS)}.")
@@ -93,29 +92,18 @@ def phantom(
     needed = _BYTES_PER_VOXEL * int(np.prod(grid.shape)) * (len(motions) + 2)
     refuse_small_disk(target, needed, "the images need", ", larger voxels or fewer loads")
     make_output(target)
-    parameters = {"seed": seed, "spacing_mm": np.broadcast_to(spacing_mm, 3).tolist(), "snr": snr}
-    parameters |= shape.plain()
+    parameters = {"seed": seed, "spacing_mm": np.broadcast_to(spacing_mm, 3).tolist(), "snr": snr, **shape.plain()}
     parameters["loads_press_shear_slide_mm"] = {load: LOADS[load] for load in motions}
     record = provenance("phantom", {}, parameters)
-    images, foot_motions = _write_images(target, heel, grid, snr, motions, record, progress or (lambda *_: None))
-    record["foot_motion"] = {
-        name: {"rotation": m.rotation.tolist(), "translation_lps_mm": m.translation_mm.tolist()}
-        for name, m in foot_motions.items()
-    }
+    images = _write_images(target, heel, grid, snr, motions, record, progress or (lambda *_: None))
     write_json(target / "phantom.json", record)
     return PhantomFiles(target, images)
 
 
 def _write_images(
-    target: Path,
-    heel: Heel,
-    grid: Grid,
-    snr: float | None,
-    motions: Mapping[str, Motion],
-    record: dict[str, object],
-    progress: OnProgress,
-) -> tuple[dict[str, Path], dict[str, RigidMotion]]:
-    """Write all images and the truth; return paths of the images and rigid foot motions, by name."""
+    target: Path, heel: Heel, grid: Grid, snr: float | None, motions: _Motions, record: _Record, progress: OnProgress
+) -> dict[str, Path]:
+    """Write all images and the truth; return paths of the images by name. ``record`` gets the foot's rigid motions."""
     labels = labels_of(heel, grid)
     bone, body = labels.region("bone"), Mask(grid, labels.labels > 0)
     images: dict[str, Path] = {}
@@ -124,7 +112,7 @@ def _write_images(
     steps = iter(np.linspace(0.0, 1.0, 3 + 2 * len(motions)))
 
     def step() -> None:
-        progress("phantom", _STAGE, float(next(steps)))
+        progress("phantom", "images and truth", float(next(steps)))
 
     # Files are compressed in one thread while the next image is formed here.
     with ThreadPoolExecutor(1) as pool:
@@ -151,7 +139,11 @@ def _write_images(
         for done in writes:
             done.result()
     step()
-    return images, foot_motions
+    record["foot_motion"] = {
+        name: {"rotation": m.rotation.tolist(), "translation_lps_mm": m.translation_mm.tolist()}
+        for name, m in foot_motions.items()
+    }
+    return images
 
 
 def _write_truth(folder: Path, maps: StrainMaps, labels: LabelMap, record: dict[str, object]) -> None:
