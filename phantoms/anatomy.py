@@ -160,15 +160,10 @@ class Heel:
         return np.asarray(_signals(points, np.zeros((1, 3, 3)), 1, self._parameters()))[:, 0]
 
     def octant_intensity(self, points_mm: FloatArray, axes_mm: FloatArray) -> FloatArray:
-        """Noise-free signal (n, 2, 2, 2) at a quarter of each edge before and behind the centres of voxels.
+        """Noise-free signal (n, 2, 2, 2) at a quarter of each edge before and behind centres (n, 3) of voxels, LPS mm.
 
-        Parameters
-        ----------
-        points_mm : (n, 3)
-            Centres, LPS mm.
-        axes_mm : (3, 3) or (n, 3, 3)
-            Columns are the voxel's edges, LPS mm: one for all, or one set for each voxel, as where the
-            voxels of a loaded image are carried back into the unloaded heel.
+        Columns of ``axes_mm`` are the voxel's edges, LPS mm: (3, 3) for all, or (n, 3, 3), one set for each voxel, as
+        where the voxels of a loaded image are carried back into the unloaded heel.
         """
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         axes = np.ascontiguousarray(axes_mm, dtype=np.float64).reshape(-1, 3, 3)

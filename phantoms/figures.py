@@ -26,15 +26,12 @@ def errors_by_place(rows: Sequence[ErrorRow], by: str) -> bytes:
             weight = np.array([r.samples for r in of_bin], dtype=np.float64)
             if weight.sum() < 200:
                 continue
-            high = of_bin[0].high
-            at.append(0.5 * (low + high) if np.isfinite(high) else 1.5 * low)
+            at.append(0.5 * (low + of_bin[0].high) if np.isfinite(of_bin[0].high) else 1.5 * low)
             rmse.append(float(np.sqrt(np.average([r.shear_rmse**2 for r in of_bin], weights=weight))))
             bias.append(float(np.average([r.shear_bias for r in of_bin], weights=weight)))
-        if not at:
-            continue
-        colour = REGION_COLOURS[number]
-        axes.plot(at, rmse, color=colour, marker=_MARKS[number], linewidth=1.8, label=tissue)
-        axes.plot(at, bias, color=colour, linestyle="--", marker=".", linewidth=1.2)
+        if at:
+            axes.plot(at, rmse, color=REGION_COLOURS[number], marker=_MARKS[number], linewidth=1.8, label=tissue)
+            axes.plot(at, bias, color=REGION_COLOURS[number], linestyle="--", marker=".", linewidth=1.2)
     axes.axhline(0.0, color="#9aa5b1", linewidth=0.8)
     label_axes(axes, by, "error of the max. shear")
     if axes.get_legend_handles_labels()[0]:  # a small study may have no bin that is large enough

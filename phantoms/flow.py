@@ -1,8 +1,4 @@
-"""Flows of soft tissue around constrained bone and, optionally, inside a constrained skin; exact gradient and inverse.
-
-A flow carries every point along a stationary velocity v for one unit of time. It is isochoric where div v = 0, which is
-the default. The inverse follows the same velocity backwards.
-"""
+"""Flows of soft tissue around constrained bone and, optionally, inside a constrained skin."""
 
 from dataclasses import dataclass, replace
 from typing import Literal, Self

@@ -1,7 +1,4 @@
-"""Closed-form motions with exact gradient and inverse, defined in all space, bone included.
-
-Frame LPS, lengths in mm, reference configuration.
-"""
+"""Closed-form motions with exact gradient and inverse, defined in all space, bone included."""
 
 from dataclasses import dataclass, replace
 from typing import Self

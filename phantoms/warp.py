@@ -1,8 +1,6 @@
 """Synthetic warp of a subject's own unloaded image: the image that a given deformation would have produced.
 
-The noise is part of the voxel values of a measured image. If it were moved with the tissue, a registration would follow
-it like texture. It is therefore removed before the warp and drawn anew afterwards; the price is given in
-`synthetic_warp`.
+A registration would follow noise that is moved with the tissue like texture, so it is removed first and drawn anew.
 """
 
 from contextlib import suppress

@@ -16,6 +16,7 @@ from mrstrain.records.provenance import provenance
 from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRow, figures, wavelength_recovered
 
 _R = TypeVar("_R", ErrorRow, ResolutionRow)
+_CONDITION = ("preset", "voxel, mm", "SNR")
 _CLOSING = (
     Section(
         "How to read this",
@@ -127,10 +128,6 @@ def _source(runs: Sequence[ErrorSamples]) -> str:
     return source
 
 
-def _named(row: ResolutionRow | CoverageRow) -> tuple[str, str, float]:
-    return row.preset, f"{row.voxel_mm} mm", row.snr
-
-
 def _by_condition(rows: Sequence[_R], floors: Sequence[FloorRow]) -> Iterator[tuple[list[_R], list[FloorRow]]]:
     """Rows of one condition, and its noise floor."""
     for condition in dict.fromkeys(r.condition for r in rows):
@@ -142,7 +139,8 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -
     values = attrgetter(
         "tissue", "true_p50", "true_p95", "shear_bias", "shear_sd", "shear_rmse", "shear_p95", "u_rmse_mm", "u_p95_mm"
     )
-    rows = tuple((_motion(r), *values(r)) for r in errors if r.by == "all")
+    labels = {off: f", labels {off:+d}" if off else "" for off in {r.labels_off for r in errors}}
+    rows = tuple((r.motion + labels[r.labels_off], *values(r)) for r in errors if r.by == "all")
     tables = [Table("Error by motion and tissue", head, rows)]
     if floors:
         of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
@@ -156,16 +154,12 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -
     return Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tuple(tables), pictures=pictures)
 
 
-def _motion(row: ErrorRow) -> str:
-    return f"{row.motion}, labels {row.labels_off:+d}" if row.labels_off else row.motion
-
-
 def _coverage_section(rows: Sequence[CoverageRow]) -> Section:
     table = Table(
         "Coverage of the error model",
-        ("preset", "voxel", "SNR", "motion", "tissue", "voxels, %", "remaining error, mean", "tissue's figures, %"),
+        (*_CONDITION, "motion", "tissue", "voxels, %", "remaining error, mean", "tissue's figures, %"),
         tuple(
-            (*_named(r), r.motion, r.tissue, 100 * r.voxels_within, r.left_over, 100 * r.figures_within) for r in rows
+            (*r.condition, r.motion, r.tissue, 100 * r.voxels_within, r.left_over, 100 * r.figures_within) for r in rows
         ),
         "Each heel is compared with a model fitted to the other heels under the same motions. Voxels: truth within "
         "1.96 SD, 95 % if the model is right. Figures: percentiles and volumes within the intervals that `register` "
@@ -179,8 +173,8 @@ def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow
     for of_condition, still in _by_condition(rows, floors):
         noise = next(((f.shear_p50, f.maer, f.sder) for f in still if f.tissue == POOLED), (None, None, None))
         wavelengths = [wavelength_recovered(of_condition, fraction) for fraction in (0.9, 0.5)]
-        table_rows.append((*_named(of_condition[0]), *wavelengths, *noise))
-    columns = ("preset", "voxel", "SNR", "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
+        table_rows.append((*of_condition[0].condition, *wavelengths, *noise))
+    columns = (*_CONDITION, "90 % at, mm", "50 % at, mm", "apparent shear, median", "MAER", "SDER")
     pictures = [Picture.drawn("Spatial resolution", figures.resolution, rows)]
     if floors:
         pictures.append(Picture.drawn("Noise against resolution", figures.trade_off, floors, rows, POOLED))
