@@ -102,9 +102,10 @@ def _offered(model: type[Options], field: str, info: FieldInfo) -> inspect.Param
         default = list(default) or None
     if kind is bool:
         default = default != cli.off
+    several = " Repeat for several." if get_origin(kind) is list else ""
     option = typer.Option(
         *(() if kind == bool | None else (name,)),  # without a name typer offers its negation as well
-        help=" ".join((cli.help or info.description or "").split()),
+        help=" ".join((cli.help or info.description or "").split()) + several,
         rich_help_panel=cli.panel or model.panel,
         min=next((least for check in metadata if (least := getattr(check, "ge", None)) is not None), None),
     )
@@ -134,4 +135,4 @@ def _made(model: type[Options], given: dict[str, Any]) -> Options:
         value, cli = given.pop(field), model.cli(field)
         if value is not None:
             chosen[field] = not value if cli.off else value * cli.times if cli.times != 1.0 else value
-    return model.of(chosen)
+    return model.of(chosen, model.option)

@@ -54,8 +54,6 @@ def register(
         Unloaded image (reference configuration).
     loads : paths
         Loaded images. Each gets a folder in ``out`` named after its file.
-    subject_files, registration, scans, onto, running
-        Their fields are given as keywords, such as ``labels=...``.
     progress : callable, optional
         ``progress(case, stage, fraction)``.
 
@@ -77,7 +75,7 @@ def register(
     align = registration.align
     if align == "bone" and subject.bone is None:
         raise InputError(
-            "Aligning on the bone needs it: give --bone, or --bone-label with --labels, or another --align."
+            "Aligning on the bone needs it: give its mask (bone) or its label (bone_label), or another align."
         )
     images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
     # Read now: what is wrong with it must not be found after an hour.
@@ -156,9 +154,9 @@ def _places(loads: list[Path], scans: Scans) -> dict[str, Path]:
     """Every image to be registered, by the name of its results' folder; the repeat scan last."""
     if not loads and scans.repeat is None:
         raise InputError("Give at least one loaded image.")
-    for option, value in (("--landmarks", scans.landmarks), ("--start", scans.start)):
+    for name, value in (("landmarks", scans.landmarks), ("start", scans.start)):
         if value is not None and len(loads) != 1:
-            raise InputError(f"{option}: belongs to one loaded image; {len(loads)} are given. Register that one alone.")
+            raise InputError(f"{name} belongs to one loaded image; {len(loads)} are given. Register that one alone.")
     places = dict(zip(case_names(loads), loads, strict=True))
     if scans.repeat is None:
         return places
@@ -169,11 +167,9 @@ def _places(loads: list[Path], scans: Scans) -> dict[str, Path]:
 
 def _check_start(scans: Scans, engine: Engine) -> None:
     if scans.start_frame is not None and scans.start is None:
-        raise ParameterError("--start-frame is the frame of --start, which is not given.")
+        raise ParameterError("start_frame is the frame of start, which is not given.")
     if scans.start is not None and not engine.starts_anywhere:
-        raise ParameterError(
-            f"--start is for --engine {DEFAULT}; {engine.family} begins at results of its own (--chain)."
-        )
+        raise ParameterError(f"start is for the engine {DEFAULT}; {engine.family} begins at its own results (chain).")
 
 
 def _shares(running: Running, loads: int) -> tuple[int, int]:

@@ -67,7 +67,7 @@ def mesh(
     out: Path | str,
     labelling: Labelling,
     meshing: Meshing,
-    watch: Callable[[float], None] = lambda _: None,
+    watch: Callable[[float], None] | None = None,
 ) -> Meshed:
     """Mesh the soft tissues of a label map.
 
@@ -95,7 +95,7 @@ def mesh(
     given = read_labels(labels, labelling.names)
     make_output(target.parent)
     how = meshing.model_dump()
-    made, quality = mesh_labels(given, **how, bones=labelling.bones, watch=watch)
+    made, quality = mesh_labels(given, **how, bones=labelling.bones, watch=watch or (lambda _: None))
     del how["limit_s"]  # no mesh depends on it
     files = {"labels": [Path(labels)], **labelling.files}
     record = provenance("mesh", files, how | {"bones": list(labelling.bones)})

@@ -21,7 +21,7 @@ class SubjectFiles(Options):
     bone_label: str | None = None
     """Or: the name of the bone in --labels."""
     tissue: Path | None = None
-    """Mask of the body; found by a threshold where it is not given."""
+    """Mask of the body. Default: by a threshold."""
     labels: Path | None = None
     """Label map of the tissues on the unloaded image."""
     names: Path | None = None
@@ -40,9 +40,9 @@ class MeshAndAxes(Options):
     mesh_frame: Frame = "LPS"
     """Frame of the mesh's coordinates."""
     plate_normal: Vector | None = None
-    """The plate's outward normal, away from the foot, LPS; default, patient inferior: --plate-normal 0 0 -1."""
+    """The plate's outward normal, away from the foot, LPS. Default: 0 0 -1 (patient inferior)."""
     shear_direction: Vector | None = None
-    """Direction of the shear force on the tissue, LPS, such as --shear-direction 0 -1 0 (anterior)."""
+    """Direction of the shear force on the tissue, LPS, such as 0 -1 0 (anterior)."""
 
 
 def _known_engine(name: str) -> str:
@@ -61,8 +61,8 @@ class EngineOptions(Options):
     engine: Annotated[str, AfterValidator(_known_engine)] | None = None
     """What finds the non-rigid part. Default: gauss-newton; with --preset, elastix."""
     borders: Flag | None = None
-    """gauss-newton: strain may jump where the tissues of --labels meet. Default: where there are labels; --no-borders
-    for labels that are off by more than a voxel."""
+    """gauss-newton: strain may jump where the tissues of --labels meet. Default: where there are labels. Not for labels
+    that are off by more than a voxel."""
     preset: str | None = None
     """Named parameters of elastix, such as heel-mr."""
     parameters: tuple[Path, ...] = ()

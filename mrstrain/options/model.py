@@ -3,7 +3,7 @@
 import functools
 import numbers
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path
@@ -55,15 +55,18 @@ class Options(BaseModel):
     panel: ClassVar[str] = "Options"
 
     @classmethod
-    def of(cls, given: Mapping[str, Any]) -> Self:
-        """The options given by name, the others by default; ParameterError names each that cannot be used, and why."""
+    def of(cls, given: Mapping[str, Any], called: Callable[[str], str] = str) -> Self:
+        """The options given by name, the others by default.
+
+        ParameterError names each that cannot be used, as it is ``called`` where it was given, and why.
+        """
         try:
             return cls(**given)
         except ValidationError as wrong:
             from dvc.errors import ParameterError
 
             raise ParameterError(
-                " ".join(f"{cls.option(str(e['loc'][0]))}: {reason(e)}." for e in wrong.errors(include_url=False))
+                " ".join(f"{called(str(e['loc'][0]))}: {reason(e)}." for e in wrong.errors(include_url=False))
             ) from wrong
 
     @classmethod
@@ -124,6 +127,6 @@ def bare(annotation: Any, metadata: list[Any]) -> Any:
         return bare(inner[0], metadata)
     if origin in (Union, UnionType):
         return functools.reduce(operator.or_, (bare(one, metadata) for one in inner))
-    if origin is tuple:
-        return tuple[tuple(one if one is ... else bare(one, metadata) for one in inner)]  # type: ignore[misc]
+    if origin in (tuple, Sequence, Mapping):
+        return origin[tuple(one if one is ... else bare(one, metadata) for one in inner)]
     return annotation

@@ -23,8 +23,7 @@ class Labelling(Options):
     names: Path | None = None
     """Names of the labels: ITK-SNAP or Slicer table, or CSV."""
     bones: Annotated[Names, Field(min_length=1), Cli("--bone")] = ("bone",)
-    """Label of bone; repeat for all. It is cut out of meshes and its surface fixed; slices go through the lowest point
-    of the first."""
+    """Label of bone. It is cut out of meshes and its surface fixed; slices go through the lowest point of the first."""
 
 
 class LabelMapFile(Labelling):
@@ -49,7 +48,7 @@ class Meshing(Options):
     edge_mm: Positive = 2.0
     """Length of edges wanted, mm; beyond four voxels these set it."""
     finer: Finer | None = None
-    """Another edge length in one region, such as --finer skin 1."""
+    """Another edge length in one region, mm, such as skin 1."""
     limit_s: Annotated[Positive, _limit("Time after which meshing is given up.")] = 3600.0
     """Time after which meshing is given up, s."""
 
@@ -71,9 +70,9 @@ class Directions(Options):
     panel: ClassVar[str] = "Model"
 
     plate_normal: Vector = (0.0, 0.0, -1.0)
-    """The plate's outward normal, away from the foot, LPS; default, patient inferior: --plate-normal 0 0 -1."""
+    """The plate's outward normal, away from the foot, LPS. Default: 0 0 -1 (patient inferior)."""
     shear_direction: Vector = (0.0, -1.0, 0.0)
-    """Direction of the shear force on the tissue, LPS, such as --shear-direction 0 -1 0 (anterior)."""
+    """Direction of the shear force on the tissue, LPS, such as 0 -1 0 (anterior)."""
 
 
 class HeelShape(Options):
@@ -108,7 +107,7 @@ class MaterialSets(Options):
     panel: ClassVar[str] = "Model"
 
     sets: Annotated[Names, Cli("--set")] = ("trebbi",)
-    """akrami, erdemir, friedman, luboz, spears, trebbi, zwam, or a .toml of your own; repeat. Default: trebbi."""
+    """akrami, erdemir, friedman, luboz, spears, trebbi, zwam, or a .toml of your own. Default: trebbi."""
 
 
 class Followed(Options):
@@ -126,7 +125,7 @@ class SimulationOptions(MaterialSets):
     """Which material sets are simulated, and how."""
 
     fixed: Annotated[Names, Cli("--fix")] = ()
-    """Facets that do not move, beside the bone's, such as cut; repeat."""
+    """Facets that do not move, beside the bone's, such as cut."""
     element: Literal["P1", "MINI", "P2"] = "P1"
     """P1 (fast), MINI, or P2 (quadratic: more exact, slow)."""
     decks: Annotated[Flag, Cli(panel="Output")] = False

@@ -139,18 +139,18 @@ def _refuse_one_name_for_two(cases: Sequence[AccuracyCase]) -> None:
         if other != case.preset:
             raise InputError(
                 f"{other} and {case.preset} would share the name '{Path(other).stem}' in this study: rename one, or "
-                "measure it in another --out."
+                "measure it in another folder (out)."
             )
 
 
 def _check(case: AccuracyCase) -> None:
     engine_named(case.preset)
     heel_grid(case.spacing_mm)
+    motion = motion_named(Heel(case.seed), case.motion)
     if case.wavelength_mm is not None and not case.wavelength_mm >= 2.0 * max(case.spacing_mm):
         raise InputError(f"{case.motion}: a wave needs at least two voxels of {max(case.spacing_mm):g} mm.")
     if not 1.0 <= case.snr <= 1000.0:
         raise InputError(f"The SNR must lie between 1 and 1000; got {case.snr}.")
-    motion = motion_named(Heel(case.seed), case.motion)
     points = np.random.default_rng(0).uniform([-32, -50, -44], [32, 44, 40], (2000, 3))
     lowest = 1.0 if motion is None else float(np.linalg.det(motion.evaluate(points)[1] + np.eye(3)).min())
     if not lowest > 0.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
@@ -150,6 +151,31 @@ def test_a_command_and_its_function_have_every_field_with_its_default(
             assert (tuple(default) if isinstance(default, list) else default) == info.default, field
 
 
+@pytest.mark.parametrize(("command", "models"), COMMANDS.items())
+def test_help_tells_every_option_with_its_default_and_the_signature_is_plain(
+    command: str, models: tuple[type[Options], ...]
+) -> None:
+    verb = getattr(mrstrain, command)
+    signature = str(inspect.signature(verb))
+    assert not [word for word in ("Annotated", "FieldInfo", "Validator", "<function", "~") if word in signature]
+    own, _, told = verb.__doc__.partition("\nOther Parameters\n----------------\n")
+    told, _, raised = told.partition("\n\nRaises\n------\n")
+    assert bool(raised) == ("Raises" in verb.with_options.__doc__)
+    entries = dict(re.findall(r"^(\w+ : .*)\n((?: {4}.*\n?)+)", told, re.MULTILINE))
+    for model in models:
+        for field, info in model.model_fields.items():
+            (head,) = [head for head in entries if head.startswith(f"{field} : ")]
+            usual = (
+                "" if info.is_required() else ", optional" if info.default is None else f", default {info.default!r}"
+            )
+            assert head.endswith(usual)
+            meaning = re.sub(r"--([a-z-]+)", lambda flag: f"`{flag[1].replace('-', '_')}`", info.description or "")
+            assert " ".join(entries[head].split()) == " ".join(meaning.split())
+    for name, parameter in inspect.signature(verb.with_options).parameters.items():  # models are called by their fields
+        if parameter.annotation in models and name not in inspect.signature(verb).parameters:
+            assert not re.search(rf"^(.*, )?{name}(, .*)?$", own, re.MULTILINE)
+
+
 @pytest.mark.parametrize(("model", "field"), FIELDS)
 def test_a_value_comes_from_the_command_line_as_it_was_typed(model: type[Options], field: str) -> None:
     made: list[Options] = []
@@ -255,8 +281,9 @@ BAD = [
 
 @pytest.mark.parametrize(("model", "field", "value"), BAD)
 def test_one_check_holds_everywhere(model: type[Options], field: str, value: Any, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match=f"{model.option(field)}: .*got "):
-        model.of({field: value})
+    for called in (str, model.option):  # in Python, and on the command line
+        with pytest.raises(ParameterError, match=f"^{called(field)}: .*got "):
+            model.of({field: value}, called)
     table, _ = TABLES[model]
     key = next(key for key, name in names_of(table).items() if name == field)
     with pytest.raises(InputError, match=rf"\[{table}\] '{key}': .*got "):
@@ -275,9 +302,9 @@ def test_paths_vectors_and_numbers_may_come_as_numpy_and_text() -> None:
     assert given == MeshAndAxes(plate_normal=(0.0, 0.0, -1.0), mesh=Path("heel.vtu"))
     assert Running.of({"seed": np.int64(3)}).seed == 3
     for wrong in (True, "1", float("nan")):
-        with pytest.raises(ParameterError, match="--bending"):
+        with pytest.raises(ParameterError, match="bending: "):
             RegistrationOptions.of({"bending": wrong})
-    with pytest.raises(ParameterError, match="--labels: it is needed"):
+    with pytest.raises(ParameterError, match="labels: it is needed"):
         mrstrain.compare("a", ["b"], out="c")
     with pytest.raises(TypeError, match="bendin"):
         mrstrain.register("a", ["b"], out="c", bendin=3.0)

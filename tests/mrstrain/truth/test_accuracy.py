@@ -132,6 +132,7 @@ def test_what_cannot_be_studied_is_refused_before_anything_runs(
         (replace(CASE, preset="heel-xr"), "heel-mr"),
         (replace(CASE, preset=str(rigid)), "no B-spline"),
         (replace(CASE, motion="wave-3"), "two voxels"),
+        (replace(CASE, motion="wave-x"), "wavelength"),
     ):
         with pytest.raises(MrstrainError, match=says):
             accuracy(tmp_path / "out", cases=[wrong])
