@@ -106,8 +106,8 @@ def _validations(runs: Sequence[ErrorSamples]) -> list[_Validation]:
     if len(seeds) < 2:
         return []
     tables = {seed: _table([r for r in runs if r.case.seed != seed]) for seed in seeds}
-    validations = (_validated(run, tissue, tables[run.case.seed]) for run in runs for tissue in SOFT)
-    return [v for v in validations if v is not None]
+    large = [(r, tissue) for r in runs for tissue in SOFT if np.count_nonzero(of_tissue(r.tissue, tissue)) >= _FEW]
+    return [_validated(run, tissue, tables[run.case.seed]) for run, tissue in large]
 
 
 def _widening(validations: Sequence[_Validation]) -> float:
@@ -117,10 +117,8 @@ def _widening(validations: Sequence[_Validation]) -> float:
     return max(1.0, float(np.quantile(np.concatenate([v.scores for v in validations]), 0.95)))
 
 
-def _validated(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Validation | None:
+def _validated(run: ErrorSamples, tissue: str, table: ErrorTable) -> _Validation:
     kept = of_tissue(run.tissue, tissue)
-    if np.count_nonzero(kept) < _FEW:
-        return None
     shear, true = run.shear[kept].astype(np.float64), run.true_shear[kept].astype(np.float64)
     bias, sd = table.expected(tissue, shear, run.to_bone_mm[kept])
     remaining = shear - true - bias

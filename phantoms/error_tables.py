@@ -152,7 +152,10 @@ class ErrorRow(OfCondition):
 
 @dataclass(frozen=True, slots=True)
 class FloorRow(OfCondition):
-    """Noise floor: apparent strain in one tissue of an unloaded pair; MAER, SDER, percentiles of the max. shear."""
+    """Noise floor: apparent strain in one tissue of an unloaded pair, dimensionless.
+
+    MAER and SDER: mean and SD of the samples' mean absolute strain component; percentiles of the max. shear.
+    """
 
     tissue: str
     maer: float
@@ -163,7 +166,7 @@ class FloorRow(OfCondition):
 
 @dataclass(frozen=True, slots=True)
 class ResolutionRow(OfCondition):
-    """Fraction of a sinusoidal shear of one wavelength that is recovered: slope of measured on true H_dn."""
+    """Fraction of a sinusoidal shear of one wavelength (mm) that is recovered: slope of measured on true H_dn."""
 
     tissue: str
     wavelength_mm: float
@@ -172,7 +175,7 @@ class ResolutionRow(OfCondition):
 
 @dataclass(frozen=True, slots=True)
 class RunRow:
-    """One registration: time, fraction of the heel without a result, folded samples, RMSE of the max. shear."""
+    """One registration: time (s), fraction of the heel without a result, folded samples, RMSE of the max. shear."""
 
     case: str
     estimated_snr: float
@@ -183,7 +186,7 @@ class RunRow:
 
 
 def run_rows(runs: Sequence[ErrorSamples]) -> list[RunRow]:
-    """One row for each run; errors are those of its soft tissue."""
+    """One row for each run, in the order given; errors are those of its soft tissue."""
     rows = []
     for run in runs:
         error = (run.shear - run.true_shear)[of_tissue(run.tissue, POOLED)].astype(np.float64)
@@ -214,7 +217,7 @@ def error_rows(runs: Sequence[ErrorSamples]) -> list[ErrorRow]:
 
 
 def floor_rows(runs: Sequence[ErrorSamples]) -> list[FloorRow]:
-    """Noise floor by condition and tissue, over the pairs without strain."""
+    """Noise floor by condition and tissue, over the runs named "still"; conditions without one have no rows."""
     rows = []
     for condition, of_condition in by_condition(runs):
         still = [r for r in of_condition if r.case.motion == "still"]
@@ -229,7 +232,7 @@ def floor_rows(runs: Sequence[ErrorSamples]) -> list[FloorRow]:
 
 
 def resolution_rows(runs: Sequence[ErrorSamples]) -> list[ResolutionRow]:
-    """Fraction of a sinusoidal strain that is recovered, by condition, tissue and rising wavelength."""
+    """Fraction of a sinusoidal strain that is recovered, by condition, tissue and rising wavelength; of waves alone."""
     rows = []
     for condition, of_condition in by_condition(runs):
         wavelengths = sorted({r.case.wavelength_mm for r in of_condition if r.case.wavelength_mm is not None})

@@ -89,8 +89,8 @@ def heel_pair(
     shape, spacing_mm
         Voxels along each axis, and voxel size in mm (one or three), of a grid centred just below the middle of the
         calcaneus.
-    snr : float or None
-        Signal of fat over the standard deviation of the noise; None for images without noise.
+    snr
+        As in `scan`.
     load : float
         Factor on the plate displacement; 1 is an indentation of 7.5 mm with a forward shear of 5 mm.
     motion : Motion, optional
@@ -154,7 +154,7 @@ def scan(
 
 
 def labels_of(heel: Heel, grid: Grid) -> LabelMap:
-    """Tissue of a heel at each voxel centre of a grid."""
+    """Tissue (a key of `TISSUES`; 0 is air) of an unloaded heel at each voxel centre of a grid, LPS mm."""
     return LabelMap(grid, heel.tissue_at(grid.points().reshape(-1, 3)).reshape(grid.shape), TISSUES)
 
 
@@ -174,7 +174,8 @@ def misdrawn(labels: LabelMap, voxels: int) -> LabelMap:
 def labels_to_mesh(heel: Heel, labels: LabelMap) -> LabelMap:
     """Part of a label map for a finite-element model: sole and heel, 75 to 100 mL of soft tissue at size 1, and bone.
 
-    The truncation surfaces are a horizontal plane through the middle of the calcaneus and a vertical one at its front.
+    The truncation surfaces are a horizontal plane through the middle of the calcaneus and a vertical one at its front;
+    beyond them labels are 0.
     """
     points = labels.grid.points()
     kept = (points[..., 2] < 0.0) & (points[..., 1] > -20.0 * heel.size)
@@ -182,13 +183,16 @@ def labels_to_mesh(heel: Heel, labels: LabelMap) -> LabelMap:
 
 
 def random_foot_motion(seed: int, number: int) -> RigidMotion:
-    """Draw the rigid motion of the foot before an acquisition: up to 3 degrees about and 2 mm along each axis."""
+    """Draw the rigid motion of the foot before an acquisition, LPS mm; equal seeds and numbers give equal motions.
+
+    Up to 3 degrees about each axis through (0, 5, 0) mm, and up to 2 mm along it.
+    """
     random = np.random.default_rng([seed, 3, number])
     return _foot_motion(random.uniform(-3.0, 3.0, 3), random.uniform(-2.0, 2.0, 3))
 
 
 def default_foot_motion() -> RigidMotion:
-    """Return the default rigid motion of the foot between scans: 3.7 degrees, 2.9 mm."""
+    """Return the default rigid motion of the foot between scans, LPS: 3.7 degrees about (0, 5, 0) mm and 2.9 mm."""
     return _foot_motion(np.array([2.5, -1.5, 2.2]), np.array([1.6, -2.0, 1.4]))
 
 
@@ -198,12 +202,12 @@ def _foot_motion(turn_deg: FloatArray, shift_mm: FloatArray) -> RigidMotion:
 
 
 def pressed(heel: Heel, load: float = 1.0) -> Flow:
-    """Return the smooth flow of a heel under a plate that moves up 7.5 mm and forward 5 mm, times ``load``."""
+    """Return the flow of `under_plate` for a plate that moves up 7.5 mm and forward 5 mm, times ``load``."""
     return under_plate(heel, press_mm=load * _PRESS_MM, shear_mm=load * _SHEAR_MM)
 
 
 def under_plate(heel: Heel, *, press_mm: float, shear_mm: float) -> Flow:
-    """Return the smooth flow of a heel under a plate that moves up by ``press_mm`` and forward by ``shear_mm``.
+    """Return the isochoric flow of a heel under a plate that moves up by ``press_mm`` and forward by ``shear_mm``.
 
     Its bones are constrained. Both displacements are those of a heel of size 1 and scale with the heel.
     """
@@ -248,7 +252,10 @@ def swelling(heel: Heel) -> Flow:
 
 
 def under_load(heel: Heel, load: str) -> Motion:
-    """Motion of a heel under one of LOADS: the pad slides inside its skin, then the plate moves all tissue."""
+    """Isochoric motion of a heel under one of `LOADS`: the pad slides inside its skin, then the plate moves all tissue.
+
+    u is relative to bone, LPS mm, reference configuration; InputError for another load.
+    """
     if load not in LOADS:
         raise InputError(f"No load '{load}'; there are {', '.join(LOADS)}.")
     press, shear, slide = LOADS[load]
@@ -265,7 +272,10 @@ _MOTIONS: Mapping[str, Callable[[Heel], Motion | None]] = {
 
 
 def motion_named(heel: Heel, name: str) -> Motion | None:
-    """Motion of a heel's tissue by its name (see `AccuracyCase`); None for "still", InputError for an unknown name."""
+    """Motion of a heel's tissue by its name (see `AccuracyCase`), LPS mm, reference configuration; None for "still".
+
+    InputError for an unknown name, or a wave whose length is not positive.
+    """
     if name in _MOTIONS:
         return _MOTIONS[name](heel)
     wavelength = wavelength_of(name)
@@ -324,7 +334,10 @@ def _may_show(heel: Heel, grid: Grid, back: Motion | None, home: RigidMotion) ->
 
 
 def centred_grid(shape: tuple[int, int, int], spacing_mm: float | Sequence[float]) -> Grid:
-    """Grid around the calcaneus, LPS mm; spacing in mm, one or three."""
+    """Grid of so many voxels along LPS x, y and z, centred 6 mm below the middle of the calcaneus of a heel of size 1.
+
+    InputError unless ``spacing_mm`` is one positive length or three.
+    """
     spacing = np.asarray(spacing_mm, dtype=np.float64)
     if spacing.shape not in {(), (3,)}:
         raise InputError(f"Voxel spacing must be one length or three, mm; got {spacing_mm}.")
@@ -354,7 +367,7 @@ def heel_grid(spacing_mm: float | Sequence[float], size: float = 1.0) -> Grid:
 
 
 def covering(grid: Grid, points_mm: FloatArray) -> Grid:
-    """Return the grid, extended by whole voxels where points (n, 3) mm come closer than 4 mm to its border."""
+    """Return the grid, extended by whole voxels where points (n, 3) LPS mm come closer than 4 mm to its border."""
     if len(points_mm) == 0:
         return grid
     indices = grid.indices_of(points_mm)

@@ -103,12 +103,12 @@ class ShearWave:
         return np.asarray(2.0 * np.pi * (points @ self.normal) / self.wavelength_mm + self.phase)
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
-        """u(X), (n, 3) mm."""
+        """u(X), (n, 3) mm, at points X (n, 3) LPS mm."""
         size = self.peak * self.wavelength_mm / (2.0 * np.pi)
         return np.asarray(size * np.sin(self._angle(points_mm))[:, None] * self.direction)
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """u(X) (n, 3) mm and H (n, 3, 3)."""
+        """u(X) (n, 3) mm and H (n, 3, 3) at points X (n, 3) LPS mm."""
         slope = self.peak * np.cos(self._angle(points_mm))
         return self.displacement(points_mm), slope[:, None, None] * np.outer(self.direction, self.normal)
 
@@ -160,11 +160,11 @@ class Bending:
         return np.column_stack([self.length, self.thickness, np.cross(self.length, self.thickness)])
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
-        """u(X), (n, 3) mm; NaN where undefined."""
+        """u(X), (n, 3) mm, at points X (n, 3) LPS mm; NaN where undefined."""
         return self.evaluate(points_mm)[0]
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """u(X) (n, 3) mm and H (n, 3, 3); NaN where undefined."""
+        """u(X) (n, 3) mm and H (n, 3, 3) at points X (n, 3) LPS mm; NaN where undefined."""
         A, R = self._axes(), self.radius_mm
         local = (np.asarray(points_mm, dtype=np.float64) - self.centre_mm) @ A
         squared = R * R + 2.0 * R * local[:, 1]

@@ -48,7 +48,7 @@ class Acquisition:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticWarp:
-    """A warped image, the standard deviation of its noise, and the fraction of the tissue that is known and in view."""
+    """A warped image, the SD of its noise (in its grey values), and the fraction of the tissue known and in view."""
 
     image: Image
     noise_sd: float
@@ -201,7 +201,9 @@ def _warped(clean: Image, tissue: Mask, motion: Deformation, near: RigidMotion, 
     home, moved = home[known], cKDTree(there[known])
     out = np.zeros(int(np.prod(grid.shape)), dtype=np.float32)
     x = grid.points().reshape(-1, 3)
-    where = np.flatnonzero(_near(tissue, x, near))
+    X, body = near.inverse().apply(x), tissue.points()
+    # Tissue is looked for within 30 mm of its bounding box, moved rigidly.
+    where = np.flatnonzero(((body.min(axis=0) - 30.0 <= X) & (body.max(axis=0) + 30.0 >= X)).all(axis=1))
     for start in range(0, len(where), _CHUNK):
         some = where[start : start + _CHUNK]
         if back is not None:
@@ -213,12 +215,6 @@ def _warped(clean: Image, tissue: Mask, motion: Deformation, near: RigidMotion, 
         at = clean.grid.indices_of(X[inside]).T
         out[some[inside]] = map_coordinates(coefficients, at, order=3, mode="mirror", prefilter=False)
     return np.maximum(out, 0.0).reshape(grid.shape)
-
-
-def _near(tissue: Mask, points_mm: FloatArray, near: RigidMotion) -> BoolArray:
-    """Which points (n, 3) may show tissue: those within 30 mm of its bounding box, moved rigidly."""
-    X, inside = near.inverse().apply(points_mm), tissue.points()
-    return np.asarray(((inside.min(axis=0) - 30.0 <= X) & (inside.max(axis=0) + 30.0 >= X)).all(axis=1))
 
 
 def _in_mask(tissue: Mask, points_mm: FloatArray) -> BoolArray:

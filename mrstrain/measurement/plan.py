@@ -10,6 +10,7 @@ import dvc
 from dvc import Deformation, Evidence, Image, Measurement, Registration, Settings, Subject, tissue_mask
 from dvc.errors import InputError, MrstrainError
 from dvc.images.noise import signal_to_noise
+from dvc.io.result_folder import REPEAT
 from dvc.measurement.error_bars import TwinCheck
 from dvc.measurement.judgement import maps_of
 from dvc.trust.quality import NoiseFloor
@@ -26,13 +27,8 @@ _SETTINGS = {*EngineOptions.model_fields, "align", "bending", "volume", "allow_u
 _FOLDED = 1e-3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Registered:
-    """A registered pair, and the check against its twin, if one was asked for."""
-
-    found: Registration
-    twin: TwinCheck | None
-    is_repeat: bool
+Registered = tuple[Registration, TwinCheck | None]
+"""A registered pair, and the check against its twin, if one was asked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,25 +41,23 @@ class Plan:
     record: Mapping[str, object]  # provenance
     twin: bool = False  # whether each pair's twin is registered, too
 
-    def register(
-        self, loaded: Image, start: Deformation | None, worker: Worker, tell: Tell, *, is_repeat: bool = False
-    ) -> Registered:
-        """Register a loaded image, or a repeat scan, and the pair's twin."""
+    def register(self, name: str, loaded: Image, start: Deformation | None, worker: Worker, tell: Tell) -> Registered:
+        """Register a loaded image, or the repeat scan if its ``name`` is "repeat", and the pair's twin."""
+        is_repeat = name == REPEAT
         of, how = self.subject, self.settings.of_repeat() if is_repeat else self.settings
         found = dvc.register(
             of.reference, loaded, bone=of.bone, tissue=of.tissue, labels=of.labels, settings=how, start=start,
             worker=worker, progress=tell,
         )  # fmt: skip
-        wanted = self.twin and not is_repeat
-        return Registered(found, _twin_check(found, of, start, worker, tell) if wanted else None, is_repeat)
+        twin = _twin_check(found, of, start, worker, tell) if self.twin and not is_repeat else None
+        return found, twin
 
     def write(self, folder: Path, done: Registered, floor: NoiseFloor | None) -> tuple[Case, NoiseFloor | None]:
         """Judge what was registered and write it; return it with the noise floor that it was judged by, or gives."""
-        more = Evidence(noise_floor=floor) if done.is_repeat else replace(self.evidence, noise_floor=floor)
-        evidence = replace(more, error_model=self.evidence.error_model, twin=done.twin)
-        measured = Measurement.from_registration(
-            done.found, self.subject, evidence, name=folder.name, is_repeat=done.is_repeat
-        )
+        (found, twin), is_repeat = done, folder.name == REPEAT
+        more = Evidence(noise_floor=floor) if is_repeat else replace(self.evidence, noise_floor=floor)
+        evidence = replace(more, error_model=self.evidence.error_model, twin=twin)
+        measured = Measurement.from_registration(found, self.subject, evidence, name=folder.name, is_repeat=is_repeat)
         return Case.of(measured, folder, self.record), measured.quality.noise_floor
 
 

@@ -146,7 +146,7 @@ def register_one(
     record = record_of(subject, {"loads": [load]}, settings, chained, more)
     plan = Plan(replace(subject, tissue=subject.body()), settings, Evidence(error_model=model), record, how.twin)
     with Worker(settings.threads) as worker:
-        done = plan.register(loaded, start, worker, tell, is_repeat=out.name == REPEAT)
+        done = plan.register(out.name, loaded, start, worker, tell)
     return plan.write(out, done, floor)[0]
 
 
@@ -202,9 +202,9 @@ class _Run:
             start = None if is_repeat else last[-1] if chain and last else self.start
             told = partial(self._told, name)
             try:
-                done = self.plan.register(self.images[name], start, worker, told, is_repeat=is_repeat)
+                done = self.plan.register(name, self.images[name], start, worker, told)
                 if not is_repeat:
-                    last.append(done.found.displacement)
+                    last.append(done[0].displacement)
                     self._floor_known.wait()
                 with self._writing:
                     told("strain and figures", 0.0)

@@ -57,8 +57,7 @@ def strain(
         "bone_label": subject_files.bone_label,
         "plate_normal_lps": subject.plate_normal.tolist(),
         "shear_direction_lps": onto.plain()["shear_direction"],
-        "mesh_unit": onto.mesh_unit,
-        "mesh_frame": onto.mesh_frame,
+        **onto.model_dump(include={"mesh_unit", "mesh_frame"}),
     }
     total = read_any(source, frame)
     record = provenance("strain", {**subject.files, "deformation": source}, parameters)
