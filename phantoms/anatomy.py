@@ -358,9 +358,7 @@ def _signals(points, axes, samples, heel):  # type: ignore[no-untyped-def]
         reach = _EDGE_MM + 0.5 * np.sqrt((a * a).sum())
         alike = _within_one_tissue(centre, reach)
         for m in range(samples):
-            s = 0.25 if m & 4 else -0.25
-            t = 0.25 if m & 2 else -0.25
-            w = 0.25 if m & 1 else -0.25
+            s, t, w = 0.25 if m & 4 else -0.25, 0.25 if m & 2 else -0.25, 0.25 if m & 1 else -0.25
             x = points[n, 0] + s * a[0, 0] + t * a[0, 1] + w * a[0, 2]
             y = points[n, 1] + s * a[1, 0] + t * a[1, 1] + w * a[1, 2]
             z = points[n, 2] + s * a[2, 0] + t * a[2, 1] + w * a[2, 2]

@@ -45,27 +45,22 @@ class Case:
         return list(self.lines)
 
 
-_CLOSING = (
-    Section(
-        "How to read this",
-        paragraphs=(
-            "Displacement u(X) = x - X is that of tissue relative to its bone: the rigid motion of the bone between "
-            "the scans is taken out. All maps are in the reference (unloaded) configuration, on the unloaded image's "
-            "voxels; components are in LPS (x to the patient's left, y to posterior, z to superior), lengths in mm.",
-            "Strain is Green-Lagrange, E = (F^T F - I)/2 with F = I + du/dX, from the analytic gradient of the cubic "
-            "B-spline; maximal shear is (E1 - E3)/2, half the difference of the largest and smallest principal strain. "
-            "det F is the ratio of deformed to reference volume.",
-            "A verdict judges the registration, not the tissue. It cannot see everything: inside a uniform region, and "
-            "along a smooth skin, an image does not show how tissue slides. Small shears are lifted by noise; a repeat "
-            "scan without load (--repeat) tells by how much. Strain that jumps at a border of tissues is smeared over "
-            "about one spacing of the control points (3 to 5 mm), unless a label map told where tissues meet. "
-            "Scanner distortion and creep between scans are not seen at all.",
-            "A noise floor is what a repeat scan shows where there is no strain. MAER is the mean over voxels of the "
-            "mean absolute value of the six strain components, SDER the standard deviation of the same.",
-            "Missing is NaN in every map, never zero; valid.nii.gz tells where values are. Programs built on ITK show "
-            "NaN in NIfTI as zero: use the NRRD twin or the validity mask there.",
-        ),
-    ),
+_HOW_TO_READ = (
+    "Displacement u(X) = x - X is that of tissue relative to its bone: the rigid motion of the bone between the scans "
+    "is taken out. All maps are in the reference (unloaded) configuration, on the unloaded image's voxels; components "
+    "are in LPS (x to the patient's left, y to posterior, z to superior), lengths in mm.",
+    "Strain is Green-Lagrange, E = (F^T F - I)/2 with F = I + du/dX, from the analytic gradient of the cubic B-spline;"
+    " maximal shear is (E1 - E3)/2, half the difference of the largest and smallest principal strain. det F is the "
+    "ratio of deformed to reference volume.",
+    "A verdict judges the registration, not the tissue. It cannot see everything: inside a uniform region, and along a"
+    " smooth skin, an image does not show how tissue slides. Small shears are lifted by noise; a repeat scan without "
+    "load (--repeat) tells by how much. Strain that jumps at a border of tissues is smeared over about one spacing of "
+    "the control points (3 to 5 mm), unless a label map told where tissues meet. Scanner distortion and creep between "
+    "scans are not seen at all.",
+    "A noise floor is what a repeat scan shows where there is no strain. MAER is the mean over voxels of the mean "
+    "absolute value of the six strain components, SDER the standard deviation of the same.",
+    "Missing is NaN in every map, never zero; valid.nii.gz tells where values are. Programs built on ITK show NaN in "
+    "NIfTI as zero: use the NRRD twin or the validity mask there.",
 )
 
 
@@ -94,7 +89,8 @@ class Series:
         told += [Section(name, Verdict("distrust", (f"Not registered. {why}",))) for name, why in failures.items()]
         verdict = worst([s.verdict for s in told if s.verdict is not None])
         write_json(out / PROVENANCE, record)
-        write_report(out / REPORT, "Strain from MR image pairs", verdict, told, _CLOSING, record_lines(record))
+        closing = (Section("How to read this", paragraphs=_HOW_TO_READ),)
+        write_report(out / REPORT, "Strain from MR image pairs", verdict, told, closing, record_lines(record))
         return cls(out, cases, failures)
 
     @property

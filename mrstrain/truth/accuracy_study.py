@@ -17,24 +17,18 @@ from phantoms import CoverageRow, ErrorRow, ErrorSamples, FloorRow, ResolutionRo
 
 _R = TypeVar("_R", ErrorRow, ResolutionRow)
 _CONDITION = ("preset", "voxel, mm", "SNR")
-_CLOSING = (
-    Section(
-        "How to read this",
-        paragraphs=(
-            "Every pair is a synthetic heel whose strain is known at every point. The error is measured minus true: of "
-            "the maximum shear strain (E1 - E3)/2 (Green-Lagrange), and of the displacement of tissue relative to its "
-            "bone, at one in eight of the heel's voxels.",
-            "Motions: still (rigid foot motion only), smooth (a smooth flow), sliding (the fat pad slides between "
-            "constrained bone and skin, with a strain discontinuity at both interfaces), Load1 to Load4 (both "
-            "combined, as strong as under the forces of the published experiment), wave-L (shear that varies as a "
-            "cosine of wavelength L mm). Labels +1 or -1: bones and skin are one voxel too large, or too small, in the "
-            "label map that the registration was given.",
-            "Spatial resolution is the wavelength at which a given fraction of the strain is recovered. Finer "
-            "resolution costs noise, so report both together.",
-            "Bias and SD in the error model are conditional on the measured shear. They apply to tissue strained and "
-            "imaged like these phantoms; scanner distortion and creep during a scan are not included.",
-        ),
-    ),
+_HOW_TO_READ = (
+    "Every pair is a synthetic heel whose strain is known at every point. The error is measured minus true: of the "
+    "maximum shear strain (E1 - E3)/2 (Green-Lagrange), and of the displacement of tissue relative to its bone, at one"
+    " in eight of the heel's voxels.",
+    "Motions: still (rigid foot motion only), smooth (a smooth flow), sliding (the fat pad slides between constrained "
+    "bone and skin, with a strain discontinuity at both interfaces), Load1 to Load4 (both combined, as strong as under"
+    " the forces of the published experiment), wave-L (shear that varies as a cosine of wavelength L mm). Labels +1 or"
+    " -1: bones and skin are one voxel too large, or too small, in the label map that the registration was given.",
+    "Spatial resolution is the wavelength at which a given fraction of the strain is recovered. Finer resolution costs"
+    " noise, so report both together.",
+    "Bias and SD in the error model are conditional on the measured shear. They apply to tissue strained and imaged "
+    "like these phantoms; scanner distortion and creep during a scan are not included.",
 )
 
 
@@ -85,8 +79,8 @@ class AccuracyStudy:
         record = provenance("accuracy", {}, about)
         write_json(out / PROVENANCE, record)
         study = cls(out, errors, floors, resolution, coverage, failures)
-        title = "Accuracy of registration presets"
-        write_report(out / REPORT, title, None, study._sections(), _CLOSING, record_lines(record))
+        title, closing = "Accuracy of registration presets", (Section("How to read this", paragraphs=_HOW_TO_READ),)
+        write_report(out / REPORT, title, None, study._sections(), closing, record_lines(record))
         return study
 
     @property
