@@ -74,9 +74,7 @@ def register(
     subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
     align = registration.align
     if align == "bone" and subject.bone is None:
-        raise InputError(
-            "Aligning on the bone needs it: give its mask (bone) or its label (bone_label), or another align."
-        )
+        raise InputError("Aligning on the bone needs it: give its mask (bone) or label (bone_label), or another align.")
     images = {name: read_image(path, allow_missing=scans.allow_missing) for name, path in places.items()}
     # Read now: what is wrong with it must not be found after an hour.
     model = None if registration.error_model is None else read_error_model(registration.error_model)

@@ -49,6 +49,11 @@ def strain(
         Frame of a displacement image's components, where no JSON file beside it tells.
     onto
         As in `register`.
+
+    Raises
+    ------
+    InputError, OutputError
+        Before anything is written: if a file cannot be read or does not fit the image, or ``out`` would replace an input.
     """
     target, source = Path(out), Path(deformation)
     subject = read_subject(reference, subject_files, onto)
