@@ -53,7 +53,7 @@ def strain(
     Raises
     ------
     InputError, OutputError
-        Before anything is written: if a file cannot be read or does not fit the image, or ``out`` would replace an input.
+        Before anything is written: if a file cannot be read or does not fit, or ``out`` would replace an input.
     """
     target, source = Path(out), Path(deformation)
     subject = read_subject(reference, subject_files, onto)
