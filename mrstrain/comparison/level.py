@@ -11,7 +11,7 @@ from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.io.result_folder import PROVENANCE, result_folders
 from fe import write_tet_mesh
-from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
+from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.register import register
 from mrstrain.options import measurement as options
@@ -83,10 +83,7 @@ def level(
     how = options.RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
     engine_of(how, labelled=subject_files.labels is not None)  # refused now rather than after the images are made
     subject = read_subject(load0, subject_files)
-    of_load, notes = model_files(
-        list(loads) or loads_of(place, reading.model_mesh is not None), [place],
-        Reading(reading.model_mesh, reading.model_unit, reading.model_frame),
-    )  # fmt: skip
+    of_load, notes = model_files(list(loads) or loads_of(place, reading.model_mesh is not None), [place], reading)
     files = {load: file for load, (file,) in of_load.items()}
     name = place.resolve().name + LEVELLED
     inputs = [Path(load0), *(p for of in (subject_files, engine, reading) for p in of.paths)]

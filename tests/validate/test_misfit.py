@@ -10,7 +10,8 @@ import pytest
 
 from dvc.errors import ExtentError, GeometryError
 from dvc.images.image import Grid
-from mrstrain.comparison.model_files import ModelFile, Reading
+from mrstrain.comparison.model_files import ModelFile
+from mrstrain.options.comparison import ModelReading
 from tests.validate.test_comparison import SIDE, cube, labels, result, sheared
 from tests.validate.test_fe_result import written
 from validate import Field, MappedFields, displacement_slip, map_fields, misfits
@@ -81,7 +82,7 @@ def test_refusals_show_both_boxes(tmp_path) -> None:
     off = replace(aside, deformation=type(aside.deformation)(moved_away, aside.deformation.u_mm))
     with pytest.raises(GeometryError, match=r"Model: -9 to 11 x 0 to 20 .*soft tissue: 0.5 to 24 x -3.5 to 24"):
         misfits(off, labels(), ["bone"])
-    file = ModelFile("heel", written(tmp_path, "vtu")["path"], Reading(unit="m"))
+    file = ModelFile("heel", written(tmp_path, "vtu")["path"], ModelReading(model_unit="m"))
     grid = Grid((40, 40, 40), np.ones(3), np.array([-10.0, -35.0, 25.0]), np.eye(3))
     with pytest.raises(
         ExtentError, match=r"no body part is that large.*spans 5000 to 15000 .*image: -10 to 30"
