@@ -47,12 +47,6 @@ _CLOSING = Section(
 def draw(one: LoadComparison, colours: Sequence[str]) -> tuple[dict[str, Picture], Viewer]:
     """A load's pictures, by the stem of their files, and its viewer; ``colours`` lists all models in colour order."""
     measured, results = one.case.read()
-    return _pictures(one, measured, results, colours), _viewer(one, measured, results)
-
-
-def _pictures(
-    one: LoadComparison, measured: Deformation, results: Sequence[FeResult], colours: Sequence[str]
-) -> dict[str, Picture]:
     fields, axes, bone = one.fields, one.case.axes, one.bones[0]
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
     tissues = [name for name in (ALL, *fields.tissues) if any(a.tissue == name for a in one.areas)]
@@ -64,13 +58,14 @@ def _pictures(
         through = f"The lowest point of {bone} lies beside the mesh: the slice goes through the mesh's middle instead."
     slices = one, measured, displacements, point
     shear, u = ((figures.differences, one, quantity) for quantity in ("max_shear", "u_mm"))
-    return {
+    pictures = {
         "curves": Picture.drawn("Volume above a strain", figures.volume_strain, one, tissues[:_PANELS], colours),
         "slices": Picture.drawn("Where the strain lies", figures.slices, *slices, note=through),
         "agreement": Picture.drawn("Maximum shear strain, cell by cell", figures.scatter, fields),
         "differences_shear": Picture.drawn("Differences of maximum shear strain", *shear),
         "differences_u": Picture.drawn("Differences of the displacement's magnitude", *u),
     }
+    return pictures, _viewer(one, measured, results)
 
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
@@ -130,7 +125,7 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
         Section(one.load, doubtful, tables, (curves, slices), (compared, *trust), (viewer,)),
-        Section(f"{one.load}, cell by cell", None, (_agreement(one), _by_distance(one)), tuple(others)),
+        Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others)),
     ]
 
 
@@ -246,31 +241,26 @@ def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
     return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.2g}–{high:.2g})"
 
 
-def _agreement(one: LoadComparison) -> Table:
-    return Table(
-        "Agreement cell by cell",
-        ("model", "quantity", "tissue", *_AGREED),
-        _rows_of(one, [ALL, *one.fields.tissues]),
-        "Maximum shear strain and displacement u: means, regression of the model on the measurement, Lin's "
-        "concordance, Bland and Altman's limits of agreement. For displacement these are of its magnitude, except "
-        "regression and concordance (the three components pooled) and RMSE (of the difference vector). All as "
-        "measured, without intervals: the error model covers maximum shear strain, and there is none of displacement.",
+def _agreement(one: LoadComparison) -> tuple[Table, Table]:
+    """Agreement cell by cell: by tissue, and by distance to bone."""
+    names, tissues = {"max_shear": "shear", "u_mm": "u, mm"}, (ALL, *one.fields.tissues)
+    rows = [(a.model, names[a.quantity], a.part, *astuple(a)[6:]) for a in one.agreements]
+    return (
+        Table(
+            "Agreement cell by cell",
+            ("model", "quantity", "tissue", *_AGREED),
+            tuple(row for row in rows if row[2] in tissues),
+            "Maximum shear strain and displacement u: means, regression of the model on the measurement, Lin's "
+            "concordance, Bland and Altman's limits of agreement. For displacement these are of its magnitude, except "
+            "regression and concordance (the three components pooled) and RMSE (of the difference vector). All as "
+            "measured, without intervals: the error model covers maximum shear strain, and there is none of "
+            "displacement.",
+        ),
+        Table(
+            "Agreement by distance to bone", ("model", "quantity", "where", *_AGREED),
+            tuple(row for row in rows if row[2] not in tissues), "In all soft tissue, as above.",
+        ),
     )  # fmt: skip
-
-
-def _by_distance(one: LoadComparison) -> Table:
-    known = (ALL, *one.fields.tissues)
-    return Table(
-        "Agreement by distance to bone",
-        ("model", "quantity", "where", *_AGREED),
-        _rows_of(one, [a.part for a in one.agreements if a.part not in known]),
-        "In all soft tissue, as above.",
-    )
-
-
-def _rows_of(one: LoadComparison, parts: Sequence[str]) -> tuple[tuple[Cell, ...], ...]:
-    names = {"max_shear": "shear", "u_mm": "u, mm"}
-    return tuple((a.model, names[a.quantity], a.part, *astuple(a)[6:]) for a in one.agreements if a.part in parts)
 
 
 def _skin(one: LoadComparison) -> Table:
