@@ -136,8 +136,11 @@ def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
 
 def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> validate.LoadCase:
     image, known = measurement.folder / REGISTERED, (measurement.table, measurement.verdict, measurement.aligned_on)
-
-    def read() -> tuple[Deformation, list[validate.FeResult]]:
-        return measurement.deformation(), [file.read(grid) for file in files]
-
+    read = partial(_read, measurement, files, grid)
     return validate.LoadCase(measurement.load, read, axes, *known, image if image.is_file() else None)
+
+
+def _read(
+    measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid
+) -> tuple[Deformation, list[validate.FeResult]]:
+    return measurement.deformation(), [file.read(grid) for file in files]
