@@ -124,13 +124,9 @@ class Comparison:
         raise InputError(f"A comparison has plots of 'curves' and 'areas', none of '{kind}'.")
 
     def write(
-        self,
-        folder: Path | str,
-        *,
-        record: Mapping[str, object] | None = None,
-        methods: Sequence[str] = (),
+        self, folder: Path | str, *, record: Mapping[str, object] | None = None, methods: Sequence[str] = (),
         on_image: bool = False,
-    ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:
+    ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:  # fmt: skip
         """Write tables, fields, pictures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
 
         It gives the sections of the report, and the closing ones.
@@ -214,16 +210,10 @@ class Comparison:
 
 
 def compare(
-    cases: Sequence[LoadCase],
-    labels: LabelMap,
-    bones: Sequence[str] = ("bone",),
-    *,
-    mesh: TetMesh | None = None,
-    criteria: Criteria | None = None,
-    notes: Sequence[str] = (),
-    warnings: Sequence[str] | None = None,
-    progress: Callable[[float], None] = lambda _: None,
-) -> Comparison:
+    cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",), *,
+    mesh: TetMesh | None = None, criteria: Criteria | None = None, notes: Sequence[str] = (),
+    warnings: Sequence[str] | None = None, progress: Callable[[float], None] = lambda _: None,
+) -> Comparison:  # fmt: skip
     """Compare models with a measurement of one or several loads.
 
     Parameters

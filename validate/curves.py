@@ -133,14 +133,10 @@ class Band:
 
 
 def bands(
-    truths: Iterable[FloatArray],
-    models: Mapping[str, FloatArray],
-    volumes_ml: FloatArray,
-    tissues: Mapping[str, np.ndarray],
-    widening: float,
-    narrowed: Callable[[FloatArray], FloatArray],
+    truths: Iterable[FloatArray], models: Mapping[str, FloatArray], volumes_ml: FloatArray,
+    tissues: Mapping[str, np.ndarray], widening: float, narrowed: Callable[[FloatArray], FloatArray],
     strains: tuple[float, float] = RANGE,
-) -> dict[str, Band]:
+) -> dict[str, Band]:  # fmt: skip
     """Bands of the true curve by tissue, from truths drawn for all cells at once.
 
     Parameters
@@ -161,8 +157,7 @@ def bands(
     them would be too small for a perfect model, whose curve is steeper.
     """
     low, high = strains
-    inner = np.linspace(low, high, _GRID)
-    outer = np.linspace(0.0, 1.5 * high, _GRID)
+    inner, outer = np.linspace(low, high, _GRID), np.linspace(0.0, 1.5 * high, _GRID)
     step = inner[1] - inner[0]
 
     def curves_of(shear: FloatArray, strains: FloatArray) -> dict[str, FloatArray]:

@@ -54,14 +54,9 @@ class FeResult:
 
 
 def read_result(
-    name: str,
-    path: Path | str,
-    *,
-    mesh: Path | str | None = None,
-    unit: str = "mm",
-    frame: str = "LPS",
+    name: str, path: Path | str, *, mesh: Path | str | None = None, unit: str = "mm", frame: str = "LPS",
     to_image: FloatArray | None = None,
-) -> FeResult:
+) -> FeResult:  # fmt: skip
     """Read a result of any code.
 
     Parameters
@@ -91,12 +86,11 @@ def read_result(
     u = (_from_table if is_table else _beside_mesh)(place, source) * MM_PER_UNIT[unit] * TO_LPS[frame]
     tets, carry = linear_tetrahedra(source)
     used = np.unique(carry.indices)
-    missing = ~np.isfinite(u[used]).all(axis=1)
-    if missing.any():
-        first = source.node_ids[used[int(np.argmax(missing))]]
+    missing = used[~np.isfinite(u[used]).all(axis=1)]
+    if len(missing):
         raise InputError(
-            f"{place}: {np.count_nonzero(missing)} of {len(missing)} nodes have no displacement, first node {first}. "
-            "Export all nodes of the tissue."
+            f"{place}: {len(missing)} of {len(used)} nodes have no displacement, first node "
+            f"{source.node_ids[missing[0]]}. Export all nodes of the tissue."
         )
     rigid = _rigid(np.eye(4) if to_image is None else to_image)
     moved = np.asarray(carry @ np.nan_to_num(u)) @ rigid.matrix.T
@@ -172,7 +166,7 @@ def _from_table(place: Path, source: MeshFile) -> FloatArray:
             f"{place}: a table of displacements has a column 'node' and three such as ux, uy, uz, with commas "
             f"between; it has {', '.join(head)}."
         )
-    columns = [named.index(node), *(named.index(c) for c in parts)]
+    columns = [named.index(c) for c in (node, *parts)]
     try:
         numbers = np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, 4)
     except (ValueError, IndexError) as error:
@@ -203,10 +197,8 @@ def check_overlap(path: Path, mesh: TetMesh, grid: Grid) -> None:
     if lies_in(1.0, (1.0, 1.0, 1.0)):
         return
     fitting = [(size, frame) for (a, size), (b, frame) in product(_SCALES.items(), _TURNS.items()) if lies_in(a, b)]
-    hint = (
-        f"It would with {' and '.join(fitting[0])}." if fitting else "Give the map to the image's frame (--to-image)."
-    )
+    hint = f"It would with {' and '.join(fitting[0])}" if fitting else "Give the map to the image's frame (--to-image)"
     raise GeometryError(
         f"{path} does not lie in the image. Model: {box_told(*mesh.bounds_mm)}; image: {box_told(*grid.bounds_mm())} "
-        f"(LPS mm). {hint}"
+        f"(LPS mm). {hint}."
     )

@@ -1,12 +1,11 @@
 """One load, measured and simulated by several models: areas, location, agreement and skin displacement."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -90,12 +89,9 @@ class LoadCase:
 
     @classmethod
     def of(
-        cls,
-        load: str,
-        measured: Deformation | Measurement,
-        results: Sequence[FeResult],
+        cls, load: str, measured: Deformation | Measurement, results: Sequence[FeResult],
         error: ErrorTable | None = None,
-    ) -> LoadCase:
+    ) -> Self:  # fmt: skip
         """A load whose fields are in memory; set the rest with `dataclasses.replace`.
 
         Parameters
@@ -113,11 +109,9 @@ class LoadCase:
         if not isinstance(measured, Measurement):
             return cls(load, partial(_given, measured, results), error=error)
         known, axes = measured.error_bars.uncertainty, None if measured.source is None else measured.source.subject.axes
-        own = None if known is None else known.table
-        case = cls(
-            load, partial(_given, measured.deformation, results), error=own if error is None else error,
-            verdict=measured.verdict, aligned_on=str(measured.alignment.get("on", "")),
-        )  # fmt: skip
+        error = known.table if error is None and known is not None else error
+        on, read = str(measured.alignment.get("on", "")), partial(_given, measured.deformation, results)
+        case = cls(load, read, error=error, verdict=measured.verdict, aligned_on=on)
         return case if axes is None else replace(case, axes=axes)
 
 
@@ -173,13 +167,9 @@ class LoadComparison:
 
 
 def compare_load(
-    case: LoadCase,
-    labels: LabelMap,
-    bones: Sequence[str] = ("bone",),
-    *,
-    mesh: TetMesh | None = None,
-    criteria: Criteria | None = None,
-) -> LoadComparison:
+    case: LoadCase, labels: LabelMap, bones: Sequence[str] = ("bone",), *,
+    mesh: TetMesh | None = None, criteria: Criteria | None = None,
+) -> LoadComparison:  # fmt: skip
     """Compare models with the measurement of one load, at the centroids of one mesh's cells.
 
     Parameters as in `validate.compare`, errors as in `validate.map_fields`.
@@ -192,17 +182,13 @@ def compare_load(
     known = {} if case.error is None else _bands(fields, case, case.error, by, truths)
     normal = -case.axes[:, 0]
     return LoadComparison(
-        case=case,
-        labels=labels,
-        bones=tuple(bones),
-        criteria=by,
-        fields=fields,
+        case, labels, tuple(bones), by, fields,
         areas=tuple(_areas(fields, case.load, known, by)),
         overlaps=tuple(_overlaps(fields, case, by, truths)),
         agreements=tuple(row for name in models for row in agreements(fields, name, case.load)),
         skin=tuple(skin_displacement(fields, name, case.load, of, measured, normal) for name, of in models.items()),
         bands=known,
-    )
+    )  # fmt: skip
 
 
 def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Criteria) -> Iterator[Area]:

@@ -165,14 +165,9 @@ class Overlap:
 
 
 def overlap(
-    model: str,
-    load: str,
-    threshold: float,
-    measured: FloatArray,
-    simulated: FloatArray,
-    cells: CellGraph,
-    least_ml: float = LEAST_ML,
-) -> Overlap:
+    model: str, load: str, threshold: float, measured: FloatArray, simulated: FloatArray,
+    cells: CellGraph, least_ml: float = LEAST_ML,
+) -> Overlap:  # fmt: skip
     """Compare the clusters above a threshold of two fields (n,) on the same cells; undefined figures are NaN."""
     of, to = (cells.clusters(shear > threshold, shear, least_ml) for shear in (measured, simulated))
     first, second = (cells.region(shear > threshold, least_ml) for shear in (measured, simulated))
@@ -244,13 +239,9 @@ _FIGURES: dict[str, Callable[[StrainedRegion, StrainedRegion], float]] = {
 
 
 def with_intervals(
-    overlaps: Sequence[Overlap],
-    truths: Sequence[FloatArray],
-    models: Mapping[str, FloatArray],
-    cells: CellGraph,
-    least_ml: float,
-    widening: float,
-) -> list[Overlap]:
+    overlaps: Sequence[Overlap], truths: Sequence[FloatArray], models: Mapping[str, FloatArray],
+    cells: CellGraph, least_ml: float, widening: float,
+) -> list[Overlap]:  # fmt: skip
     """Overlaps of a load with 95 % intervals from truths drawn, and with the value that a perfect model would get.
 
     Truths and models are the maximum shear strain in ``cells`` (n,); ``widening`` is the factor on intervals of draws,

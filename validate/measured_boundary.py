@@ -52,10 +52,10 @@ def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArra
     if not known.any():
         raise InputError("The measurement is defined at no node of the mesh. Do they share a frame?")
     distance, _ = cKDTree(mesh.points_mm[known]).query(mesh.points_mm[~known])
-    if np.count_nonzero(distance > _FAR_MM) > _FEW * len(u):
+    if (far := np.count_nonzero(distance > _FAR_MM)) > _FEW * len(u):
         raise InputError(
-            f"{np.count_nonzero(distance > _FAR_MM)} of {len(u)} nodes lie over {_FAR_MM:g} mm from any at which the "
-            "measurement is defined; it does not cover the model."
+            f"{far} of {len(u)} nodes lie over {_FAR_MM:g} mm from any at which the measurement is defined; it does "
+            "not cover the model."
         )
     u = filled_from_nearest(u, mesh.points_mm)
     if BONE in mesh.facets:
@@ -64,14 +64,9 @@ def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArra
 
 
 def simulate_driven(
-    mesh: TetMesh,
-    materials: Mapping[str, Material],
-    measured: Deformation,
-    load: str,
-    *,
-    threads: int = 1,
-    tell: Callable[[str], None] = lambda _: None,
-) -> LoadState:
+    mesh: TetMesh, materials: Mapping[str, Material], measured: Deformation, load: str, *,
+    threads: int = 1, tell: Callable[[str], None] = lambda _: None,
+) -> LoadState:  # fmt: skip
     """Equilibrium of a mesh with the measured displacement prescribed on its surface.
 
     The state has no plate. If equilibrium was lost, it is the last converged increment, and ``reached`` is below 1.
@@ -96,8 +91,7 @@ def simulate_driven(
     model = Model.of(mesh, materials, element("P1"))
     assembler = Assembler(model, (3 * nodes[:, None] + np.arange(3)).ravel(), {})
     solver = Solver(assembler.indptr, assembler.indices, threads=threads)
-    state = np.zeros(model.unknowns)
-    count = 3 * len(mesh.points_mm)
+    state, count = np.zeros(model.unknowns), 3 * len(mesh.points_mm)
     done, step, iterations = 0.0, _FIRST_STEP, 0
     try:
         while done < 1.0 and step > _LEAST_STEP:
@@ -116,16 +110,10 @@ def simulate_driven(
     if done == 0.0:
         raise MrstrainError(f"{load}: no equilibrium was found with the measured displacement on the surface.")
     return LoadState(
-        load=LoadStep(load, float("nan")),
-        reached=done,
-        u_mm=state[:count].reshape(-1, 3),
-        pressure_mpa=model.pressures(state).mean(axis=1),
-        gradients=model.gradients(state),
-        on_plate=np.empty(0, dtype=np.int64),
-        curve=(),
-        iterations=iterations,
-        seconds=time.monotonic() - began,
-    )
+        load=LoadStep(load, float("nan")), reached=done, u_mm=state[:count].reshape(-1, 3),
+        pressure_mpa=model.pressures(state).mean(axis=1), gradients=model.gradients(state),
+        on_plate=np.empty(0, dtype=np.int64), curve=(), iterations=iterations, seconds=time.monotonic() - began,
+    )  # fmt: skip
 
 
 def write_boundary_conditions(
@@ -143,13 +131,13 @@ def write_boundary_conditions(
     abaqus = [f"{n}, {axis}, {axis}, {value:.9g}" for n, axis, value in values]
     ansys = [f"D,{n},U{' XYZ'[axis]},{value:.9g}" for n, axis, value in values]
     files = {
-        ".inp": [f"** {about}; into a *STEP", "*BOUNDARY", *abaqus],
-        ".mac": [f"! {about}", *ansys],
-        ".feb": _febio(numbers, u, about),
+        stem.with_name(f"{stem.name}.inp"): [f"** {about}; into a *STEP", "*BOUNDARY", *abaqus],
+        stem.with_name(f"{stem.name}.mac"): [f"! {about}", *ansys],
+        stem.with_name(f"{stem.name}.feb"): _febio(numbers, u, about),
     }
-    for ending, lines in files.items():
-        write_whole(stem.with_name(stem.name + ending), "\n".join(lines) + "\n")
-    return [stem.with_name(stem.name + ending) for ending in files]
+    for path, lines in files.items():
+        write_whole(path, "\n".join(lines) + "\n")
+    return list(files)
 
 
 def _febio(numbers: IntArray, u: FloatArray, about: str) -> Iterator[str]:

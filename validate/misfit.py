@@ -14,13 +14,9 @@ from validate.fe_result import FeResult, check_overlap
 from validate.load_comparison import LoadCase
 from validate.mapping import MappedFields, check_bones, tissues_of
 
-_LEAST_OVERLAP, _GOOD_OVERLAP = 0.85, 0.95
-_SAME_TISSUE = 0.8
+_LEAST_OVERLAP, _GOOD_OVERLAP, _SAME_TISSUE, _VOLUME_CHANGE = 0.85, 0.95, 0.8, 0.15
 _NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
-_VOLUME_CHANGE = 0.15
-_ALONG, _TURNED = 0.7, 0.5
-_UNIT = 1000.0
-_TIED = 0.02
+_ALONG, _TURNED, _TIED, _UNIT = 0.7, 0.5, 0.02, 1000.0
 
 
 def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",)) -> list[str]:
@@ -57,11 +53,11 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
     overlap = float(mesh.volumes_mm3[inside].sum() / smaller)
     if overlap < _LEAST_OVERLAP:
         there = labels.grid.points(labelled)
+        own, of_tissue = box_told(*mesh.bounds_mm), box_told(there.min(axis=0), there.max(axis=0))
         raise GeometryError(
-            f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: "
-            f"{box_told(*mesh.bounds_mm)}; labelled soft tissue: "
-            f"{box_told(there.min(axis=0), there.max(axis=0))} (LPS mm). It is turned, mirrored or moved against the "
-            "image, or its label map is another's: check unit and frame, or give the map to the image's frame."
+            f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: {own}; labelled soft "
+            f"tissue: {of_tissue} (LPS mm). It is turned, mirrored or moved against the image, or its label map is "
+            "another's: check unit and frame, or give the map to the image's frame."
         )
     return overlap
 
