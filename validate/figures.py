@@ -17,10 +17,7 @@ from validate.load_comparison import LoadComparison
 from validate.mapping import ALL, MappedFields, filled_from_nearest
 from validate.tables import LOWER, UPPER, Curve, curves_of
 
-_POINTS = 601
-_COLUMNS = 3
-_BAND = "#b8bfc9"
-_BINS = 60
+_POINTS, _COLUMNS, _BINS, _BAND = 601, 3, 60, "#b8bfc9"
 
 
 def volume_strain(one: LoadComparison, tissues: Sequence[str], colours: Sequence[str]) -> bytes:
@@ -111,8 +108,7 @@ def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatA
     undefined. A node beyond the measurement is drawn with the displacement of the nearest one within. Letters name the
     sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
-    panels = slice_panels(one.fields, measured, u_mm)
-    return png_bytes(slice_sheet(one.fields.mesh, panels, one.case.axes, point_mm))
+    return png_bytes(slice_sheet(one.fields.mesh, slice_panels(one.fields, measured, u_mm), one.case.axes, point_mm))
 
 
 def slice_panels(fields: MappedFields, measured: Deformation, u_mm: Mapping[str, FloatArray]) -> list[Slice]:
@@ -146,19 +142,18 @@ def differences(one: LoadComparison, quantity: str) -> bytes:
 
     The solid line is the mean difference, dashed lines are the limits of agreement, 1.96 standard deviations away.
     """
-    fields, where = one.fields, one.fields.common
-    limits = {row.model: row for row in one.agreements if (row.quantity, row.part) == (quantity, ALL)}
+    fields, where, unit = one.fields, one.fields.common, "" if quantity == "max_shear" else ", mm"
+    limits = [row for row in one.agreements if (row.quantity, row.part) == (quantity, ALL)]
     figure, spots = _by_model(max(1, len(limits)))
-    for spot, name in zip(spots, limits, strict=False):
+    for spot, row in zip(spots, limits, strict=False):
         x, y = (
             field.max_shear[where] if quantity == "max_shear" else np.linalg.norm(field.u_mm[where], axis=1)
-            for field in (fields.measured, fields.models[name])
+            for field in (fields.measured, fields.models[row.model])
         )
         spot.hist2d(0.5 * (x + y), y - x, bins=_BINS, weights=fields.volumes_ml[where], norm="log", cmap="Blues")
-        for height, style in ((limits[name].bias, "-"), (limits[name].lower, "--"), (limits[name].upper, "--")):
+        for height, style in ((row.bias, "-"), (row.lower, "--"), (row.upper, "--")):
             spot.axhline(height, color=INK, linewidth=0.9, linestyle=style)
-        spot.set_title(name, color=INK, **FONT)
-        unit = "" if quantity == "max_shear" else ", mm"
+        spot.set_title(row.model, color=INK, **FONT)
         label_axes(spot, f"mean of both{unit}", f"simulated - measured{unit}")
     return png_bytes(figure)
 

@@ -18,6 +18,7 @@ Pairs = tuple[tuple[str, str], ...]
 """Of models, each in the order of their areas."""
 
 ALL_LOADS = "all loads"
+_SURE, _LEVEL = 0.95, 0.975
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,8 +102,7 @@ def _under(one: LoadComparison, pairs: Pairs) -> str:
     if one.hardly_strained:
         low = one.criteria.strains[0]
         return f"{one.load}: less than 1 % of the tissue exceeds {low:g}, so the area metric is not informative."
-    distrusted = one.case.verdict is not None and one.case.verdict.level == "distrust"
-    caveat = " Its registration is not to be trusted." * distrusted
+    caveat = " Its registration is not to be trusted." * bool(one.case.verdict and one.case.verdict.level == "distrust")
     return _statement(f"under {one.load}", one.ranked(), pairs, caveat) if ALL in one.bands else ""
 
 
@@ -119,9 +119,6 @@ def _statement(where: str, ranked: Sequence[Area], pairs: Pairs, caveat: str) ->
         + (f" Further down, not distinguishable: {'; '.join(neighbours)}." if neighbours else "")
         + caveat
     )
-
-
-_SURE, _LEVEL = 0.95, 0.975
 
 
 @dataclass(frozen=True, slots=True)

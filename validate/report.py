@@ -17,8 +17,7 @@ from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
 from validate.ranking import ALL_LOADS, Ranking
 
-_AROUND = 4  # voxels around the tissue in the viewer
-_PANELS = 4  # tissues whose curves are drawn, all soft tissue first
+_AROUND, _PANELS = 4, 4  # voxels around the tissue in the viewer; tissues whose curves are drawn, all soft tissue first
 _AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
 _CLOSING = Section(
     "How to read this",
@@ -115,16 +114,15 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
 def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: Viewer) -> list[Section]:
     """A load's part of the report: how much and where, then cell by cell."""
     verdict = one.case.verdict
-    covered = one.fields.coverage()
-    compared = (
-        f"Compared: {covered['common']:.1f} mL of the mesh's {covered['mesh']:.1f} mL of soft tissue; the "
-        f"measurement is defined in {covered['measured']:.1f} mL."
-    )
-    trust = () if verdict is None else (f"Verdict on its registration: {verdict.words}.",)
+    words = [
+        "Compared: {common:.1f} mL of the mesh's {mesh:.1f} mL of soft tissue; the measurement is defined in "
+        "{measured:.1f} mL.".format(**one.fields.coverage())
+    ]
+    words += [] if verdict is None else [f"Verdict on its registration: {verdict.words}."]
     curves, slices, *others = pictures.values()
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
-        Section(one.load, doubtful, tables, (curves, slices), (compared, *trust), (viewer,)),
+        Section(one.load, doubtful, tables, (curves, slices), tuple(words), (viewer,)),
         Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others)),
     ]
 

@@ -106,7 +106,7 @@ def level(
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")
         else:
-            _write(target / name / f"{load}.vtu", result, registered)
+            _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):
         raise RegistrationError(" ".join(failures))
     return Levelled(target / name, (*notes, *smoothed, *failures))
@@ -137,17 +137,15 @@ def _prepare(target: Path, name: str, images: Mapping[str, Image], record: Mappi
     work = target / f"{name}-work"
     for folder in (target, target / name, work, work / "images", work / "registered"):
         make_output(folder)
-    for load in images:
-        (target / name / f"{load}.vtu").unlink(missing_ok=True)
-    write_json(target / name / PROVENANCE, record)
     for load, image in images.items():
+        (target / name / f"{load}.vtu").unlink(missing_ok=True)
         write_image(work / "images" / f"{load}.nii.gz", image)
+    write_json(target / name / PROVENANCE, record)
     write_whole(target / name / SETTINGS, IN_IMAGE)
 
 
-def _write(path: Path, result: FeResult, registered: Path) -> None:
-    """Write the registered displacement at the nodes of the model's mesh; where undefined, that of the nearest node."""
-    mesh = result.mesh
+def _write(path: Path, mesh: TetMesh, registered: Path) -> None:
+    """Write the registered displacement at the nodes of a model's mesh; where undefined, that of the nearest node."""
     (measured,) = result_folders(registered)
     u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)
     write_tet_mesh(path, TetMesh(mesh.points_mm, mesh.cells, mesh.regions), {}, {"displacement_mm": u})
