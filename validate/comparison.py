@@ -17,6 +17,7 @@ from dvc.report.sheet import png_bytes
 from dvc.trust.verdict import LEVELS, worst
 from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
+from validate.arguments import check_kind
 from validate.curves import Area
 from validate.extrapolation import LEVELLED
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
@@ -236,7 +237,10 @@ def compare(
     InputError, GeometryError
         As `check_models` and `map_fields`.
     """
-    by = criteria or Criteria()
+    by = Criteria() if criteria is None else criteria
+    check_kind("criteria", by, Criteria)
+    if mesh is not None:
+        check_kind("mesh", mesh, TetMesh)
     odd = list(check_models(cases, labels, bones) if warnings is None else warnings)
     loads: list[LoadComparison] = []
     for number, case in enumerate(cases):

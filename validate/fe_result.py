@@ -18,6 +18,7 @@ from dvc.deformation.nodal import OnMesh
 from dvc.errors import GeometryError, InputError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import box_told
+from validate.arguments import check_kind
 from validate.tetrahedra import linear_tetrahedra
 
 _NAMES = ("displacement_mm", "displacement", "displacements", "disp", "u")
@@ -45,6 +46,7 @@ class FeResult:
     @classmethod
     def of(cls, name: str, deformation: OnMesh) -> "FeResult":
         """The result of a model in memory, by its name in tables: ``simulation.deformation("Load1")``, say."""
+        check_kind("deformation", deformation, OnMesh)
         return cls(name, Path(name), deformation)
 
     @property

@@ -15,6 +15,7 @@ from dvc.errors import InputError
 from dvc.trust.truth_draws import TruthDraws
 from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
+from validate.arguments import check_each, check_kind
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
 from validate.extrapolation import LEVELLED
 from validate.fe_result import FeResult
@@ -87,6 +88,11 @@ class LoadCase:
     aligned_on: str = ""
     image: Path | None = None
 
+    def __post_init__(self) -> None:
+        check_kind("read", self.read, Callable)
+        if self.error is not None:
+            check_kind("error", self.error, ErrorTable)
+
     @classmethod
     def of(
         cls, load: str, measured: Deformation | Measurement, results: Sequence[FeResult],
@@ -106,7 +112,9 @@ class LoadCase:
         error : ErrorTable, optional
             Error of the measured maximum shear strain, in place of the measurement's own.
         """
+        check_each("results", results, FeResult)
         if not isinstance(measured, Measurement):
+            check_kind("measured", measured, Deformation)
             return cls(load, partial(_given, measured, results), error=error)
         known, axes = measured.error_bars.uncertainty, None if measured.source is None else measured.source.subject.axes
         error = known.table if error is None and known is not None else error
@@ -175,6 +183,7 @@ def compare_load(
     Parameters as in `validate.compare`, errors as in `validate.map_fields`.
     """
     by = criteria or Criteria()
+    check_kind("case", case, LoadCase)
     measured, results = case.read()
     models = {result.name: result.deformation for result in results}
     fields = map_fields(mesh if mesh is not None else results[0].mesh, labels, bones, measured, models)

@@ -10,6 +10,7 @@ from dvc import Deformation, LabelMap, StrainField, TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.trust.regions import volume_above
+from validate.arguments import check_each, check_kind
 
 ALL = "all soft tissue"
 """Name of all compared tissue together."""
@@ -105,6 +106,8 @@ def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray
 
 def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
     """Refuse bones that are not in the label map, with an `InputError` that names its labels."""
+    check_kind("labels", labels, LabelMap)
+    check_each("bones", bones, str)
     known = labels.names.values()
     if missing := [name for name in bones if name not in known]:
         raise InputError(
@@ -138,6 +141,7 @@ def map_fields(
     InputError
         If a bone is not in the label map, or measurement and models have no tissue in common.
     """
+    check_kind("mesh", mesh, TetMesh)
     check_bones(labels, bones)
     tissue = tissues_of(mesh, labels)
     soft = ~np.isin(tissue, list(bones))

@@ -22,6 +22,7 @@ from fe.assembly import Assembler
 from fe.elements import Model, element
 from fe.linear import Solver
 from fe.newton import Imposed, equilibrium
+from validate.arguments import check_kind
 from validate.mapping import filled_from_nearest
 
 _FIRST_STEP, _LEAST_STEP = 0.25, 1.0 / 64.0
@@ -46,6 +47,8 @@ def boundary_displacement(mesh: TetMesh, measured: Deformation) -> tuple[IntArra
 
 def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
     """Surface nodes (k,), and the measured displacement of all nodes (n, 3), zero on the surface of bone."""
+    check_kind("mesh", mesh, TetMesh)
+    check_kind("measured", measured, Deformation)
     nodes = np.unique(outer_faces(mesh.cells))
     u = measured.displacement(mesh.points_mm)
     known = np.isfinite(u).all(axis=1)
@@ -85,9 +88,9 @@ def simulate_driven(
     InputError
         As `boundary_displacement`, or if a cell does not have exactly one constitutive model.
     """
-    check_materials(mesh, materials)
     began = time.monotonic()
     nodes, guess = _boundary(mesh, measured)
+    check_materials(mesh, materials)
     model = Model.of(mesh, materials, element("P1"))
     assembler = Assembler(model, (3 * nodes[:, None] + np.arange(3)).ravel(), {})
     solver = Solver(assembler.indptr, assembler.indices, threads=threads)

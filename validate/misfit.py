@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from dvc import LabelMap, TetMesh
 from dvc.errors import GeometryError, InputError
 from dvc.mesh import box_told
+from validate.arguments import check_each
 from validate.fe_result import FeResult, check_overlap
 from validate.load_comparison import LoadCase
 from validate.mapping import MappedFields, check_bones, tissues_of
@@ -30,6 +31,7 @@ def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[st
         If a model does not lie in the image, or less than 85 % of it in the labelled soft tissue.
     """
     check_bones(labels, bones)
+    check_each("cases", cases, LoadCase)
     if not cases:
         raise InputError("No load is given to compare.")
     warnings = []
@@ -37,6 +39,7 @@ def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[st
         _, results = case.read()
         if not results:
             raise InputError(f"{case.load}: no model is given.")
+        check_each(f"{case.load}: results", results, FeResult)
         for result in results:
             check_overlap(result.path, result.mesh, labels.grid)
             warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones)]
