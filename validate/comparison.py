@@ -24,7 +24,7 @@ from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison
 from validate.location import Overlap
 from validate.mapping import ALL
 from validate.misfit import check_models, displacement_slip
-from validate.ranking import ALL_LOADS, Ranking, rank_over_loads
+from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
 from validate.report import area_rows, closing_sections, draw, load_sections, overview, shown
 from validate.tables import Curve
 
@@ -74,15 +74,16 @@ class Comparison:
         """Verdict, areas, and which differences are significant, a line each."""
         lines = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}"]
         for load in self.coverage_ml:
-            areas = {a.model: a for a in self.areas if (a.load, a.tissue) == (load, ALL) and a.model != NOTHING}
+            areas = {a.model: a for a in self.areas if (a.load, a.tissue) == (load, ALL)}
+            nothing = areas.pop(NOTHING)
             levelled = {name: a for name, a in areas.items() if name.endswith(LEVELLED)}
             ranked = sorted((a for name, a in areas.items() if name not in levelled), key=lambda a: a.best_ml)
-            lines.append(f"{load}: area between curves, mL, best first: {_listed(ranked)}")
+            lines.append(f"{load}: area between curves, mL, best first: {_listed(ranked, nothing)}")
             for name, area in levelled.items():
                 before = areas[name.removesuffix(LEVELLED)].ml if name.removesuffix(LEVELLED) in areas else np.nan
                 lines.append(f"{load}: {name} {area.ml:.2f} as measured, {before:.2f} before levelling")
         if len(self.coverage_ml) > 1 and self.ranking.areas:
-            lines.append(f"All loads: {_listed(self.ranking.areas)}")
+            lines.append(f"All loads: {_listed(self.ranking.areas, self.ranking.nothing)}")
         return [*lines, *self.ranking.statements, *self.notes]
 
     def __str__(self) -> str:
@@ -105,7 +106,11 @@ class Comparison:
             return self.ranking.statements[0]
         ranked = self.ranking.areas or [a for a in self.areas if a.tissue == ALL and a.model != NOTHING]
         best = min(ranked, key=lambda a: a.best_ml)
-        return f"{best.model}: area between curves {shown(best)} mL ({best.load}), normalised {best.share:.1%}."
+        nothing = {a.load: a for a in (*self.areas, self.ranking.nothing) if (a.model, a.tissue) == (NOTHING, ALL)}
+        worse = (
+            ", no nearer to the measurement than no deformation at all" if no_nearer([best], nothing[best.load]) else ""
+        )
+        return f"{best.model}: area between curves {shown(best)} mL ({best.load}), normalised {best.share:.1%}{worse}."
 
     def plot(self, kind: Literal["curves", "areas"] = "curves", *, tissue: str = ALL) -> Figure:
         """Draw volume-strain curves, a panel for each load, or the areas between them with their 95 % intervals.
@@ -307,8 +312,10 @@ def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
     return notes
 
 
-def _listed(areas: Sequence[Area]) -> str:
-    return ", ".join(f"{a.model} {shown(a)}" for a in areas)
+def _listed(areas: Sequence[Area], nothing: Area) -> str:
+    worse = ", ".join(no_nearer(areas, nothing))
+    listed = ", ".join(f"{a.model} {shown(a)}" for a in areas)
+    return listed + (f"; no nearer than {NOTHING} ({shown(nothing)}): {worse}" if worse else "")
 
 
 def _plain(verdict: Verdict | None) -> dict[str, object] | None:

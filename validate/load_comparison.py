@@ -173,6 +173,11 @@ class LoadComparison:
         models = (a for a in self.areas if a.tissue == ALL and a.model != NOTHING and not a.model.endswith(LEVELLED))
         return sorted(models, key=lambda a: a.best_ml)
 
+    @property
+    def nothing(self) -> Area:
+        """Area of `NOTHING` in all soft tissue."""
+        return next(a for a in self.areas if (a.model, a.tissue) == (NOTHING, ALL))
+
 
 def compare_load(
     case: LoadCase, labels: LabelMap, bones: Sequence[str] = ("bone",), *,

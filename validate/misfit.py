@@ -131,7 +131,7 @@ def displacement_slip(fields: MappedFields, name: str) -> str:
         axes = " ".join(("-" if sign < 0.0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
         axes += " (the other of LPS and RAS)" if axes == "-x -y z" else ""
         warnings.append(
-            f"fits far better with its components taken as {axes} (cosine {most:.2f}, as given {as_given:.2f}): is it "
+            f"fits far better with its components taken as {axes} (cosine {most:.2f}, as given {as_given:z.2f}): is it "
             "in the frame and order of axes of the coordinates?"
         )
     if abs(np.log(of_model / size)) > 0.5 * np.log(_UNIT):

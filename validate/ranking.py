@@ -1,6 +1,6 @@
 """Models ranked by the area between curves: under each load, over all loads, and over subjects."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
@@ -71,9 +71,15 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     statements = [_under(one, pairs[one.load]) for one in loads]
     if len(loads) > 1 and everywhere and informative is not None:
         distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
-        counted = f" The registration of {', '.join(distrusted)}, which counts in it, is not to be trusted."
-        statements.insert(0, _statement("over all loads", _ranked(rows), pairs[ALL_LOADS], counted * bool(distrusted)))
+        caveat = f" The registration of {', '.join(distrusted)}, which counts in it, is not to be trusted."
+        caveat *= bool(distrusted)
+        statements.insert(0, _statement("over all loads", _ranked(rows), nothing, pairs[ALL_LOADS], caveat))
     return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs)
+
+
+def no_nearer(areas: Iterable[Area], nothing: Area) -> list[str]:
+    """Ranked models whose area is no smaller than that of `NOTHING` under the same load."""
+    return [a.model for a in areas if a.best_ml >= nothing.best_ml and not a.model.endswith(LEVELLED)]
 
 
 def _summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
@@ -103,10 +109,10 @@ def _under(one: LoadComparison, pairs: Pairs) -> str:
         low = one.criteria.strains[0]
         return f"{one.load}: less than 1 % of the tissue exceeds {low:g}, so the area metric is not informative."
     caveat = " Its registration is not to be trusted." * bool(one.case.verdict and one.case.verdict.level == "distrust")
-    return _statement(f"under {one.load}", one.ranked(), pairs, caveat) if ALL in one.bands else ""
+    return _statement(f"under {one.load}", one.ranked(), one.nothing, pairs, caveat) if ALL in one.bands else ""
 
 
-def _statement(where: str, ranked: Sequence[Area], pairs: Pairs, caveat: str) -> str:
+def _statement(where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, caveat: str) -> str:
     """The best model, and ranks that do not differ significantly from it or their neighbours; "" for a single model."""
     if len(ranked) < 2:
         return ""
@@ -116,6 +122,7 @@ def _statement(where: str, ranked: Sequence[Area], pairs: Pairs, caveat: str) ->
     return (
         f"Best match {where} (area metric): {best}"
         + (f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other.")
+        + " It is no nearer to the measurement than no deformation at all." * (best in no_nearer(ranked, nothing))
         + (f" Further down, not distinguishable: {'; '.join(neighbours)}." if neighbours else "")
         + caveat
     )

@@ -10,12 +10,13 @@ from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from validate import figures
+from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
 from validate.fe_result import FeResult
 from validate.load_comparison import NOTHING, LoadComparison
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
-from validate.ranking import ALL_LOADS, Ranking
+from validate.ranking import ALL_LOADS, Ranking, no_nearer
 
 _AROUND, _PANELS = 4, 4  # voxels around the tissue in the viewer; tissues whose curves are drawn, all soft tissue first
 _AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
@@ -156,7 +157,8 @@ def shown(area: Area) -> str:
 
 def _ranks(ranking: Ranking, model: str) -> str:
     """Rank of a model over all loads: a range if not distinguishable from neighbours, a dash if not ranked."""
-    return "–".join(str(rank) for rank in dict.fromkeys(ranking.rank(model) or ("–",)))
+    ranks = "–".join(str(rank) for rank in dict.fromkeys(ranking.rank(model) or ("–",)))
+    return ranks + f", no nearer than {NOTHING}" * (model in no_nearer(ranking.areas, ranking.nothing))
 
 
 def area_rows(areas: Iterable[Area], ranking: Ranking, loads: Sequence[str]) -> list[tuple[str, ...]]:
@@ -179,7 +181,8 @@ def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
         "The best model over all loads first; the rank is a range where models are not distinguishable. Where the "
         "measurement uncertainty is known, the area is the median over the true fields drawn, with a 95 % interval; "
         "areas as measured, and by tissue, stand below and in areas.csv. Levelled models come last, with their area as "
-        "measured. Below the line: the area of a model that predicts zero strain everywhere.",
+        "measured. Below the line: the area of a model that predicts zero strain everywhere; where a model's is no "
+        "smaller, that is said beside its rank.",
         (nothing,),
     )
 
@@ -242,7 +245,7 @@ def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
 def _agreement(one: LoadComparison) -> tuple[Table, Table]:
     """Agreement cell by cell: by tissue, and by distance to bone."""
     names, tissues = {"max_shear": "shear", "u_mm": "u, mm"}, (ALL, *one.fields.tissues)
-    rows = [(a.model, names[a.quantity], a.part, *astuple(a)[6:]) for a in one.agreements]
+    rows: list[tuple[Cell, ...]] = [(a.model, names[a.quantity], a.part, *_rounded(a, 6)) for a in one.agreements]
     return (
         Table(
             "Agreement cell by cell",
@@ -261,13 +264,18 @@ def _agreement(one: LoadComparison) -> tuple[Table, Table]:
     )  # fmt: skip
 
 
+def _rounded(row: Agreement | SkinDisplacement, first: int) -> tuple[float, ...]:
+    """Figures of a row from the first on; what rounding leaves of a zero, and its sign, is dropped."""
+    return tuple(round(figure, 9) + 0.0 for figure in astuple(row)[first:])
+
+
 def _skin(one: LoadComparison) -> Table:
     return Table(
         "Skin under the plate, and volume change of the fat",
         ("model", "nodes", "inward, measured, mm", "model, mm", "tangential, measured, mm", "model, mm",
          "fat's volume change, measured, %", "model, %"),
         tuple(
-            (t.model, *astuple(t)[2:7], 100.0 * t.measured_volume_change, 100.0 * t.model_volume_change)
+            (t.model, t.nodes, *_rounded(t, 3)[:4], *(100.0 * change for change in _rounded(t, 3)[4:]))
             for t in one.skin
         ),
         "Mean displacement 1 mm inside the skin on the model's plate, against the plate's outward normal and "

@@ -60,6 +60,9 @@ def test_a_slip_of_axes_frame_or_unit_is_named_under_a_small_load() -> None:
     assert "taken as -x -y z (the other of LPS and RAS)" in told(found, rough * [-1.0, -1.0, 1.0])
     assert told(found, 1e-3 * rough).endswith("times as large as the measured one: is it in metres?")
     assert told(found, 1e3 * rough).endswith("is it 1000 times too large?")
+    swapped = right[:, [1, 0, 2]]
+    across = swapped - right * (0.999 * (weight @ (swapped * right).sum(axis=1)) / (weight @ (right**2).sum(axis=1)))
+    assert "as given 0.00)" in told(found, across)  # a cosine of -0.0002
     both = told(found, 1e-3 * rough[:, [1, 0, 2]])
     assert "taken as y x z" in both
     assert "in metres" in both
