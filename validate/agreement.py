@@ -78,7 +78,11 @@ def agreement(
 
 
 def agreements(fields: MappedFields, model: str, load: str) -> list[Agreement]:
-    """Agreement of maximum shear strain and displacement: all soft tissue, each tissue, and by distance to bone."""
+    """Agreement of a model's maximum shear strain and displacement (mm) with the measured, cell by cell.
+
+    Rows for all soft tissue, each tissue, and bins of distance to bone; none for a part with fewer than ten cells in
+    which the measurement and all models are defined.
+    """
     common, field, parts = fields.common, fields.models[model], fields.parts
     for low, high in pairwise((*TO_BONE_MM, np.inf)):
         name = f"{low:g} to {high:g} mm from bone" if np.isfinite(high) else f"over {low:g} mm from bone"
@@ -142,7 +146,18 @@ def skin_on_plate(model: OnMesh, normal: FloatArray) -> IntArray:
 def skin_displacement(
     fields: MappedFields, name: str, load: str, model: OnMesh, measured: Deformation, normal: FloatArray
 ) -> SkinDisplacement:
-    """Displacement, measured and simulated, 1 mm inside the skin on the plate of outward unit ``normal`` (3,), LPS."""
+    """Displacement, measured and simulated, 1 mm inside the skin on the plate.
+
+    Parameters
+    ----------
+    fields : MappedFields
+        With the model ``name``; gives the volume change of the fat.
+    model, measured : OnMesh, Deformation
+        Both relative to the bone, reference configuration, LPS mm. Skin on the plate is the model's surface that is
+        flat across ``normal`` when deformed.
+    normal : (3,)
+        The plate's outward unit normal, LPS.
+    """
     inside = model.mesh.points_mm[skin_on_plate(model, normal)] - _INWARD_MM * normal
     both = measured.displacement(inside), model.displacement(inside)
     known = np.isfinite(np.concatenate(both, axis=1)).all(axis=1)

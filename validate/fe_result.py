@@ -37,7 +37,15 @@ _MOST_MM = 200.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeResult:
-    """A model's result for one load, on linear tetrahedra in the reference configuration, LPS mm of the image."""
+    """A model's result for one load, on linear tetrahedra in the reference (unloaded) configuration, LPS mm.
+
+    Attributes
+    ----------
+    name, path : str, path
+        Of the model, as it stands in tables; and of its file, which messages name.
+    deformation : OnMesh
+        Displacement (n, 3) of the mesh's nodes relative to the bone, LPS mm, in the frame of the unloaded image.
+    """
 
     name: str
     path: Path
@@ -45,7 +53,10 @@ class FeResult:
 
     @classmethod
     def of(cls, name: str, deformation: OnMesh) -> "FeResult":
-        """The result of a model in memory, by its name in tables: ``simulation.deformation("Load1")``, say."""
+        """The result of a model in memory, by its name in tables: ``simulation.deformation("Load1")``, say.
+
+        Another class than `fe.Simulation.deformation` gives is an `InputError`.
+        """
         check_kind("deformation", deformation, OnMesh)
         return cls(name, Path(name), deformation)
 
@@ -59,16 +70,21 @@ def read_result(
     name: str, path: Path | str, *, mesh: Path | str | None = None, unit: str = "mm", frame: str = "LPS",
     to_image: FloatArray | None = None,
 ) -> FeResult:  # fmt: skip
-    """Read a result of any code.
+    """Read a result of any code for one load; displacement is relative to the bone, which does not move.
 
     Parameters
     ----------
     name : str
         Of the model, as it stands in tables.
     path, mesh : path
-        With mesh and displacement, or a table of nodal displacements and the mesh that they belong to.
+        One file with mesh and displacement: VTU, VTK, Gmsh .msh, CalculiX .frd, FEBio .xplt, with an array of three
+        components at the nodes called displacement (or displacement_mm, displacements, disp, u). Or a table (.csv)
+        of nodal displacements and, as ``mesh``, the mesh of its nodes: these formats, Abaqus .inp, ANSYS .cdb. The
+        table has a head, commas, and columns in any order and case: the node's number in the mesh file (node, node
+        label, node number, node_id, nodeid, id), and three components along x, y, z of the frame (ux, uy, uz; or in
+        this manner ux_mm, u1, u-u1, u_x, u.x, u.u1, disp_x, dx). Other columns are not read.
     unit, frame : {"mm", "m"}, {"LPS", "RAS"}
-        Of coordinates and displacements.
+        Of coordinates and displacements, whatever the columns are called. Coordinates are those of the unloaded mesh.
     to_image : (4, 4), optional
         Rigid map of the model's frame to the image's, LPS mm, applied after unit and frame; it also rotates the
         displacement.

@@ -39,7 +39,11 @@ class Threshold:
 
 
 def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
-    """Read a CSV table of max_shear (0 to 3; errors are `InputError`) and source; by default the one in the package."""
+    """Read thresholds from a CSV table; by default the one in the package.
+
+    Columns are max_shear, a maximum shear strain (E1 - E3) / 2 between 0 and 3 (no percent), and source, a text. A
+    table without them, or without a row, is an `InputError`.
+    """
     place = path if path is not None else files("validate") / "thresholds.csv"
     try:
         rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines(), restval=""))
@@ -58,7 +62,11 @@ def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StrainCluster:
-    """Connected cells (k,) above a threshold; their centroid (3,) in the reference configuration, LPS mm."""
+    """Connected cells above a threshold of maximum shear strain.
+
+    Numbers (k,) of the cells; their volume, mL, volume-weighted mean of the maximum shear strain, and centroid (3,) in
+    the reference configuration, LPS mm.
+    """
 
     cells: IntArray
     volume_ml: float
@@ -68,7 +76,11 @@ class StrainCluster:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellGraph:
-    """Cells of a mesh: volumes (n,), centroids (n, 3) in the reference configuration (LPS), shared faces (n, n)."""
+    """Cells of a mesh, and which of them share a face.
+
+    Volumes (n,), mL, and centroids (n, 3), LPS mm, in the reference configuration; adjacency (n, n), sparse, one
+    entry for each pair of cells with a common face.
+    """
 
     volumes_ml: FloatArray
     points_mm: FloatArray
@@ -168,7 +180,19 @@ def overlap(
     model: str, load: str, threshold: float, measured: FloatArray, simulated: FloatArray,
     cells: CellGraph, least_ml: float = LEAST_ML,
 ) -> Overlap:  # fmt: skip
-    """Compare the clusters above a threshold of two fields (n,) on the same cells; undefined figures are NaN."""
+    """Compare the clusters above a threshold of two fields on the same cells; undefined figures are NaN.
+
+    Parameters
+    ----------
+    model, load : str
+        As they stand in tables.
+    threshold : float
+        Maximum shear strain above which cells are compared.
+    measured, simulated : (n,)
+        Maximum shear strain (E1 - E3) / 2 in the cells.
+    cells, least_ml : CellGraph, float
+        The cells, and the volume of the smallest cluster that counts, mL.
+    """
     of, to = (cells.clusters(shear > threshold, shear, least_ml) for shear in (measured, simulated))
     first, second = (cells.region(shear > threshold, least_ml) for shear in (measured, simulated))
     largest = float(np.linalg.norm(of[0].centroid_mm - to[0].centroid_mm)) if of and to else float("nan")

@@ -95,7 +95,10 @@ class MappedFields:
 
 
 def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray:
-    """Values (n, k) at points (n, 3), rows with NaN replaced by the row of the nearest point without."""
+    """Values (n, k) at points (n, 3), mm, rows with NaN replaced by the row of the nearest point without.
+
+    At least one row has to be without.
+    """
     known = np.isfinite(values).all(axis=1)
     filled = values.copy()
     if not known.all():

@@ -122,10 +122,18 @@ def simulate_driven(
 def write_boundary_conditions(
     stem: Path, mesh: TetMesh, nodes: IntArray, u_mm: FloatArray, *, unit: str = "mm", frame: str = "LPS"
 ) -> list[Path]:
-    """Write displacements (k, 3) LPS mm of a mesh's nodes as boundary conditions, in its file's own unit and frame.
+    """Write displacements of a mesh's nodes as boundary conditions for other codes, to be merged into a model.
 
-    Node numbers are those of the mesh file, or counted from 1, as in `fe.decks`, if it has none. Files: ``.inp`` for
-    Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D), ``.feb`` for FEBio 4, to be merged into a model.
+    Parameters
+    ----------
+    stem : path
+        The files are called so, with ``.inp`` for Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D), ``.feb``
+        for FEBio 4; their paths are given back.
+    nodes, u_mm : (k,), (k, 3)
+        As `boundary_displacement` gives them, LPS mm. Files have the node numbers of the mesh's file, or, if it has
+        none, numbers from 1, as `fe.write_calculix`.
+    unit, frame : {"mm", "m"}, {"LPS", "RAS"}
+        Of the mesh's file, in which the displacements are written.
     """
     numbers = mesh.node_ids[nodes] + (1 if mesh.node_ids.min() == 0 else 0)
     u = u_mm / MM_PER_UNIT[unit] * TO_LPS[frame]
