@@ -102,8 +102,6 @@ class LoadCase:
 
         Parameters
         ----------
-        load : str
-            Its name.
         measured : Deformation or Measurement
             Of tissue relative to its bone, reference configuration, LPS mm. A measurement also gives its error, its
             verdict, what it was aligned on, and the plate's axes where a shear direction was given.

@@ -40,19 +40,11 @@ class Compared:
 
 @door
 def compare(
-    dvc: Path | str,
-    models: Sequence[Path | str],
-    *,
-    out: Path | str,
-    labelling: LabelMapFile,
-    loads: Sequence[str] = (),
-    reading: ModelReading,
-    to_image: FloatArray | None = None,
-    directions: Directions,
-    towards: Mapping[str, tuple[Vector, Vector]] | None = None,
-    comparison: ComparisonOn,
+    dvc: Path | str, models: Sequence[Path | str], *, out: Path | str, labelling: LabelMapFile,
+    loads: Sequence[str] = (), reading: ModelReading, to_image: FloatArray | None = None, directions: Directions,
+    towards: Mapping[str, tuple[Vector, Vector]] | None = None, comparison: ComparisonOn,
     progress: Callable[[str, str, float], None] | None = None,
-) -> Compared:
+) -> Compared:  # fmt: skip
     """Compare finite-element models of any code with a measurement; see `validate.compare`.
 
     Parameters

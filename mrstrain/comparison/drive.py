@@ -36,16 +36,10 @@ class Driven:
 
 @door
 def drive(
-    mesh: Path | str,
-    dvc: Path | str,
-    *,
-    out: Path | str,
-    material: MaterialSets,
-    loads: Sequence[str] = (),
-    threads: int | None = None,
-    coordinates: MeshCoordinates,
+    mesh: Path | str, dvc: Path | str, *, out: Path | str, material: MaterialSets, loads: Sequence[str] = (),
+    threads: int | None = None, coordinates: MeshCoordinates,
     progress: Callable[[str, str, float], None] | None = None,
-) -> Driven:
+) -> Driven:  # fmt: skip
     """Simulate a mesh with the measured displacement prescribed on its surface.
 
     Parameters

@@ -39,17 +39,10 @@ class Levelled:
 
 @door
 def level(
-    load0: Path | str,
-    model: Path | str,
-    *,
-    out: Path | str,
-    subject_files: options.SubjectFiles,
-    loads: Sequence[str] = (),
-    engine: options.EngineOptions,
-    reading: ModelReading,
-    seeded: options.Seeded,
+    load0: Path | str, model: Path | str, *, out: Path | str, subject_files: options.SubjectFiles,
+    loads: Sequence[str] = (), engine: options.EngineOptions, reading: ModelReading, seeded: options.Seeded,
     progress: Callable[[str, str, float], None] | None = None,
-) -> Levelled:
+) -> Levelled:  # fmt: skip
     """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
 
     Parameters

@@ -54,17 +54,10 @@ class Converged:
 
 @door
 def converge(
-    labels: Path | str,
-    edges_mm: Sequence[float],
-    *,
-    out: Path | str,
-    labelling: options.Labelling,
-    followed: options.Followed,
-    loads: Sequence[LoadStep] = LOADS,
-    directions: options.Directions,
-    workers: int | None = None,
-    progress: Progress | None = None,
-) -> Converged:
+    labels: Path | str, edges_mm: Sequence[float], *, out: Path | str, labelling: options.Labelling,
+    followed: options.Followed, loads: Sequence[LoadStep] = LOADS, directions: options.Directions,
+    workers: int | None = None, progress: Progress | None = None,
+) -> Converged:  # fmt: skip
     """Mesh a label map with several edge lengths, simulate the same loads on each, and extrapolate.
 
     Parameters

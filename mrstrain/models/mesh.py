@@ -62,13 +62,9 @@ class Meshed:
 
 @door
 def mesh(
-    labels: Path | str,
-    *,
-    out: Path | str,
-    labelling: Labelling,
-    meshing: Meshing,
+    labels: Path | str, *, out: Path | str, labelling: Labelling, meshing: Meshing,
     watch: Callable[[float], None] = lambda _: None,
-) -> Meshed:
+) -> Meshed:  # fmt: skip
     """Mesh the soft tissues of a label map.
 
     Parameters

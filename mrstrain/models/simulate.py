@@ -49,17 +49,10 @@ class Simulations:
 
 @door
 def simulate(
-    mesh: Path | str,
-    *,
-    out: Path | str,
-    simulation: SimulationOptions,
-    loads: Sequence[fe.LoadStep] = LOADS,
-    plate_options: PlateOptions,
-    towards: Mapping[str, tuple[Vector, Vector]] | None = None,
-    coordinates: MeshCoordinates,
-    cores: Cores,
-    progress: Progress | None = None,
-) -> Simulations:
+    mesh: Path | str, *, out: Path | str, simulation: SimulationOptions, loads: Sequence[fe.LoadStep] = LOADS,
+    plate_options: PlateOptions, towards: Mapping[str, tuple[Vector, Vector]] | None = None,
+    coordinates: MeshCoordinates, cores: Cores, progress: Progress | None = None,
+) -> Simulations:  # fmt: skip
     """Simulate a plate that presses and shears soft tissue on fixed bone.
 
     Parameters
