@@ -127,7 +127,6 @@ def test_register(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.full_size
 def test_validate(heel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(heel, tmp_path / "heel")
-    write_model(heel, tmp_path / "abaqus", 1, 0.8)
     follow("tutorials/validate.md", tmp_path, monkeypatch)
 
 
