@@ -14,10 +14,8 @@ from validate.mapping import MappedFields
 TO_BONE_MM = (0.0, 3.0, 6.0, 12.0)
 """Lower ends of the bins of distance to bone, mm."""
 
-_FLAT = 1e-12  # variance over mean square
-_LEAST = 10  # cells; fewer give no row
-_COPLANAR_MM = 0.3
-_INWARD_MM = 1.0
+_FLAT, _LEAST = 1e-12, 10  # variance over mean square; cells, of which fewer give no row
+_COPLANAR_MM, _INWARD_MM = 0.3, 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +78,12 @@ def agreement(
 
 
 def agreements(fields: MappedFields, model: str, load: str) -> list[Agreement]:
-    """Agreement of maximum shear strain and displacement: all soft tissue, each tissue, and by distance to bone."""
-    common, field = fields.common, fields.models[model]
-    parts = fields.parts
+    """Agreement of a model's maximum shear strain and displacement (mm) with the measured, cell by cell.
+
+    Rows for all soft tissue, each tissue, and bins of distance to bone; none for a part with fewer than ten cells in
+    which the measurement and all models are defined.
+    """
+    common, field, parts = fields.common, fields.models[model], fields.parts
     for low, high in pairwise((*TO_BONE_MM, np.inf)):
         name = f"{low:g} to {high:g} mm from bone" if np.isfinite(high) else f"over {low:g} mm from bone"
         parts[name] = common & (fields.to_bone_mm >= low) & (fields.to_bone_mm < high)
@@ -90,12 +91,12 @@ def agreements(fields: MappedFields, model: str, load: str) -> list[Agreement]:
     for part, where in parts.items():
         volumes = fields.volumes_ml[where]
         u, v = fields.measured.u_mm[where], field.u_mm[where]
-        rmse = float(np.sqrt(volumes @ ((v - u) ** 2).sum(axis=1) / volumes.sum())) if where.any() else 0.0
         shears, of_u = (fields.measured.max_shear[where], field.max_shear[where]), (model, load, "u_mm", part)
         rows.append(agreement((model, load, "max_shear", part), *shears, volumes))
         row = agreement(of_u, np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1), volumes)
         pooled = agreement(of_u, u.ravel(), v.ravel(), np.repeat(volumes, 3))
         if row is not None and pooled is not None:
+            rmse = float(np.sqrt(volumes @ ((v - u) ** 2).sum(axis=1) / volumes.sum()))
             by_component = ("slope", "intercept", "r2", "concordance")
             rows.append(replace(row, rmse=rmse, **{name: getattr(pooled, name) for name in by_component}))
     return [row for row in rows if row is not None]
@@ -145,13 +146,22 @@ def skin_on_plate(model: OnMesh, normal: FloatArray) -> IntArray:
 def skin_displacement(
     fields: MappedFields, name: str, load: str, model: OnMesh, measured: Deformation, normal: FloatArray
 ) -> SkinDisplacement:
-    """Displacement, measured and simulated, 1 mm inside the skin on the plate of outward unit ``normal`` (3,), LPS."""
-    nodes = skin_on_plate(model, normal)
-    inside = model.mesh.points_mm[nodes] - _INWARD_MM * normal
+    """Displacement, measured and simulated, 1 mm inside the skin on the plate.
+
+    Parameters
+    ----------
+    fields : MappedFields
+        With the model ``name``; gives the volume change of the fat.
+    model, measured : OnMesh, Deformation
+        Both relative to the bone, reference configuration, LPS mm. Skin on the plate is the model's surface that is
+        flat across ``normal`` when deformed.
+    normal : (3,)
+        The plate's outward unit normal, LPS.
+    """
+    inside = model.mesh.points_mm[skin_on_plate(model, normal)] - _INWARD_MM * normal
     both = measured.displacement(inside), model.displacement(inside)
-    known = np.isfinite(both[0]).all(axis=1) & np.isfinite(both[1]).all(axis=1)
-    moved = [u[known] for u in both]
-    mean = [m.mean(axis=0) if known.any() else np.full(3, np.nan) for m in moved]
+    known = np.isfinite(np.concatenate(both, axis=1)).all(axis=1)
+    mean = [u[known].mean(axis=0) if known.any() else np.full(3, np.nan) for u in both]
     fat = np.char.lower(fields.tissue) == "fat"
     where = fields.common & (fat if (fields.common & fat).any() else True)
     volumes = fields.volumes_ml[where] / fields.volumes_ml[where].sum()

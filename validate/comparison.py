@@ -1,12 +1,10 @@
 """A measurement compared with finite-element models under one or several loads: figures, files, notebook, plots."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,19 +14,21 @@ from dvc.atomic_files import whole_folder, write_json
 from dvc.errors import InputError
 from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
 from dvc.report.sheet import png_bytes
-from dvc.trust.verdict import worst
+from dvc.trust.verdict import LEVELS, worst
 from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
+from validate.arguments import check_kind
 from validate.curves import Area
 from validate.extrapolation import LEVELLED
-from validate.limitations import doubts_of, limitations, verdict_on
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
 from validate.location import Overlap
 from validate.mapping import ALL
 from validate.misfit import check_models, displacement_slip
-from validate.ranking import ALL_LOADS, Ranking, rank_over_loads
+from validate.ranking import ALL_LOADS, Ranking, no_nearer, rank_over_loads
 from validate.report import area_rows, closing_sections, draw, load_sections, overview, shown
 from validate.tables import Curve
+
+_COVERED = 0.9  # fraction of the mesh; a model that covers less is noted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,14 +74,16 @@ class Comparison:
         """Verdict, areas, and which differences are significant, a line each."""
         lines = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}"]
         for load in self.coverage_ml:
-            areas = {a.model: a for a in self.areas if (a.load, a.tissue) == (load, ALL) and a.model != NOTHING}
-            ranked = sorted((a for a in areas.values() if not a.model.endswith(LEVELLED)), key=lambda a: a.best_ml)
-            lines.append(f"{load}: area between curves, mL, best first: {_listed(ranked)}")
-            for name in (name for name in areas if name.endswith(LEVELLED)):
+            areas = {a.model: a for a in self.areas if (a.load, a.tissue) == (load, ALL)}
+            nothing = areas.pop(NOTHING)
+            levelled = {name: a for name, a in areas.items() if name.endswith(LEVELLED)}
+            ranked = sorted((a for name, a in areas.items() if name not in levelled), key=lambda a: a.best_ml)
+            lines.append(f"{load}: area between curves, mL, best first: {_listed(ranked, nothing)}")
+            for name, area in levelled.items():
                 before = areas[name.removesuffix(LEVELLED)].ml if name.removesuffix(LEVELLED) in areas else np.nan
-                lines.append(f"{load}: {name} {areas[name].ml:.2f} as measured, {before:.2f} before levelling")
+                lines.append(f"{load}: {name} {area.ml:.2f} as measured, {before:.2f} before levelling")
         if len(self.coverage_ml) > 1 and self.ranking.areas:
-            lines.append(f"All loads: {_listed(self.ranking.areas)}")
+            lines.append(f"All loads: {_listed(self.ranking.areas, self.ranking.nothing)}")
         return [*lines, *self.ranking.statements, *self.notes]
 
     def __str__(self) -> str:
@@ -104,7 +106,11 @@ class Comparison:
             return self.ranking.statements[0]
         ranked = self.ranking.areas or [a for a in self.areas if a.tissue == ALL and a.model != NOTHING]
         best = min(ranked, key=lambda a: a.best_ml)
-        return f"{best.model}: area between curves {shown(best)} mL ({best.load}), normalised {best.share:.1%}."
+        nothing = {a.load: a for a in (*self.areas, self.ranking.nothing) if (a.model, a.tissue) == (NOTHING, ALL)}
+        worse = (
+            ", no nearer to the measurement than no deformation at all" if no_nearer([best], nothing[best.load]) else ""
+        )
+        return f"{best.model}: area between curves {shown(best)} mL ({best.load}), normalised {best.share:.1%}{worse}."
 
     def plot(self, kind: Literal["curves", "areas"] = "curves", *, tissue: str = ALL) -> Figure:
         """Draw volume-strain curves, a panel for each load, or the areas between them with their 95 % intervals.
@@ -124,13 +130,9 @@ class Comparison:
         raise InputError(f"A comparison has plots of 'curves' and 'areas', none of '{kind}'.")
 
     def write(
-        self,
-        folder: Path | str,
-        *,
-        record: Mapping[str, object] | None = None,
-        methods: Sequence[str] = (),
+        self, folder: Path | str, *, record: Mapping[str, object] | None = None, methods: Sequence[str] = (),
         on_image: bool = False,
-    ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:
+    ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:  # fmt: skip
         """Write tables, fields, pictures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
 
         It gives the sections of the report, and the closing ones.
@@ -158,7 +160,7 @@ class Comparison:
         tables.remove_earlier(target, list(self.coverage_ml))
         about = dict(record) if record is not None else {"parameters": {"strains": list(self.strains)}}
         colours = list(dict.fromkeys(name for one in self.loads for name in one.fields.models))
-        notes = [note for note in self.notes if note not in doubts_of(self.verdict)]
+        notes = [note for note in self.notes if note not in _doubts(self.verdict)]
         sections = [overview(self.loads, self.ranking, self.warnings, notes)]
         for one in self.loads:
             pictures, viewer = draw(one, colours)
@@ -170,14 +172,24 @@ class Comparison:
                     tables.write_on_image(part, one)
                 write_json(part / "provenance.json", about | {"verdict": _plain(one.case.verdict)})
             sections += load_sections(one, pictures, viewer)
-        self._write_tables(target)
-        write_json(target / tables.RECORD, self._record() | about)
+        known = {load: of for load, of in self.verdicts.items() if of is not None}
+        levels = {load: of.level for load, of in known.items()}
+        levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
+        areas, ranking = (*self.areas, *self.ranking.areas, self.ranking.nothing), self.ranking
+        tables.write_tables(target, (areas, self.overlaps, self.agreements, self.skin), self.curves, levels)
+        own: dict[str, object] = {
+            "total_area_ml": {a.model: a.best_ml for a in ranking.areas}, "told_apart": list(ranking.statements),
+            "not_told_apart": ranking.not_distinguishable, "notes": list(self.notes), "coverage_ml": self.coverage_ml,
+            "verdict": _plain(self.verdict),
+            "verdict_by_load": {load: _plain(verdict) for load, verdict in self.verdicts.items()},
+        }  # fmt: skip
+        write_json(target / tables.RECORD, own | about)
         closing, title = closing_sections(self.loads[0].criteria.thresholds, methods), "Models against the measurement"
         write_report(target / "report.html", title, self.verdict, sections, closing, record_lines(about))
         return tuple(sections), tuple(closing)
 
     @classmethod
-    def read(cls, folder: Path | str) -> Comparison:
+    def read(cls, folder: Path | str) -> Self:
         """Read a comparison from its folder, to the six digits of the tables, without the fields in the cells.
 
         Raises
@@ -202,37 +214,12 @@ class Comparison:
             by_load, overlaps, agreements, skin, curves, ranking, (low, high), coverage, verdict, verdicts, notes
         )
 
-    def _write_tables(self, target: Path) -> None:
-        known = {load: of for load, of in self.verdicts.items() if of is not None}
-        levels = {load: of.level for load, of in known.items()}
-        levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
-        areas = (*self.areas, *self.ranking.areas, self.ranking.nothing)
-        rows = (areas, self.overlaps, self.agreements, self.skin)
-        tables.write_tables(target, rows, self.curves, levels)
-
-    def _record(self) -> dict[str, object]:
-        return {
-            "total_area_ml": {a.model: a.best_ml for a in self.ranking.areas},
-            "told_apart": list(self.ranking.statements),
-            "not_told_apart": self.ranking.not_distinguishable,
-            "notes": list(self.notes),
-            "coverage_ml": self.coverage_ml,
-            "verdict": _plain(self.verdict),
-            "verdict_by_load": {load: _plain(verdict) for load, verdict in self.verdicts.items()},
-        }
-
 
 def compare(
-    cases: Sequence[LoadCase],
-    labels: LabelMap,
-    bones: Sequence[str] = ("bone",),
-    *,
-    mesh: TetMesh | None = None,
-    criteria: Criteria | None = None,
-    notes: Sequence[str] = (),
-    warnings: Sequence[str] | None = None,
-    progress: Callable[[float], None] = lambda _: None,
-) -> Comparison:
+    cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",), *,
+    mesh: TetMesh | None = None, criteria: Criteria | None = None, notes: Sequence[str] = (),
+    warnings: Sequence[str] | None = None, progress: Callable[[float], None] = lambda _: None,
+) -> Comparison:  # fmt: skip
     """Compare models with a measurement of one or several loads.
 
     Parameters
@@ -255,7 +242,10 @@ def compare(
     InputError, GeometryError
         As `check_models` and `map_fields`.
     """
-    by = criteria or Criteria()
+    by = Criteria() if criteria is None else criteria
+    check_kind("criteria", by, Criteria)
+    if mesh is not None:
+        check_kind("mesh", mesh, TetMesh)
     odd = list(check_models(cases, labels, bones) if warnings is None else warnings)
     loads: list[LoadComparison] = []
     for number, case in enumerate(cases):
@@ -263,26 +253,69 @@ def compare(
         loads.append(compare_load(case, labels, bones, mesh=mesh, criteria=by))
         fields = loads[-1].fields
         odd += [f"{case.load}: {slip}" for name in fields.models if (slip := displacement_slip(fields, name))]
-    verdict = verdict_on({case.load: case.verdict for case in cases}, odd)
+    verdicts = {case.load: case.verdict for case in cases}
+    verdict, coverage = verdict_on(verdicts, odd), {one.load: one.fields.coverage() for one in loads}
     return Comparison(
         areas=tuple(a for one in loads for a in one.areas),
         overlaps=tuple(o for one in loads for o in one.overlaps),
         agreements=tuple(a for one in loads for a in one.agreements),
         skin=tuple(s for one in loads for s in one.skin),
         curves=tuple(curve for one in loads for curve in tables.curves_of(one)),
-        ranking=rank_over_loads(loads),
-        strains=by.strains,
-        coverage_ml={one.load: one.fields.coverage() for one in loads},
-        verdict=verdict,
-        verdicts={case.load: case.verdict for case in cases},
-        notes=(*notes, *doubts_of(verdict), *limitations(loads)),
-        warnings=tuple(odd),
-        loads=tuple(loads),
-    )
+        ranking=rank_over_loads(loads), strains=by.strains, coverage_ml=coverage, verdict=verdict, verdicts=verdicts,
+        notes=(*notes, *_doubts(verdict), *_limitations(loads)), warnings=tuple(odd), loads=tuple(loads),
+    )  # fmt: skip
 
 
-def _listed(areas: Sequence[Area]) -> str:
-    return ", ".join(f"{a.model} {shown(a)}" for a in areas)
+def verdict_on(measured: Mapping[str, Verdict | None], warnings: Sequence[str] = ()) -> Verdict | None:
+    """The verdict on the inputs: the worst of the registrations' (by load) and of warnings on models, None without any.
+
+    It lists all reasons below trust, the worst first.
+    """
+    verdicts = [Verdict("caution", tuple(warnings))] if warnings else []
+    for load, verdict in measured.items():
+        if verdict is not None:
+            what = "is not to be trusted" if verdict.level == "distrust" else "is to be used with care"
+            reasons = tuple(f"{load}: its registration {what}: {reason}" for reason in verdict.reasons)
+            verdicts.append(Verdict(verdict.level, () if verdict.level == "trust" else reasons))
+    if not verdicts:
+        return None
+    distrust, caution = ([r for v in verdicts if v.level == level for r in v.reasons] for level in LEVELS[:0:-1])
+    sound = f"The measurement: {len(verdicts)} registrations are sound. The models are compared below."
+    return Verdict(worst(verdicts).level, (*distrust, *caution) or (sound,))
+
+
+def _doubts(verdict: Verdict | None) -> tuple[str, ...]:
+    """Reasons of a verdict below trust."""
+    return () if verdict is None or verdict.level == "trust" else verdict.reasons
+
+
+def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
+    """What the measurement of each load lacks, and which models cover little of the mesh, in sentences."""
+    notes = []
+    for one in loads:
+        load, error, volumes = one.load, one.case.error, one.fields.coverage()
+        if one.case.aligned_on == "none":
+            what = "the bone's motion was not removed from this measurement: displacements are not the tissue's alone."
+            notes.append(f"{load}: {what}")
+        if error is not None and np.isnan(error.widening):
+            what = "the coverage of its intervals is unknown (an error model of one subject): they are not widened."
+            notes.append(f"{load}: {what}")
+        notes += [
+            f"{load}: {name} covers {volumes[name] / volumes['mesh']:.0%} of the mesh, and all models are scored on "
+            "the tissue that every one covers."
+            for name in one.fields.models
+            if volumes[name] < _COVERED * volumes["mesh"]
+        ]
+    if unknown := ", ".join(one.load for one in loads if one.case.error is None):
+        what = "the measurement uncertainty is unknown (no error_model.json beside the results)"
+        notes.append(f"{unknown}: {what}: no difference counts as significant.")
+    return notes
+
+
+def _listed(areas: Sequence[Area], nothing: Area) -> str:
+    worse = ", ".join(no_nearer(areas, nothing))
+    listed = ", ".join(f"{a.model} {shown(a)}" for a in areas)
+    return listed + (f"; no nearer than {NOTHING} ({shown(nothing)}): {worse}" if worse else "")
 
 
 def _plain(verdict: Verdict | None) -> dict[str, object] | None:

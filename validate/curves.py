@@ -133,14 +133,10 @@ class Band:
 
 
 def bands(
-    truths: Iterable[FloatArray],
-    models: Mapping[str, FloatArray],
-    volumes_ml: FloatArray,
-    tissues: Mapping[str, np.ndarray],
-    widening: float,
-    narrowed: Callable[[FloatArray], FloatArray],
+    truths: Iterable[FloatArray], models: Mapping[str, FloatArray], volumes_ml: FloatArray,
+    tissues: Mapping[str, np.ndarray], widening: float, narrowed: Callable[[FloatArray], FloatArray],
     strains: tuple[float, float] = RANGE,
-) -> dict[str, Band]:
+) -> dict[str, Band]:  # fmt: skip
     """Bands of the true curve by tissue, from truths drawn for all cells at once.
 
     Parameters
@@ -161,35 +157,27 @@ def bands(
     them would be too small for a perfect model, whose curve is steeper.
     """
     low, high = strains
-    inner = np.linspace(low, high, _GRID)
-    outer = np.linspace(0.0, 1.5 * high, _GRID)
-    step = inner[1] - inner[0]
+    inner, outer = np.linspace(low, high, _GRID), np.linspace(0.0, 1.5 * high, _GRID)
 
     def curves_of(shear: FloatArray, strains: FloatArray) -> dict[str, FloatArray]:
         return {name: volume_above(shear[inside], volumes_ml[inside], strains) for name, inside in tissues.items()}
 
-    def area(first: FloatArray, second: FloatArray) -> float:
-        return float(np.trapezoid(np.abs(first - second), dx=step))
+    def areas(first: FloatArray, second: FloatArray) -> FloatArray:
+        return np.asarray(np.trapezoid(np.abs(first - second), dx=inner[1] - inner[0]))
 
     curves = {model: curves_of(shear, inner) for model, shear in models.items()}
-    drawn: dict[str, list[FloatArray]] = {name: [] for name in tissues}
-    areas: dict[str, dict[str, list[float]]] = {name: {model: [] for model in models} for name in tissues}
-    floors: dict[str, list[float]] = {name: [] for name in tissues}
-    perfect: dict[str, FloatArray] = {}
+    drawn, perfect = list[dict[str, FloatArray]](), list[dict[str, FloatArray]]()
     for number, truth in enumerate(truths):
-        for name, both in curves_of(truth, np.concatenate([outer, inner])).items():
-            curve = both[len(outer) :]
-            drawn[name].append(both[: len(outer)])
-            for model, simulated in curves.items():
-                areas[name][model].append(area(simulated[name], curve))
-            if name in perfect:
-                floors[name].append(area(perfect.pop(name), curve))
+        drawn.append(curves_of(truth, np.concatenate([outer, inner])))
         if number % _EVERY == 0:
-            perfect = curves_of(narrowed(truth), inner)
+            perfect.append(curves_of(narrowed(truth), inner))
     result = {}
     for name, inside in tissues.items():
-        least, _, most = widened(np.array(drawn[name]), widening)
-        most, floor = np.minimum(most, volumes_ml[inside].sum()), float(np.median(floors[name]))
-        of_models = {model: np.array(drawn_areas) for model, drawn_areas in areas[name].items()}
-        result[name] = Band(outer, least, most, of_models, floor, widening)
+        on_outer, on_inner = np.split(np.array([of[name] for of in drawn]), [_GRID], axis=1)
+        least, _, most = widened(on_outer, widening)
+        following = on_inner[1::_EVERY]  # the truths drawn after those that were made perfect models
+        floor = np.median(areas(np.array([of[name] for of in perfect])[: len(following)], following))
+        of_models = {model: areas(simulated[name], on_inner) for model, simulated in curves.items()}
+        most = np.minimum(most, volumes_ml[inside].sum())
+        result[name] = Band(outer, least, most, of_models, float(floor), widening)
     return result

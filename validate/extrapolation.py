@@ -17,8 +17,7 @@ from dvc.errors import InputError
 LEVELLED = "-levelled"
 """Suffix of the name of a levelled model."""
 
-_SMOOTH_MM, _ROUNDS = 2.0, 40
-_MENDING, _LEAST_VOLUME = 12, 0.1
+_SMOOTH_MM, _ROUNDS, _MENDING, _LEAST_VOLUME = 2.0, 40, 12, 0.1
 
 
 def extrapolated(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacement:
@@ -28,10 +27,9 @@ def extrapolated(model: OnMesh, grid: Grid, bone: BoolArray) -> SampledDisplacem
     voxel lies is refused with an `InputError`.
     """
     at = grid.indices_of(np.array(list(product(*model.mesh.bounds_mm.T))))
-    first = np.clip(np.floor(at.min(axis=0)).astype(int), 0, grid.shape)
-    last = np.clip(np.ceil(at.max(axis=0)).astype(int) + 1, 0, grid.shape)
+    ends = np.clip([np.floor(at.min(axis=0)), np.ceil(at.max(axis=0)) + 1], 0, grid.shape).astype(int)
     box = np.zeros(grid.shape, dtype=bool)
-    box[tuple(map(slice, first, last))] = True
+    box[tuple(map(slice, *ends))] = True
     u = np.full((*grid.shape, 3), np.nan)
     u[box] = evaluate_on_grid(model, grid, box)[0]
     inside = np.isfinite(u).all(axis=-1)

@@ -18,6 +18,7 @@ from dvc.deformation.nodal import OnMesh
 from dvc.errors import GeometryError, InputError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import box_told
+from validate.arguments import check_kind
 from validate.tetrahedra import linear_tetrahedra
 
 _NAMES = ("displacement_mm", "displacement", "displacements", "disp", "u")
@@ -36,7 +37,15 @@ _MOST_MM = 200.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeResult:
-    """A model's result for one load, on linear tetrahedra in the reference configuration, LPS mm of the image."""
+    """A model's result for one load, on linear tetrahedra in the reference (unloaded) configuration, LPS mm.
+
+    Attributes
+    ----------
+    name, path : str, path
+        Of the model, as it stands in tables; and of its file, which messages name.
+    deformation : OnMesh
+        Displacement (n, 3) of the mesh's nodes relative to the bone, LPS mm, in the frame of the unloaded image.
+    """
 
     name: str
     path: Path
@@ -44,7 +53,11 @@ class FeResult:
 
     @classmethod
     def of(cls, name: str, deformation: OnMesh) -> "FeResult":
-        """The result of a model in memory, by its name in tables: ``simulation.deformation("Load1")``, say."""
+        """The result of a model in memory, by its name in tables: ``simulation.deformation("Load1")``, say.
+
+        Another class than `fe.Simulation.deformation` gives is an `InputError`.
+        """
+        check_kind("deformation", deformation, OnMesh)
         return cls(name, Path(name), deformation)
 
     @property
@@ -54,24 +67,24 @@ class FeResult:
 
 
 def read_result(
-    name: str,
-    path: Path | str,
-    *,
-    mesh: Path | str | None = None,
-    unit: str = "mm",
-    frame: str = "LPS",
+    name: str, path: Path | str, *, mesh: Path | str | None = None, unit: str = "mm", frame: str = "LPS",
     to_image: FloatArray | None = None,
-) -> FeResult:
-    """Read a result of any code.
+) -> FeResult:  # fmt: skip
+    """Read a result of any code for one load; displacement is relative to the bone, which does not move.
 
     Parameters
     ----------
     name : str
         Of the model, as it stands in tables.
     path, mesh : path
-        With mesh and displacement, or a table of nodal displacements and the mesh that they belong to.
+        One file with mesh and displacement: VTU, VTK, Gmsh .msh, CalculiX .frd, FEBio .xplt, with an array of three
+        components at the nodes called displacement (or displacement_mm, displacements, disp, u). Or a table (.csv)
+        of nodal displacements and, as ``mesh``, the mesh of its nodes: these formats, Abaqus .inp, ANSYS .cdb. The
+        table has a head, commas, and columns in any order and case: the node's number in the mesh file (node, node
+        label, node number, node_id, nodeid, id), and three components along x, y, z of the frame (ux, uy, uz; or in
+        this manner ux_mm, u1, u-u1, u_x, u.x, u.u1, disp_x, dx). Other columns are not read.
     unit, frame : {"mm", "m"}, {"LPS", "RAS"}
-        Of coordinates and displacements.
+        Of coordinates and displacements, whatever the columns are called. Coordinates are those of the unloaded mesh.
     to_image : (4, 4), optional
         Rigid map of the model's frame to the image's, LPS mm, applied after unit and frame; it also rotates the
         displacement.
@@ -91,12 +104,11 @@ def read_result(
     u = (_from_table if is_table else _beside_mesh)(place, source) * MM_PER_UNIT[unit] * TO_LPS[frame]
     tets, carry = linear_tetrahedra(source)
     used = np.unique(carry.indices)
-    missing = ~np.isfinite(u[used]).all(axis=1)
-    if missing.any():
-        first = source.node_ids[used[int(np.argmax(missing))]]
+    missing = used[~np.isfinite(u[used]).all(axis=1)]
+    if len(missing):
         raise InputError(
-            f"{place}: {np.count_nonzero(missing)} of {len(missing)} nodes have no displacement, first node {first}. "
-            "Export all nodes of the tissue."
+            f"{place}: {len(missing)} of {len(used)} nodes have no displacement, first node "
+            f"{source.node_ids[missing[0]]}. Export all nodes of the tissue."
         )
     rigid = _rigid(np.eye(4) if to_image is None else to_image)
     moved = np.asarray(carry @ np.nan_to_num(u)) @ rigid.matrix.T
@@ -172,7 +184,7 @@ def _from_table(place: Path, source: MeshFile) -> FloatArray:
             f"{place}: a table of displacements has a column 'node' and three such as ux, uy, uz, with commas "
             f"between; it has {', '.join(head)}."
         )
-    columns = [named.index(node), *(named.index(c) for c in parts)]
+    columns = [named.index(c) for c in (node, *parts)]
     try:
         numbers = np.array([[float(row[c]) for c in columns] for row in rows]).reshape(-1, 4)
     except (ValueError, IndexError) as error:
@@ -203,10 +215,8 @@ def check_overlap(path: Path, mesh: TetMesh, grid: Grid) -> None:
     if lies_in(1.0, (1.0, 1.0, 1.0)):
         return
     fitting = [(size, frame) for (a, size), (b, frame) in product(_SCALES.items(), _TURNS.items()) if lies_in(a, b)]
-    hint = (
-        f"It would with {' and '.join(fitting[0])}." if fitting else "Give the map to the image's frame (--to-image)."
-    )
+    hint = f"It would with {' and '.join(fitting[0])}" if fitting else "Give the map to the image's frame (--to-image)"
     raise GeometryError(
         f"{path} does not lie in the image. Model: {box_told(*mesh.bounds_mm)}; image: {box_told(*grid.bounds_mm())} "
-        f"(LPS mm). {hint}"
+        f"(LPS mm). {hint}."
     )

@@ -1,6 +1,6 @@
 """Figures of a comparison: PNG bytes, with the docstring as caption, and matplotlib figures for interactive use."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,15 +15,9 @@ from fe.figures import Slice, slice_sheet
 from validate.curves import Area
 from validate.load_comparison import LoadComparison
 from validate.mapping import ALL, MappedFields, filled_from_nearest
-from validate.tables import LOWER, UPPER, Curve
+from validate.tables import LOWER, UPPER, Curve, curves_of
 
-_POINTS = 601
-_COLUMNS = 3
-_BAND = "#b8bfc9"
-_BINS = 60
-
-# Strains, the volumes above them by name, and the edges of the 95 % band of the true curve.
-_Panel = tuple[FloatArray, Mapping[str, FloatArray], tuple[FloatArray, FloatArray, FloatArray] | None]
+_POINTS, _COLUMNS, _BINS, _BAND = 601, 3, 60, "#b8bfc9"
 
 
 def volume_strain(one: LoadComparison, tissues: Sequence[str], colours: Sequence[str]) -> bytes:
@@ -32,20 +26,24 @@ def volume_strain(one: LoadComparison, tissues: Sequence[str], colours: Sequence
     The grey band contains the true curve in 95 % of cases, by the measurement's error model; areas are taken between
     the dotted lines.
     """
-    at = np.linspace(0.0, 1.5 * one.criteria.strains[1], _POINTS)
-    edges = {name: (band.strains, band.low_ml, band.high_ml) for name, band in one.bands.items()}
-    panels = {tissue: (at, one.fields.curves(tissue, at), edges.get(tissue)) for tissue in tissues}
-    return png_bytes(_curves(panels, one.criteria.strains, colours))
+    curves = curves_of(one, np.linspace(0.0, 1.5 * one.criteria.strains[1], _POINTS))
+    return png_bytes(_curves([c for c in curves if c.tissue in tissues], "tissue", one.criteria.strains, colours))
 
 
-def _curves(panels: Mapping[str, _Panel], strains: tuple[float, float], colours: Sequence[str]) -> Figure:
+def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], colours: Sequence[str]) -> Figure:
+    """Curves, a panel for each load or tissue."""
+    panels: dict[str, dict[str, Curve]] = {}
+    for curve in curves:
+        panels.setdefault(getattr(curve, by), {})[curve.field] = curve
     figure, spots = _panels(len(panels))
-    for axes, (title, (at, volumes_ml, band)) in zip(spots, panels.items(), strict=True):
-        if band is not None:
-            axes.fill_between(*band, color=_BAND, linewidth=0, label="95 % of truths")
-        for name, above in volumes_ml.items():
+    for axes, (title, of) in zip(spots, panels.items(), strict=True):
+        at = of["measured"].max_shear
+        if LOWER in of:
+            edges = of[LOWER].volume_above_ml, of[UPPER].volume_above_ml
+            axes.fill_between(at, *edges, color=_BAND, linewidth=0, label="95 % of truths")
+        for name in (name for name in ("measured", *colours) if name in of):
             colour, width = ("black", 2.2) if name == "measured" else (_colour(colours.index(name)), 1.5)
-            axes.plot(at, above, color=colour, linewidth=width, label=name)
+            axes.plot(at, of[name].volume_above_ml, color=colour, linewidth=width, label=name)
         for edge in strains:
             axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
         axes.set(xlim=(0.0, at[-1]), ylim=(0.0, None))
@@ -64,16 +62,8 @@ def curves_by_load(curves: Sequence[Curve], strains: tuple[float, float]) -> Fig
 
     The grey band contains the true curve in 95 % of cases; areas are taken between the dotted lines.
     """
-    by_load: dict[str, dict[str, Curve]] = {}
-    for curve in curves:
-        by_load.setdefault(curve.load, {})[curve.field] = curve
     models = [name for name in dict.fromkeys(c.field for c in curves) if name not in ("measured", LOWER, UPPER)]
-    panels: dict[str, _Panel] = {}
-    for load, of in by_load.items():
-        at = of["measured"].max_shear
-        band = (at, of[LOWER].volume_above_ml, of[UPPER].volume_above_ml) if LOWER in of else None
-        panels[load] = at, {name: of[name].volume_above_ml for name in ("measured", *models) if name in of}, band
-    return _curves(panels, strains, models)
+    return _curves(curves, "load", strains, models)
 
 
 def areas_by_load(areas: Sequence[Area]) -> Figure:
@@ -118,8 +108,7 @@ def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatA
     undefined. A node beyond the measurement is drawn with the displacement of the nearest one within. Letters name the
     sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left.
     """
-    panels = slice_panels(one.fields, measured, u_mm)
-    return png_bytes(slice_sheet(one.fields.mesh, panels, one.case.axes, point_mm))
+    return png_bytes(slice_sheet(one.fields.mesh, slice_panels(one.fields, measured, u_mm), one.case.axes, point_mm))
 
 
 def slice_panels(fields: MappedFields, measured: Deformation, u_mm: Mapping[str, FloatArray]) -> list[Slice]:
@@ -153,19 +142,18 @@ def differences(one: LoadComparison, quantity: str) -> bytes:
 
     The solid line is the mean difference, dashed lines are the limits of agreement, 1.96 standard deviations away.
     """
-    fields, where = one.fields, one.fields.common
-    limits = {row.model: row for row in one.agreements if (row.quantity, row.part) == (quantity, ALL)}
+    fields, where, unit = one.fields, one.fields.common, "" if quantity == "max_shear" else ", mm"
+    limits = [row for row in one.agreements if (row.quantity, row.part) == (quantity, ALL)]
     figure, spots = _by_model(max(1, len(limits)))
-    for spot, name in zip(spots, limits, strict=False):
+    for spot, row in zip(spots, limits, strict=False):
         x, y = (
             field.max_shear[where] if quantity == "max_shear" else np.linalg.norm(field.u_mm[where], axis=1)
-            for field in (fields.measured, fields.models[name])
+            for field in (fields.measured, fields.models[row.model])
         )
         spot.hist2d(0.5 * (x + y), y - x, bins=_BINS, weights=fields.volumes_ml[where], norm="log", cmap="Blues")
-        for height, style in ((limits[name].bias, "-"), (limits[name].lower, "--"), (limits[name].upper, "--")):
+        for height, style in ((row.bias, "-"), (row.lower, "--"), (row.upper, "--")):
             spot.axhline(height, color=INK, linewidth=0.9, linestyle=style)
-        spot.set_title(name, color=INK, **FONT)
-        unit = "" if quantity == "max_shear" else ", mm"
+        spot.set_title(row.model, color=INK, **FONT)
         label_axes(spot, f"mean of both{unit}", f"simulated - measured{unit}")
     return png_bytes(figure)
 

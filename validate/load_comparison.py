@@ -1,12 +1,11 @@
 """One load, measured and simulated by several models: areas, location, agreement and skin displacement."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from dvc.errors import InputError
 from dvc.trust.truth_draws import TruthDraws
 from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
+from validate.arguments import check_each, check_kind
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
 from validate.extrapolation import LEVELLED
 from validate.fe_result import FeResult
@@ -88,20 +88,20 @@ class LoadCase:
     aligned_on: str = ""
     image: Path | None = None
 
+    def __post_init__(self) -> None:
+        check_kind("read", self.read, Callable)
+        if self.error is not None:
+            check_kind("error", self.error, ErrorTable)
+
     @classmethod
     def of(
-        cls,
-        load: str,
-        measured: Deformation | Measurement,
-        results: Sequence[FeResult],
+        cls, load: str, measured: Deformation | Measurement, results: Sequence[FeResult],
         error: ErrorTable | None = None,
-    ) -> LoadCase:
+    ) -> Self:  # fmt: skip
         """A load whose fields are in memory; set the rest with `dataclasses.replace`.
 
         Parameters
         ----------
-        load : str
-            Its name.
         measured : Deformation or Measurement
             Of tissue relative to its bone, reference configuration, LPS mm. A measurement also gives its error, its
             verdict, what it was aligned on, and the plate's axes where a shear direction was given.
@@ -110,14 +110,14 @@ class LoadCase:
         error : ErrorTable, optional
             Error of the measured maximum shear strain, in place of the measurement's own.
         """
+        check_each("results", results, FeResult)
         if not isinstance(measured, Measurement):
+            check_kind("measured", measured, Deformation)
             return cls(load, partial(_given, measured, results), error=error)
         known, axes = measured.error_bars.uncertainty, None if measured.source is None else measured.source.subject.axes
-        own = None if known is None else known.table
-        case = cls(
-            load, partial(_given, measured.deformation, results), error=own if error is None else error,
-            verdict=measured.verdict, aligned_on=str(measured.alignment.get("on", "")),
-        )  # fmt: skip
+        error = known.table if error is None and known is not None else error
+        on, read = str(measured.alignment.get("on", "")), partial(_given, measured.deformation, results)
+        case = cls(load, read, error=error, verdict=measured.verdict, aligned_on=on)
         return case if axes is None else replace(case, axes=axes)
 
 
@@ -171,20 +171,22 @@ class LoadComparison:
         models = (a for a in self.areas if a.tissue == ALL and a.model != NOTHING and not a.model.endswith(LEVELLED))
         return sorted(models, key=lambda a: a.best_ml)
 
+    @property
+    def nothing(self) -> Area:
+        """Area of `NOTHING` in all soft tissue."""
+        return next(a for a in self.areas if (a.model, a.tissue) == (NOTHING, ALL))
+
 
 def compare_load(
-    case: LoadCase,
-    labels: LabelMap,
-    bones: Sequence[str] = ("bone",),
-    *,
-    mesh: TetMesh | None = None,
-    criteria: Criteria | None = None,
-) -> LoadComparison:
+    case: LoadCase, labels: LabelMap, bones: Sequence[str] = ("bone",), *,
+    mesh: TetMesh | None = None, criteria: Criteria | None = None,
+) -> LoadComparison:  # fmt: skip
     """Compare models with the measurement of one load, at the centroids of one mesh's cells.
 
     Parameters as in `validate.compare`, errors as in `validate.map_fields`.
     """
     by = criteria or Criteria()
+    check_kind("case", case, LoadCase)
     measured, results = case.read()
     models = {result.name: result.deformation for result in results}
     fields = map_fields(mesh if mesh is not None else results[0].mesh, labels, bones, measured, models)
@@ -192,17 +194,13 @@ def compare_load(
     known = {} if case.error is None else _bands(fields, case, case.error, by, truths)
     normal = -case.axes[:, 0]
     return LoadComparison(
-        case=case,
-        labels=labels,
-        bones=tuple(bones),
-        criteria=by,
-        fields=fields,
+        case, labels, tuple(bones), by, fields,
         areas=tuple(_areas(fields, case.load, known, by)),
         overlaps=tuple(_overlaps(fields, case, by, truths)),
         agreements=tuple(row for name in models for row in agreements(fields, name, case.load)),
         skin=tuple(skin_displacement(fields, name, case.load, of, measured, normal) for name, of in models.items()),
         bands=known,
-    )
+    )  # fmt: skip
 
 
 def _areas(fields: MappedFields, load: str, known: Mapping[str, Band], by: Criteria) -> Iterator[Area]:

@@ -1,7 +1,5 @@
 """Strain location: clusters of tissue above a strain threshold, their overlap and distance, with 95 % intervals."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +7,7 @@ from functools import cached_property, partial
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from scipy import sparse
@@ -41,7 +39,11 @@ class Threshold:
 
 
 def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
-    """Read a CSV table of max_shear (0 to 3; errors are `InputError`) and source; by default the one in the package."""
+    """Read thresholds from a CSV table; by default the one in the package.
+
+    Columns are max_shear, a maximum shear strain (E1 - E3) / 2 between 0 and 3 (no percent), and source, a text. A
+    table without them, or without a row, is an `InputError`.
+    """
     place = path if path is not None else files("validate") / "thresholds.csv"
     try:
         rows = list(csv.DictReader(place.read_text(encoding="utf-8").splitlines(), restval=""))
@@ -60,7 +62,11 @@ def read_thresholds(path: Path | None = None) -> tuple[Threshold, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StrainCluster:
-    """Connected cells (k,) above a threshold; their centroid (3,) in the reference configuration, LPS mm."""
+    """Connected cells above a threshold of maximum shear strain.
+
+    Numbers (k,) of the cells; their volume, mL, volume-weighted mean of the maximum shear strain, and centroid (3,) in
+    the reference configuration, LPS mm.
+    """
 
     cells: IntArray
     volume_ml: float
@@ -70,14 +76,18 @@ class StrainCluster:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellGraph:
-    """Cells of a mesh: volumes (n,), centroids (n, 3) in the reference configuration (LPS), shared faces (n, n)."""
+    """Cells of a mesh, and which of them share a face.
+
+    Volumes (n,), mL, and centroids (n, 3), LPS mm, in the reference configuration; adjacency (n, n), sparse, one
+    entry for each pair of cells with a common face.
+    """
 
     volumes_ml: FloatArray
     points_mm: FloatArray
     adjacency: sparse.csr_matrix
 
     @classmethod
-    def of(cls, mesh: TetMesh) -> CellGraph:
+    def of(cls, mesh: TetMesh) -> Self:
         """All cells of a mesh."""
         count = len(mesh.cells)
         faces = np.sort(np.concatenate([mesh.cells[:, face] for face in FACES]), axis=1)
@@ -87,9 +97,9 @@ class CellGraph:
         pairs = sparse.csr_matrix((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
         return cls(mesh.volumes_mm3 / 1000.0, mesh.centroids_mm, pairs)
 
-    def part(self, kept: BoolArray) -> CellGraph:
+    def part(self, kept: BoolArray) -> Self:
         """Some of the cells (n,)."""
-        return CellGraph(self.volumes_ml[kept], self.points_mm[kept], self.adjacency[kept][:, kept])
+        return type(self)(self.volumes_ml[kept], self.points_mm[kept], self.adjacency[kept][:, kept])
 
     def clusters(self, above: BoolArray, shear: FloatArray, least_ml: float = LEAST_ML) -> list[StrainCluster]:
         """Clusters of the cells ``above`` (n,) of at least a volume, the largest first; ``shear`` (n,)."""
@@ -104,7 +114,7 @@ class CellGraph:
                 kept.append(StrainCluster(members, float(volume.sum()), mean, centroid))
         return sorted(kept, key=lambda c: -c.volume_ml)
 
-    def region(self, above: BoolArray, least_ml: float = LEAST_ML) -> StrainedRegion:
+    def region(self, above: BoolArray, least_ml: float = LEAST_ML) -> "StrainedRegion":
         """All cells ``above`` (n,) that lie in a cluster of at least a volume."""
         cells, number = self._components(above)
         kept = np.zeros(len(above), dtype=bool)
@@ -115,9 +125,8 @@ class CellGraph:
     def _components(self, above: BoolArray) -> tuple[IntArray, IntArray]:
         """The cells above, and the number of the cluster of each."""
         cells = np.flatnonzero(above)
-        if not len(cells):
-            return cells, cells
-        return cells, connected_components(self.adjacency[cells][:, cells], directed=False)[1]
+        number = connected_components(self.adjacency[cells][:, cells], directed=False)[1] if len(cells) else cells
+        return cells, number
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,15 +177,22 @@ class Overlap:
 
 
 def overlap(
-    model: str,
-    load: str,
-    threshold: float,
-    measured: FloatArray,
-    simulated: FloatArray,
-    cells: CellGraph,
-    least_ml: float = LEAST_ML,
-) -> Overlap:
-    """Compare the clusters above a threshold of two fields (n,) on the same cells; undefined figures are NaN."""
+    model: str, load: str, threshold: float, measured: FloatArray, simulated: FloatArray,
+    cells: CellGraph, least_ml: float = LEAST_ML,
+) -> Overlap:  # fmt: skip
+    """Compare the clusters above a threshold of two fields on the same cells; undefined figures are NaN.
+
+    Parameters
+    ----------
+    model, load : str
+        As they stand in tables.
+    threshold : float
+        Maximum shear strain above which cells are compared.
+    measured, simulated : (n,)
+        Maximum shear strain (E1 - E3) / 2 in the cells.
+    cells, least_ml : CellGraph, float
+        The cells, and the volume of the smallest cluster that counts, mL.
+    """
     of, to = (cells.clusters(shear > threshold, shear, least_ml) for shear in (measured, simulated))
     first, second = (cells.region(shear > threshold, least_ml) for shear in (measured, simulated))
     largest = float(np.linalg.norm(of[0].centroid_mm - to[0].centroid_mm)) if of and to else float("nan")
@@ -191,9 +207,8 @@ class StrainedRegion:
     """Cells (n,) in clusters ``above`` a threshold."""
 
     def __init__(self, above: BoolArray, cells: CellGraph) -> None:
-        self.above = above
-        self._volumes, self._points = cells.volumes_ml, cells.points_mm
-        self.volume_ml = float(self._volumes[above].sum())
+        self.above, self.volumes, self._points = above, cells.volumes_ml, cells.points_mm
+        self.volume_ml = float(self.volumes[above].sum())
 
     @cached_property
     def _near(self) -> cKDTree:
@@ -204,18 +219,14 @@ class StrainedRegion:
         """Reference configuration, LPS mm; NaN for no cell."""
         if not self.above.any():
             return np.full(3, np.nan)
-        return np.asarray(self._volumes[self.above] @ self._points[self.above] / self.volume_ml)
+        return np.asarray(self.volumes[self.above] @ self._points[self.above] / self.volume_ml)
 
     def mean_of(self, values: FloatArray) -> float:
         """Volume-weighted mean of values (n,); NaN for no cell."""
         inside = self.above
-        return float(self._volumes[inside] @ values[inside] / self.volume_ml) if inside.any() else float("nan")
+        return float(self.volumes[inside] @ values[inside] / self.volume_ml) if inside.any() else float("nan")
 
-    def shared_ml(self, other: StrainedRegion) -> float:
-        """Volume common to both."""
-        return float(self._volumes[self.above & other.above].sum())
-
-    def distance95(self, other: StrainedRegion, most: int | None = None) -> float:
+    def distance95(self, other: Self, most: int | None = None) -> float:
         """95th percentile (by volume) of these cells' distance (of ``most`` at equal steps) to another region, mm."""
         cells = np.flatnonzero(self.above)
         cells = cells[:: max(1, len(cells) // most)] if most else cells
@@ -223,14 +234,14 @@ class StrainedRegion:
         distance = np.zeros(len(cells))
         distance[alone] = other._near.query(self._points[cells[alone]])[0]
         order = np.argsort(distance)
-        volume = np.cumsum(self._volumes[cells[order]])
+        volume = np.cumsum(self.volumes[cells[order]])
         return float(distance[order][min(int(np.searchsorted(volume, 0.95 * volume[-1])), len(order) - 1)])
 
 
 def dice(first: StrainedRegion, second: StrainedRegion) -> float:
     """Twice the common volume over the sum of both (Dice 1945); NaN where both are empty."""
-    both = first.volume_ml + second.volume_ml
-    return 2.0 * first.shared_ml(second) / both if both > 0.0 else float("nan")
+    both, shared = first.volume_ml + second.volume_ml, float(first.volumes[first.above & second.above].sum())
+    return 2.0 * shared / both if both > 0.0 else float("nan")
 
 
 def centroid_distance(first: StrainedRegion, second: StrainedRegion) -> float:
@@ -240,9 +251,8 @@ def centroid_distance(first: StrainedRegion, second: StrainedRegion) -> float:
 
 def hausdorff95(first: StrainedRegion, second: StrainedRegion, most: int | None = None) -> float:
     """Hausdorff distance at the 95th percentile, mm; NaN where one is empty. ``most`` as in `distance95`."""
-    if not (first.above.any() and second.above.any()):
-        return float("nan")
-    return max(first.distance95(second, most), second.distance95(first, most))
+    both = first.above.any() and second.above.any()
+    return max(first.distance95(second, most), second.distance95(first, most)) if both else float("nan")
 
 
 _FIGURES: dict[str, Callable[[StrainedRegion, StrainedRegion], float]] = {
@@ -253,13 +263,9 @@ _FIGURES: dict[str, Callable[[StrainedRegion, StrainedRegion], float]] = {
 
 
 def with_intervals(
-    overlaps: Sequence[Overlap],
-    truths: Sequence[FloatArray],
-    models: Mapping[str, FloatArray],
-    cells: CellGraph,
-    least_ml: float,
-    widening: float,
-) -> list[Overlap]:
+    overlaps: Sequence[Overlap], truths: Sequence[FloatArray], models: Mapping[str, FloatArray],
+    cells: CellGraph, least_ml: float, widening: float,
+) -> list[Overlap]:  # fmt: skip
     """Overlaps of a load with 95 % intervals from truths drawn, and with the value that a perfect model would get.
 
     Truths and models are the maximum shear strain in ``cells`` (n,); ``widening`` is the factor on intervals of draws,
@@ -270,21 +276,21 @@ def with_intervals(
     rows: list[Overlap] = []
     for threshold in dict.fromkeys(o.threshold for o in overlaps):
         regions = [cells.region(truth > threshold, least_ml) for truth in truths]
-        volume = _interval([region.volume_ml for region in regions], widening)
+        least, _, most = _interval([region.volume_ml for region in regions], widening)
+        most = min(most, float(cells.volumes_ml.sum()))
         neighbours = list(pairwise(regions))
         perfect = {figure: _interval([of(*pair) for pair in neighbours], 1.0)[1] for figure, of in _FIGURES.items()}
         for one in (o for o in overlaps if o.threshold == threshold):
             model = cells.region(models[one.model] > threshold, least_ml)
-            most = min(volume[2], float(cells.volumes_ml.sum()))
-            values: dict[str, Any] = {"measured_low_ml": volume[0], "measured_high_ml": most}
+            values: dict[str, Any] = {"measured_low_ml": least, "measured_high_ml": most}
             for figure, of in _FIGURES.items():
                 low, _, high = _interval([of(region, model) for region in regions], widening)
                 if of is dice:
                     high = 1.0 if high >= perfect[figure] else high
                 elif low <= perfect[figure]:
                     low = 0.0
-                for end, value in (("_low", low), ("_high", high), ("_perfect", perfect[figure])):
-                    values[figure.format(end)] = value
+                ends = {"_low": low, "_high": high, "_perfect": perfect[figure]}
+                values |= {figure.format(end): value for end, value in ends.items()}
             rows.append(replace(one, **values))
     order = {(o.model, o.threshold): n for n, o in enumerate(overlaps)}
     return sorted(rows, key=lambda o: order[o.model, o.threshold])

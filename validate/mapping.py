@@ -10,6 +10,7 @@ from dvc import Deformation, LabelMap, StrainField, TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.trust.regions import volume_above
+from validate.arguments import check_each, check_kind
 
 ALL = "all soft tissue"
 """Name of all compared tissue together."""
@@ -94,7 +95,10 @@ class MappedFields:
 
 
 def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray:
-    """Values (n, k) at points (n, 3), rows with NaN replaced by the row of the nearest point without."""
+    """Values (n, k) at points (n, 3), mm, rows with NaN replaced by the row of the nearest point without.
+
+    At least one row has to be without.
+    """
     known = np.isfinite(values).all(axis=1)
     filled = values.copy()
     if not known.all():
@@ -105,16 +109,17 @@ def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray
 
 def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
     """Refuse bones that are not in the label map, with an `InputError` that names its labels."""
-    for name in bones:
-        if name not in labels.names.values():
-            raise InputError(
-                f"The label map has no '{name}'; it has {', '.join(labels.names.values())}. Bones are named with "
-                "--bone, labels by the table --names."
-            )
+    check_kind("labels", labels, LabelMap)
+    check_each("bones", bones, str)
+    known = labels.names.values()
+    if missing := [name for name in bones if name not in known]:
+        raise InputError(
+            f"The label map has no '{missing[0]}'; it has {', '.join(known)}. Bones are named with --bone, labels by "
+            "the table --names."
+        )
 
 
-def sample(deformation: Deformation, points_mm: FloatArray) -> Field:
-    """A deformation at points (n, 3)."""
+def _sampled(deformation: Deformation, points_mm: FloatArray) -> Field:
     u, H = deformation.evaluate(points_mm)
     strain = StrainField.from_gradient(H)
     return Field(u, strain.max_shear, strain.jacobian)
@@ -139,18 +144,17 @@ def map_fields(
     InputError
         If a bone is not in the label map, or measurement and models have no tissue in common.
     """
+    check_kind("mesh", mesh, TetMesh)
     check_bones(labels, bones)
-    points = mesh.centroids_mm
     tissue = tissues_of(mesh, labels)
     soft = ~np.isin(tissue, list(bones))
+    mesh, tissue = mesh if soft.all() else _part(mesh, np.flatnonzero(soft)), tissue[soft]
+    points = mesh.centroids_mm
     bone = np.isin(labels.labels, [number for number, name in labels.names.items() if name in bones])
-    distance, _ = cKDTree(labels.grid.points(bone)).query(points[soft])
+    distance, _ = cKDTree(labels.grid.points(bone)).query(points)
     distance = np.maximum(distance - 0.5 * labels.grid.spacing_mm.min(), 0.0)  # from voxels' centres to the surface
-    points, mesh = points[soft], mesh if soft.all() else _part(mesh, np.flatnonzero(soft))
-    sampled = {name: sample(model, points) for name, model in models.items()}
-    fields = MappedFields(
-        mesh, points, mesh.volumes_mm3 / 1000.0, tissue[soft], distance, sample(measured, points), sampled
-    )
+    by_model, volumes = {name: _sampled(model, points) for name, model in models.items()}, mesh.volumes_mm3 / 1000.0
+    fields = MappedFields(mesh, points, volumes, tissue, distance, _sampled(measured, points), by_model)
     if not fields.common.any():
         covered = "; ".join(f"{name} {volume:.1f} mL" for name, volume in fields.coverage().items())
         raise InputError(f"Measurement and models are defined nowhere together ({covered}). Do they share a frame?")

@@ -22,6 +22,7 @@ from fe.assembly import Assembler
 from fe.elements import Model, element
 from fe.linear import Solver
 from fe.newton import Imposed, equilibrium
+from validate.arguments import check_kind
 from validate.mapping import filled_from_nearest
 
 _FIRST_STEP, _LEAST_STEP = 0.25, 1.0 / 64.0
@@ -46,16 +47,18 @@ def boundary_displacement(mesh: TetMesh, measured: Deformation) -> tuple[IntArra
 
 def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
     """Surface nodes (k,), and the measured displacement of all nodes (n, 3), zero on the surface of bone."""
+    check_kind("mesh", mesh, TetMesh)
+    check_kind("measured", measured, Deformation)
     nodes = np.unique(outer_faces(mesh.cells))
     u = measured.displacement(mesh.points_mm)
     known = np.isfinite(u).all(axis=1)
     if not known.any():
         raise InputError("The measurement is defined at no node of the mesh. Do they share a frame?")
     distance, _ = cKDTree(mesh.points_mm[known]).query(mesh.points_mm[~known])
-    if np.count_nonzero(distance > _FAR_MM) > _FEW * len(u):
+    if (far := np.count_nonzero(distance > _FAR_MM)) > _FEW * len(u):
         raise InputError(
-            f"{np.count_nonzero(distance > _FAR_MM)} of {len(u)} nodes lie over {_FAR_MM:g} mm from any at which the "
-            "measurement is defined; it does not cover the model."
+            f"{far} of {len(u)} nodes lie over {_FAR_MM:g} mm from any at which the measurement is defined; it does "
+            "not cover the model."
         )
     u = filled_from_nearest(u, mesh.points_mm)
     if BONE in mesh.facets:
@@ -64,14 +67,9 @@ def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArra
 
 
 def simulate_driven(
-    mesh: TetMesh,
-    materials: Mapping[str, Material],
-    measured: Deformation,
-    load: str,
-    *,
-    threads: int = 1,
-    tell: Callable[[str], None] = lambda _: None,
-) -> LoadState:
+    mesh: TetMesh, materials: Mapping[str, Material], measured: Deformation, load: str, *,
+    threads: int = 1, tell: Callable[[str], None] = lambda _: None,
+) -> LoadState:  # fmt: skip
     """Equilibrium of a mesh with the measured displacement prescribed on its surface.
 
     The state has no plate. If equilibrium was lost, it is the last converged increment, and ``reached`` is below 1.
@@ -90,14 +88,13 @@ def simulate_driven(
     InputError
         As `boundary_displacement`, or if a cell does not have exactly one constitutive model.
     """
-    check_materials(mesh, materials)
     began = time.monotonic()
     nodes, guess = _boundary(mesh, measured)
+    check_materials(mesh, materials)
     model = Model.of(mesh, materials, element("P1"))
     assembler = Assembler(model, (3 * nodes[:, None] + np.arange(3)).ravel(), {})
     solver = Solver(assembler.indptr, assembler.indices, threads=threads)
-    state = np.zeros(model.unknowns)
-    count = 3 * len(mesh.points_mm)
+    state, count = np.zeros(model.unknowns), 3 * len(mesh.points_mm)
     done, step, iterations = 0.0, _FIRST_STEP, 0
     try:
         while done < 1.0 and step > _LEAST_STEP:
@@ -116,25 +113,27 @@ def simulate_driven(
     if done == 0.0:
         raise MrstrainError(f"{load}: no equilibrium was found with the measured displacement on the surface.")
     return LoadState(
-        load=LoadStep(load, float("nan")),
-        reached=done,
-        u_mm=state[:count].reshape(-1, 3),
-        pressure_mpa=model.pressures(state).mean(axis=1),
-        gradients=model.gradients(state),
-        on_plate=np.empty(0, dtype=np.int64),
-        curve=(),
-        iterations=iterations,
-        seconds=time.monotonic() - began,
-    )
+        load=LoadStep(load, float("nan")), reached=done, u_mm=state[:count].reshape(-1, 3),
+        pressure_mpa=model.pressures(state).mean(axis=1), gradients=model.gradients(state),
+        on_plate=np.empty(0, dtype=np.int64), curve=(), iterations=iterations, seconds=time.monotonic() - began,
+    )  # fmt: skip
 
 
 def write_boundary_conditions(
     stem: Path, mesh: TetMesh, nodes: IntArray, u_mm: FloatArray, *, unit: str = "mm", frame: str = "LPS"
 ) -> list[Path]:
-    """Write displacements (k, 3) LPS mm of a mesh's nodes as boundary conditions, in its file's own unit and frame.
+    """Write displacements of a mesh's nodes as boundary conditions for other codes, to be merged into a model.
 
-    Node numbers are those of the mesh file, or counted from 1, as in `fe.decks`, if it has none. Files: ``.inp`` for
-    Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D), ``.feb`` for FEBio 4, to be merged into a model.
+    Parameters
+    ----------
+    stem : path
+        The files are called so, with ``.inp`` for Abaqus and CalculiX (*BOUNDARY), ``.mac`` for ANSYS (D), ``.feb``
+        for FEBio 4; their paths are given back.
+    nodes, u_mm : (k,), (k, 3)
+        As `boundary_displacement` gives them, LPS mm. Files have the node numbers of the mesh's file, or, if it has
+        none, numbers from 1, as `fe.write_calculix`.
+    unit, frame : {"mm", "m"}, {"LPS", "RAS"}
+        Of the mesh's file, in which the displacements are written.
     """
     numbers = mesh.node_ids[nodes] + (1 if mesh.node_ids.min() == 0 else 0)
     u = u_mm / MM_PER_UNIT[unit] * TO_LPS[frame]
@@ -143,13 +142,13 @@ def write_boundary_conditions(
     abaqus = [f"{n}, {axis}, {axis}, {value:.9g}" for n, axis, value in values]
     ansys = [f"D,{n},U{' XYZ'[axis]},{value:.9g}" for n, axis, value in values]
     files = {
-        ".inp": [f"** {about}; into a *STEP", "*BOUNDARY", *abaqus],
-        ".mac": [f"! {about}", *ansys],
-        ".feb": _febio(numbers, u, about),
+        stem.with_name(f"{stem.name}.inp"): [f"** {about}; into a *STEP", "*BOUNDARY", *abaqus],
+        stem.with_name(f"{stem.name}.mac"): [f"! {about}", *ansys],
+        stem.with_name(f"{stem.name}.feb"): _febio(numbers, u, about),
     }
-    for ending, lines in files.items():
-        write_whole(stem.with_name(stem.name + ending), "\n".join(lines) + "\n")
-    return [stem.with_name(stem.name + ending) for ending in files]
+    for path, lines in files.items():
+        write_whole(path, "\n".join(lines) + "\n")
+    return list(files)
 
 
 def _febio(numbers: IntArray, u: FloatArray, about: str) -> Iterator[str]:

@@ -10,17 +10,14 @@ from scipy.spatial import cKDTree
 from dvc import LabelMap, TetMesh
 from dvc.errors import GeometryError, InputError
 from dvc.mesh import box_told
+from validate.arguments import check_each
 from validate.fe_result import FeResult, check_overlap
 from validate.load_comparison import LoadCase
 from validate.mapping import MappedFields, check_bones, tissues_of
 
-_LEAST_OVERLAP, _GOOD_OVERLAP = 0.85, 0.95
-_SAME_TISSUE = 0.8
+_LEAST_OVERLAP, _GOOD_OVERLAP, _SAME_TISSUE, _VOLUME_CHANGE = 0.85, 0.95, 0.8, 0.15
 _NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
-_VOLUME_CHANGE = 0.15
-_ALONG, _TURNED = 0.7, 0.5
-_UNIT = 1000.0
-_TIED = 0.02
+_ALONG, _TURNED, _TIED, _UNIT = 0.7, 0.5, 0.02, 1000.0
 
 
 def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",)) -> list[str]:
@@ -34,6 +31,7 @@ def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[st
         If a model does not lie in the image, or less than 85 % of it in the labelled soft tissue.
     """
     check_bones(labels, bones)
+    check_each("cases", cases, LoadCase)
     if not cases:
         raise InputError("No load is given to compare.")
     warnings = []
@@ -41,6 +39,7 @@ def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[st
         _, results = case.read()
         if not results:
             raise InputError(f"{case.load}: no model is given.")
+        check_each(f"{case.load}: results", results, FeResult)
         for result in results:
             check_overlap(result.path, result.mesh, labels.grid)
             warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones)]
@@ -48,7 +47,11 @@ def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[st
 
 
 def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence[str]) -> float:
-    """Overlap of a mesh and the labelled soft tissue, as a fraction of the smaller volume; refused if under 85 %."""
+    """Overlap of a mesh and the labelled soft tissue, as a fraction of the smaller volume.
+
+    Both in the reference configuration, LPS mm; all labels but ``bones`` are soft tissue. Below 85 % it is refused with
+    a `GeometryError`, which names ``path`` and shows both boxes.
+    """
     soft = [number for number, name in labels.names.items() if name not in bones]
     tissue = tissues_of(mesh, labels, by_mesh=False)
     inside = np.isin(tissue, [labels.names[number] for number in soft])
@@ -57,17 +60,22 @@ def check_in_tissue(path: Path, mesh: TetMesh, labels: LabelMap, bones: Sequence
     overlap = float(mesh.volumes_mm3[inside].sum() / smaller)
     if overlap < _LEAST_OVERLAP:
         there = labels.grid.points(labelled)
+        own, of_tissue = box_told(*mesh.bounds_mm), box_told(there.min(axis=0), there.max(axis=0))
         raise GeometryError(
-            f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: "
-            f"{box_told(*mesh.bounds_mm)}; labelled soft tissue: "
-            f"{box_told(there.min(axis=0), there.max(axis=0))} (LPS mm). It is turned, mirrored or moved against the "
-            "image, or its label map is another's: check unit and frame, or give the map to the image's frame."
+            f"{path}: only {overlap:.0%} of the model lies in the labelled soft tissue. Model: {own}; labelled soft "
+            f"tissue: {of_tissue} (LPS mm). It is turned, mirrored or moved against the image, or its label map is "
+            "another's: check unit and frame, or give the map to the image's frame."
         )
     return overlap
 
 
 def misfits(result: FeResult, labels: LabelMap, bones: Sequence[str]) -> list[str]:
-    """Check a model against the label map, also as `check_in_tissue`; a sentence for each thing that looks wrong."""
+    """Check a model against the label map; a sentence for each thing that looks wrong.
+
+    It looks wrong if less than 95 % of it lies in the labelled soft tissue, it names under 80 % of the tissue as the
+    label map does, it moves by over 1 mm at the bone, or its cells change their volume by over 15 % in the mean. Errors
+    as `check_in_tissue`.
+    """
     mesh, warnings = result.mesh, []
     overlap = check_in_tissue(result.path, mesh, labels, bones)
     if overlap < _GOOD_OVERLAP:
@@ -132,7 +140,7 @@ def displacement_slip(fields: MappedFields, name: str) -> str:
         axes = " ".join(("-" if sign < 0.0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
         axes += " (the other of LPS and RAS)" if axes == "-x -y z" else ""
         warnings.append(
-            f"fits far better with its components taken as {axes} (cosine {most:.2f}, as given {as_given:.2f}): is it "
+            f"fits far better with its components taken as {axes} (cosine {most:.2f}, as given {as_given:z.2f}): is it "
             "in the frame and order of axes of the coordinates?"
         )
     if abs(np.log(of_model / size)) > 0.5 * np.log(_UNIT):

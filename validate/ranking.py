@@ -1,6 +1,6 @@
 """Models ranked by the area between curves: under each load, over all loads, and over subjects."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
@@ -18,6 +18,7 @@ Pairs = tuple[tuple[str, str], ...]
 """Of models, each in the order of their areas."""
 
 ALL_LOADS = "all loads"
+_SURE, _LEVEL = 0.95, 0.975
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,9 +71,15 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
     statements = [_under(one, pairs[one.load]) for one in loads]
     if len(loads) > 1 and everywhere and informative is not None:
         distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
-        counted = f" The registration of {', '.join(distrusted)}, which counts in it, is not to be trusted."
-        statements.insert(0, _statement("over all loads", _ranked(rows), pairs[ALL_LOADS], counted * bool(distrusted)))
+        caveat = f" The registration of {', '.join(distrusted)}, which counts in it, is not to be trusted."
+        caveat *= bool(distrusted)
+        statements.insert(0, _statement("over all loads", _ranked(rows), nothing, pairs[ALL_LOADS], caveat))
     return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs)
+
+
+def no_nearer(areas: Iterable[Area], nothing: Area) -> list[str]:
+    """Ranked models whose area is no smaller than that of `NOTHING` under the same load."""
+    return [a.model for a in areas if a.best_ml >= nothing.best_ml and not a.model.endswith(LEVELLED)]
 
 
 def _summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
@@ -101,12 +108,11 @@ def _under(one: LoadComparison, pairs: Pairs) -> str:
     if one.hardly_strained:
         low = one.criteria.strains[0]
         return f"{one.load}: less than 1 % of the tissue exceeds {low:g}, so the area metric is not informative."
-    distrusted = one.case.verdict is not None and one.case.verdict.level == "distrust"
-    caveat = " Its registration is not to be trusted." * distrusted
-    return _statement(f"under {one.load}", one.ranked(), pairs, caveat) if ALL in one.bands else ""
+    caveat = " Its registration is not to be trusted." * bool(one.case.verdict and one.case.verdict.level == "distrust")
+    return _statement(f"under {one.load}", one.ranked(), one.nothing, pairs, caveat) if ALL in one.bands else ""
 
 
-def _statement(where: str, ranked: Sequence[Area], pairs: Pairs, caveat: str) -> str:
+def _statement(where: str, ranked: Sequence[Area], nothing: Area, pairs: Pairs, caveat: str) -> str:
     """The best model, and ranks that do not differ significantly from it or their neighbours; "" for a single model."""
     if len(ranked) < 2:
         return ""
@@ -116,12 +122,10 @@ def _statement(where: str, ranked: Sequence[Area], pairs: Pairs, caveat: str) ->
     return (
         f"Best match {where} (area metric): {best}"
         + (f"; not distinguishable from {', '.join(near)}." if near else ", significantly better than every other.")
+        + " It is no nearer to the measurement than no deformation at all." * (best in no_nearer(ranked, nothing))
         + (f" Further down, not distinguishable: {'; '.join(neighbours)}." if neighbours else "")
         + caveat
     )
-
-
-_SURE, _LEVEL = 0.95, 0.975
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,15 +10,15 @@ from dvc.arrays import FloatArray
 from dvc.io.images.read import read_voxels
 from dvc.report.page import METHODS, Cell, Picture, Section, Table, Viewer, Volume
 from validate import figures
+from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
 from validate.fe_result import FeResult
 from validate.load_comparison import NOTHING, LoadComparison
 from validate.location import Threshold
 from validate.mapping import ALL, filled_from_nearest
-from validate.ranking import ALL_LOADS, Ranking
+from validate.ranking import ALL_LOADS, Ranking, no_nearer
 
-_AROUND = 4  # voxels around the tissue in the viewer
-_PANELS = 4  # tissues whose curves are drawn, all soft tissue first
+_AROUND, _PANELS = 4, 4  # voxels around the tissue in the viewer; tissues whose curves are drawn, all soft tissue first
 _AGREED = ("measured", "model", "slope", "intercept", "R²", "RMSE", "concordance", "bias", "limits from", "to")
 _CLOSING = Section(
     "How to read this",
@@ -47,12 +47,6 @@ _CLOSING = Section(
 def draw(one: LoadComparison, colours: Sequence[str]) -> tuple[dict[str, Picture], Viewer]:
     """A load's pictures, by the stem of their files, and its viewer; ``colours`` lists all models in colour order."""
     measured, results = one.case.read()
-    return _pictures(one, measured, results, colours), _viewer(one, measured, results)
-
-
-def _pictures(
-    one: LoadComparison, measured: Deformation, results: Sequence[FeResult], colours: Sequence[str]
-) -> dict[str, Picture]:
     fields, axes, bone = one.fields, one.case.axes, one.bones[0]
     displacements = {r.name: _at_nodes(r, fields.mesh.points_mm) for r in results}
     tissues = [name for name in (ALL, *fields.tissues) if any(a.tissue == name for a in one.areas)]
@@ -64,13 +58,14 @@ def _pictures(
         through = f"The lowest point of {bone} lies beside the mesh: the slice goes through the mesh's middle instead."
     slices = one, measured, displacements, point
     shear, u = ((figures.differences, one, quantity) for quantity in ("max_shear", "u_mm"))
-    return {
+    pictures = {
         "curves": Picture.drawn("Volume above a strain", figures.volume_strain, one, tissues[:_PANELS], colours),
         "slices": Picture.drawn("Where the strain lies", figures.slices, *slices, note=through),
         "agreement": Picture.drawn("Maximum shear strain, cell by cell", figures.scatter, fields),
         "differences_shear": Picture.drawn("Differences of maximum shear strain", *shear),
         "differences_u": Picture.drawn("Differences of the displacement's magnitude", *u),
     }
+    return pictures, _viewer(one, measured, results)
 
 
 def lowest_bone_point(labels: LabelMap, bone: str, axes: FloatArray) -> FloatArray:
@@ -120,17 +115,16 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
 def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: Viewer) -> list[Section]:
     """A load's part of the report: how much and where, then cell by cell."""
     verdict = one.case.verdict
-    covered = one.fields.coverage()
-    compared = (
-        f"Compared: {covered['common']:.1f} mL of the mesh's {covered['mesh']:.1f} mL of soft tissue; the "
-        f"measurement is defined in {covered['measured']:.1f} mL."
-    )
-    trust = () if verdict is None else (f"Verdict on its registration: {verdict.words}.",)
+    words = [
+        "Compared: {common:.1f} mL of the mesh's {mesh:.1f} mL of soft tissue; the measurement is defined in "
+        "{measured:.1f} mL.".format(**one.fields.coverage())
+    ]
+    words += [] if verdict is None else [f"Verdict on its registration: {verdict.words}."]
     curves, slices, *others = pictures.values()
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
-        Section(one.load, doubtful, tables, (curves, slices), (compared, *trust), (viewer,)),
-        Section(f"{one.load}, cell by cell", None, (_agreement(one), _by_distance(one)), tuple(others)),
+        Section(one.load, doubtful, tables, (curves, slices), tuple(words), (viewer,)),
+        Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others)),
     ]
 
 
@@ -163,7 +157,8 @@ def shown(area: Area) -> str:
 
 def _ranks(ranking: Ranking, model: str) -> str:
     """Rank of a model over all loads: a range if not distinguishable from neighbours, a dash if not ranked."""
-    return "–".join(str(rank) for rank in dict.fromkeys(ranking.rank(model) or ("–",)))
+    ranks = "–".join(str(rank) for rank in dict.fromkeys(ranking.rank(model) or ("–",)))
+    return ranks + f", no nearer than {NOTHING}" * (model in no_nearer(ranking.areas, ranking.nothing))
 
 
 def area_rows(areas: Iterable[Area], ranking: Ranking, loads: Sequence[str]) -> list[tuple[str, ...]]:
@@ -186,7 +181,8 @@ def _areas(loads: Sequence[LoadComparison], ranking: Ranking) -> Table:
         "The best model over all loads first; the rank is a range where models are not distinguishable. Where the "
         "measurement uncertainty is known, the area is the median over the true fields drawn, with a 95 % interval; "
         "areas as measured, and by tissue, stand below and in areas.csv. Levelled models come last, with their area as "
-        "measured. Below the line: the area of a model that predicts zero strain everywhere.",
+        "measured. Below the line: the area of a model that predicts zero strain everywhere; where a model's is no "
+        "smaller, that is said beside its rank.",
         (nothing,),
     )
 
@@ -246,31 +242,31 @@ def _ranged(value: float, low: float = np.nan, high: float = np.nan) -> str:
     return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.2g}–{high:.2g})"
 
 
-def _agreement(one: LoadComparison) -> Table:
-    return Table(
-        "Agreement cell by cell",
-        ("model", "quantity", "tissue", *_AGREED),
-        _rows_of(one, [ALL, *one.fields.tissues]),
-        "Maximum shear strain and displacement u: means, regression of the model on the measurement, Lin's "
-        "concordance, Bland and Altman's limits of agreement. For displacement these are of its magnitude, except "
-        "regression and concordance (the three components pooled) and RMSE (of the difference vector). All as "
-        "measured, without intervals: the error model covers maximum shear strain, and there is none of displacement.",
+def _agreement(one: LoadComparison) -> tuple[Table, Table]:
+    """Agreement cell by cell: by tissue, and by distance to bone."""
+    names, tissues = {"max_shear": "shear", "u_mm": "u, mm"}, (ALL, *one.fields.tissues)
+    rows: list[tuple[Cell, ...]] = [(a.model, names[a.quantity], a.part, *_rounded(a, 6)) for a in one.agreements]
+    return (
+        Table(
+            "Agreement cell by cell",
+            ("model", "quantity", "tissue", *_AGREED),
+            tuple(row for row in rows if row[2] in tissues),
+            "Maximum shear strain and displacement u: means, regression of the model on the measurement, Lin's "
+            "concordance, Bland and Altman's limits of agreement. For displacement these are of its magnitude, except "
+            "regression and concordance (the three components pooled) and RMSE (of the difference vector). All as "
+            "measured, without intervals: the error model covers maximum shear strain, and there is none of "
+            "displacement.",
+        ),
+        Table(
+            "Agreement by distance to bone", ("model", "quantity", "where", *_AGREED),
+            tuple(row for row in rows if row[2] not in tissues), "In all soft tissue, as above.",
+        ),
     )  # fmt: skip
 
 
-def _by_distance(one: LoadComparison) -> Table:
-    known = (ALL, *one.fields.tissues)
-    return Table(
-        "Agreement by distance to bone",
-        ("model", "quantity", "where", *_AGREED),
-        _rows_of(one, [a.part for a in one.agreements if a.part not in known]),
-        "In all soft tissue, as above.",
-    )
-
-
-def _rows_of(one: LoadComparison, parts: Sequence[str]) -> tuple[tuple[Cell, ...], ...]:
-    names = {"max_shear": "shear", "u_mm": "u, mm"}
-    return tuple((a.model, names[a.quantity], a.part, *astuple(a)[6:]) for a in one.agreements if a.part in parts)
+def _rounded(row: Agreement | SkinDisplacement, first: int) -> tuple[float, ...]:
+    """Figures of a row from the first on; what rounding leaves of a zero, and its sign, is dropped."""
+    return tuple(round(figure, 9) + 0.0 for figure in astuple(row)[first:])
 
 
 def _skin(one: LoadComparison) -> Table:
@@ -279,7 +275,7 @@ def _skin(one: LoadComparison) -> Table:
         ("model", "nodes", "inward, measured, mm", "model, mm", "tangential, measured, mm", "model, mm",
          "fat's volume change, measured, %", "model, %"),
         tuple(
-            (t.model, *astuple(t)[2:7], 100.0 * t.measured_volume_change, 100.0 * t.model_volume_change)
+            (t.model, t.nodes, *_rounded(t, 3)[:4], *(100.0 * change for change in _rounded(t, 3)[4:]))
             for t in one.skin
         ),
         "Mean displacement 1 mm inside the skin on the model's plate, against the plate's outward normal and "

@@ -44,9 +44,9 @@ class Curve:
     volume_above_ml: FloatArray
 
 
-def curves_of(one: LoadComparison) -> list[Curve]:
-    """The curves of one load, from 0 to one and a half times the upper end of the range."""
-    at = np.arange(0.0, 1.5 * one.criteria.strains[1] + _STEP / 2, _STEP)
+def curves_of(one: LoadComparison, strains: FloatArray | None = None) -> list[Curve]:
+    """The curves of one load at strains (k,), by default from 0 to one and a half times the upper end of the range."""
+    at = np.arange(0.0, 1.5 * one.criteria.strains[1] + _STEP / 2, _STEP) if strains is None else strains
     made = []
     for tissue in (ALL, *one.fields.tissues):
         volumes = one.fields.curves(tissue, at)

@@ -28,21 +28,11 @@ class Shape:
         """Faces with four corners."""
         return tuple(face for face in self.faces if len(face) == 4)
 
-    @property
-    def edged(self) -> int:
-        """Number of corners and edges: the nodes that every quadratic cell of this shape has."""
-        return len(self.corners) + len(self.edges)
-
     def around(self, face: Nodes) -> Nodes:
         """Nodes of a quadratic cell along the rim of a face: a corner, the middle of an edge, and so on."""
         middle = {frozenset(edge): len(self.corners) + n for n, edge in enumerate(self.edges)}
         pairs = zip(face, (*face[1:], face[0]), strict=True)
         return tuple(n for a, b in pairs for n in (a, middle[frozenset((a, b))]))
-
-    @property
-    def nodes(self) -> FloatArray:
-        """Reference coordinates of corners and middles of edges."""
-        return np.concatenate([self.corners, [self.corners[list(edge)].mean(axis=0) for edge in self.edges]])
 
     def weights(self, nodes: Nodes, corners: Nodes) -> FloatArray:
         """Weights with which values at ``nodes`` give that at the mean of ``corners``, exact for every quadratic field.
@@ -54,19 +44,20 @@ class Shape:
             x, y, z = at.T
             return np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x], axis=1)
 
+        at = np.concatenate([self.corners, [self.corners[list(edge)].mean(axis=0) for edge in self.edges]])
         point = self.corners[list(corners)].mean(axis=0)
-        return np.asarray(np.linalg.pinv(monomials(self.nodes[list(nodes)]).T) @ monomials(point[None])[0])
+        return np.asarray(np.linalg.pinv(monomials(at[list(nodes)]).T) @ monomials(point[None])[0])
 
     def halved(self, face: Nodes) -> IntArray:
         """Triangles (k, 3) of half its size that make up a face of a quadratic cell.
 
-        A quadrangle's have its middle in common: node number `edged` and on, in the order of the quadrangles.
+        A quadrangle's have its middle in common: the nodes after those of the edges, in the order of the quadrangles.
         """
         rim = self.around(face)
         if len(face) == 3:
             a, ab, b, bc, c, ca = rim
             return np.array([(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)])
-        middle = self.edged + self.quadrangles.index(face)
+        middle = len(self.corners) + len(self.edges) + self.quadrangles.index(face)
         return np.array([(rim[i], rim[(i + 1) % 8], middle) for i in range(8)])
 
 
@@ -147,11 +138,11 @@ def linear_tetrahedra(mesh: MeshFile) -> tuple[TetMesh, sparse.csr_matrix]:
     every, parent = np.concatenate(cells), np.concatenate(parents)
     order = np.argsort(parent, kind="stable")
     starts = np.searchsorted(parent[order], np.arange(mesh.cell_count + 1))
-    members = {
-        name: np.concatenate([order[:0], *(order[starts[c] : starts[c + 1]] for c in index)])
+    regions = {
+        name: np.concatenate([order[starts[c] : starts[c + 1]] for c in index])
         for name, index in mesh.regions.items()
+        if any(starts[c] < starts[c + 1] for c in index)
     }
-    regions = {name: cells_of for name, cells_of in members.items() if len(cells_of)}
     surfaces = {name: _on_surface(corners, faces, len(mesh.points_mm)) for name, corners in _surfaces(mesh).items()}
     facets = {name: triangles for name, triangles in surfaces.items() if len(triangles)}
     tets = TetMesh(nodes.points, every, regions, facets, np.arange(len(nodes.points)))
@@ -186,20 +177,17 @@ class _Nodes:
 def _linear_faces(block: CellBlock) -> _Faces:
     """Faces as triangles, quadrangles cut from their lowest node."""
     faces: _Faces = []
-    for face in SHAPES[block.shape].faces:
-        corners = block.corners[:, list(face)]
-        if len(face) == 3:
-            faces.append((corners, corners[:, None]))
-        else:
-            turned = np.take_along_axis(corners, (np.argmin(corners, axis=1)[:, None] + np.arange(4)) % 4, axis=1)
-            faces.append((corners, turned[:, np.array([(0, 1, 2), (0, 2, 3)])]))
+    for corners in (block.corners[:, list(face)] for face in SHAPES[block.shape].faces):
+        count = corners.shape[1]
+        turned = np.take_along_axis(corners, (np.argmin(corners, axis=1)[:, None] + np.arange(count)) % count, axis=1)
+        faces.append((corners, corners[:, None] if count == 3 else turned[:, np.array([(0, 1, 2), (0, 2, 3)])]))
     return faces
 
 
 def _quadratic(block: CellBlock, nodes: _Nodes) -> tuple[_Faces, IntArray]:
     """Faces of quadratic cells as triangles of half their size, and the cells' middles (m,)."""
     shape = SHAPES[block.shape]
-    own, edged = block.nodes, shape.edged
+    own, edged = block.nodes, len(shape.corners) + len(shape.edges)
     if own.shape[1] == edged:
         # the middle of a quadrangle is one node for both its cells
         rims = [shape.around(face) for face in shape.quadrangles]
@@ -262,8 +250,7 @@ def _on_surface(corners: list[tuple[int, ...]], faces: _Faces, count: int) -> In
     there[np.concatenate([np.array(face) for face in wanted])] = True
     matching: dict[tuple[int, ...], IntArray] = {}
     for keys, triangles in faces:
-        for row in np.flatnonzero(there[keys].all(axis=1)):
-            key = tuple(sorted(keys[row].tolist()))
-            if key in wanted:
-                matching[key] = triangles[row]
+        at = np.flatnonzero(there[keys].all(axis=1))
+        sets = (tuple(row) for row in np.sort(keys[at], axis=1).tolist())
+        matching |= {face: triangles[row] for row, face in zip(at, sets, strict=True) if face in wanted}
     return np.concatenate(list(matching.values())) if matching else np.empty((0, 3), dtype=np.int64)

@@ -15,7 +15,7 @@ from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, 
 from dvc.report.page import Section
 from fe import read_tet_mesh
 from mrstrain.comparison.methods import methods
-from mrstrain.comparison.model_files import ModelFile, Reading, model_files
+from mrstrain.comparison.model_files import ModelFile, model_files
 from mrstrain.options.comparison import ComparisonOn, ModelReading
 from mrstrain.options.door import door
 from mrstrain.options.model import Vector
@@ -40,19 +40,11 @@ class Compared:
 
 @door
 def compare(
-    dvc: Path | str,
-    models: Sequence[Path | str],
-    *,
-    out: Path | str,
-    labelling: LabelMapFile,
-    loads: Sequence[str] = (),
-    reading: ModelReading,
-    to_image: FloatArray | None = None,
-    directions: Directions,
-    towards: Mapping[str, tuple[Vector, Vector]] | None = None,
-    comparison: ComparisonOn,
+    dvc: Path | str, models: Sequence[Path | str], *, out: Path | str, labelling: LabelMapFile,
+    loads: Sequence[str] = (), reading: ModelReading, to_image: FloatArray | None = None, directions: Directions,
+    towards: Mapping[str, tuple[Vector, Vector]] | None = None, comparison: ComparisonOn,
     progress: Callable[[str, str, float], None] | None = None,
-) -> Compared:
+) -> Compared:  # fmt: skip
     """Compare finite-element models of any code with a measurement; see `validate.compare`.
 
     Parameters
@@ -80,66 +72,50 @@ def compare(
         If measurement and models have no load in common, or as in `validate.compare`.
     """
     target, tell, tissues = Path(out), progress or (lambda *_: None), read_labels(labelling.labels, labelling.names)
-    thresholds = validate.read_thresholds(comparison.thresholds)
+    thresholds, share = validate.read_thresholds(comparison.thresholds), partial(tell, "compare", "comparing")
     criteria = validate.Criteria(comparison.strains, thresholds, comparison.least_ml)
     bones, usual = labelling.bones, _axes(directions.plate_normal, directions.shear_direction)
     own = {load: _axes(*of) for load, of in (towards or {}).items()}
     measurements = result_folders(Path(dvc), loads)
-    how = Reading(reading.model_mesh, reading.model_unit, reading.model_frame, to_image)
-    files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], how)
-    inputs = _inputs(measurements, files, labelling, comparison.mesh)
+    files, notes = model_files([m.load for m in measurements], [Path(m) for m in models], reading, to_image)
+    results = [file for of in files.values() for file in of]
+    inputs = {
+        "measured": [f for m in measurements for f in m.files],
+        "models": [*(file.path for file in results), *dict.fromkeys(p for file in results for p in file.reading.paths)],
+        **labelling.files,
+        "mesh": [] if comparison.mesh is None else [comparison.mesh],
+        "error_models": [f for m in measurements if (f := m.folder / ERROR_MODEL).is_file()],
+    }
     refuse_touching_inputs(target, list(files), [path for paths in inputs.values() for path in paths])
-    folders = [Path(dvc), *(m.folder for m in measurements), *map(Path, models)]
-    if target.resolve() in [folder.resolve() for folder in folders]:
+    if target.resolve() in [f.resolve() for f in (Path(dvc), *(m.folder for m in measurements), *map(Path, models))]:
         raise InputError(f"{target} is a folder of results that are compared; choose another --out.")
     common = None if comparison.mesh is None else _common_mesh(comparison.mesh, tissues, bones)
-    compared = [m for m in measurements if m.load in files]
-    cases = [_case(m, files[m.load], tissues.grid, own.get(m.load, usual)) for m in compared]
+    compared = {m.load: m for m in measurements if m.load in files}
+    cases = [_case(m, files[load], tissues.grid, own.get(load, usual)) for load, m in compared.items()]
     # Every file is read once before anything is computed or removed, and again in its turn: together they fill memory.
     warnings = validate.check_models(cases, tissues, bones)
     make_output(target)
     given = {
         "bones": list(bones), "plate_axes_lps": usual.tolist(), "strains": list(criteria.strains),
-        "plate_axes_lps_of": {load: axes.tolist() for load, axes in own.items()},
-        "least_cluster_ml": criteria.least_ml,
-        "thresholds": [[t.max_shear, t.source] for t in criteria.thresholds],
-        "model_unit": how.unit, "model_frame": how.frame,
+        "plate_axes_lps_of": {load: axes.tolist() for load, axes in own.items()}, "least_cluster_ml": criteria.least_ml,
+        "thresholds": [[t.max_shear, t.source] for t in thresholds], **reading.model_dump(exclude={"model_mesh"}),
         "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": criteria.seed,
         "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
     }  # fmt: skip
     record = provenance("compare", inputs, given)
     result = validate.compare(
-        cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings,
-        progress=lambda fraction: tell("compare", "comparing", fraction),
-    )  # fmt: skip
-    results = {file.name: file.path for of in files.values() for file in of}
-    paragraphs = methods({m.load: m.folder for m in compared}, results, result, criteria)
+        cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings, progress=share
+    )
+    folders, of_models = {load: m.folder for load, m in compared.items()}, {file.name: file.path for file in results}
+    paragraphs = methods(folders, of_models, result, criteria)
     sections, closing = result.write(target, record=record, methods=paragraphs, on_image=comparison.on_image)
-    tell("compare", "comparing", 1.0)
+    share(1.0)
     return Compared(target, result, sections, closing)
 
 
 def _axes(normal: Sequence[float], shear: Sequence[float]) -> FloatArray:
     """The plate's axes (3, 3) from its outward normal and the direction of shear, LPS."""
     return plate_axes(-np.asarray(normal, dtype=np.float64), shear)
-
-
-def _inputs(
-    measurements: Sequence[ResultFolder],
-    files: Mapping[str, Sequence[ModelFile]],
-    labelling: LabelMapFile,
-    mesh: Path | None,
-) -> dict[str, list[Path]]:
-    """All files that are read, by role."""
-    results = [file for of in files.values() for file in of]
-    meshes = dict.fromkeys(f.reading.mesh for f in results if f.reading.mesh is not None)
-    return {
-        "measured": [f for m in measurements for f in m.files],
-        "models": [*(file.path for file in results), *meshes],
-        **labelling.files,
-        "mesh": [] if mesh is None else [mesh],
-        "error_models": [f for m in measurements if (f := m.folder / ERROR_MODEL).is_file()],
-    }
 
 
 def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
@@ -150,15 +126,13 @@ def _common_mesh(path: Path, labels: LabelMap, bones: Sequence[str]) -> TetMesh:
     return mesh
 
 
+def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> validate.LoadCase:
+    image, known = measurement.folder / REGISTERED, (measurement.table, measurement.verdict, measurement.aligned_on)
+    read = partial(_read, measurement, files, grid)
+    return validate.LoadCase(measurement.load, read, axes, *known, image if image.is_file() else None)
+
+
 def _read(
     measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid
 ) -> tuple[Deformation, list[validate.FeResult]]:
     return measurement.deformation(), [file.read(grid) for file in files]
-
-
-def _case(measurement: ResultFolder, files: Sequence[ModelFile], grid: Grid, axes: FloatArray) -> validate.LoadCase:
-    image = measurement.folder / REGISTERED
-    return validate.LoadCase(
-        measurement.load, partial(_read, measurement, files, grid), axes,
-        measurement.table, measurement.verdict, measurement.aligned_on, image if image.is_file() else None,
-    )  # fmt: skip

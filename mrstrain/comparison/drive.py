@@ -18,8 +18,7 @@ from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.provenance import provenance
 from validate import boundary_displacement, simulate_driven, write_boundary_conditions
 
-BOUNDARY, ENDING = "boundary", "-driven"
-"""Folder of the boundary conditions for other codes; ending of a set's folder."""
+BOUNDARY, ENDING = "boundary", "-driven"  # folder of the boundary conditions for other codes; end of a set's folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,16 +36,10 @@ class Driven:
 
 @door
 def drive(
-    mesh: Path | str,
-    dvc: Path | str,
-    *,
-    out: Path | str,
-    material: MaterialSets,
-    loads: Sequence[str] = (),
-    threads: int | None = None,
-    coordinates: MeshCoordinates,
+    mesh: Path | str, dvc: Path | str, *, out: Path | str, material: MaterialSets, loads: Sequence[str] = (),
+    threads: int | None = None, coordinates: MeshCoordinates,
     progress: Callable[[str, str, float], None] | None = None,
-) -> Driven:
+) -> Driven:  # fmt: skip
     """Simulate a mesh with the measured displacement prescribed on its surface.
 
     Parameters
@@ -75,8 +68,8 @@ def drive(
     unit, frame, sets = coordinates.mesh_unit, coordinates.mesh_frame, material.sets
     read = fe.read_tet_mesh(place, unit=unit, frame=frame)
     laws = {one.name: one.for_regions(read.regions) for one in material_sets(sets)}
-    for region_laws, _ in laws.values():
-        fe.check_materials(read, region_laws)
+    for materials, _ in laws.values():
+        fe.check_materials(read, materials)
     measurements = result_folders(Path(dvc), loads)
     if loose := [m.load for m in measurements if m.aligned_on == "none"]:
         raise InputError(
@@ -99,13 +92,13 @@ def drive(
     doubtful = [(m.load, m.verdict) for m in measurements if m.verdict and m.verdict.reasons]
     lines = [f"{load}: verdict on the measurement: {verdict.words}" for load, verdict in doubtful]
     complete, regions = True, {str(n): region for n, region in enumerate(read.regions, start=1)}
-    for number, (name, (region_laws, notes)) in enumerate(laws.items()):
+    for number, (name, (materials, notes)) in enumerate(laws.items()):
         tell("drive", "simulating", number / len(laws))
-        outcome, messages = _drive_set(folders[name], read, region_laws, measured, threads or usable_cores())
+        outcome, messages = _drive_set(folders[name], read, materials, measured, threads or usable_cores())
         complete = complete and [of["reached"] for of in outcome.values()] == [1.0] * len(measured)
         lines += messages
         about = {"outcome": outcome, "notes": list(notes), "region_numbers_in_vtu": regions, "set": name}
-        about |= {"laws": {region: law.description for region, law in region_laws.items()}}
+        about |= {"laws": {region: law.description for region, law in materials.items()}}
         write_json(folders[name] / "simulation.json", about | record)
     tell("drive", "simulating", 1.0)
     return Driven(target, complete, tuple(lines))

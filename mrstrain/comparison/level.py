@@ -11,7 +11,7 @@ from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, RegistrationError, WorkerError
 from dvc.io.result_folder import PROVENANCE, result_folders
 from fe import write_tet_mesh
-from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, Reading, loads_of, model_files
+from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, loads_of, model_files
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.register import register
 from mrstrain.options import measurement as options
@@ -39,17 +39,10 @@ class Levelled:
 
 @door
 def level(
-    load0: Path | str,
-    model: Path | str,
-    *,
-    out: Path | str,
-    subject_files: options.SubjectFiles,
-    loads: Sequence[str] = (),
-    engine: options.EngineOptions,
-    reading: ModelReading,
-    seeded: options.Seeded,
+    load0: Path | str, model: Path | str, *, out: Path | str, subject_files: options.SubjectFiles,
+    loads: Sequence[str] = (), engine: options.EngineOptions, reading: ModelReading, seeded: options.Seeded,
     progress: Callable[[str, str, float], None] | None = None,
-) -> Levelled:
+) -> Levelled:  # fmt: skip
     """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
 
     Parameters
@@ -83,10 +76,7 @@ def level(
     how = options.RegistrationOptions(**dict(engine), volume=volume, allow_unknown_parameters=True)
     engine_of(how, labelled=subject_files.labels is not None)  # refused now rather than after the images are made
     subject = read_subject(load0, subject_files)
-    of_load, notes = model_files(
-        list(loads) or loads_of(place, reading.model_mesh is not None), [place],
-        Reading(reading.model_mesh, reading.model_unit, reading.model_frame),
-    )  # fmt: skip
+    of_load, notes = model_files(list(loads) or loads_of(place, reading.model_mesh is not None), [place], reading)
     files = {load: file for load, (file,) in of_load.items()}
     name = place.resolve().name + LEVELLED
     inputs = [Path(load0), *(p for of in (subject_files, engine, reading) for p in of.paths)]
@@ -109,7 +99,7 @@ def level(
         except (RegistrationError, WorkerError) as failed:
             failures.append(f"{load} was not registered: {failed}")
         else:
-            _write(target / name / f"{load}.vtu", result, registered)
+            _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):
         raise RegistrationError(" ".join(failures))
     return Levelled(target / name, (*notes, *smoothed, *failures))
@@ -140,17 +130,15 @@ def _prepare(target: Path, name: str, images: Mapping[str, Image], record: Mappi
     work = target / f"{name}-work"
     for folder in (target, target / name, work, work / "images", work / "registered"):
         make_output(folder)
-    for load in images:
-        (target / name / f"{load}.vtu").unlink(missing_ok=True)
-    write_json(target / name / PROVENANCE, record)
     for load, image in images.items():
+        (target / name / f"{load}.vtu").unlink(missing_ok=True)
         write_image(work / "images" / f"{load}.nii.gz", image)
+    write_json(target / name / PROVENANCE, record)
     write_whole(target / name / SETTINGS, IN_IMAGE)
 
 
-def _write(path: Path, result: FeResult, registered: Path) -> None:
-    """Write the registered displacement at the nodes of the model's mesh; where undefined, that of the nearest node."""
-    mesh = result.mesh
+def _write(path: Path, mesh: TetMesh, registered: Path) -> None:
+    """Write the registered displacement at the nodes of a model's mesh; where undefined, that of the nearest node."""
     (measured,) = result_folders(registered)
     u = filled_from_nearest(measured.deformation().displacement(mesh.points_mm), mesh.points_mm)
     write_tet_mesh(path, TetMesh(mesh.points_mm, mesh.cells, mesh.regions), {}, {"displacement_mm": u})

@@ -39,10 +39,9 @@ _PAPERS = {
     "Bland 1986": "Bland JM, Altman DG. Statistical methods for assessing agreement between two methods of clinical "
     "measurement. Lancet 327(8476):307-310, 1986. doi:10.1016/S0140-6736(86)90837-8",
 }
-_IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")
-"""Roles in a record of the files that are read as images."""
+_IMAGES = ("load0", "loads", "repeat", "bone", "tissue", "labels")  # roles in a record of the files read as images
 _GIVEN = "the displacement was taken as it was given."
-_PUBLISHED = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")  # tables 2 and 3 of Trebbi 2023
+_PUBLISHED = {"trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam"}  # tables 2 and 3 of Trebbi 2023
 
 Record = Mapping[str, Any]
 
@@ -55,17 +54,15 @@ def methods(
     ``measured`` are the measurement's folders by load, with their ``provenance.json`` where `register` or `strain`
     wrote them; ``models`` a result's file of each, with a ``simulation.json`` beside it if it was computed here.
     """
-    parts = [_measured(measured), *_simulated(models, measured)]
-    parts.append(_compared(len(comparison.loads[0].fields.points_mm), criteria))
-    if any(one.bands for one in comparison.loads):
-        parts.append(_uncertainty(measured))
-    parts.append(f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue).")
-    return _with_references(parts)
+    compared = _compared(len(comparison.loads[0].fields.points_mm), criteria)
+    uncertainty = [_uncertainty(measured)] if any(one.bands for one in comparison.loads) else []
+    viewer = f"Volumes in the report are shown with niivue {NIIVUE} (https://github.com/niivue/niivue)."
+    return _with_references([_measured(measured), *_simulated(models, measured), compared, *uncertainty, viewer])
 
 
 def methods_of_registrations(measured: Mapping[str, Path]) -> tuple[str, ...]:
     """Paragraphs on the measurement alone, the references last; ``measured`` as in `methods`."""
-    known = _sources(measured)
+    known = _sources(_errors(measured))
     return _with_references([_measured(measured), *([f"Error of the maximum shear strain: {known}"] if known else [])])
 
 
@@ -121,22 +118,17 @@ def _files(record: Record) -> str:
         return ""
     versions, inputs = record.get("versions", {}), record.get("inputs", {})
     formats = sorted({format_of(file["name"]) for role in _IMAGES for file in inputs.get(role, [])})
-    read = (
-        f"Images ({', '.join(formats)}) were read, and maps (NIfTI, NRRD) written," if formats else "Maps were written"
-    )
-    of_dicom = (
-        f" and pydicom {versions.get('pydicom', '?')} for DICOM (SimpleITK {versions.get('SimpleITK', '?')} where its "
-        "pixels are compressed in one of the JPEG formats)"
-    )
-    return (
-        f" {read} by mrstrain's own code, with nibabel {versions.get('nibabel', '?')} for the headers of NIfTI "
-        f"files{of_dicom if 'DICOM' in formats else ''}."
-    )
+    images = f"Images ({', '.join(formats)}) were read, and maps (NIfTI, NRRD) written,"
+    code = f"mrstrain's own code, with nibabel {versions.get('nibabel', '?')} for the headers of NIfTI files"
+    if "DICOM" in formats:
+        code += f" and pydicom {versions.get('pydicom', '?')} for DICOM (SimpleITK {versions.get('SimpleITK', '?')} "
+        code += "where its pixels are compressed in one of the JPEG formats)"
+    return f" {images if formats else 'Maps were written'} by {code}."
 
 
 def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list[str]:
     """How models were computed: those of ours by their own records, others by their files."""
-    sets, driven, others, published = list[str](), list[str](), list[str](), False
+    sets, driven, others, used = list[str](), list[str](), list[str](), set[str]()
     solvers, levelled = dict[str, list[str]](), dict[str, list[str]]()
     for name, path in models.items():
         record = _record(path.parent / "simulation.json")
@@ -144,13 +136,13 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
         if command == "drive":
             laws = "; ".join(f"{region}: {law}" for region, law in record["laws"].items())
             driven.append(f"{name}: with mrstrain {record.get('versions', {}).get('mrstrain', '?')} ({laws}).")
-            published = published or record["set"] in _PUBLISHED
+            used.add(record["set"])
         elif _record(path.parent / PROVENANCE).get("command") == "level":
             levelled.setdefault(_levelled(path, measured), []).append(name)
         elif command == "simulate" and "set" in given:
             laws = "; ".join(f"{region}: {law['law']}" for region, law in given["laws"].items())
             sets.append(f"{name}: {given['title']} ({laws}).")
-            published = published or given["set"] in _PUBLISHED
+            used.add(given["set"])
             solvers.setdefault(_solver(record), []).append(name)
         else:
             others.append(f"{name} ({path.suffix[1:]})")
@@ -158,7 +150,7 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
     return [
         *([ours] if sets else []),
         *([f"{_DRIVEN} {' '.join(driven)}"] if driven else []),
-        *(["Published sets of laws are those that Trebbi 2023 compiled."] if published else []),
+        *(["Published sets of laws are those that Trebbi 2023 compiled."] if used & _PUBLISHED else []),
         *(f"{_listed(names)}: {how}" for how, names in levelled.items()),
         *([f"Results of other programs were taken as given: {_listed(others)}."] if others else []),
     ]
@@ -171,7 +163,7 @@ _DRIVEN = (
 
 
 def _levelled(path: Path, measured: Mapping[str, Path]) -> str:
-    """How a model's file came out of the measurement that it was sent through."""
+    """How the measurement was simulated on a model's file."""
     work = path.parent.with_name(path.parent.name + "-work") / "registered" / path.stem / path.stem
     how = _registration(_record(work / PROVENANCE))
     same = how in {_registration(_record(folder / PROVENANCE)) for folder in measured.values()}
@@ -222,29 +214,22 @@ def _compared(cells: int, criteria: Criteria) -> str:
 
 
 def _uncertainty(measured: Mapping[str, Path]) -> str:
-    known, twin = _sources(measured), _twins(measured)
-    return (
-        f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) come from truths drawn by "
-        "the registration's error model: bias, spatially correlated noise. "
-        f"{known} {twin}Displacement has no error model."
-    )
-
-
-def _sources(measured: Mapping[str, Path]) -> str:
-    """Where the registrations' error models come from, each once."""
-    return " ".join(sorted({str(one["source"]) for one in _errors(measured).values() if one.get("source")}))
-
-
-def _twins(measured: Mapping[str, Path]) -> str:
-    """Which registrations' error bars were checked by a synthetic warp; a sentence and a space, or nothing."""
-    factors = {load: [row.get("factor") for row in of.get("twin", [])] for load, of in _errors(measured).items()}
-    checked = [load for load, of in factors.items() if any(factor is not None for factor in of)]
-    if not checked:
-        return ""
-    return (
+    errors = _errors(measured)
+    checked = [load for load, of in errors.items() if any(r.get("factor") is not None for r in of.get("twin", []))]
+    twin = checked and (
         f"The error bars of {_listed(checked)} were checked by a synthetic warp (the unloaded image moved by what was "
         "measured, and registered once more), and made wider where they did not hold. "
     )
+    return (
+        f"Intervals of 95 % for areas ({DRAWS} draws) and location ({LOCATION_DRAWS} draws) come from truths drawn by "
+        "the registration's error model: bias, spatially correlated noise. "
+        f"{_sources(errors)} {twin or ''}Displacement has no error model."
+    )
+
+
+def _sources(errors: Mapping[str, Record]) -> str:
+    """Where the registrations' error models come from, each once."""
+    return " ".join(sorted({str(one["source"]) for one in errors.values() if one.get("source")}))
 
 
 def _errors(measured: Mapping[str, Path]) -> dict[str, Record]:

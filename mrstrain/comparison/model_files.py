@@ -3,7 +3,7 @@
 import json
 import tomllib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from dvc import Grid
 from dvc.arrays import FloatArray
 from dvc.errors import ExtentError, InputError
 from dvc.mesh import box_told
+from mrstrain.options.comparison import ModelReading
 from mrstrain.records.inputs import read_matrix
 from validate import FeResult, check_overlap, read_result
 
@@ -25,27 +26,19 @@ IN_IMAGE = 'unit = "mm"\nframe = "LPS"\nto_image = [[1, 0, 0, 0], [0, 1, 0, 0], 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reading:
-    """How a model's files are read; as in `validate.read_result`."""
-
-    mesh: Path | None = None
-    unit: str = "mm"
-    frame: str = "LPS"
-    to_image: FloatArray | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ModelFile:
-    """A model's result for one load."""
+    """A model's result for one load, and how it is read."""
 
     name: str
     path: Path
-    reading: Reading
+    reading: ModelReading
+    to_image: FloatArray | None = None  # as in `validate.read_result`
 
     def read(self, grid: Grid) -> FeResult:
         """The result, which has to lie in the image on this grid; errors as `read_result` and `check_overlap`."""
+        mesh, unit, frame = self.reading.model_mesh, self.reading.model_unit, self.reading.model_frame
         try:
-            result = read_result(self.name, self.path, **asdict(self.reading))
+            result = read_result(self.name, self.path, mesh=mesh, unit=unit, frame=frame, to_image=self.to_image)
         except ExtentError as failure:
             raise ExtentError(f"{failure} The image: {box_told(*grid.bounds_mm())} (LPS mm).") from failure
         check_overlap(self.path, result.mesh, grid)
@@ -53,12 +46,9 @@ class ModelFile:
 
 
 def model_files(
-    loads: Sequence[str], models: Sequence[Path], usual: Reading
+    loads: Sequence[str], models: Sequence[Path], usual: ModelReading, to_image: FloatArray | None = None
 ) -> tuple[dict[str, list[ModelFile]], list[str]]:
-    """Files of the models by load, in the order of the models; and a sentence for each that is missing.
-
-    An `InputError` says that a model is not there, two have one name, or none has a file of a measured load.
-    """
+    """Files of the models by load, in the order of the models; and a sentence for each that is missing."""
     if not models:
         raise InputError("No model is given: a folder with a file for each load, or a file.")
     files: dict[str, list[ModelFile]] = {load: [] for load in loads}
@@ -75,14 +65,14 @@ def model_files(
             continue
         taken.add(name)
         reached, stable = _outcome(place, "reached"), _outcome(place, "stable_share")
-        reading = _reading(place, usual)
+        reading = _reading(place, usual, to_image)
         for load in loads:
             if load not in chosen:
                 notes.append(f"{name} has no result for {load}.")
             elif reached.get(load, 0.0 if reached else 1.0) < 1.0:
                 notes.append(f"{name} reached only {reached.get(load, 0.0):.0%} of {load}, which is not compared.")
             else:
-                files[load].append(ModelFile(name, chosen[load], reading))
+                files[load].append(ModelFile(name, chosen[load], *reading))
                 if stable.get(load, 1.0) < 1.0:
                     notes.append(
                         f"{name}, {load}: a material of it is not stable (Drucker) at the strain reached, in up to "
@@ -116,23 +106,21 @@ def _chosen(place: Path, loads: Sequence[str]) -> tuple[str, dict[str, Path]]:
 
 def files_named(place: Path) -> list[Path]:
     """The file of a model's settings, if it has any, and the files that they name."""
-    settings = _folder(place) / SETTINGS
     try:
         content = _settings(place)
     except InputError:  # said where the model is read
         content = {}
-    named = [settings.parent / str(content[key]) for key in ("mesh", "to_image") if isinstance(content.get(key), str)]
-    return [path for path in (settings, *named) if path.is_file()]
+    named = [SETTINGS, *(content[key] for key in ("mesh", "to_image") if isinstance(content.get(key), str))]
+    return [path for name in named if (path := _folder(place) / name).is_file()]
 
 
 def loads_of(place: Path, has_mesh: bool) -> list[str]:
     """Loads for which a model's folder has a file: by the record of one of our simulations, else by file names."""
-    reached = _outcome(place, "reached")
-    if reached:
+    if reached := _outcome(place, "reached"):
         return [load for load in reached if any((place / (load + ending)).is_file() for ending in ENDINGS)]
     kept = [ending for ending in ENDINGS if ending != ".csv" or has_mesh or (place / SETTINGS).is_file()]
-    own = _reading(place, Reading()).mesh
-    return sorted({p.stem for p in place.iterdir() if p.suffix.lower() in kept and p != own})
+    mesh = _reading(place, ModelReading())[0].model_mesh
+    return sorted({p.stem for p in place.iterdir() if p.suffix.lower() in kept and p != mesh})
 
 
 def _outcome(place: Path, key: str) -> dict[str, float]:
@@ -157,16 +145,17 @@ def _settings(place: Path) -> dict[str, Any]:
         raise InputError(f"{settings} is no TOML file ({error}).") from error
 
 
-def _reading(place: Path, usual: Reading) -> Reading:
+def _reading(
+    place: Path, usual: ModelReading, to_image: FloatArray | None = None
+) -> tuple[ModelReading, FloatArray | None]:
+    """How a model is read, by its settings or else as usual."""
     folder, content = _folder(place), _settings(place)
     if unknown := sorted(set(content) - {"mesh", "unit", "frame", "to_image"}):
         raise InputError(f"{folder / SETTINGS}: '{unknown[0]}' is none of mesh, unit, frame, to_image.")
-    own: dict[str, Any] = {key: str(content[key]) for key in ("unit", "frame") if key in content}
+    own: dict[str, Any] = {f"model_{key}": str(content[key]) for key in ("unit", "frame") if key in content}
     if "mesh" in content:
-        own["mesh"] = folder / str(content["mesh"])
+        own["model_mesh"] = folder / str(content["mesh"])
     if "to_image" in content:
         matrix = content["to_image"]
-        own["to_image"] = (
-            read_matrix(folder / matrix) if isinstance(matrix, str) else np.array(matrix, dtype=np.float64)
-        )
-    return replace(usual, **own)
+        to_image = read_matrix(folder / matrix) if isinstance(matrix, str) else np.array(matrix, dtype=np.float64)
+    return usual.model_copy(update=own), to_image

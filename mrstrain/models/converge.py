@@ -45,27 +45,19 @@ class Converged:
         """A few lines for a person."""
         lines = ["Size of the cells, mm: " + ", ".join(f"{s:.2f}" for s in self.sizes_mm)]
         for row in self.rows:
-            values = ", ".join(f"{v:.4g}" for v in row.values)
-            limit, tends = row.limit, "no limit can be determined"
-            if np.isfinite(limit.limit):
-                tends = f"tends to {limit.limit:.4g} (order {limit.order:.1f}), the finest is off by {limit.error:+.1%}"
+            values, of = ", ".join(f"{v:.4g}" for v in row.values), row.limit
+            tends = f"tends to {of.limit:.4g} (order {of.order:.1f}), the finest is off by {of.error:+.1%}"
+            tends = tends if np.isfinite(of.limit) else "no limit can be determined"
             lines.append(f"{row.load}, {row.figure}: {values}; {tends}")
         return [*lines, f"Results: {self.out}"]
 
 
 @door
 def converge(
-    labels: Path | str,
-    edges_mm: Sequence[float],
-    *,
-    out: Path | str,
-    labelling: options.Labelling,
-    followed: options.Followed,
-    loads: Sequence[LoadStep] = LOADS,
-    directions: options.Directions,
-    workers: int | None = None,
-    progress: Progress | None = None,
-) -> Converged:
+    labels: Path | str, edges_mm: Sequence[float], *, out: Path | str, labelling: options.Labelling,
+    followed: options.Followed, loads: Sequence[LoadStep] = LOADS, directions: options.Directions,
+    workers: int | None = None, progress: Progress | None = None,
+) -> Converged:  # fmt: skip
     """Mesh a label map with several edge lengths, simulate the same loads on each, and extrapolate.
 
     Parameters
@@ -87,10 +79,9 @@ def converge(
     MrstrainError
         If a load is not reached on a mesh.
     """
-    edges = sorted(set(edges_mm), reverse=True)
+    target, edges = Path(out), sorted(set(edges_mm), reverse=True)
     if len(edges) < _FEWEST:
         raise InputError(f"A study of convergence needs {_FEWEST} edge lengths or more; got {len(edges)}.")
-    target = Path(out)
     inputs = {"labels": [Path(labels)], **labelling.files}
     refuse_touching_inputs(target, [f"simulated-{edge:g}" for edge in edges], [Path(labels), *labelling.paths])
     make_output(target)
@@ -130,15 +121,13 @@ def converge(
 
 def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], float]:
     """What is followed from mesh to mesh, by load and figure: the plate's way, and percentiles of a region's shear."""
-    values = {
-        (state.load.name, "plate travel, mm"): float(np.hypot(*state.plate_displacement_mm[:2]))
-        for state in simulation.states
+    moved = {state.load.name: float(np.hypot(*state.plate_displacement_mm[:2])) for state in simulation.states}
+    return {(load, "plate travel, mm"): travel for load, travel in moved.items()} | {
+        (row.load, f"maximal shear of {region}, p{percent}"): value
+        for row in simulation.regions
+        if row.region == region
+        for percent, value in ((50, row.shear_p50), (90, row.shear_p90), (99, row.shear_p99))
     }
-    for row in simulation.regions:
-        if row.region == region:
-            for percent, value in ((50, row.shear_p50), (90, row.shear_p90), (99, row.shear_p99)):
-                values[row.load, f"maximal shear of {region}, p{percent}"] = value
-    return values
 
 
 def _is_of(place: Path, inputs: dict[str, list[Path]], bones: Sequence[str]) -> bool:

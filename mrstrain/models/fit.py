@@ -30,22 +30,18 @@ class Fitted:
             scale, unit = (1.0, "") if p.name.startswith("alpha") else (1000.0, " kPa")
             low, high = scale * p.low, scale * p.high
             lines.append(f"  {p.name} {scale * p.value:.4g}{unit}, 95 % from {low:.4g} to {high:.4g}")
+            unknown = f"These curves do not determine {p.name}:"
             if p.at_bound:
                 doubts.append(
-                    f"These curves do not determine {p.name}: alone they would have it lower than a law may have it, "
-                    "and its value is that bound. Measure nearer to a stretch of 1, or take a law with fewer "
-                    "parameters."
+                    f"{unknown} alone they would have it lower than a law may have it, and its value is that bound. "
+                    "Measure nearer to a stretch of 1, or take a law with fewer parameters."
                 )
             elif p.low <= 0.0 <= p.high:
-                doubts.append(
-                    f"These curves do not determine {p.name}: its interval holds 0. Take a law with fewer parameters."
-                )
+                doubts.append(f"{unknown} its interval holds 0. Take a law with fewer parameters.")
         lines.append("R2 " + ", ".join(f"{mode} {r2:.4f}" for mode, r2 in fitted.r2.items()))
         for mode, (low, high) in fitted.reached.items():
-            least, most = fitted.stable[mode]
-            lines.append(
-                f"{mode}: measured at stretches {low:.3g} to {high:.3g}, stable from {least:.3g} to {most:.3g}"
-            )
+            stable = "stable from {:.3g} to {:.3g}".format(*fitted.stable[mode])
+            lines.append(f"{mode}: measured at stretches {low:.3g} to {high:.3g}, {stable}")
         lines += [*_in_programs(fitted.material), *doubts]
         if not fitted.stable_where_measured:
             lines.append("NOT stable (Drucker) at every stretch measured: take another law, or simulate less strain.")

@@ -62,13 +62,9 @@ class Meshed:
 
 @door
 def mesh(
-    labels: Path | str,
-    *,
-    out: Path | str,
-    labelling: Labelling,
-    meshing: Meshing,
+    labels: Path | str, *, out: Path | str, labelling: Labelling, meshing: Meshing,
     watch: Callable[[float], None] | None = None,
-) -> Meshed:
+) -> Meshed:  # fmt: skip
     """Mesh the soft tissues of a label map.
 
     Parameters
@@ -85,7 +81,7 @@ def mesh(
     InputError, OutputError, MrstrainError
         As there; or if the output is not a .vtu, or would replace an input.
     """
-    target = Path(out)
+    target, files = Path(out), {"labels": [Path(labels)], **labelling.files}
     if target.suffix.lower() != ".vtu":
         raise InputError(f"--out is the mesh itself and ends in .vtu; got {target}.")
     written = [target.with_suffix(ending).resolve() for ending in (".vtu", ".json", ".png")]
@@ -97,7 +93,6 @@ def mesh(
     how = meshing.model_dump()
     made, quality = mesh_labels(given, **how, bones=labelling.bones, watch=watch or (lambda _: None))
     del how["limit_s"]  # no mesh depends on it
-    files = {"labels": [Path(labels)], **labelling.files}
     record = provenance("mesh", files, how | {"bones": list(labelling.bones)})
     write_tet_mesh(target, made, {"quality": asdict(quality)} | record)
     figures.write_figure(target.with_suffix(".png"), figures.mesh_slice(made, Plate(_INFERIOR, _FORWARD)))

@@ -49,17 +49,10 @@ class Simulations:
 
 @door
 def simulate(
-    mesh: Path | str,
-    *,
-    out: Path | str,
-    simulation: SimulationOptions,
-    loads: Sequence[fe.LoadStep] = LOADS,
-    plate_options: PlateOptions,
-    towards: Mapping[str, tuple[Vector, Vector]] | None = None,
-    coordinates: MeshCoordinates,
-    cores: Cores,
-    progress: Progress | None = None,
-) -> Simulations:
+    mesh: Path | str, *, out: Path | str, simulation: SimulationOptions, loads: Sequence[fe.LoadStep] = LOADS,
+    plate_options: PlateOptions, towards: Mapping[str, tuple[Vector, Vector]] | None = None,
+    coordinates: MeshCoordinates, cores: Cores, progress: Progress | None = None,
+) -> Simulations:  # fmt: skip
     """Simulate a plate that presses and shears soft tissue on fixed bone.
 
     Parameters
@@ -85,7 +78,7 @@ def simulate(
         If the mesh, a set or a load cannot be used; before anything is computed.
     """
     place, target, tell = Path(mesh), Path(out), progress or (lambda *_: None)
-    sets, limit_s = simulation.sets, simulation.limit_s
+    sets, limit_s, decks = simulation.sets, simulation.limit_s, simulation.decks
     read = fe.read_tet_mesh(place, unit=coordinates.mesh_unit, frame=coordinates.mesh_frame)
     chosen = material_sets(sets)
     towards = dict(towards or {})
@@ -102,19 +95,19 @@ def simulate(
     ]
     refuse_touching_inputs(target, [one.name for one in chosen], [place])
     make_output(target)
-    for one in chosen:
-        _make_empty(target / one.name, loads)
+    for folder in (target / one.name for one in chosen):
+        make_output(folder)
+        fe.clear_simulation(folder)
+        for left in folder.glob(f"*{ENDING}"):  # checkpoints of these loads stay
+            if left.name.removesuffix(ENDING) not in plates:
+                left.unlink()
     beside = [names] if (names := place.with_suffix(".json")).is_file() else []
     files = {"mesh": [place, *beside], "sets": [Path(s) for s in sets if s.endswith(".toml")]}
     given = coordinates.plain() | contact | {"fixed": list(held), "limit_s": limit_s, "mesh_made": _mesh_made(place)}
     at_once = max(1, min(cores.workers or usable_cores(), len(jobs)))
     each = cores.threads or max(1, usable_cores() // at_once)
     options = fe.SolverOptions(each, np.inf if limit_s is None else limit_s)
-
-    def record(one: fe.Simulation) -> dict[str, object]:
-        return provenance("simulate", files, given | one.parameters())
-
-    run = _Run(target, jobs, record, simulation.decks, tell)
+    run = _Run(target, jobs, lambda one: provenance("simulate", files, given | one.parameters()), decks, tell)
     each_in_workers(jobs, lambda job, worker: run.path(*job, options, worker), at_once=at_once, threads=each)
     if not run.done:
         raise MrstrainError("No simulation ended. " + " ".join(f"{n}: {r}" for n, r in run.failures.items()))
@@ -169,33 +162,23 @@ class _Run:
         if not states:
             return
         made, folder = fe.Simulation.of(chosen, problems, states), self.target / chosen.name
-        if self.decks:
-            try:
+        try:
+            if self.decks:
                 made.write_decks(folder)
-            except InputError as refused:
-                made = replace(made, remarks=(*made.remarks, f"No decks: {refused}"))
+        except InputError as refused:
+            made = replace(made, remarks=(*made.remarks, f"No decks: {refused}"))
         made.write(folder, record=self.record(made), fields=False)
         self.done[chosen.name] = made
-
-
-def _make_empty(folder: Path, loads: Sequence[fe.LoadStep]) -> None:
-    """Make a set's folder, without what an earlier simulation wrote but for checkpoints of these loads."""
-    make_output(folder)
-    fe.clear_simulation(folder)
-    for left in folder.glob(f"*{ENDING}"):
-        if left.name.removesuffix(ENDING) not in {load.name for load in loads}:
-            left.unlink()
 
 
 def _mesh_made(place: Path) -> dict[str, object] | None:
     """How `mesh` made a mesh, by the record that it leaves beside it; None for meshes made elsewhere."""
     try:
         record = json.loads(place.with_suffix(".json").read_text(encoding="utf-8"))
-        if record["command"] == "mesh":
-            return {"edge_mm": record["parameters"]["edge_mm"], "pytetwild": record["versions"]["pytetwild"]}
+        made = {"edge_mm": record["parameters"]["edge_mm"], "pytetwild": record["versions"]["pytetwild"]}
+        return made if record["command"] == "mesh" else None
     except (OSError, ValueError, KeyError, TypeError):
-        pass
-    return None
+        return None
 
 
 def solve_in_folder(problem: fe.Problem, options: fe.SolverOptions, folder: Path, share: Path) -> list[fe.LoadState]:
@@ -222,12 +205,10 @@ class _Files(fe.Observer):
         kept: list[fe.Checkpoint] = []
         for load in self._problem.loads:
             checkpoint = read_checkpoint(self._checkpoint_of(load), self._made_from[load.name])
-            if checkpoint is None:
+            if checkpoint is None or (kept and kept[-1].reached < 1.0):
                 break
             self.log(f"{load.name}: {checkpoint.reached:.0%} of it was there from an earlier run")
             kept.append(checkpoint)
-            if checkpoint.reached < 1.0:
-                break
         return kept
 
     def log(self, line: str) -> None:

@@ -15,8 +15,9 @@ from dvc.measurement.subject import is_bones_name
 from dvc.trust.error_model import error_model_of
 from dvc.worker import usable_cores
 from fe import MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
-from mrstrain.comparison.model_files import Reading, model_files
+from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
+from mrstrain.options.comparison import ModelReading
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
@@ -264,7 +265,7 @@ class _Look:
     def at_results(self, labels: LabelMap) -> None:
         """Read every result of another code."""
         study = self.study
-        files, _ = model_files(list(study.loads), [study.path(p) for p in study.models.results], Reading())
+        files, _ = model_files(list(study.loads), [study.path(p) for p in study.models.results], ModelReading())
         for of in files.values():
             for file in of:
                 self.tried(file.read, labels.grid)

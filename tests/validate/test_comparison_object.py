@@ -6,14 +6,18 @@ import base64
 import re
 from dataclasses import astuple, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import validate
+from dvc.report.page import shown
+from dvc.trust.error_model import ErrorTable
 from dvc.trust.verdict import Verdict
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, result, sheared
-from validate import ALL, Comparison, Criteria, InputError, compare
+from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
+from validate.report import area_rows, load_sections
 
 GAMMAS = {"half": 0.2, "double": 0.8}
 
@@ -118,3 +122,43 @@ def test_the_front_door_offers_what_it_lists() -> None:
         assert getattr(validate, name) is not None
     with pytest.raises(AttributeError, match="validate attribute nothing"):
         _ = validate.nothing
+
+
+def test_a_model_no_nearer_than_no_deformation_is_said_to_be_so_beside_its_rank() -> None:
+    mesh = cube(4)
+
+    def compared(gammas: dict[str, float], error: ErrorTable | None, *loads: float) -> Comparison:
+        models = [result(name, mesh, sheared(gamma)) for name, gamma in gammas.items()]
+        cases = [case(f"Load{n}", sheared(gamma), models, error) for n, gamma in enumerate(loads, start=1)]
+        return compare(cases, labels(), criteria=Criteria((0.05, 0.5)))
+
+    for error in (None, error_table(0.0, 0.01)):
+        both = compared({"twice": 0.9, "thrice": 1.2, "right": 0.38}, error, 0.4, 0.42)
+        ranks = {row[0]: row[1] for row in area_rows(both.areas, both.ranking, ["Load1", "Load2"])}
+        assert ranks["right"] == ("1" if error else "1–3")
+        assert ranks["twice"] == ("2" if error else "1–3") + ", no nearer than no deformation"
+        assert ranks["no deformation"] == "–"
+        words = re.findall(
+            r"(\S+): area between.*; no nearer than no deformation \([\d.]+.*\): twice, thrice$", str(both), re.M
+        )
+        assert words == ["Load1", "Load2"]
+        assert re.search(r"^All loads: .*; no nearer than no deformation \(.*\): twice, thrice$", str(both), re.M)
+        assert "It is no nearer" not in str(both)
+        for gammas in ({"twice": 0.9, "thrice": 1.2}, {"twice": 0.9}):
+            wrong = compared(gammas, error, 0.4)
+            assert area_rows(wrong.areas, wrong.ranking, ["Load1"])[0][1].endswith(", no nearer than no deformation")
+            assert f"): {', '.join(gammas)}" in str(wrong)
+            answer = wrong._repr_html_().partition("<table")[0]
+            assert "no nearer to the measurement than no deformation at all" in answer
+    right = compared({"right": 0.38}, None, 0.4)
+    assert "no nearer" not in str(right) + right._repr_html_()
+
+
+def test_tables_show_no_negative_zero_and_no_rounding_of_zero() -> None:
+    mesh = cube(4)
+    one = compare_load(case("Load1", sheared(0.4), [result("soft", mesh, sheared(0.5))]), labels())
+    pictures: Any = dict.fromkeys(("curves", "slices"))
+    for section in load_sections(one, pictures, pictures):
+        for table in section.tables:
+            cells = [shown(cell) for row in (*table.rows, *table.apart) for cell in row]
+            assert not [cell for cell in cells if re.match(r"-0(\.0*)?$|.*e-1\d", cell)], table.title

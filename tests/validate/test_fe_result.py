@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -15,7 +16,7 @@ from dvc.images.image import Grid
 from dvc.io.meshes.read import read_mesh
 from dvc.mesh import outer_faces
 from tests.meshfiles import TAGS, block, write_abaqus, write_ansys, write_gmsh22
-from validate import CellGraph, check_overlap, read_result
+from validate import CellGraph, check_overlap, fe_result, read_result
 from validate.tetrahedra import linear_tetrahedra
 
 GRADIENT = np.array([[0.1, 0.05, 0.0], [0.0, -0.08, 0.2], [0.03, 0.0, 0.02]])
@@ -292,3 +293,11 @@ def test_vtk_as_febio_writes_it(tmp_path: Path) -> None:
     assert {name: len(inside) for name, inside in read_mesh(tmp_path / "heel.1.vtk").regions.items()} == {
         "part_id 0": np.count_nonzero(~part), "part_id 1": np.count_nonzero(part),
     }  # fmt: skip
+
+
+def test_the_docstring_says_every_name_that_is_read() -> None:
+    told = " ".join((read_result.__doc__ or "").split())
+    for name in (*fe_result._NAMES, *fe_result._NODE_COLUMNS, *(first for first, _, _ in fe_result._COMPONENTS)):
+        assert re.search(rf"(?<![\w.-]){re.escape(name)}(?![\w.-]*\w)", told), name
+    for ending in (".csv", ".inp", ".cdb", ".frd", ".xplt", "LPS", "unloaded"):
+        assert ending in told

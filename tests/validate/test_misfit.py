@@ -10,7 +10,8 @@ import pytest
 
 from dvc.errors import ExtentError, GeometryError
 from dvc.images.image import Grid
-from mrstrain.comparison.model_files import ModelFile, Reading
+from mrstrain.comparison.model_files import ModelFile
+from mrstrain.options.comparison import ModelReading
 from tests.validate.test_comparison import SIDE, cube, labels, result, sheared
 from tests.validate.test_fe_result import written
 from validate import Field, MappedFields, displacement_slip, map_fields, misfits
@@ -59,6 +60,9 @@ def test_a_slip_of_axes_frame_or_unit_is_named_under_a_small_load() -> None:
     assert "taken as -x -y z (the other of LPS and RAS)" in told(found, rough * [-1.0, -1.0, 1.0])
     assert told(found, 1e-3 * rough).endswith("times as large as the measured one: is it in metres?")
     assert told(found, 1e3 * rough).endswith("is it 1000 times too large?")
+    swapped = right[:, [1, 0, 2]]
+    across = swapped - right * (0.999 * (weight @ (swapped * right).sum(axis=1)) / (weight @ (right**2).sum(axis=1)))
+    assert "as given 0.00)" in told(found, across)  # a cosine of -0.0002
     both = told(found, 1e-3 * rough[:, [1, 0, 2]])
     assert "taken as y x z" in both
     assert "in metres" in both
@@ -81,7 +85,7 @@ def test_refusals_show_both_boxes(tmp_path) -> None:
     off = replace(aside, deformation=type(aside.deformation)(moved_away, aside.deformation.u_mm))
     with pytest.raises(GeometryError, match=r"Model: -9 to 11 x 0 to 20 .*soft tissue: 0.5 to 24 x -3.5 to 24"):
         misfits(off, labels(), ["bone"])
-    file = ModelFile("heel", written(tmp_path, "vtu")["path"], Reading(unit="m"))
+    file = ModelFile("heel", written(tmp_path, "vtu")["path"], ModelReading(model_unit="m"))
     grid = Grid((40, 40, 40), np.ones(3), np.array([-10.0, -35.0, 25.0]), np.eye(3))
     with pytest.raises(
         ExtentError, match=r"no body part is that large.*spans 5000 to 15000 .*image: -10 to 30"

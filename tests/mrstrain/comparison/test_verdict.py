@@ -14,7 +14,7 @@ from dvc.trust.verdict import Verdict
 from mrstrain.comparison.compare import Compared, compare
 from tests.mrstrain.comparison.test_compare import given, rows, study, with_errors
 from tests.validate.test_comparison import cube, sheared
-from validate.limitations import verdict_on
+from validate.comparison import verdict_on
 
 __all__ = ["study"]
 
