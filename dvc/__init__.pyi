@@ -1,6 +1,6 @@
 from . import errors
-from .deformation.bordered_spline import BorderedSpline
 from .deformation.bspline import BSpline
+from .deformation.interface_spline import InterfaceSpline
 from .deformation.protocol import (
     Affine,
     Composed,
@@ -39,13 +39,13 @@ from .trust.quality import Quality, noise_floor
 from .trust.verdict import Verdict
 
 __all__ = [
-    "Affine", "AlignedPair", "Alignment", "BSpline", "BorderedSpline", "Composed", "Deformation", "Elastix",
-    "Engine", "ErrorModel", "ErrorTable", "Evidence", "GaussNewton", "GaussNewtonWithInterfaces", "Grid", "Image",
+    "Affine", "AlignedPair", "Alignment", "BSpline", "Composed", "Deformation", "Elastix", "Engine", "ErrorModel",
+    "ErrorTable", "Evidence", "GaussNewton", "GaussNewtonWithInterfaces", "Grid", "Image", "InterfaceSpline",
     "LabelMap", "Mask", "Measurement", "MeshFile", "Preset", "Quality", "Registration", "RigidMotion",
     "SampledDisplacement", "Settings", "Similarity", "StrainField", "StrainMaps", "Subject", "TetMesh", "Verdict",
-    "Within", "assess", "engine_named", "errors", "evaluate_on_grid", "fit_mask", "load_preset",
-    "local_correlation", "measure", "noise_floor", "plate_axes", "preset_names", "principal_values",
-    "read_displacement", "read_error_model", "read_image", "read_labels", "read_landmarks", "read_mask",
-    "read_mesh", "read_parameter_file", "read_transform", "register", "strain_maps", "target_registration_error",
-    "tissue_mask", "write_image", "write_labels", "write_mask", "write_vectors",
+    "Within", "assess", "engine_named", "errors", "evaluate_on_grid", "fit_mask", "load_preset", "local_correlation",
+    "measure", "noise_floor", "plate_axes", "preset_names", "principal_values", "read_displacement", "read_error_model",
+    "read_image", "read_labels", "read_landmarks", "read_mask", "read_mesh", "read_parameter_file", "read_transform",
+    "register", "strain_maps", "target_registration_error", "tissue_mask", "write_image", "write_labels", "write_mask",
+    "write_vectors",
 ]  # fmt: skip

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from dvc import BSpline, Mask, Settings, read_image, read_labels, register
-from dvc.io.transforms.bordered_spline import write_bordered_spline
+from dvc.io.transforms.interface_spline import write_interface_spline
 from dvc.io.transforms.write import write_elastix_transform
 
 
@@ -27,7 +27,7 @@ def main() -> None:
     if isinstance(found.displacement, BSpline):
         write_elastix_transform(folder, found.displacement, None, reference.grid)[0].rename(folder / "found.txt")
     else:
-        write_bordered_spline(folder / "found.npz", found.displacement)
+        write_interface_spline(folder / "found.npz", found.displacement)
 
 
 if __name__ == "__main__":

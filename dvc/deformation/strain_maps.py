@@ -1,4 +1,4 @@
-"""Displacement and strain on the voxels of a grid, ready to be written or looked at."""
+"""Displacement and strain on the voxels of a grid, and where they are defined, up to the edge of the scan."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -23,7 +23,7 @@ from dvc.io.images.read import read_voxels
 from dvc.io.images.write import write_image, write_mask, write_vectors
 from dvc.io.meshes.read import MeshFile
 from dvc.io.meshes.write import write_nodal_displacements, write_on_mesh
-from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE
+from dvc.io.transforms.interface_spline import FILE as INTERFACE_SPLINE
 from dvc.io.transforms.read import read_displacement, read_transform
 from dvc.io.transforms.write import ELASTIX_FILES
 from dvc.trust.error_model import ErrorModel, ErrorTable, Interval, Uncertainty, read_error_model
@@ -33,7 +33,7 @@ DISPLACEMENT, DISPLACEMENT_NRRD = "displacement.nii.gz", "displacement.nrrd"
 GREEN_LAGRANGE, GREEN_LAGRANGE_PLATE = "green_lagrange.nii.gz", "green_lagrange_plate.nii.gz"
 MAX_SHEAR, JACOBIAN, VALID = "max_shear.nii.gz", "jacobian.nii.gz", "valid.nii.gz"
 ALIGNED, REGISTERED = "aligned.nii.gz", "registered.nii.gz"
-SPLINE, SPLINE_WITH_BORDERS = ELASTIX_FILES[0], BORDERED_SPLINE
+SPLINE, SPLINE_WITH_BORDERS = ELASTIX_FILES[0], INTERFACE_SPLINE
 ITK_TRANSFORM = "transform.h5"
 SIGMA, INTERVALS, ERROR_MODEL = "sigma_max_shear.nii.gz", "intervals.csv", "error_model.json"
 REGIONS, QUALITY, PROVENANCE = "regions.csv", "quality.json", "provenance.json"

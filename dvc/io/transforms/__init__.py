@@ -1,1 +1,1 @@
-"""Transforms and displacement fields as files: elastix, ITK, displacement images and bordered splines."""
+"""Transforms and displacement fields as files: elastix, ITK, displacement images and interface splines."""

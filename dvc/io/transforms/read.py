@@ -21,8 +21,8 @@ from dvc.images.itk_image import from_sitk as image_from_sitk
 from dvc.io import StrPath
 from dvc.io.images.read import read_header
 from dvc.io.images.text_headers import nrrd_fields
-from dvc.io.transforms.bordered_spline import read_bordered_spline
 from dvc.io.transforms.elastix_text import Parameters, parse_parameters
+from dvc.io.transforms.interface_spline import read_interface_spline
 
 _ITK_SUFFIXES = (".h5", ".hdf5", ".tfm", ".mat")
 _ITK_TEXT = b"#Insight Transform File"
@@ -75,7 +75,7 @@ def read_transform(path: StrPath) -> Deformation:
     if not place.is_file():
         raise InputError(f"{place}: no such transform file. Check the path.")
     if place.suffix.lower() == ".npz":
-        return read_bordered_spline(place)
+        return read_interface_spline(place)
     if place.suffix.lower() in _ITK_SUFFIXES or place.read_bytes()[: len(_ITK_TEXT)] == _ITK_TEXT:
         return _read_itk(place)
     return _read_elastix(place, ())

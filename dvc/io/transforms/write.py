@@ -9,15 +9,15 @@ import SimpleITK as sitk
 
 from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
-from dvc.deformation.bordered_spline import BorderedSpline
 from dvc.deformation.bspline import BSpline
+from dvc.deformation.interface_spline import InterfaceSpline
 from dvc.deformation.protocol import Deformation, RigidMotion
 from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.images.itk_image import to_sitk
 from dvc.io import StrPath
-from dvc.io.transforms.bordered_spline import FILE as BORDERED_SPLINE, write_bordered_spline
 from dvc.io.transforms.elastix_text import Value, format_parameters
+from dvc.io.transforms.interface_spline import FILE as INTERFACE_SPLINE, write_interface_spline
 
 ELASTIX_FILES = ("TransformParameters.0.txt", "TransformParameters.1.txt")
 """Names of the files of a chain: a B-spline, and the rigid motion that follows."""
@@ -80,7 +80,7 @@ def write_itk_transform(
 ) -> Path:
     """Write ``x = R (X + u(X)) + t`` as an ITK composite transform (.h5 or .tfm), as 3D Slicer reads it.
 
-    A B-spline is written as one. ITK has no spline with strain discontinuities: of a `BorderedSpline` u is written at
+    A B-spline is written as one. ITK has no spline with strain discontinuities: of an `InterfaceSpline` u is written at
     the voxels of its interfaces, the box around the tissue, and of any other displacement at those of `grid`. Between
     them ITK interpolates linearly; outside the box, as outside a B-spline, it takes u as 0.
     """
@@ -107,7 +107,7 @@ def _itk_part(displacement: Deformation, grid: Grid | None) -> sitk.Transform:
     match displacement:
         case BSpline(control=control, coefficients_mm=coefficients):
             return sitk.BSplineTransform([to_sitk(control, c) for c in coefficients], 3)
-        case BorderedSpline(borders=borders):
+        case InterfaceSpline(borders=borders):
             grid = borders.grid
     if grid is None:
         raise InputError(f"To write a {type(displacement).__name__} for ITK, give the grid of its displacement field.")
@@ -118,10 +118,10 @@ def _itk_part(displacement: Deformation, grid: Grid | None) -> sitk.Transform:
 def write_displacement_as_found(found: Deformation, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
     """Write a displacement with its own gradient, if a file can hold its kind, and the motion `then` (R, t).
 
-    A `BSpline` goes into elastix' text files (grid of transformix: `reference`), a `BorderedSpline` into one of ours.
+    A `BSpline` goes into elastix' text files (grid of transformix: `reference`), an `InterfaceSpline` into one of ours.
     """
     match found:
         case BSpline():
             write_elastix_transform(folder, found, then, reference)
-        case BorderedSpline():
-            write_bordered_spline(folder / BORDERED_SPLINE, found)
+        case InterfaceSpline():
+            write_interface_spline(folder / INTERFACE_SPLINE, found)

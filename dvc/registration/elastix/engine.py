@@ -134,7 +134,7 @@ def _as_bspline(start: Deformation) -> BSpline:
     if isinstance(start, BSpline):
         return start
     raise InputError(
-        f"elastix starts from one B-spline, and a {type(start).__name__} is given: start from a result without tissue "
+        f"elastix starts from one B-spline; got {type(start).__name__}. Start from a result without tissue "
         "interfaces, or register with gauss-newton."
     )
 

@@ -1,7 +1,7 @@
 """Gauss-Newton registration where the tissues are known: strain may jump at their interfaces, and bone is rigid.
 
 The smooth displacement of `dvc.registration.gauss_newton.fit` is the start of one more stage at full resolution, for a
-`BorderedSpline` u = m v + psi w. Its energy is
+`InterfaceSpline` u = m v + psi w. Its energy is
 
     1/(2 s^2) sum r^2 + b/2 int (c l^4 |Δ Δ v|^2 + 3 L^2 c l^4 |Δ Δ w|^2 + q |w|^2) + v/2 int (J - 1)^2
     + k/2 int_skin |E|^2
@@ -18,8 +18,8 @@ from dataclasses import replace
 import numpy as np
 
 from dvc.arrays import BoolArray, FloatArray
-from dvc.deformation.bordered_spline import NUMBERS, BorderedSpline, Interfaces
 from dvc.deformation.bspline import BSpline
+from dvc.deformation.interface_spline import NUMBERS, Interfaces, InterfaceSpline
 from dvc.deformation.protocol import Deformation
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError
@@ -52,7 +52,7 @@ def fit_with_interfaces(
     skin: float | None = None,
     start: Deformation | None = None,
     progress: Callable[[float], None] = lambda _: None,
-) -> tuple[BorderedSpline, Choice]:
+) -> tuple[InterfaceSpline, Choice]:
     """Find the displacement, LPS mm, that carries the fixed image to the moving one, its gradient free at interfaces.
 
     The pair needs labels; a tissue named "skin" may resist strain, and the bone, if there is one, does not move. The
@@ -86,7 +86,7 @@ def fit_with_interfaces(
     coefficients = stage.whole.descend(coefficients, choice.weights, steps=steps, stop_mm=stop_mm)
     progress(1.0)
     v, w = (BSpline(control, turned(axes, part)) for part in np.split(coefficients, 2))
-    return BorderedSpline(v, w, stage.interfaces), choice
+    return InterfaceSpline(v, w, stage.interfaces), choice
 
 
 class _Stage:

@@ -12,8 +12,8 @@ import pytest
 import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
 
-from dvc.deformation.bordered_spline import BorderedSpline, Interfaces
 from dvc.deformation.bspline import BSpline
+from dvc.deformation.interface_spline import Interfaces, InterfaceSpline
 from dvc.deformation.protocol import Deformation, RigidMotion, evaluate_on_grid
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError, ParameterError, RegistrationError
@@ -35,7 +35,7 @@ from mrstrain.measurement.register import register as run, register_one
 from mrstrain.measurement.strain import read_any, strain
 from mrstrain.options.measurement import RegistrationOptions
 from phantoms import Heel, distances_mm, labels_of, random_foot_motion, scan, sliding
-from tests.dvc.deformation.test_bordered_spline import scanned, sheared
+from tests.dvc.deformation.test_interface_spline import scanned, sheared
 
 GRID = Grid((35, 35, 28), (1.6, 1.6, 1.6), (-28.2, -10.2, -43.6))  # the pad, with the lower half of the calcaneus
 INNER = (slice(3, -3),) * 3
@@ -172,7 +172,7 @@ def test_what_is_read_again_has_the_jumps_that_the_maps_have(pad, out):
     assert np.isnan(shear[~valid]).all()
     assert np.isnan(u.reshape(*GRID.shape, 3)[~valid]).all()
     spline = read_any(out / "Load1" / SPLINE_WITH_BORDERS)
-    assert isinstance(spline, BorderedSpline)
+    assert isinstance(spline, InterfaceSpline)
     assert spline.borders.rest >= 0
     assert [file.name for file in measured.files] == [SPLINE_WITH_BORDERS, "valid.nii.gz"]
 
@@ -185,7 +185,7 @@ def test_a_damaged_spline_is_refused_by_name(out, tmp_path, monkeypatch):
         with pytest.raises(InputError, match=SPLINE_WITH_BORDERS):
             read_transform(place)
     place.write_bytes(whole)
-    monkeypatch.setattr("dvc.io.transforms.bordered_spline.NUMBERS", {"blur": 2.0})
+    monkeypatch.setattr("dvc.io.transforms.interface_spline.NUMBERS", {"blur": 2.0})
     with pytest.raises(InputError, match="register again"):  # its depths would be others today
         read_transform(place)
     with pytest.raises(InputError, match="register this load again"):
@@ -210,7 +210,7 @@ def test_a_study_begins_a_load_where_the_one_before_ended(pad, out, monkeypatch)
     np.testing.assert_array_equal(used["labels"].labels, pad.labels.labels)
     u = np.asarray(nibabel.load(out / "Load1" / "displacement.nii.gz").dataobj)[:, :, :, 0]
     known = np.isfinite(u).all(axis=-1)
-    assert isinstance(used["start"], BorderedSpline)
+    assert isinstance(used["start"], InterfaceSpline)
     np.testing.assert_allclose(used["start"].displacement(GRID.points(known)), u[known], atol=1e-5)
     assert np.abs(u[known]).max() > 2.0
 
@@ -229,9 +229,9 @@ def layers() -> dict[str, object]:
 
 
 @pytest.fixture(scope="module")
-def found(layers, worker) -> BorderedSpline:
+def found(layers, worker) -> InterfaceSpline:
     spline = register(**layers, worker=worker).displacement
-    assert isinstance(spline, BorderedSpline)
+    assert isinstance(spline, InterfaceSpline)
     return spline
 
 
@@ -297,13 +297,13 @@ def test_a_result_with_borders_may_be_a_start(layers, worker):
     loaded, labels = layers["loaded"], layers["labels"]
     control = control_grid(labels.grid, np.full(3, 4.0))
     there = np.broadcast_to(far[:, None, None, None], (3, *control.shape))
-    start = BorderedSpline(
+    start = InterfaceSpline(
         BSpline(control, there), BSpline(control, np.zeros_like(there)), Interfaces.of(labels, None, 3.0)
     )
     moved = replace(loaded, grid=loaded.grid.moved_by(np.eye(3), far))
     X = labels.grid.points()[8:-8:3, 8:-8:3, 8:-8:3].reshape(-1, 3)
 
-    def off_mm(begun_at: BorderedSpline | None) -> float:
+    def off_mm(begun_at: InterfaceSpline | None) -> float:
         found = register(**{**layers, "bone": None, "loaded": moved}, start=begun_at, worker=worker).displacement
         return float(np.median(np.linalg.norm(found.displacement(X) - far - sheared(X, 0.0), axis=1)))
 
@@ -321,7 +321,7 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
         register(**{**layers, "labels": replace(labels, grid=aside)})
     with pytest.raises(InputError, match="label map is empty"):
         register(**{**layers, "labels": replace(labels, labels=np.zeros_like(labels.labels))})
-    with pytest.raises(InputError, match="a BorderedSpline is given"):
+    with pytest.raises(InputError, match="one B-spline; got InterfaceSpline"):
         register(**{**layers, "settings": Settings.of("heel-mr"), "start": found})
     with pytest.raises(ParameterError, match="must be above 0"):
         GaussNewtonWithInterfaces(skin=0.0)

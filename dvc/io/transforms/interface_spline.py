@@ -11,8 +11,8 @@ import numpy as np
 
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.atomic_files import whole_file
-from dvc.deformation.bordered_spline import NUMBERS, BorderedSpline, Interfaces
 from dvc.deformation.bspline import BSpline
+from dvc.deformation.interface_spline import NUMBERS, Interfaces, InterfaceSpline
 from dvc.errors import InputError, MrstrainError
 from dvc.images.image import Grid
 
@@ -22,7 +22,7 @@ _FORMAT = 1
 _UNREADABLE = OSError, EOFError, zlib.error, zipfile.BadZipFile, ValueError, KeyError, TypeError
 
 
-def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
+def write_interface_spline(path: Path, spline: InterfaceSpline) -> None:
     """Write a displacement with strain discontinuities, LPS mm; of interfaces only the tissues' numbers are kept."""
     borders = spline.borders
     content: dict[str, Any] = {
@@ -35,8 +35,8 @@ def write_bordered_spline(path: Path, spline: BorderedSpline) -> None:
         np.savez_compressed(file, **content)
 
 
-def read_bordered_spline(path: Path | str) -> BorderedSpline:
-    """Read what `write_bordered_spline` wrote."""
+def read_interface_spline(path: Path | str) -> InterfaceSpline:
+    """Read what `write_interface_spline` wrote."""
     try:
         with np.load(io.BytesIO(Path(path).read_bytes())) as file:
             if int(file["format"]) != _FORMAT:
@@ -46,7 +46,7 @@ def read_bordered_spline(path: Path | str) -> BorderedSpline:
             control = _grid(file["control"])
             own = frozen(file["own"], np.int64)
             borders = _between(_grid(file["voxels"]), own, int(file["rest"]), float(file["reach_mm"]))
-            return BorderedSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
+            return InterfaceSpline(BSpline(control, file["smooth"]), BSpline(control, file["jump"]), borders)
     except (*_UNREADABLE, MrstrainError) as failure:
         why = f"{type(failure).__name__}: {failure}"
         raise InputError(f"{path}: no displacement with borders as `mrstrain register` writes it ({why}).") from failure

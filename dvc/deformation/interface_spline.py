@@ -163,7 +163,7 @@ def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BorderedSpline:
+class InterfaceSpline:
     """x = X + u(X), u = m v + psi w: two cubic B-splines v (mm) and w, and the factors of `Interfaces`.
 
     u is continuous, and zero in the bone at rest. Its gradient H = m grad v + v (x) grad m + psi grad w + w (x) grad
@@ -189,7 +189,7 @@ class BorderedSpline:
 
     def __post_init__(self) -> None:
         if not self.smooth.control.same_as(self.jump.control, tolerance_voxels=1e-6):
-            raise GeometryError("The two splines of a displacement with borders need one control grid.")
+            raise GeometryError("The two splines of an interface spline need one control grid.")
 
     @property
     def control(self) -> Grid:
@@ -201,9 +201,9 @@ class BorderedSpline:
         """Distance (3,) between the control points along their axes, mm."""
         return self.control.spacing_mm
 
-    def turned(self, rotation: FloatArray) -> BorderedSpline:
+    def turned(self, rotation: FloatArray) -> InterfaceSpline:
         """The same displacement of a body that is turned, with its borders, about the world's origin."""
-        return BorderedSpline(self.smooth.turned(rotation), self.jump.turned(rotation), self.borders.turned(rotation))
+        return InterfaceSpline(self.smooth.turned(rotation), self.jump.turned(rotation), self.borders.turned(rotation))
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the splines' valid region."""

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dvc.deformation.bordered_spline import BorderedSpline, Interfaces
 from dvc.deformation.bspline import BSpline
+from dvc.deformation.interface_spline import Interfaces, InterfaceSpline
 from dvc.deformation.protocol import Deformation, evaluate_on_grid
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
-from dvc.io.transforms.bordered_spline import read_bordered_spline, write_bordered_spline
+from dvc.io.transforms.interface_spline import read_interface_spline, write_interface_spline
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.fit import Parameters, control_grid, fit
@@ -70,10 +70,12 @@ def test_what_has_no_label_in_the_body_never_is_the_bone_at_rest():
 
 
 @pytest.fixture(scope="module")
-def spline(borders) -> BorderedSpline:
+def spline(borders) -> InterfaceSpline:
     control = control_grid(GRID, np.full(3, 6.0))
     random = np.random.default_rng(2)
-    return BorderedSpline(*(BSpline(control, s * random.normal(size=(3, *control.shape))) for s in (1.0, 0.2)), borders)
+    return InterfaceSpline(
+        *(BSpline(control, s * random.normal(size=(3, *control.shape))) for s in (1.0, 0.2)), borders
+    )
 
 
 def test_factors_are_those_of_the_distance_from_a_plane(borders):
@@ -168,11 +170,11 @@ def test_files_with_the_same_borders_share_them_and_no_others_do(spline, borders
         "grid": replace(borders, grid=borders.grid.moved_by(np.eye(3), np.array([1.0, 0.0, 0.0]))),
         "own": borders_of(LabelMap(GRID, np.roll(layers().labels, 1, axis=0), NAMES)),
     }
-    write_bordered_spline(tmp_path / "first", spline)
+    write_interface_spline(tmp_path / "first", spline)
     for name, other in others.items():
-        write_bordered_spline(tmp_path / name, replace(spline, borders=other))
-        first = read_bordered_spline(tmp_path / "first").borders
-        found = read_bordered_spline(tmp_path / name).borders
+        write_interface_spline(tmp_path / name, replace(spline, borders=other))
+        first = read_interface_spline(tmp_path / "first").borders
+        found = read_interface_spline(tmp_path / name).borders
         assert (found is first) == (name == "again")
         assert np.array_equal(found.depth, other.depth)
         assert np.array_equal(found.own, other.own)
@@ -183,7 +185,7 @@ def test_files_with_the_same_borders_share_them_and_no_others_do(spline, borders
 def test_what_does_not_fit_together_is_refused(spline, borders):
     other = control_grid(GRID, np.full(3, 5.0))
     with pytest.raises(GeometryError, match="one control grid"):
-        BorderedSpline(spline.smooth, BSpline(other, np.zeros((3, *other.shape))), borders)
+        InterfaceSpline(spline.smooth, BSpline(other, np.zeros((3, *other.shape))), borders)
     labels = layers()
     empty = LabelMap(GRID, np.zeros(GRID.shape, dtype=np.int64), {})
     with pytest.raises(InputError, match="no tissue"):
@@ -204,7 +206,7 @@ def sums(spline) -> SplineSums:
     return SplineSums(control, along, inside, spline.borders.at_voxels())
 
 
-def test_sums_with_factors_are_those_of_the_bordered_spline(sums, spline):
+def test_sums_with_factors_are_those_of_the_interface_spline(sums, spline):
     c = np.concatenate([spline.smooth.coefficients_mm, spline.jump.coefficients_mm])
     u, H = sums.evaluate(c)
     true_u, true_H = spline.evaluate_on_grid(GRID, sums.inside)
@@ -262,7 +264,7 @@ KEPT = Parameters(volume=300.0)
 
 
 @pytest.fixture(scope="module")
-def along_stiff_skin() -> tuple[BorderedSpline, Choice]:
+def along_stiff_skin() -> tuple[InterfaceSpline, Choice]:
     fixed, moving, body, labels = scanned(skin=0.0)
     return fit_with_interfaces(AlignedPair(fixed, moving, body, body, labels.region("bone"), labels), KEPT)
 
