@@ -4,9 +4,8 @@ The gradient is the analytic derivative of the spline, not a difference of sampl
 has no error of its own from the sampling of the image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numba import njit, prange
@@ -77,14 +76,12 @@ class BSpline:
     def __post_init__(self) -> None:
         coefficients = frozen(self.coefficients_mm, np.float64)
         if coefficients.shape != (3, *self.control.shape):
+            needed = (3, *self.control.shape)
             raise InputError(
-                f"B-spline coefficients have shape {coefficients.shape}; the control grid needs "
-                f"{(3, *self.control.shape)}, component first."
+                f"B-spline coefficients have shape {coefficients.shape}; the grid needs {needed}, component first."
             )
         if min(self.control.shape) < _SUPPORT:
-            raise InputError(
-                f"A cubic B-spline needs four control points or more along an axis; got {self.control.shape}."
-            )
+            raise InputError(f"A cubic B-spline needs four control points or more per axis; got {self.control.shape}.")
         object.__setattr__(self, "coefficients_mm", coefficients)
 
     @property
@@ -92,10 +89,10 @@ class BSpline:
         """Distance (3,) between the control points along their axes, mm."""
         return self.control.spacing_mm
 
-    def turned(self, rotation: FloatArray) -> BSpline:
+    def turned(self, rotation: FloatArray) -> Self:
         """The same displacement of a body that is turned, with its control points, about the world's origin."""
         turned = np.einsum("ij,j...->i...", rotation, self.coefficients_mm)
-        return BSpline(self.control.moved_by(rotation, np.zeros(3)), turned)
+        return type(self)(self.control.moved_by(rotation, np.zeros(3)), turned)
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the valid region."""
@@ -106,19 +103,13 @@ class BSpline:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the valid region."""
         indices = self.control.indices_of(np.asarray(points_mm, dtype=np.float64))
         u, per_index = evaluate_spline(self.coefficients_mm, indices, mirror=False)
-        H = per_index.reshape(-1, 3) @ self._index_per_mm()
-        return u, H.reshape(-1, 3, 3)
+        return u, (per_index.reshape(-1, 3) @ self._index_per_mm()).reshape(-1, 3, 3)
 
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid, in the order of ``np.argwhere(where)``.
 
         Where the grid's axes are those of the control grid, up to order and direction, the sums are done
-        axis by axis; else point by point. Both give the same to rounding.
-
-        Raises
-        ------
-        InputError
-            If ``where`` does not have the shape of ``grid``.
+        axis by axis; else point by point. Both give the same to rounding. InputError if the shapes differ.
         """
         where = np.ascontiguousarray(where, dtype=np.bool_)
         if where.shape != grid.shape:
@@ -134,20 +125,16 @@ class BSpline:
         _on_grid(coefficients, where, slabs, (i, j, k), np.ascontiguousarray(self._index_per_mm()[order]), u, H)
         return u, H
 
-    def plus(self, other: BSpline) -> BSpline:
-        """Add two displacements on the same control grid: u(X) = u_1(X) + u_2(X).
-
-        Raises
-        ------
-        GeometryError
-            If the control grids differ.
-        """
+    def plus(self, other: Self) -> Self:
+        """Add two displacements: u(X) = u_1(X) + u_2(X); GeometryError if their control grids differ."""
         if not self.control.same_as(other.control, tolerance_voxels=_ALIGNED_INDEX):
+            grids = (self.control, other.control)
+            both = [f"{g.shape} points every {g.spacing_mm.round(4)} mm from {g.origin_mm.round(4)}" for g in grids]
             raise GeometryError(
-                f"B-splines on different control grids cannot be added: {_described(self.control)}, and "
-                f"{_described(other.control)}. Register both on one reference grid with one FinalGridSpacing."
+                f"B-splines on different control grids cannot be added: {', and '.join(both)}. Register both on one "
+                "reference grid with one FinalGridSpacing."
             )
-        return BSpline(self.control, self.coefficients_mm + other.coefficients_mm)
+        return type(self)(self.control, self.coefficients_mm + other.coefficients_mm)
 
     def _index_per_mm(self) -> FloatArray:
         return np.asarray(np.linalg.inv(self.control.direction) / self.control.spacing_mm[:, None])
@@ -161,18 +148,12 @@ class BSpline:
         start = self.control.indices_of(grid.origin_mm)
         steps = self.control.indices_of(grid.points_at(np.eye(3))) - start  # row a: one voxel further along axis a
         along = [start[p] + steps[a, p] * np.arange(grid.shape[a]) for a, p in enumerate(order)]
-        last = np.array(grid.shape) - 1.0
         ends = np.array(list(np.ndindex(2, 2, 2)))
-        true = self.control.indices_of(grid.points_at(ends * last))
+        true = self.control.indices_of(grid.points_at(ends * (np.array(grid.shape) - 1.0)))
         separable = np.stack([along[a][-ends[:, a]] for a in range(3)], axis=1)
         if np.abs(true[:, order] - separable).max() > _ALIGNED_INDEX:
             return None
         return order, along
-
-
-def _described(control: Grid) -> str:
-    spacing, origin = control.spacing_mm.round(4).tolist(), control.origin_mm.round(4).tolist()
-    return f"{control.shape} points every {spacing} mm from {origin}"
 
 
 def evaluate_spline(
@@ -185,9 +166,8 @@ def evaluate_spline(
     not wholly inside. NaN for an index that is not finite.
     """
     places = np.ascontiguousarray(indices, dtype=np.float64)
-    count = len(places)
-    values = np.empty((count, len(coefficients)))
-    slopes = np.empty((count if gradient else 0, len(coefficients), 3))
+    values = np.empty((len(places), len(coefficients)))
+    slopes = np.empty((len(places) if gradient else 0, len(coefficients), 3))
     _at_indices(np.ascontiguousarray(coefficients), places, mirror, gradient, values, slopes)
     return values, slopes
 

@@ -4,9 +4,8 @@ Strain is smooth inside a tissue, but not across its border: fat that shears alo
 right up to them. One B-spline for all carries that strain over the border, as far as its control points lie apart.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
@@ -14,10 +13,10 @@ from scipy.special import ndtri
 
 from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
 from dvc.deformation.bspline import BSpline, evaluate_spline
+from dvc.deformation.protocol import CHUNK, in_chunks
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, LabelMap, Mask
 
-_CHUNK = 200_000
 _BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
 _SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off
 _NEAR = 1.0  # voxels
@@ -46,7 +45,7 @@ class Interfaces:
     reach_mm: float  # L
 
     @classmethod
-    def of(cls, labels: LabelMap, bone: Mask | None, reach_mm: float, body: Mask | None = None) -> Interfaces:
+    def of(cls, labels: LabelMap, bone: Mask | None, reach_mm: float, body: Mask | None = None) -> Self:
         """Interfaces of the tissues in a label map; L is about the spacing of the control points.
 
         A bone that does not move counts as a tissue of its own, whatever its labels are. Voxels of the body without a
@@ -58,25 +57,29 @@ class Interfaces:
                 raise GeometryError(f"The {name} is not on the grid of the label map; bring it there (fit_mask).")
         if not (np.isfinite(reach_mm) and reach_mm > 0):
             raise InputError(f"The reach of a border must be above 0 mm; got {reach_mm}.")
-        values = labels.labels if bone is None else np.where(bone.inside, -1, labels.labels)
+        values = labels.labels if bone is None else np.where(bone.inside, -1, labels.labels)  # -1: bone at rest
         if not values.any():
             raise InputError("The label map has no tissue in the part of the image that is registered.")
         spacing = labels.grid.spacing_mm
-        if body is not None:
-            values = _labelled(values, body.inside & (values == 0), spacing)
+        if body is not None and (unknown := body.inside & (values == 0)).any():
+            filled = np.where(unknown, values.max() + 1, values)
+            if (values > 0).any():
+                gap_mm, nearest = distance_transform_edt(values <= 0, sampling=spacing, return_indices=True)
+                filled = np.where(unknown & (gap_mm <= _GAP_MM), values[tuple(nearest)], filled)
+            values = filled
         nearest = distance_transform_edt(values == 0, sampling=spacing, return_distances=False, return_indices=True)
         tissues, own = np.unique(values[tuple(nearest)], return_inverse=True)
         rest = int(np.flatnonzero(tissues == -1)[0]) if bool((tissues == -1).any()) else -1
         return cls.between(labels.grid, frozen(own.reshape(values.shape), np.int64), rest, float(reach_mm))
 
     @classmethod
-    def between(cls, grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Interfaces:
+    def between(cls, grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Self:
         """Interfaces between tissues that are numbered from 0 on; parameters as the attributes."""
         depths = [_depth_mm(own == number, grid.spacing_mm) for number in range(int(own.max()) + 1)]
         depth = np.stack([spline_filter(depth, order=3, mode="mirror") for depth in depths])
         return cls(grid, frozen(depth, np.float64), own, rest, reach_mm)
 
-    def turned(self, rotation: FloatArray) -> Interfaces:
+    def turned(self, rotation: FloatArray) -> Self:
         """The borders of a body that is turned about the world's origin."""
         return replace(self, grid=self.grid.moved_by(rotation, np.zeros(3)))
 
@@ -85,19 +88,22 @@ class Interfaces:
 
         On a border the gradient is that of the voxel's own side.
         """
-        values, slopes = np.zeros(self.grid.shape), np.zeros((*self.grid.shape, 3))
+        depth, slope = np.zeros(self.grid.shape), np.zeros((*self.grid.shape, 3))
         for number in range(len(self.depth)):
             mine = self.own == number
-            values[mine], slopes[mine] = self._at_voxels(number, mine)
-        if self.rest < 0:
-            return self._factors(values, slopes, np.full(values.shape, np.inf), np.zeros_like(slopes), self.own)
-        bone, toward = self._at_voxels(self.rest, np.ones(self.grid.shape, dtype=bool))
-        return self._factors(values, slopes, -bone.reshape(values.shape), -toward.reshape(slopes.shape), self.own)
+            depth[mine], slope[mine] = self._at_voxels(number, mine)
+        away, toward = np.full(depth.shape, np.inf), np.zeros_like(slope)
+        if self.rest >= 0:
+            bone, into = self._at_voxels(self.rest, np.ones(self.grid.shape, dtype=bool))
+            away, toward = -bone.reshape(depth.shape), -into.reshape(slope.shape)
+        return self._factors(depth, slope, away, toward, self.own)
 
-    def at(self, points_mm: FloatArray) -> FloatArray:
-        """Factors at points (n, 3) LPS mm, (n, 2, 4): of m and psi the value, and the gradient in LPS."""
+    def at(self, points_mm: FloatArray, gradient: bool = True) -> FloatArray:
+        """Factors at points (n, 3) LPS mm, (n, 2, 4): of m and psi the value, and the gradient in LPS, or 0 for it."""
         indices = self.grid.indices_of(np.asarray(points_mm, dtype=np.float64))
-        depths, slopes = evaluate_spline(self.depth, indices, mirror=True)
+        depths, slopes = evaluate_spline(self.depth, indices, mirror=True, gradient=gradient)
+        if not gradient:
+            slopes = np.zeros((*depths.shape, 3))
         slopes = slopes @ (np.linalg.inv(self.grid.direction) / self.grid.spacing_mm[:, None])
         own = np.where(np.isnan(depths), -np.inf, depths).argmax(axis=1)
         each = np.arange(len(own))
@@ -127,15 +133,6 @@ class Interfaces:
         indices = np.argwhere(where).astype(np.float64)
         depth, per_voxel = evaluate_spline(self.depth[number : number + 1], indices, mirror=True)
         return depth[:, 0], per_voxel[:, 0] / self.grid.spacing_mm
-
-
-def _labelled(values: IntArray, unknown: BoolArray, spacing_mm: FloatArray) -> IntArray:
-    """Labels with those of unknown voxels of the body filled in; -1 is the bone at rest."""
-    filled = np.where(unknown, values.max() + 1, values)
-    if unknown.any() and (values > 0).any():
-        gap_mm, nearest = distance_transform_edt(values <= 0, sampling=spacing_mm, return_indices=True)
-        filled = np.where(unknown & (gap_mm <= _GAP_MM), values[tuple(nearest)], filled)
-    return np.asarray(filled)
 
 
 def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
@@ -201,20 +198,25 @@ class InterfaceSpline:
         """Distance (3,) between the control points along their axes, mm."""
         return self.control.spacing_mm
 
-    def turned(self, rotation: FloatArray) -> InterfaceSpline:
+    def turned(self, rotation: FloatArray) -> Self:
         """The same displacement of a body that is turned, with its borders, about the world's origin."""
-        return InterfaceSpline(self.smooth.turned(rotation), self.jump.turned(rotation), self.borders.turned(rotation))
+        return type(self)(self.smooth.turned(rotation), self.jump.turned(rotation), self.borders.turned(rotation))
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the splines' valid region."""
-        return self.evaluate(points_mm)[0]
+        points = np.asarray(points_mm, dtype=np.float64)
+        u = np.zeros((len(points), 3))
+        for some in in_chunks(len(points)):
+            here, factors = points[some], self.borders.at(points[some], gradient=False)
+            for f, spline in enumerate((self.smooth, self.jump)):
+                u[some] += factors[:, f, 0, None] * spline.displacement(here)
+        return u
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the splines' valid region."""
         points = np.asarray(points_mm, dtype=np.float64)
         u, H = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
-        for start in range(0, len(points), _CHUNK):
-            some = slice(start, start + _CHUNK)
+        for some in in_chunks(len(points)):
             here = points[some]
             u[some], H[some] = self._joined(here, self.smooth.evaluate(here), self.jump.evaluate(here))
         return u, H
@@ -223,7 +225,7 @@ class InterfaceSpline:
         """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid; order and errors as in `BSpline`."""
         if where.shape != grid.shape:
             raise InputError(f"The mask 'where' has shape {where.shape}; its grid has {grid.shape}.")
-        step = max(1, _CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: memory stays that of the result
+        step = max(1, CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: memory stays that of the result
         found = []
         for start in range(0, grid.shape[0], step):
             box = (slice(start, start + step), slice(None), slice(None))

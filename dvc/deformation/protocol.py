@@ -4,11 +4,9 @@ A deformation maps a point X of the reference (unloaded) configuration to x = X 
 gradient H = du/dX (H[i, j] = du_i/dX_j, no unit), both in LPS, and NaN where it is not defined: missing is never zero.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinates, spline_filter
@@ -17,7 +15,8 @@ from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
 from dvc.errors import InputError
 from dvc.images.image import Grid, Mask
 
-_CHUNK = 200_000
+CHUNK = 200_000
+"""Points that are evaluated at once, so that memory stays that of the result."""
 _RIM = 6  # voxels: what lies beyond weighs less than a thousandth in a cubic spline
 
 
@@ -36,7 +35,7 @@ class Deformation(Protocol):
 class Motion(Deformation, Protocol):
     """A deformation whose inverse is known."""
 
-    def inverse(self) -> Motion:
+    def inverse(self) -> "Motion":
         """The map back, from the deformed configuration to the reference."""
 
 
@@ -46,6 +45,11 @@ class GridDeformation(Deformation, Protocol):
 
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
         """U and H at the voxels of ``grid`` in ``where``, ordered as ``np.argwhere(where)``."""
+
+
+def in_chunks(count: int) -> Iterator[slice]:
+    """The parts of so many points, each of `CHUNK` at the most."""
+    return (slice(start, start + CHUNK) for start in range(0, count, CHUNK))
 
 
 def evaluate_on_grid(
@@ -60,8 +64,7 @@ def evaluate_on_grid(
         return deformation.evaluate_on_grid(grid, inside)
     points = grid.points(inside)
     u, H = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
-    for start in range(0, len(points), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for part in in_chunks(len(points)):
         u[part], H[part] = deformation.evaluate(points[part])
     return u, H
 
@@ -114,10 +117,10 @@ class Affine:
         u = self.displacement(points_mm)
         return u, np.tile(self.matrix - np.eye(3), (len(u), 1, 1))
 
-    def inverse(self) -> Affine:
+    def inverse(self) -> Self:
         """The map back."""
         back = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
-        return Affine(back, -back @ self.translation_mm)
+        return type(self)(back, -back @ self.translation_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,12 +149,12 @@ class RigidMotion:
         object.__setattr__(self, "translation_mm", translation)
 
     @classmethod
-    def identity(cls) -> RigidMotion:
+    def identity(cls) -> Self:
         """No motion."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
-    def about(cls, centre_mm: FloatArray, rotation: FloatArray, translation_mm: FloatArray) -> RigidMotion:
+    def about(cls, centre_mm: FloatArray, rotation: FloatArray, translation_mm: FloatArray) -> Self:
         """Rotation about a centre, then a translation: x = R (X - c) + c + t."""
         centre = np.asarray(centre_mm, dtype=np.float64)
         return cls(rotation, centre - rotation @ centre + translation_mm)
@@ -176,11 +179,11 @@ class RigidMotion:
         u = self.displacement(points_mm)
         return u, np.tile(self.rotation - np.eye(3), (len(u), 1, 1))
 
-    def inverse(self) -> RigidMotion:
+    def inverse(self) -> "RigidMotion":
         """The motion back."""
         return RigidMotion(self.rotation.T, -self.rotation.T @ self.translation_mm)
 
-    def after(self, first: RigidMotion) -> RigidMotion:
+    def after(self, first: "RigidMotion") -> "RigidMotion":
         """The motion ``first``, then this one."""
         return RigidMotion(self.rotation @ first.rotation, self.rotation @ first.translation_mm + self.translation_mm)
 
@@ -217,20 +220,14 @@ class Composed:
             H = H + step + step @ H  # (I + step)(I + H) - I without losing small H against I
         return np.asarray(x - start), H
 
-    def inverse(self) -> Composed:
-        """The map back: the parts' inverses in the opposite order.
-
-        Raises
-        ------
-        InputError
-            If a part has no known inverse.
-        """
+    def inverse(self) -> Self:
+        """The map back: the parts' inverses in the opposite order; InputError if a part has no known inverse."""
         back: list[Deformation] = []
         for part in reversed(self.parts):
             if not isinstance(part, Motion):
                 raise InputError(f"A composition has an inverse where its parts have; {type(part).__name__} has none.")
             back.append(part.inverse())
-        return Composed(back)
+        return type(self)(back)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -253,10 +250,9 @@ class Within:
 
     def _outside(self, points_mm: FloatArray) -> BoolArray:
         nearest = np.rint(self.mask.grid.indices_of(points_mm))
-        known = np.all((nearest >= 0) & (nearest < self.mask.grid.shape), axis=1)
-        outside = np.ones(len(nearest), dtype=bool)
-        outside[known] = ~self._near[tuple(nearest[known].astype(np.int64).T)]
-        return outside
+        outside = ~np.all((nearest >= 0) & (nearest < self.mask.grid.shape), axis=1)
+        outside[~outside] = ~self._near[tuple(nearest[~outside].astype(np.int64).T)]
+        return np.asarray(outside)
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm; NaN outside."""

@@ -4,9 +4,8 @@ Configurations: E (Green-Lagrange) and everything derived from it here live in t
 its axes are LPS, its numbers have no unit.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -58,7 +57,7 @@ class StrainField:
     valid: BoolArray
 
     @classmethod
-    def from_gradient(cls, gradient: npt.ArrayLike) -> StrainField:
+    def from_gradient(cls, gradient: npt.ArrayLike) -> Self:
         """Compute the strain of displacement gradients.
 
         Parameters
@@ -97,8 +96,6 @@ class StrainField:
         arbitrary choice among the possible ones. NaN where not valid.
         """
         directions = np.full(self.green_lagrange.shape, np.nan)
-        if not self.valid.any():
-            return directions
         vectors = np.linalg.eigh(self.green_lagrange[self.valid])[1][:, :, ::-1].copy()
         largest = np.abs(vectors).argmax(axis=1)[:, None, :]
         vectors *= np.where(np.take_along_axis(vectors, largest, axis=1) < 0, -1.0, 1.0)
@@ -121,8 +118,6 @@ class StrainField:
         NaN where not valid, and where det F is zero.
         """
         logarithm = np.full(self.green_lagrange.shape, np.nan)
-        if not self.valid.any():
-            return logarithm
         values, vectors = np.linalg.eigh(self.green_lagrange[self.valid])
         stretch = 0.5 * np.log1p(2.0 * np.where(values > -0.5, values, np.nan))
         logarithm[self.valid] = (vectors * stretch[:, None, :]) @ vectors.transpose(0, 2, 1)
@@ -281,13 +276,9 @@ def _principal_of(tensors: FloatArray, values: FloatArray) -> None:
 
 @njit(parallel=True, cache=True)
 def _strain(
-    gradient: FloatArray,
-    strain: FloatArray,
-    principal: FloatArray,
-    shear: FloatArray,
-    jacobian: FloatArray,
+    gradient: FloatArray, strain: FloatArray, principal: FloatArray, shear: FloatArray, jacobian: FloatArray,
     valid: BoolArray,
-) -> None:
+) -> None:  # fmt: skip
     for n in prange(gradient.shape[0]):
         H, E = gradient[n], strain[n]
         known = True

@@ -7,11 +7,9 @@ registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Gauss-N
 side along each of the six ways to move. Their mean is the result; the largest distance of two is its repeatability.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from scipy import fft
@@ -74,7 +72,7 @@ class Alignment:
     repeatability_mm: float
     bone_shift_mm: FloatArray
 
-    def turned(self, rotation: FloatArray) -> Alignment:
+    def turned(self, rotation: FloatArray) -> Self:
         """The same alignment of two images that are both turned about the world's origin."""
         R, motion = rotation, self.motion
         same = RigidMotion(R @ motion.rotation @ R.T, R @ motion.translation_mm)
@@ -129,10 +127,8 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
     if not score >= _LOWEST_SIMILARITY:
         raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
     points = mask.points()
-    advice = (
-        f"the {on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly inside "
-        "the loaded one."
-    )
+    advice = f"the {on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly "
+    advice += "inside the loaded one."
     try:
         pairs = fit.halves(motion)
     except RegistrationError as why:
@@ -142,8 +138,9 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
         raise RegistrationError(
             f"Two rigid fits on the {on} differ by {spread:.2f} mm (at most {_LARGEST_SPREAD_MM} is accepted): {advice}"
         )
-    centroid = points.mean(axis=0)[None]
-    motion = _midway([half for pair in pairs for half in pair], centroid)
+    centroid, halves = points.mean(axis=0)[None], [half for pair in pairs for half in pair]
+    R = Rotation.from_matrix(np.stack([half.rotation for half in halves])).mean().as_matrix()
+    motion = RigidMotion(R, np.mean([half.apply(centroid)[0] for half in halves], axis=0) - R @ centroid[0])
     after = _similarity(reference, loaded, mask, motion)
     return Alignment(motion, on, before, after, spread, motion.displacement(centroid)[0])
 
@@ -167,12 +164,6 @@ def without_motion(whole: Deformation, bone: Mask | None) -> tuple[Deformation, 
         return whole, RigidMotion.identity()
     motion = motion_of(whole, bone)
     return Composed([whole, motion.inverse()]), motion
-
-
-def _midway(motions: list[RigidMotion], centre: FloatArray) -> RigidMotion:
-    rotation = Rotation.from_matrix(np.stack([motion.rotation for motion in motions])).mean().as_matrix()
-    target = np.mean([motion.apply(centre)[0] for motion in motions], axis=0)
-    return RigidMotion(rotation, target - rotation @ centre[0])
 
 
 def _similarity(reference: Image, loaded: Image, mask: Mask, motion: RigidMotion) -> float:
@@ -278,8 +269,7 @@ def _template(reference: Image, mask: Mask, centre: FloatArray) -> tuple[Image, 
     near = Mask(mask.grid, widened(mask, _SEARCH_MARGIN_MM).inside & ~reference.missing)
     reach = float(np.linalg.norm(near.points() - centre, axis=1).max())
     half = int(np.ceil(reach / _SEARCH_MM)) + 1
-    n = 2 * half + 1
-    grid = Grid((n, n, n), np.full(3, _SEARCH_MM), centre - half * _SEARCH_MM)
+    grid = Grid((2 * half + 1,) * 3, np.full(3, _SEARCH_MM), centre - half * _SEARCH_MM)
     weight = smoothed(Image(mask.grid, near.inside.astype(np.float32)), _SEARCH_MM / 2.0)
     return smoothed(fill_missing(reference), _SEARCH_MM / 2.0), weight, grid
 

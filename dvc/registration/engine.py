@@ -4,8 +4,6 @@ An engine is a frozen dataclass of its parameters that subclasses `Engine` and l
 defines its name, its parameters and how it finds a displacement; for the rest there are defaults.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol, Self
@@ -52,21 +50,21 @@ class AlignedPair:
     @classmethod
     def of(
         cls, fixed: Image, moving: Image, motion: RigidMotion, body: Mask, bone: Mask | None, labels: LabelMap | None
-    ) -> AlignedPair:
+    ) -> Self:
         """Take the bone's ``motion`` out of the moving image, and compare the body and 3 mm around it."""
         back = motion.inverse()
         compared = Mask(fixed.grid, widened(body, _MASK_MARGIN_MM).inside & ~fixed.missing)
         still = Image(moving.grid.moved_by(back.rotation, back.translation_mm), moving.values)
         return cls(fixed, still, compared, body, bone, labels)
 
-    def cut(self) -> AlignedPair:
+    def cut(self) -> Self:
         """The pair on the box of the voxels compared and a few around it: control points in empty air cost time."""
         box = self.compared.box(_CROP_VOXELS)
         grid = self.fixed.grid.part(box)
         compared, body = (Mask(grid, mask.inside[box]) for mask in (self.compared, self.body))
         bone = self.bone and Mask(grid, self.bone.inside[box])
         labels = self.labels and LabelMap(grid, self.labels.labels[box], self.labels.names)
-        return AlignedPair(Image(grid, self.fixed.values[box]), self.moving, compared, body, bone, labels)
+        return type(self)(Image(grid, self.fixed.values[box]), self.moving, compared, body, bone, labels)
 
 
 class Displacement(Deformation, Protocol):
@@ -79,7 +77,7 @@ class Displacement(Deformation, Protocol):
         Nearer than that to the end of a scan it rests on a part of the image that is not there.
         """
 
-    def turned(self, rotation: FloatArray) -> Displacement:
+    def turned(self, rotation: FloatArray) -> Self:
         """The same displacement of a body that is rotated about the world's origin."""
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from dvc.errors import ParameterError
 from dvc.registration.elastix.engine import Elastix
-from dvc.registration.elastix.presets import preset_names, preset_or_file
+from dvc.registration.elastix.presets import load_preset, preset_names, read_parameter_file
 from dvc.registration.engine import Engine
 from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
 
@@ -33,10 +33,12 @@ def engine_named(name: str) -> Engine:
     """
     if name in ENGINES:
         return ENGINES[name]()
-    if not name.endswith(".txt") and name not in preset_names():
+    if name.endswith(".txt"):
+        return Elastix((read_parameter_file(name),))
+    if name not in preset_names():
         known = ", ".join((*ENGINES, *preset_names()))
         raise ParameterError(f"No engine or preset '{name}'; there are {known}, or a parameter file of elastix (.txt).")
-    return Elastix((preset_or_file(name),))
+    return Elastix((load_preset(name),))
 
 
 def methods_of(record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
@@ -45,8 +47,6 @@ def methods_of(record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
     Empty where no engine is recorded.
     """
     kinds: list[type[Engine]] = [*ENGINES.values(), Elastix]
-    for kind in kinds:
-        if text := kind.methods(record, versions):
-            return text
     known = record.get("engine")
-    return f"with the engine {known} of mrstrain {versions.get('mrstrain', '?')}" if known else ""
+    unknown = f"with the engine {known} of mrstrain {versions.get('mrstrain', '?')}" if known else ""
+    return next(filter(None, (kind.methods(record, versions) for kind in kinds)), unknown)

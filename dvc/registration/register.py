@@ -5,14 +5,12 @@ displacement u then maps the reference configuration straight to the bone-aligne
 tissue relative to its bone; T(X) = R (X + u(X)) + t is the whole motion.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Any, TypeVar, get_args
+from typing import Any, Self, TypeVar, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -67,12 +65,12 @@ class Settings:
         if self.threads < 1:
             raise ParameterError(f"`threads` is 1 or more; got {self.threads}.")
 
-    def of_repeat(self) -> Settings:
+    def of_repeat(self) -> Self:
         """The settings for a repeat scan, which is smoothed no more than a loaded image."""
         return replace(self, engine=self.engine.of_repeat())
 
     @classmethod
-    def of(cls, name: str = DEFAULT, **others: Any) -> Settings:
+    def of(cls, name: str = DEFAULT, **others: Any) -> Self:
         """Settings with an engine by its name, as in `dvc.registration.engines.engine_named`."""
         return cls(engine_named(name), **others)
 
@@ -182,7 +180,12 @@ def register(
         engine.check_start(start)
     with Worker(chosen.threads) if worker is None else nullcontext(worker) as runner:
         pair, alignment, turn = _aligned(reference, loaded, body, bone, tissues, chosen, runner, tell)
-        guess = None if start is None else _turned_start(start, turn.T)
+        guess = start
+        if isinstance(start, BSpline):  # and remains one
+            guess = start.turned(turn.T)
+        elif start is not None:
+            there = RigidMotion(turn.T, np.zeros(3))
+            guess = Composed([there.inverse(), start, there])
         found = engine.find(pair, start=guess, seeds=_seeds(chosen)[1:], worker=runner, progress=tell)
     return Registration(
         reference, loaded, body, bone, alignment.turned(turn), found.displacement.turned(turn), chosen,
@@ -198,17 +201,21 @@ def _aligned(
 
     elastix draws samples from a box along the world's axes, which of an oblique image holds a part or nothing.
     """
-    tell("aligning", 0.0)
     # Axes toward L, P, S: a scan stored in another orientation then gives the same result.
-    fixed = worker.run("correcting the shading", without_shading, reference.toward_lps())
+    upright = reference.toward_lps()
+    turn: FloatArray = Rotation.from_matrix(upright.grid.direction).as_matrix()
+
+    def turned(scan: _Scan) -> _Scan:
+        return replace(scan, grid=scan.grid.moved_by(turn.T, np.zeros(3)))
+
+    tell("aligning", 0.0)
+    fixed = turned(worker.run("correcting the shading", without_shading, upright))
     tell("aligning", 0.2)
-    moving = worker.run("correcting the shading", without_shading, loaded.toward_lps())
+    moving = turned(worker.run("correcting the shading", without_shading, loaded.toward_lps()))
     tell("aligning", 0.4)
-    turn: FloatArray = Rotation.from_matrix(fixed.grid.direction).as_matrix()
-    fixed, moving, body = _turned(fixed, turn.T), _turned(moving, turn.T), _turned(body.toward_lps(), turn.T)
-    bone = bone and _turned(bone.toward_lps(), turn.T)
-    labels = labels and _turned(labels.toward_lps(), turn.T)
-    rigid, on = bone if settings.align_on == "bone" else None, settings.align_on
+    body, labels = turned(body.toward_lps()), labels and turned(labels.toward_lps())
+    on = settings.align_on
+    rigid = turned(bone.toward_lps()) if bone and on == "bone" else None
     if on == "none":
         alignment = not_aligned(fixed, moving, body)
         if settings.engine.needs_one_contrast:  # a rigid alignment refuses it by itself
@@ -217,10 +224,6 @@ def _aligned(
         alignment = worker.run("aligning the bone", align, fixed, moving, rigid or body, on, _seeds(settings)[0])
     tell("aligning", 1.0)
     return AlignedPair.of(fixed, moving, alignment.motion, body, rigid, labels), alignment, turn
-
-
-def _turned(scan: _Scan, rotation: FloatArray) -> _Scan:
-    return replace(scan, grid=scan.grid.moved_by(rotation, np.zeros(3)))
 
 
 def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:
@@ -247,14 +250,6 @@ def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | N
             raise InputError(f"The {name} is not on the unloaded image's grid; bring it there (fit_mask).")
         if not (given.labels if isinstance(given, LabelMap) else given.inside).any():
             raise InputError(f"The {name} is empty.")
-
-
-def _turned_start(start: Deformation, rotation: FloatArray) -> Deformation:
-    """The start in a world that is rotated about its origin; a B-spline remains one."""
-    if isinstance(start, BSpline):
-        return start.turned(rotation)
-    there = RigidMotion(rotation, np.zeros(3))
-    return Composed([there.inverse(), start, there])
 
 
 def _seeds(settings: Settings) -> list[int]:

@@ -134,20 +134,17 @@ class RigidFit:
         slopes = np.stack(list(np.gradient(fixed, *part.grid.spacing_mm)), axis=-1)
         thin = np.zeros(inside.shape, dtype=bool)
         thin[_every(part.grid, blur_mm)] = True
-        at = np.argwhere(inside & thin)
-        if len(at) < _LEAST_VOXELS:
-            at = np.argwhere(inside)
-        points = part.grid.points_at(at.astype(np.float64))
-        gradient = slopes[tuple(at.T)] @ part.grid.direction.T
+        enough = np.count_nonzero(inside & thin) >= _LEAST_VOXELS
+        at = np.argwhere(inside & thin if enough else inside)
+        points, here = part.grid.points_at(at.astype(np.float64)), tuple(at.T)
+        gradient = slopes[here] @ part.grid.direction.T
         turning = np.cross(points - self._centre, gradient) / self._radius_mm
-        values = fixed[tuple(at.T)]
         x, y, z = ((points - self._centre) / self._radius_mm).T
         places = np.column_stack([np.ones(len(at)), x, y, z, x * x, y * y, z * z, x * y, y * z, z * x])
         if self._radius_mm < _SHADED_MM:
             places = places[:, :1]
-        around = convolve(fixed, _NEIGHBOURS, mode="nearest")[tuple(at.T)]
-        changes, order = np.hstack([gradient, turning]), 1 if blur_mm else 3
-        return _Level(blur_mm, points, values, around, places, changes, scene, order)
+        around, changes = convolve(fixed, _NEIGHBOURS, mode="nearest")[here], np.hstack([gradient, turning])
+        return _Level(blur_mm, points, fixed[here], around, places, changes, scene, 1 if blur_mm else 3)
 
     def _settled(self, level: _Level, motion: RigidMotion, part: BoolArray) -> RigidMotion:
         """Where steps over some of a level's points come to rest."""
@@ -175,14 +172,12 @@ class RigidFit:
         values, places, changes = level.values[part][shown], level.places[part][shown], level.changes[part][shown]
         if not ((values - values.mean()) * (carried - carried.mean())).sum() > 0.0:
             raise RegistrationError("What is brighter in the unloaded image is not brighter in the loaded one.")
-        columns, by = (
-            np.column_stack([places * seen[:, None], np.ones(len(seen))])
-            for seen in (values, level.around[part][shown])
-        )
+        both = values, level.around[part][shown]
+        columns, by = (np.column_stack([places * seen[:, None], np.ones(len(seen))]) for seen in both)
         found = _regressed(columns, carried, by)
         gain = np.einsum("ni,i->n", places, found[:-1])
         gain = np.maximum(gain, _LEAST_GAIN * carried.std() / values.std())
-        return _regressed(changes, values - (carried - found[-1]) / gain)
+        return _regressed(changes, values - (carried - found[-1]) / gain, changes)
 
     def _step(self, step: FloatArray) -> RigidMotion:
         turn = Rotation.from_rotvec(step[3:] / self._radius_mm).as_matrix()
@@ -205,9 +200,8 @@ def _surrounded(image: Image, mask: Mask) -> Mask:
     return Mask(mask.grid, inside if few else surrounded)
 
 
-def _regressed(columns: FloatArray, on: FloatArray, instruments: FloatArray | None = None) -> FloatArray:
-    """Least squares, or with instruments in the columns' place; by sums whose bits do not depend on threads."""
-    by = columns if instruments is None else instruments
+def _regressed(columns: FloatArray, on: FloatArray, by: FloatArray) -> FloatArray:
+    """Regression with instruments `by`, or the columns themselves; by sums whose bits do not depend on threads."""
     normal, right = np.einsum("ni,nj->ij", by, columns), np.einsum("ni,n->i", by, on)
     return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-9)[0])
 

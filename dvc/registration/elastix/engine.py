@@ -144,15 +144,14 @@ def _one_stage(
     tell: Callable[[float], None],
 ) -> BSpline:  # fmt: skip
     """Displacement by one stage, added to that of the stage or load before it, ``start``."""
-    grid, initial, total = pair.fixed.grid, None, preset.iterations
+    grid = pair.fixed.grid
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
-        if start is not None:
-            initial = str(write_elastix_transform(Path(folder), start, None, grid)[0])
+        initial = start and str(write_elastix_transform(Path(folder), start, None, grid)[0])
         run = _resolvable(preset.complete(seed=seed, combine="Compose" if start is None else "Add"), grid)
         found = worker.run(
             f"registering with {preset.name}", elastix.register, pair.fixed, pair.moving, run, pair.compared,
             moving_mask, initial, folder,
-            watch=lambda: tell(min(1.0, elastix.finished_iterations(Path(folder)) / total)),
+            watch=lambda: tell(min(1.0, elastix.finished_iterations(Path(folder)) / preset.iterations)),
         )  # fmt: skip
     tell(1.0)
     bspline = bspline_from_elastix(found)

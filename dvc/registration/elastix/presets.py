@@ -17,25 +17,18 @@ from dvc.errors import InputError, ParameterError
 from dvc.io.transforms.elastix_text import parse_parameters
 
 _FOLDER = files("dvc.registration.elastix") / "parameters"
-_LABEL = re.compile(
-    r"^(Metric|Transform|Optimizer|Interpolator|ImageSampler|FixedImagePyramid|MovingImagePyramid|Registration)\d*"
-)
+_KINDS = "Metric|Transform|Optimizer|Interpolator|ImageSampler|FixedImagePyramid|MovingImagePyramid|Registration"
+_LABEL = re.compile(rf"^({_KINDS})\d*")
 
 # What mrstrain itself decides, so that results are reproducible and can be read back.
 _ALWAYS: dict[str, tuple[str, ...]] = {
-    "FixedImageDimension": ("3",),
-    "MovingImageDimension": ("3",),
-    "FixedInternalImagePixelType": ("float",),
-    "MovingInternalImagePixelType": ("float",),
-    "UseDirectionCosines": ("true",),
-    "WriteResultImage": ("false",),
-    "WriteFinalTransformParameters": ("false",),
-    "WriteIterationInfo": ("true",),
-    "DefaultPixelValue": ("0",),
-    "Resampler": ("DefaultResampler",),
-    "ResampleInterpolator": ("FinalBSplineInterpolator",),
+    "FixedImageDimension": ("3",), "MovingImageDimension": ("3",),
+    "FixedInternalImagePixelType": ("float",), "MovingInternalImagePixelType": ("float",),
+    "UseDirectionCosines": ("true",), "DefaultPixelValue": ("0",),
+    "WriteResultImage": ("false",), "WriteFinalTransformParameters": ("false",), "WriteIterationInfo": ("true",),
+    "Resampler": ("DefaultResampler",), "ResampleInterpolator": ("FinalBSplineInterpolator",),
     "ResultImageFormat": ("nii.gz",),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +92,6 @@ def load_preset(name: str) -> Preset:
     return _checked(name, (_FOLDER / f"{name}.txt").read_text(), allow_unknown=False)
 
 
-def preset_or_file(name: str) -> Preset:
-    """A preset by its name, or a user's own elastix parameter file by a path that ends in .txt; errors as of both."""
-    return read_parameter_file(name) if name.endswith(".txt") else load_preset(name)
-
-
 def read_parameter_file(path: Path | str, *, allow_unknown: bool = False) -> Preset:
     """A user's own elastix parameter file, checked.
 
@@ -131,27 +119,22 @@ def _checked(name: str, text: str, *, allow_unknown: bool) -> Preset:
         parameters = parse_parameters(text)
     except ParameterError as failure:
         raise ParameterError(f"{name}: {failure}") from failure
-    if not allow_unknown:
-        for parameter in parameters:
-            _check_name(name, parameter)
-    for kind, components in _known()[1].items():
+    names, components_of = _known()
+    for parameter in () if allow_unknown else parameters:
+        bare = _LABEL.sub("", parameter)  # without the metric's label
+        spellings = {parameter, parameter.rstrip("0123456789"), bare}
+        if not names & spellings and not (_LABEL.match(parameter) and "Metric" + bare in names):
+            raise ParameterError(
+                f"{name}: elastix has no parameter '{parameter}' and would ignore it in silence; "
+                f"{_nearest(parameter, names)} Pass --allow-unknown-parameters if it is right all the same."
+            )
+    for kind, components in components_of.items():
         for value in parameters.get(kind, ()):
             if value not in components:
                 raise ParameterError(f'{name}: elastix has no {kind} "{value}"; {_nearest(value, components)}')
     if "Transform" not in parameters:
         raise ParameterError(f'{name}: no (Transform "...") given; a B-spline or Euler transform is needed.')
     return Preset(name, text, parameters)
-
-
-def _check_name(file: str, parameter: str) -> None:
-    known, without_label = _known()[0], _LABEL.sub("", parameter)
-    spellings = {parameter, parameter.rstrip("0123456789"), without_label}
-    if known & spellings or (_LABEL.match(parameter) and "Metric" + without_label in known):
-        return
-    raise ParameterError(
-        f"{file}: elastix has no parameter '{parameter}' and would ignore it in silence; "
-        f"{_nearest(parameter, known)} Pass --allow-unknown-parameters if it is right all the same."
-    )
 
 
 def _nearest(name: str, known: Sequence[str] | frozenset[str]) -> str:

@@ -17,32 +17,12 @@ from dvc.images.image import Grid, Image, Mask
 from dvc.images.itk_image import to_itk
 
 _LOG = "elastix.log"
-_SELF_TEST: dict[str, tuple[str, ...]] = {
-    "Registration": ("MultiResolutionRegistration",),
-    "Metric": ("AdvancedNormalizedCorrelation",),
-    "Optimizer": ("AdaptiveStochasticGradientDescent",),
-    "Transform": ("TranslationTransform",),
-    "Interpolator": ("LinearInterpolator",),
-    "ImageSampler": ("RandomCoordinate",),
-    "FixedImagePyramid": ("FixedSmoothingImagePyramid",),
-    "MovingImagePyramid": ("MovingSmoothingImagePyramid",),
-    "AutomaticTransformInitialization": ("false",),
-    "AutomaticParameterEstimation": ("true",),
-    "NewSamplesEveryIteration": ("true",),
-    "NumberOfResolutions": ("2",),
-    "MaximumNumberOfIterations": ("300",),
-}
 
 
 def register(
-    fixed: Image,
-    moving: Image,
-    parameters: Mapping[str, tuple[str, ...]],
-    fixed_mask: Mask | None,
-    moving_mask: Mask | None,
-    initial_transform: str | None,
-    folder: str,
-) -> dict[str, tuple[str, ...]]:
+    fixed: Image, moving: Image, parameters: Mapping[str, tuple[str, ...]], fixed_mask: Mask | None,
+    moving_mask: Mask | None, initial_transform: str | None, folder: str,
+) -> dict[str, tuple[str, ...]]:  # fmt: skip
     """The parameter map, every value as text, of the transform from points of `fixed` (LPS mm) to those of `moving`.
 
     The images have no missing values; samples are taken inside the fixed mask only. The parameters are complete
@@ -79,11 +59,12 @@ def self_test() -> str:
     """Register a small pair of known shift; return a sentence on what came out, for `mrstrain doctor`."""
     from scipy.ndimage import zoom
 
-    from dvc.registration.elastix.presets import Preset
+    from dvc.registration.elastix.presets import load_preset
 
     values = zoom(np.random.default_rng(0).normal(size=(10, 10, 10)).astype(np.float32), 4.0, order=3)
     grid, shifted = (Grid((40, 40, 40), np.ones(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.5))
-    parameters = Preset("self-test", "", _SELF_TEST).complete(seed=1)
+    short = {"Transform": ("TranslationTransform",), "MaximumNumberOfIterations": ("80",)}
+    parameters = load_preset("heel-mr").complete(seed=1) | short
     with tempfile.TemporaryDirectory(prefix="mrstrain-") as folder:
         found = register(Image(grid, values), Image(shifted, values), parameters, None, None, None, folder)
     shift = float(found["TransformParameters"][0])

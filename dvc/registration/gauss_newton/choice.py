@@ -38,11 +38,7 @@ class Choice(Regularisation):
 
     @property
     def caution(self) -> str:
-        """Why the result is to be used with care: the images asked for a change of volume.
-
-        On phantoms that change their volume like that, two thirds to all of the change came back. Images of another
-        foot ask for one too, and fit better once it is allowed.
-        """
+        """Why the result is to be used with care: of the change of volume, two thirds to all came back on phantoms."""
         return f"{self.volume_told} It may be larger than was found." if self.frees_volume else ""
 
     @property
@@ -51,12 +47,10 @@ class Choice(Regularisation):
         if self.asked is None:
             return f"Its weight was fixed beforehand, {self.weights.volume:g}/mm3."
         found = f"{100.0 * self.asked:.1f} % or more in a hundredth of the soft tissue"
-        if self.frees_volume:
-            return (
-                f"The images ask for a change of volume, of {found}: it was allowed, and only its gradient held "
-                f"({self.weights.volume_gradient:g}/mm)."
-            )
-        return f"The images ask for no more change of volume than noise does, {found}: volume was kept."
+        if not self.frees_volume:
+            return f"The images ask for no more change of volume than noise does, {found}: volume was kept."
+        held = f"only its gradient held ({self.weights.volume_gradient:g}/mm)"
+        return f"The images ask for a change of volume, of {found}: it was allowed, and {held}."
 
     @property
     def caption(self) -> str:
@@ -77,17 +71,14 @@ class Choice(Regularisation):
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON."""
-        told: dict[str, object] = {
+        asked, above = (None, None) if self.asked is None else (round(self.asked, 4), _ASKED)
+        skin = [{"rigidity": weight, "left_out_over_best": round(left, 6)} for weight, left in self.tried_in_skin]
+        return {
             "weights": asdict(self.weights),
             "rigidity_of": self.rigidity_of,
             "rule": self.rule,
-            "tried": [{"bending": b, "left_out_over_best": round(v, 6)} for b, v in self.tried],
-            "change_of_volume": {
-                "rule": self.volume_told,
-                "asked": None if self.asked is None else round(self.asked, 4),
-                "allowed_above": None if self.asked is None else _ASKED,
-            },
+            "tried": [{"bending": weight, "left_out_over_best": round(left, 6)} for weight, left in self.tried],
+            "change_of_volume": {"rule": self.volume_told, "asked": asked, "allowed_above": above},
+            **({"tried_in_skin": skin} if skin else {}),
+            "borders": self.at_interfaces,
         }
-        if self.tried_in_skin:
-            told["tried_in_skin"] = [{"rigidity": w, "left_out_over_best": round(v, 6)} for w, v in self.tried_in_skin]
-        return told | {"borders": self.at_interfaces}

@@ -1,14 +1,12 @@
 """The Gauss-Newton engine, with one smooth spline, and with strain that may jump at tissue interfaces."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -38,7 +36,7 @@ class GaussNewton(Parameters, Engine):
     spacing_mm : float
         Between control points, at the finest level; never less than two voxels.
     bending : float or None
-        Weight of the bending, 1/mm; None: chosen for each pair by cross-validation.
+        Weight of the bending, 1/mm; None: chosen for each pair by cross-validation. Fixed, it costs the error bars.
     volume : float or None
         Weight of the change of volume in soft tissue, 1/mm3; None: 300, unless the images ask for such a change.
     rigidity : float
@@ -48,6 +46,12 @@ class GaussNewton(Parameters, Engine):
     ------
     ParameterError
         For a spacing that is not above zero, or a weight that is negative or not finite.
+
+    Notes
+    -----
+    `Measurement.sigma` and `.intervals` are known only for the parameters that the error model was measured with: the
+    bending chosen by cross-validation, the default spacing and rigidity, `volume` None or 300. To keep error bars,
+    leave the others alone; `Measurement.error_bars.told` says why there are none. Repeat scans get 3/mm in any case.
     """
 
     family = name = "gauss-newton"
@@ -55,13 +59,13 @@ class GaussNewton(Parameters, Engine):
     @property
     def unlike_its_error_model(self) -> str:
         """Why an error model of its name does not hold for it, where its parameters are not those of the model."""
-        return _bending_fixed(self.name, self) or other_parameters(self.name)
+        return _unlike(self.name, self)
 
-    def of_repeat(self) -> GaussNewton:
+    def of_repeat(self) -> Self:
         """With the usual weights: those chosen for a pair without strain would smooth away the noise it is to show."""
         return replace(self, bending=self.weights.bending, volume=self.weights.volume)
 
-    def keeping_volume(self) -> GaussNewton:
+    def keeping_volume(self) -> Self:
         """With the weight of tissue that keeps its volume, whatever the images ask for."""
         return replace(self, volume=self.weights.volume)
 
@@ -73,7 +77,23 @@ class GaussNewton(Parameters, Engine):
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
         """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
         own = record.get("gauss_newton")
-        return _methods(own, record, versions) if own and record.get("borders") is None else ""
+        if not own or record.get("borders") is not None:
+            return ""
+        bending, volume = own.get("bending"), own.get("volume")
+        weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
+        kept = "300/mm3, or of its gradient alone where the images ask for such a change"
+        if volume is not None:
+            kept = f"{volume:g}/mm3"
+        held = f" and on change of volume in the tissue ({kept})"
+        if record.get("align") == "bone":
+            rigid = f"strain of the bone ({own.get('rigidity'):g}/mm3)"
+            held = f", on change of volume in soft tissue ({kept}) and on {rigid}"
+        return (
+            f"with the Gauss-Newton engine of mrstrain {versions.get('mrstrain', '?')}: a cubic B-spline with control "
+            f"points every {own.get('spacing_mm'):g} mm (every two voxels, if that is more), least squares over all "
+            "voxels of the tissue and 3 mm around it, and penalties on bending (the square of the Laplacian of its "
+            f"coefficients, less where the displacement is curved; weight {weight}){held}"
+        )
 
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
@@ -120,13 +140,13 @@ class GaussNewtonWithInterfaces(Engine):
     @property
     def unlike_its_error_model(self) -> str:
         """Why an error model of its name does not hold for it, where its parameters are not those of the model."""
-        return _bending_fixed(self.name, self.smooth) or other_parameters(self.name)
+        return _unlike(self.name, self.smooth)
 
-    def of_repeat(self) -> GaussNewtonWithInterfaces:
+    def of_repeat(self) -> Self:
         """With the usual weights: those chosen for a pair without strain would smooth away the noise it is to show."""
         return replace(self, smooth=self.smooth.of_repeat(), skin=self.skin or USUAL_SKIN)
 
-    def keeping_volume(self) -> GaussNewtonWithInterfaces:
+    def keeping_volume(self) -> Self:
         """With the weight of tissue that keeps its volume, whatever the images ask for."""
         return replace(self, smooth=self.smooth.keeping_volume())
 
@@ -137,13 +157,14 @@ class GaussNewtonWithInterfaces(Engine):
     @classmethod
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
         """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
-        own, last = record.get("gauss_newton"), record.get("borders")
-        if not own or last is None:
+        last = record.get("borders")
+        smooth = GaussNewton.methods({**record, "borders": None}, versions)
+        if not smooth or last is None:
             return ""
         skin, held = last.get("skin"), record.get("align") == "bone"
         weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
         return (
-            f"{_methods(own, record, versions)}; from there a second B-spline was added that vanishes on the borders "
+            f"{smooth}; from there a second B-spline was added that vanishes on the borders "
             "of the label map's tissues, so that strain may jump there, "
             f"{'the bone held at rest and ' if held else ''}strain of a tissue called skin penalised (weight {weight})"
             ", and bending counted by the Laplacian of both splines' Laplacian"
@@ -194,9 +215,10 @@ def _note(path: str, share: float) -> None:
     Path(path).write_text(f"{share:.3f}")
 
 
-def _bending_fixed(name: str, used: Parameters) -> str:
+def _unlike(name: str, used: Parameters) -> str:
+    """Why the error model of that name does not hold for other weights than its own."""
     if used.bending is None:
-        return ""
+        return other_parameters(name)
     return (
         f"The error of {name} was measured with the weight of the bending chosen by its rule, as for a loaded image; "
         f"here it was fixed at {used.bending:g}/mm, as for a repeat scan or by --bending."
@@ -209,23 +231,4 @@ def _volume_freed(name: str, choice: Choice) -> str:
     return (
         f"The error of {name} was measured on phantoms that keep their volume; here the images ask for a change of "
         "volume, which was allowed."
-    )
-
-
-def _methods(own: Mapping[str, Any], record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
-    bending, volume = own.get("bending"), own.get("volume")
-    weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
-    kept = "300/mm3, or of its gradient alone where the images ask for such a change"
-    if volume is not None:
-        kept = f"{volume:g}/mm3"
-    held = (
-        f", on change of volume in soft tissue ({kept}) and on strain of the bone ({own.get('rigidity'):g}/mm3)"
-        if record.get("align") == "bone"
-        else f" and on change of volume in the tissue ({kept})"
-    )
-    return (
-        f"with the Gauss-Newton engine of mrstrain {versions.get('mrstrain', '?')}: a cubic B-spline with control "
-        f"points every {own.get('spacing_mm'):g} mm (every two voxels, if that is more), least squares over all "
-        "voxels of the tissue and 3 mm around it, and penalties on bending (the square of the Laplacian of its "
-        f"coefficients, less where the displacement is curved; weight {weight}){held}"
     )

@@ -21,7 +21,7 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation
 from dvc.errors import InputError, ParameterError
-from dvc.images.image import Grid, Image, Mask
+from dvc.images.image import Grid, Image
 from dvc.images.resample import smoothed, thinned
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
@@ -48,24 +48,7 @@ _LAST_STEPS = 2
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Parameters of the fit: the spacing of the control points and the weights of the prior.
-
-    Attributes
-    ----------
-    spacing_mm : float
-        Between control points, at the finest level; never less than two voxels.
-    bending : float or None
-        Weight b of the bending, 1/mm; None: chosen for each pair by cross-validation.
-    volume : float or None
-        Weight v of the change of volume in soft tissue, 1/mm3; None: 300, unless the images ask for such a change.
-    rigidity : float
-        Weight w of strain in the bone, 1/mm3.
-
-    Raises
-    ------
-    ParameterError
-        For a spacing that is not above zero, or a weight that is negative or not finite.
-    """
+    """The spacing of the control points and the weights b, v and w of the prior, as in `dvc.GaussNewton`."""
 
     spacing_mm: float = 3.2
     bending: float | None = None
@@ -119,11 +102,9 @@ def fit(
         core = distance_transform_edt(pair.bone.inside, sampling=pair.bone.grid.spacing_mm) > _RIM_MM
     weights, choice = parameters.weights, Choice(parameters.weights, "fixed beforehand")
     spacing = np.maximum(parameters.spacing_mm, _LEAST_VOXELS * fixed.grid.spacing_mm)
-    axes = np.array(fixed.grid.direction)
-    soft = pair.body.inside & ~core
-    coefficients, control = np.zeros(0), fixed.grid
+    axes, soft = np.array(fixed.grid.direction), pair.body.inside & ~core
+    guess = start
     for number, (sigma_mm, factor, steps, stop_mm) in enumerate(LEVELS):
-        guess = start if number == 0 else BSpline(control, turned(axes, coefficients))
         control = control_grid(fixed.grid, factor * spacing)
         coefficients = np.zeros((3, *control.shape))
         if guess is not None:
@@ -134,11 +115,14 @@ def fit(
             choice = replace(choice, asked=_volume_asked(level, coefficients, weights))
             if choice.frees_volume:
                 weights = replace(weights, volume=0.0, volume_gradient=_FREED)
+        guess = BSpline(control, turned(axes, coefficients))
         progress((number + 1) / (len(LEVELS) + 2))
     choice = replace(choice, weights=weights)
     level.roughness = level.following(coefficients)
     if parameters.bending is None:
-        part = _middle(pair.compared)
+        part, box = np.zeros_like(inside), pair.compared.box()  # the middle third: enough, in a third of the time
+        margins = [int(0.5 * (1.0 - _MIDDLE) * (edge.stop - edge.start)) for edge in box]
+        part[tuple(slice(e.start + m, e.stop - m) for e, m in zip(box, margins, strict=True))] = True
         middle = Level(*pictures, inside & part, soft & part, core & part, control)
         middle.roughness = level.roughness
         choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
@@ -150,13 +134,9 @@ def fit(
 
 
 def choose(
-    level: Level,
-    coefficients: FloatArray,
-    weights: Weights,
-    name: str = "bending",
-    powers: tuple[int, int] = _POWERS,
-    margin: float | None = None,
-) -> Choice:
+    level: Level, coefficients: FloatArray, weights: Weights, name: str = "bending",
+    powers: tuple[int, int] = _POWERS, margin: float | None = None,
+) -> Choice:  # fmt: skip
     """One of the weights by two-fold cross-validation, around the value that it has.
 
     One half of the voxels (a chessboard of small cubes) is fitted, the other half's residual is what counts: noise that
@@ -203,14 +183,6 @@ def _volume_asked(level: Level, coefficients: FloatArray, weights: Weights) -> f
     held = _LOOKING_MM4 * level.sharpness(coefficients)
     looking = replace(weights, bending=USUAL_BENDING, volume=0.0, volume_gradient=held)
     return level.swelling(level.descend(coefficients, looking, steps=1, stop_mm=0.0), 99.0)
-
-
-def _middle(mask: Mask) -> BoolArray:
-    """The middle of a mask's box, a third of its volume: enough to choose a weight, in a third of the time."""
-    part, box = np.zeros_like(mask.inside), mask.box()
-    margins = [int(0.5 * (1.0 - _MIDDLE) * (edge.stop - edge.start)) for edge in box]
-    part[tuple(slice(e.start + m, e.stop - m) for e, m in zip(box, margins, strict=True))] = True
-    return part
 
 
 def _level(

@@ -49,15 +49,9 @@ class ImagePair:
     """
 
     def __init__(
-        self,
-        fixed: Image,
-        moving: Image,
-        inside: BoolArray,
-        control: Grid,
-        block: IntArray,
-        rim_mm: float = 0.0,
+        self, fixed: Image, moving: Image, inside: BoolArray, control: Grid, block: IntArray, rim_mm: float = 0.0,
         factors: FloatArray | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.grid, self.block = fixed.grid, block
         missing = fixed.missing
         self.inside = inside & ~binary_dilation(missing) if missing.any() else inside
@@ -68,16 +62,15 @@ class ImagePair:
         ends = moving.grid.indices_of(self.grid.origin_mm + self.grid.direction.T)
         self._scene: _Scene = (splines, _gaps(moving, rim_mm), np.ascontiguousarray((ends - start).T), start)
         self._step = np.array(self.grid.spacing_mm)
-        at = control.indices_of(self.grid.origin_mm)
-        per_voxel = self.grid.spacing_mm / control.spacing_mm
-        count = -(-np.array(self.grid.shape) // block)
-        along = [a + s * np.arange(n) for a, s, n in zip(at, per_voxel, self.grid.shape, strict=True)]
+        axes = list(zip(control.indices_of(self.grid.origin_mm), self._step / control.spacing_mm, block, strict=True))
+        along = [a + s * np.arange(n) for (a, s, _), n in zip(axes, self.grid.shape, strict=True)]
         self.sums = SplineSums(control, along, self.inside, factors)
         self._first: tuple[slice, ...] | None = None
         compared = self.share(inside) > 0  # a block is, if any voxel of it is: before `_first` is set
         if factors is None:
-            middles = [s * ((np.arange(n) + 0.5) * b - 0.5) for s, n, b in zip(per_voxel, count, block, strict=True)]
-            self.blocks = SplineSums(control, [a + m for a, m in zip(at, middles, strict=True)], compared)
+            counts = zip(axes, compared.shape, strict=True)
+            middles = [a + s * ((np.arange(n) + 0.5) * b - 0.5) for (a, s, b), n in counts]
+            self.blocks = SplineSums(control, middles, compared)
         else:
             self._first = tuple(slice(None, None, int(b)) for b in block)
             firsts = [a[f] for a, f in zip(along, self._first, strict=True)]
@@ -88,9 +81,8 @@ class ImagePair:
         """Volume of each block that lies in ``where``, mm3; with factors, all of it where its first voxel does."""
         if self._first is not None:
             return np.asarray(where[self._first] * float(np.prod(self.block)) * self.grid.voxel_volume_mm3)
-        whole = [-(-n // b) * b for n, b in zip(where.shape, self.block, strict=True)]
-        padded = np.pad(where, [(0, w - n) for w, n in zip(whole, where.shape, strict=True)])
-        (a, b, c), (i, j, k) = self.block, (w // b for w, b in zip(whole, self.block, strict=True))
+        padded = np.pad(where, [(0, -n % b) for n, b in zip(where.shape, self.block, strict=True)])
+        (a, b, c), (i, j, k) = self.block, padded.shape // self.block
         counted = padded.reshape(i, a, j, b, k, c).sum(axis=(1, 3, 5))
         return np.asarray(counted * self.grid.voxel_volume_mm3)
 
@@ -122,13 +114,10 @@ class ImagePair:
 
 def _gaps(image: Image, rim_mm: float) -> BoolArray:
     """Voxels that cannot be used: missing ones, their neighbours, and a rim around them and along the image's ends."""
-    rim = np.rint(rim_mm / image.grid.spacing_mm).astype(int)
-    used = np.zeros(image.grid.shape, dtype=bool)
-    used[tuple(slice(n, size - n) for n, size in zip(rim, used.shape, strict=True))] = True
-    missing = image.missing
-    if missing.any():
-        used &= ~binary_dilation(missing, iterations=max(2, int(rim.max())))
-    return ~used
+    rim, missing = np.rint(rim_mm / image.grid.spacing_mm).astype(int), image.missing
+    gaps = np.ones(image.grid.shape, dtype=bool)
+    gaps[tuple(slice(n, size - n) for n, size in zip(rim, gaps.shape, strict=True))] = False
+    return gaps | binary_dilation(missing, iterations=max(2, int(rim.max()))) if missing.any() else gaps
 
 
 @njit(cache=True)

@@ -76,31 +76,23 @@ class Level:
     """
 
     def __init__(
-        self,
-        fixed: Image,
-        moving: Image,
-        inside: BoolArray,
-        soft: BoolArray,
-        stiff: BoolArray,
-        control: Grid,
-        rim_mm: float = 0.0,
-        splines: Splines = _ONE_SPLINE,
-    ) -> None:
+        self, fixed: Image, moving: Image, inside: BoolArray, soft: BoolArray, stiff: BoolArray, control: Grid,
+        rim_mm: float = 0.0, splines: Splines = _ONE_SPLINE,
+    ) -> None:  # fmt: skip
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
         self.control = control
         self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm, splines.factors)
         self.roughness = Roughness(control, splines.rough, splines.laplacians)
         self._tissue = _share_at(control, soft | stiff, fixed.grid)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
-        self._resists = self._stiff > 0
-        # between neighbouring blocks of soft tissue: the volume that their difference stands for, over its length^2
-        lengths = enumerate(block * fixed.grid.spacing_mm)
-        self._between = [np.minimum(*_neighbours(self._soft, axis)) / length**2 for axis, length in lengths]
+        self._resists, self._whole_soft = self._stiff > 0, self._soft > 0.99 * self._soft.max()
+        self._between = []  # neighbours in soft tissue: the volume that their difference stands for, over its length^2
         self._alone = np.zeros_like(self._soft)  # what a change of volume in one block alone costs by its gradient
-        for axis, between in enumerate(self._between):
+        for axis, length in enumerate(block * fixed.grid.spacing_mm):
+            self._between.append(np.minimum(*_neighbours(self._soft, axis)) / length**2)
             before, after = _neighbours(self._alone, axis)
-            before += between
-            after += between
+            before += self._between[-1]
+            after += self._between[-1]
 
     def following(self, coefficients: FloatArray) -> Roughness:
         """`roughness`, with less weight where this displacement of the tissue is curved."""
@@ -149,10 +141,10 @@ class Level:
             for entry in (6 * spline, 6 * spline + 3, 6 * spline + 5):
                 diagonal[entry] += weights.bending * rough
                 diagonal[entry] += _SMALLEST * diagonal[entry].max()
-        blocks, roughness = self.pair.blocks, self.roughness
+        blocks = self.pair.blocks
 
         def product(c: FloatArray) -> FloatArray:
-            out = blocks.product(c, stiffness) + weights.bending * roughness.product(c)
+            out = blocks.product(c, stiffness) + weights.bending * self.roughness.product(c)
             if weights.volume_gradient:
                 swelling = np.einsum("...ab,...ab->...", state.cofactor, blocks.evaluate(c)[1])
                 pressure = weights.volume_gradient * self._unevenness(swelling)
@@ -171,8 +163,7 @@ class Level:
         """
         state = self.at(coefficients, halves)
         for _ in range(steps):
-            variance = max(state.variance, _LEAST_RESIDUAL**2)
-            count = state.images.count
+            variance, count = max(state.variance, _LEAST_RESIDUAL**2), state.images.count
 
             def energy(at: State, variance: float = variance, count: int = count) -> float:
                 # with the mean over voxels, so that tissue that leaves the picture does not lower it
@@ -197,8 +188,7 @@ class Level:
 
     def swelling(self, coefficients: FloatArray, percentile: float) -> float:
         """A percentile of |J - 1| over the blocks that are soft tissue alone."""
-        change = np.abs(self.at(coefficients).J - 1.0)[self._whole_soft]
-        return float(np.percentile(change, percentile))
+        return float(np.percentile(np.abs(self.at(coefficients).J - 1.0)[self._whole_soft], percentile))
 
     def sharpness(self, coefficients: FloatArray) -> float:
         """How sharply the images see a displacement: median over soft tissue of g^2 / s^2 along an axis, 1/mm5."""
@@ -206,17 +196,12 @@ class Level:
         seen = state.images.matrix[self._whole_soft][:, [0, 3, 5]].mean(axis=1)
         return float(np.median(seen)) / max(state.variance, _LEAST_RESIDUAL**2) / float(self._soft.max())
 
-    @property
-    def _whole_soft(self) -> BoolArray:
-        return np.asarray(self._soft > 0.99 * self._soft.max())
-
     def _unevenness(self, J: FloatArray) -> FloatArray:
         """Derivative by J of half the integral of |grad J|^2 over soft tissue, by differences, mm."""
         out = np.zeros_like(J)
         for axis, between in enumerate(self._between):
-            low, high = _neighbours(J, axis)
+            (low, high), (before, after) = _neighbours(J, axis), _neighbours(out, axis)
             flow = between * (high - low)
-            before, after = _neighbours(out, axis)
             before -= flow
             after += flow
         return out
@@ -246,8 +231,7 @@ def _neighbours(field: FloatArray, axis: int) -> tuple[FloatArray, FloatArray]:
 
 def cofactors(F: FloatArray) -> FloatArray:
     """Cofactors of matrices (..., 3, 3): cof F = det F F^-T, the derivative of det F."""
-    rows = (np.cross(F[..., 1, :], F[..., 2, :]), np.cross(F[..., 2, :], F[..., 0, :]))
-    return np.stack([*rows, np.cross(F[..., 0, :], F[..., 1, :])], axis=-2)
+    return np.stack([np.cross(F[..., a, :], F[..., b, :]) for a, b in ((1, 2), (2, 0), (0, 1))], axis=-2)
 
 
 def conjugate_gradients(

@@ -49,7 +49,11 @@ class Roughness:
         self._here = np.full(control.shape, scale) if here is None else scale * here
         self._laplacian = [_second_differences(n, h) for n, h in zip(control.shape, control.spacing_mm, strict=True)]
         self._transposed = [np.stack([np.roll(high, 1), on, np.roll(low, -1)]) for low, on, high in self._laplacian]
-        self._diagonal = self._here * _square_of_one(control.spacing_mm, laplacians)
+        one = np.zeros((1, 7, 7, 7))
+        one[0, 3, 3, 3] = 1.0  # the Laplacian of one coefficient of 1 mm, far from any face
+        for _ in range(laplacians):
+            one = _summed(one, [_second_differences(7, h) for h in control.spacing_mm])
+        self._diagonal = self._here * float((one**2).sum())
 
     @property
     def diagonals(self) -> list[FloatArray]:
@@ -84,9 +88,8 @@ class Roughness:
         largest = float(np.abs(coefficients).max() * (2.0 / self._control.spacing_mm**2).sum()) ** 2
         if mean <= _STRAIGHT * largest:
             return type(self)(self._control, self._own, self._times)
-        sigma = _NEAR_MM / self._control.spacing_mm
-        share = gaussian_filter(tissue, sigma)
-        nearby = (gaussian_filter(tissue * curved, sigma) + _SMALLEST * mean) / (share + _SMALLEST)
+        share, weighed = (gaussian_filter(f, _NEAR_MM / self._control.spacing_mm) for f in (tissue, tissue * curved))
+        nearby = (weighed + _SMALLEST * mean) / (share + _SMALLEST)
         here = (nearby / mean + _LEAST) ** _POWER
         here /= np.exp((tissue * np.log(here)).sum() / all_of_it)
         return type(self)(self._control, self._own, self._times, here)
@@ -97,15 +100,6 @@ def _second_differences(count: int, spacing_mm: float) -> FloatArray:
     rows = np.repeat([[1.0], [-2.0], [1.0]], count, axis=1) / spacing_mm**2
     rows[:, [0, -1]] = 0.0
     return rows
-
-
-def _square_of_one(spacing_mm: FloatArray, laplacians: int) -> float:
-    """The sum of squares of the Laplacian of one coefficient of 1 mm, far from any face, mm2 over its length."""
-    one = np.zeros((1, 7, 7, 7))
-    one[0, 3, 3, 3] = 1.0
-    for _ in range(laplacians):
-        one = _summed(one, [_second_differences(7, h) for h in spacing_mm])
-    return float((one**2).sum())
 
 
 def _summed(coefficients: FloatArray, along: Sequence[FloatArray]) -> FloatArray:

@@ -65,23 +65,20 @@ class SplineSums:
 
         (6 splines, mi, mj, mk): xx, xy, xz, yy, yz, zz, spline by spline; cofactors are taken as those of no strain.
         """
-        splines = self.factors.shape[3]
-        if splines == 0:
-            image, _, volume, shear = stiffness
-            return self._diagonal(image, volume, shear)
-        return np.concatenate([self._diagonal(*self._of_one(stiffness, n)) for n in range(splines)])
-
-    def _of_one(self, stiffness: Stiffness, spline: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Matrices and weights as one spline sees them through its factor, products of B and grad B left out."""
         image, _, volume, shear = stiffness
-        a, slope = self.factors[..., spline, 0], self.factors[..., spline, 1:]
-        seen = image * (a * a)[..., None]
-        if slope.any():
-            square = np.einsum("...a,...a->...", slope, slope)
-            for entry, (m, n) in enumerate(_PAIRS):
-                alone = 0.5 * shear * square * (m == n)
-                seen[..., entry] += (volume + 0.5 * shear) * slope[..., m] * slope[..., n] + alone
-        return seen, volume * a * a, shear * a * a
+        if not self.factors.shape[3]:
+            return self._diagonal(image, volume, shear)
+        diagonals = []
+        for factor in np.moveaxis(self.factors, 3, 0):  # each spline seen through it, products of B and grad B left out
+            a, slope = factor[..., 0], factor[..., 1:]
+            seen = image * (a * a)[..., None]
+            if slope.any():
+                square = np.einsum("...a,...a->...", slope, slope)
+                for entry, (m, n) in enumerate(_PAIRS):
+                    alone = 0.5 * shear * square * (m == n)
+                    seen[..., entry] += (volume + 0.5 * shear) * slope[..., m] * slope[..., n] + alone
+            diagonals.append(self._diagonal(seen, volume * a * a, shear * a * a))
+        return np.concatenate(diagonals)
 
     def _diagonal(self, image: FloatArray, volume: FloatArray, shear: FloatArray) -> FloatArray:
         # of each axis, the matrices that sum B B, B' B and B' B'

@@ -119,6 +119,14 @@ def test_without_bone_nothing_is_held(borders):
     assert not found[:, 0, 1:].any()
 
 
+def test_displacement_alone_is_the_same_and_takes_no_gradient(spline, monkeypatch):
+    points = GRID.points().reshape(-1, 3)
+    u = spline.evaluate(points)[0]
+    monkeypatch.delattr(InterfaceSpline, "evaluate")
+    monkeypatch.delattr(BSpline, "evaluate")
+    assert spline.displacement(points).tobytes() == u.tobytes()
+
+
 def test_its_gradient_is_that_of_its_displacement(spline):
     points = inner_points(3000)
     z = height(points)
