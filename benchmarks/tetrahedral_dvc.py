@@ -32,7 +32,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from benchmarks.nodal import at_corners, located
 from dvc import AlignedPair, Deformation, Settings, StrainField, TetMesh, read_image, read_labels, register
-from dvc.registration.gauss_newton.fit import scaled
+from dvc.registration.gauss_newton.fit import brightness_scaled
 from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
 from fe import NeoHooke, material_set, read_tet_mesh
 from mrstrain.records.provenance import versions
@@ -84,15 +84,13 @@ class Correlation:
     """Images as the engine was given them, the mesh, and the elastic body."""
 
     def __init__(self, mesh: TetMesh, pair: AlignedPair, stiffness_mpa: dict[str, float]) -> None:
-        fixed, moving, inside, body = pair.fixed, pair.moving, pair.compared, pair.body
-        scale = float(np.nanpercentile(fixed.values[body.inside], 75))
-        fixed, self.moving = scaled(fixed, scale), scaled(moving, scale)
+        fixed, self.moving = brightness_scaled(pair)
         self.filtered = spline_filter(np.nan_to_num(self.moving.values), order=3, mode="mirror")
         self.mesh, self.nodes, self.grid = mesh, len(mesh.points_mm), fixed.grid
-        points = fixed.grid.points(inside.inside)
+        points = fixed.grid.points(pair.compared.inside)
         cell, weights = located(mesh, points)
         kept = cell >= 0
-        self.voxels = tuple(np.argwhere(inside.inside)[kept].T)
+        self.voxels = tuple(np.argwhere(pair.compared.inside)[kept].T)
         self.points, self.cell, self.weights = points[kept], cell[kept], weights[kept]
         values = fixed.values.astype(np.float64)
         slope = np.stack(np.gradient(values, *fixed.grid.spacing_mm), axis=-1)

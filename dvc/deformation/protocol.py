@@ -6,7 +6,7 @@ gradient H = du/dX (H[i, j] = du_i/dX_j, no unit), both in LPS, and NaN where it
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, Self, runtime_checkable
+from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinates, spline_filter
@@ -94,13 +94,14 @@ class Affine:
 
     matrix: FloatArray
     translation_mm: FloatArray
+    _KIND: ClassVar[str] = "An affine map"
 
     def __post_init__(self) -> None:
         matrix, translation = frozen(self.matrix, np.float64), frozen(self.translation_mm, np.float64)
         if matrix.shape != (3, 3) or translation.shape != (3,):
-            raise InputError("An affine map needs a 3 x 3 matrix and three translations in mm.")
+            raise InputError(f"{self._KIND} needs a 3 x 3 matrix and three translations in mm.")
         if not (np.isfinite(matrix).all() and np.isfinite(translation).all()):
-            raise InputError("An affine map needs finite numbers.")
+            raise InputError(f"{self._KIND} needs finite numbers; got {matrix.tolist()} and {translation.tolist()}.")
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "translation_mm", translation)
 
@@ -117,15 +118,15 @@ class Affine:
         u = self.displacement(points_mm)
         return u, np.tile(self.matrix - np.eye(3), (len(u), 1, 1))
 
-    def inverse(self) -> Self:
+    def inverse(self) -> "Affine":
         """The map back."""
         back = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
-        return type(self)(back, -back @ self.translation_mm)
+        return Affine(back, -back @ self.translation_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RigidMotion:
-    """x = rotation @ X + translation_mm, LPS mm; a proper rotation.
+class RigidMotion(Affine):
+    """x = rotation @ X + translation_mm, LPS mm: an affine map by a proper rotation.
 
     Raises
     ------
@@ -133,20 +134,18 @@ class RigidMotion:
         If the matrix is not orthonormal with determinant +1.
     """
 
-    rotation: FloatArray
-    translation_mm: FloatArray
+    _KIND: ClassVar[str] = "A rigid motion"
 
     def __post_init__(self) -> None:
-        rotation, translation = frozen(self.rotation, np.float64), frozen(self.translation_mm, np.float64)
-        if rotation.shape != (3, 3) or translation.shape != (3,):
-            raise InputError("A rigid motion needs a 3 x 3 rotation and three translations in mm.")
-        if not np.isfinite(translation).all():
-            raise InputError(f"A rigid motion needs finite translations; got {translation.tolist()}.")
-        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-        if not error < 1e-6 or np.linalg.det(rotation) < 0:
+        Affine.__post_init__(self)
+        error = np.abs(self.rotation.T @ self.rotation - np.eye(3)).max()
+        if not error < 1e-6 or np.linalg.det(self.rotation) < 0:
             raise InputError(f"Not a proper rotation (R^T R differs from I by {error:.2g}).")
-        object.__setattr__(self, "rotation", rotation)
-        object.__setattr__(self, "translation_mm", translation)
+
+    @property
+    def rotation(self) -> FloatArray:
+        """R, (3, 3), LPS."""
+        return self.matrix
 
     @classmethod
     def identity(cls) -> Self:
@@ -166,18 +165,9 @@ class RigidMotion:
         sine = 0.5 * np.sqrt(skew[2, 1] ** 2 + skew[0, 2] ** 2 + skew[1, 0] ** 2)
         return float(np.degrees(np.arctan2(sine, (np.trace(self.rotation) - 1.0) / 2.0)))
 
-    def apply(self, points_mm: FloatArray) -> FloatArray:
-        """Where the points (n, 3) mm go."""
-        return np.asarray(np.asarray(points_mm) @ self.rotation.T + self.translation_mm)
-
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm."""
         return self.apply(points_mm) - np.asarray(points_mm)
-
-    def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """u(X) (n, 3) mm and the constant H = R - I."""
-        u = self.displacement(points_mm)
-        return u, np.tile(self.rotation - np.eye(3), (len(u), 1, 1))
 
     def inverse(self) -> "RigidMotion":
         """The motion back."""

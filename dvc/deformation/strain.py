@@ -138,9 +138,7 @@ class StrainField:
         """
         A = np.asarray(axes, dtype=np.float64)
         if A.shape != (3, 3) or not np.abs(A.T @ A - np.eye(3)).max() < _ORTHONORMAL:
-            raise InputError(
-                f"Axes must be three perpendicular unit vectors, columns of a 3 x 3 matrix; got {A.tolist()}."
-            )
+            raise InputError(f"Axes are three perpendicular unit vectors, columns of a 3 x 3 matrix; got {A.tolist()}.")
         return np.asarray(A.T @ self.green_lagrange @ A)
 
 

@@ -111,26 +111,23 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
         raise InputError("The mask to align on is empty.")
     fit = RigidFit(reference, loaded, mask, seed)
     starts, highest = _search(reference, loaded, mask)
-    candidates: list[tuple[float, RigidMotion]] = []
+    score, best = -np.inf, RigidMotion.identity()
     for start in starts:
         try:
             motion = fit.whole(start)
         except RegistrationError:
             continue  # not the place
-        score = _similarity(reference, loaded, mask, motion)
-        if np.isfinite(score):
-            candidates.append((score, motion))
+        if (similarity := _similarity(reference, loaded, mask, motion)) > score:
+            score, best = similarity, motion
         if score >= _CERTAIN_SIMILARITY:
             break  # only the right place looks like this
-    before = _similarity(reference, loaded, mask, RigidMotion.identity())
-    score, motion = max(candidates, key=lambda c: c[0], default=(float("nan"), RigidMotion.identity()))
-    if not score >= _LOWEST_SIMILARITY:
+    if score < _LOWEST_SIMILARITY:
         raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
     points = mask.points()
     advice = f"the {on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly "
     advice += "inside the loaded one."
     try:
-        pairs = fit.halves(motion)
+        pairs = fit.halves(best)
     except RegistrationError as why:
         raise RegistrationError(f"A half of the {on} cannot be fitted by itself ({why}): {advice}") from why
     spread = max(apart_mm(one, other, points) for one, other in pairs)
@@ -141,7 +138,7 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
     centroid, halves = points.mean(axis=0)[None], [half for pair in pairs for half in pair]
     R = Rotation.from_matrix(np.stack([half.rotation for half in halves])).mean().as_matrix()
     motion = RigidMotion(R, np.mean([half.apply(centroid)[0] for half in halves], axis=0) - R @ centroid[0])
-    after = _similarity(reference, loaded, mask, motion)
+    before, after = (_similarity(reference, loaded, mask, m) for m in (RigidMotion.identity(), motion))
     return Alignment(motion, on, before, after, spread, motion.displacement(centroid)[0])
 
 

@@ -11,10 +11,7 @@ from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInt
 
 DEFAULT = GaussNewton.name
 """Name of the engine that is used unless another is asked for."""
-ENGINES: dict[str, type[Engine]] = {
-    GaussNewton.name: GaussNewton,
-    GaussNewtonWithInterfaces.name: GaussNewtonWithInterfaces,
-}
+ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (GaussNewton, GaussNewtonWithInterfaces)}
 """Engines that are known by one name. elastix is known by its presets and parameter files."""
 
 

@@ -238,9 +238,7 @@ def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:
 
 def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | None, settings: Settings) -> None:
     if settings.align_on == "bone" and bone is None:
-        raise InputError(
-            "Aligning on the bone needs its mask on the unloaded image: give --bone, or --align image or none."
-        )
+        raise InputError("Alignment on bone needs a mask on the unloaded image: give --bone, or --align image or none.")
     if settings.engine.needs_labels and labels is None:
         raise InputError("Strain may jump at tissue interfaces only where a label map tells them: give --labels, too.")
     for name, given in (("tissue mask", body), ("bone mask", bone), ("label map", labels)):

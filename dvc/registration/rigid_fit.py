@@ -91,9 +91,7 @@ class RigidFit:
         RegistrationError if half of the voxels leave the loaded image, its contrast is inverted there, or the motion
         goes off by 15 mm.
         """
-        motion = start
-        for level in self._levels:
-            motion = self._settled(level, motion, np.ones(len(level.points), dtype=bool))
+        motion = self._settled(start, self._levels, [np.ones(len(level.points), bool) for level in self._levels])
         if (moved_mm := apart_mm(motion, start, self._levels[0].points)) > _FARTHEST_MM:
             raise RegistrationError(f"The fit went off by {moved_mm:.0f} mm.")
         return motion
@@ -105,14 +103,14 @@ class RigidFit:
         the images tell nothing the pair stays apart, or noise leads the halves to places that agree by chance alone.
         RegistrationError as in `whole`, of a half's voxels.
         """
-        changes = self._levels[-1].changes
+        changes, fine = self._levels[-1].changes, self._levels[_FINE_FROM:]
         _, ways = np.linalg.eigh(np.einsum("ni,nj->ij", changes, changes))
         pairs = []
         for way in _ASIDE_MM * ways.T:
             corner = self._random.uniform(0.0, 2.0 * self._block_mm, 3)
-            halves = [self._divided(level.points, corner) for level in self._levels[_FINE_FROM:]]
-            one = self._part(near.after(self._step(way)), halves)
-            pairs.append((one, self._part(near.after(self._step(-way)), [~half for half in halves])))
+            halves = [self._divided(level.points, corner) for level in fine]
+            one = self._settled(near.after(self._step(way)), fine, halves)
+            pairs.append((one, self._settled(near.after(self._step(-way)), fine, [~half for half in halves])))
         return pairs
 
     def _divided(self, points: FloatArray, corner: FloatArray) -> BoolArray:
@@ -121,11 +119,6 @@ class RigidFit:
         if not _LEAST_SHARE <= half.mean() <= 1.0 - _LEAST_SHARE:
             half = self._random.permuted(np.arange(len(half)) % 2 == 0)
         return np.asarray(half)
-
-    def _part(self, motion: RigidMotion, parts: list[BoolArray]) -> RigidMotion:
-        for level, part in zip(self._levels[_FINE_FROM:], parts, strict=True):
-            motion = self._settled(level, motion, part)
-        return motion
 
     def _level(self, reference: Image, mask: Mask, blur_mm: float, scene: Image) -> _Level:
         box = mask.box(int(np.ceil(3.0 * blur_mm / mask.grid.spacing_mm.min())) + 2)
@@ -146,15 +139,16 @@ class RigidFit:
         around, changes = convolve(fixed, _NEIGHBOURS, mode="nearest")[here], np.hstack([gradient, turning])
         return _Level(blur_mm, points, fixed[here], around, places, changes, scene, 1 if blur_mm else 3)
 
-    def _settled(self, level: _Level, motion: RigidMotion, part: BoolArray) -> RigidMotion:
-        """Where steps over some of a level's points come to rest."""
-        small = max(_SMALL_MM, _SMALL_SHARE * level.blur_mm)
-        for _ in range(_STEPS):
-            step = self._next(level, motion, part)
-            length = float(np.linalg.norm(step))
-            motion = motion.after(self._step(step * min(1.0, _LONGEST_MM / max(length, 1e-12))))
-            if length < small:
-                break
+    def _settled(self, motion: RigidMotion, levels: list[_Level], parts: list[BoolArray]) -> RigidMotion:
+        """Where steps over some of each level's points, one level after the other, come to rest."""
+        for level, part in zip(levels, parts, strict=True):
+            small = max(_SMALL_MM, _SMALL_SHARE * level.blur_mm)
+            for _ in range(_STEPS):
+                step = self._next(level, motion, part)
+                length = float(np.linalg.norm(step))
+                motion = motion.after(self._step(step * min(1.0, _LONGEST_MM / max(length, 1e-12))))
+                if length < small:
+                    break
         return motion
 
     def _next(self, level: _Level, motion: RigidMotion, part: BoolArray) -> FloatArray:

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from dvc.registration.engine import Regularisation
 from dvc.registration.gauss_newton.level import Weights
 
+_RIGID = {False: "bone", True: "skin"}  # whose strain the weight "rigidity" is of, by `at_interfaces`
 _ASKED = 0.04  # the change of volume that a hundredth of the soft tissue exceeds: between loads and swelling
 
 
@@ -22,14 +23,9 @@ class Choice(Regularisation):
     rule: str
     tried: tuple[tuple[float, float], ...] = ()
     tried_in_skin: tuple[tuple[float, float], ...] = ()
-    at_interfaces: bool = False  # if so the weight "rigidity" is that of the skin's strain
+    at_interfaces: bool = False
     asked: float | None = None
     in_bone: tuple[float, float] | None = None
-
-    @property
-    def rigidity_of(self) -> str:
-        """Whose strain the weight "rigidity" is of."""
-        return "skin" if self.at_interfaces else "bone"
 
     @property
     def frees_volume(self) -> bool:
@@ -59,7 +55,7 @@ class Choice(Regularisation):
 
     def rows(self) -> list[tuple[str, float, str, str | float]]:
         """Each weight: what it penalises, its value, its unit, and "used" or what it left out, % above the least."""
-        stiff = f"strain of {self.rigidity_of}"
+        stiff = f"strain of {_RIGID[self.at_interfaces]}"
         return [
             ("bending", self.weights.bending, "1/mm", "used"),
             ("change of volume in soft tissue", self.weights.volume, "1/mm3", "used"),
@@ -75,7 +71,7 @@ class Choice(Regularisation):
         skin = [{"rigidity": weight, "left_out_over_best": round(left, 6)} for weight, left in self.tried_in_skin]
         return {
             "weights": asdict(self.weights),
-            "rigidity_of": self.rigidity_of,
+            "rigidity_of": _RIGID[self.at_interfaces],
             "rule": self.rule,
             "tried": [{"bending": weight, "left_out_over_best": round(left, 6)} for weight, left in self.tried],
             "change_of_volume": {"rule": self.volume_told, "asked": asked, "allowed_above": above},

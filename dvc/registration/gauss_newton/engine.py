@@ -81,9 +81,8 @@ class GaussNewton(Parameters, Engine):
             return ""
         bending, volume = own.get("bending"), own.get("volume")
         weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
-        kept = "300/mm3, or of its gradient alone where the images ask for such a change"
-        if volume is not None:
-            kept = f"{volume:g}/mm3"
+        by_rule = "300/mm3, or of its gradient alone where the images ask for such a change"
+        kept = by_rule if volume is None else f"{volume:g}/mm3"
         held = f" and on change of volume in the tissue ({kept})"
         if record.get("align") == "bone":
             rigid = f"strain of the bone ({own.get('rigidity'):g}/mm3)"
@@ -180,9 +179,7 @@ class GaussNewtonWithInterfaces(Engine):
     def unlike_study(self, pair: AlignedPair, choice: Choice) -> str:
         """Why its error model does not hold for a pair; empty where it does."""
         if pair.bone is None:
-            return (
-                f"The error of {self.name} was measured with the bone held at rest; here nothing was aligned on a bone."
-            )
+            return f"The error of {self.name} was measured with the bone held at rest; here no bone was aligned on."
         if choice.frees_volume or pair.labels is None:
             return _volume_freed(self.name, choice)
         share = float(np.mean(pair.labels.labels[pair.body.inside] == 0))

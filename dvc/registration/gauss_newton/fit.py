@@ -26,7 +26,7 @@ from dvc.images.resample import smoothed, thinned
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.level import Level, Weights
-from dvc.registration.gauss_newton.roughness import NUMBERS
+from dvc.registration.gauss_newton.roughness import NUMBERS, Roughness
 
 # Of each level: smoothing of both images (mm), control spacing over the finest, most steps, the step that ends it (mm).
 LEVELS = ((3.2, 4.0, 8, 0.1), (1.6, 2.5, 8, 0.03), (0.8, 1.75, 5, 0.02), (0.0, 1.0, 3, 0.005))
@@ -85,11 +85,9 @@ class Parameters:
 
 
 def fit(
-    pair: AlignedPair,
-    parameters: Parameters,
-    start: Deformation | None = None,
+    pair: AlignedPair, parameters: Parameters, start: Deformation | None = None,
     progress: Callable[[float], None] = lambda _: None,
-) -> tuple[BSpline, Choice]:
+) -> tuple[BSpline, Choice]:  # fmt: skip
     """Find the displacement, LPS mm, that carries the fixed image to the moving one.
 
     Where the first guess `start` (u in mm LPS) is not defined its nearest value is taken; `progress` gets the share
@@ -112,7 +110,8 @@ def fit(
         level = _level(pictures, inside, soft, core, control, sigma_mm)
         coefficients = level.descend(coefficients, weights, steps=steps * weights.patience, stop_mm=stop_mm)
         if parameters.volume is None and number == len(LEVELS) - 2:
-            choice = replace(choice, asked=_volume_asked(level, coefficients, weights))
+            usual = replace(weights, bending=USUAL_BENDING)
+            choice = replace(choice, asked=level.volume_asked(coefficients, usual, _LOOKING_MM4))
             if choice.frees_volume:
                 weights = replace(weights, volume=0.0, volume_gradient=_FREED)
         guess = BSpline(control, turned(axes, coefficients))
@@ -123,8 +122,7 @@ def fit(
         part, box = np.zeros_like(inside), pair.compared.box()  # the middle third: enough, in a third of the time
         margins = [int(0.5 * (1.0 - _MIDDLE) * (edge.stop - edge.start)) for edge in box]
         part[tuple(slice(e.start + m, e.stop - m) for e, m in zip(box, margins, strict=True))] = True
-        middle = Level(*pictures, inside & part, soft & part, core & part, control)
-        middle.roughness = level.roughness
+        middle = Level(pictures, inside & part, soft & part, core & part, level.roughness)
         choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
         progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
     steps = _LAST_STEPS * choice.weights.patience
@@ -174,26 +172,13 @@ def choose(
     return Choice(chosen, rule, tuple((float(usual * _RATIO**p), found[p] / found[best]) for p in sorted(found)))
 
 
-def _volume_asked(level: Level, coefficients: FloatArray, weights: Weights) -> float:
-    """The change of volume |J - 1| that a hundredth of the soft tissue exceeds once only its gradient is held.
-
-    One step from the result that keeps volume. Held so, a change over 2 cm or more costs little, and noise, or detail
-    that the spline cannot follow without a change of volume, moves it by a hundredth.
-    """
-    held = _LOOKING_MM4 * level.sharpness(coefficients)
-    looking = replace(weights, bending=USUAL_BENDING, volume=0.0, volume_gradient=held)
-    return level.swelling(level.descend(coefficients, looking, steps=1, stop_mm=0.0), 99.0)
-
-
 def _level(
     pictures: tuple[Image, Image], inside: BoolArray, soft: BoolArray, bone: BoolArray, control: Grid, sigma_mm: float
 ) -> Level:
     """Images smoothed, and every so manyth voxel of them: a smooth image needs no more."""
-    if sigma_mm == 0.0:
-        return Level(*pictures, inside, soft, bone, control)
     fixed, moving = (thinned(smoothed(i, sigma_mm), _every(i.grid, sigma_mm)) for i in pictures)
-    every = _every(pictures[0].grid, sigma_mm)
-    return Level(fixed, moving, inside[every], soft[every], bone[every], control, _BLURRED * sigma_mm)
+    every, rim_mm = _every(pictures[0].grid, sigma_mm), _BLURRED * sigma_mm
+    return Level((fixed, moving), inside[every], soft[every], bone[every], Roughness(control), rim_mm)
 
 
 def brightness_scaled(pair: AlignedPair) -> tuple[Image, Image]:
@@ -201,12 +186,8 @@ def brightness_scaled(pair: AlignedPair) -> tuple[Image, Image]:
     scale = float(np.nanpercentile(pair.fixed.values[pair.body.inside], 75))
     if not scale > 0:
         raise InputError("The unloaded image is zero or negative in most of the tissue; it needs positive intensities.")
-    return scaled(pair.fixed, scale), scaled(pair.moving, scale)
-
-
-def scaled(image: Image, scale: float) -> Image:
-    """The image over a brightness."""
-    return Image(image.grid, image.values / np.float32(scale))
+    fixed, moving = (Image(image.grid, image.values / np.float32(scale)) for image in (pair.fixed, pair.moving))
+    return fixed, moving
 
 
 def _every(grid: Grid, sigma_mm: float) -> tuple[slice, ...]:

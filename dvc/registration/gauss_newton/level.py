@@ -1,7 +1,7 @@
 """One level of a Gauss-Newton registration: its energy, and steps that lower it."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -10,7 +10,7 @@ from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image
 from dvc.registration.gauss_newton.image_term import ImagePair, Normal
-from dvc.registration.gauss_newton.roughness import REST, Roughness
+from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.spline_sums import Stiffness
 
 _BLOCKS = 2.5  # blocks between two control points, about
@@ -56,39 +56,27 @@ class State:
         return self.images.square / self.images.count
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Splines:
-    """The splines that a displacement is the sum of, and how each of them is smoothed: one alone by default."""
-
-    factors: FloatArray | None = None  # at the voxels, as in `SplineSums`
-    rough: Sequence[tuple[float, float]] = ((1.0, REST),)  # weights of each spline, as in `Roughness`
-    laplacians: int = 1  # as in `Roughness`
-
-
-_ONE_SPLINE = Splines()
-
-
 class Level:
-    """Two images at one resolution, the control points, and the tissue that the prior is about.
+    """Two images at one resolution, the roughness on the control points, and the tissue that the prior is about.
 
     `soft` voxels of the fixed image keep their volume, `stiff` ones (bone, or the skin) resist strain. Other parameters
     as in `ImagePair`.
     """
 
     def __init__(
-        self, fixed: Image, moving: Image, inside: BoolArray, soft: BoolArray, stiff: BoolArray, control: Grid,
-        rim_mm: float = 0.0, splines: Splines = _ONE_SPLINE,
+        self, images: tuple[Image, Image], inside: BoolArray, soft: BoolArray, stiff: BoolArray, roughness: Roughness,
+        rim_mm: float = 0.0, factors: FloatArray | None = None,
     ) -> None:  # fmt: skip
-        block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / fixed.grid.spacing_mm), 1).astype(np.int64)
-        self.control = control
-        self.pair = ImagePair(fixed, moving, inside, control, block, rim_mm, splines.factors)
-        self.roughness = Roughness(control, splines.rough, splines.laplacians)
-        self._tissue = _share_at(control, soft | stiff, fixed.grid)
+        grid, control = images[0].grid, roughness.control
+        block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / grid.spacing_mm), 1).astype(np.int64)
+        self.control, self.roughness = control, roughness
+        self.pair = ImagePair(*images, inside, control, block, rim_mm, factors)
+        self._tissue = _share_at(control, soft | stiff, grid)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
-        self._resists, self._whole_soft = self._stiff > 0, self._soft > 0.99 * self._soft.max()
+        self._resists = self._stiff > 0
         self._between = []  # neighbours in soft tissue: the volume that their difference stands for, over its length^2
         self._alone = np.zeros_like(self._soft)  # what a change of volume in one block alone costs by its gradient
-        for axis, length in enumerate(block * fixed.grid.spacing_mm):
+        for axis, length in enumerate(block * grid.spacing_mm):
             self._between.append(np.minimum(*_neighbours(self._soft, axis)) / length**2)
             before, after = _neighbours(self._alone, axis)
             before += self._between[-1]
@@ -173,7 +161,9 @@ class Level:
             step = self.step(state, weights, variance, _SOLVER if halves < 0 else _SOLVER_OF_HALF)
             if not np.isfinite(step).all():
                 raise RegistrationError("The registration diverged: a step is not finite.")
-            step *= min(1.0, _LONGEST / max(self._longest(step), _SMALLEST))
+            moved = self.pair.blocks.evaluate(step)[0][(self._soft > 0) | self._resists]  # air may go where it likes
+            longest = float((np.abs(moved) / self.control.spacing_mm).max(initial=0.0))
+            step *= min(1.0, _LONGEST / max(longest, _SMALLEST))
             for _ in range(_HALVINGS):
                 trial = self.at(state.coefficients + step, halves)
                 if energy(trial) <= before + _SLACK * abs(before):
@@ -182,19 +172,25 @@ class Level:
             else:
                 break
             state = trial
-            if self._moved_mm(step) < stop_mm:
+            moved = self.pair.blocks.evaluate(step)[0]
+            square = np.einsum("...a,...a->...", moved, moved)
+            if np.sqrt(_dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)) < stop_mm:
                 break
         return state.coefficients
 
-    def swelling(self, coefficients: FloatArray, percentile: float) -> float:
-        """A percentile of |J - 1| over the blocks that are soft tissue alone."""
-        return float(np.percentile(np.abs(self.at(coefficients).J - 1.0)[self._whole_soft], percentile))
+    def volume_asked(self, coefficients: FloatArray, weights: Weights, held_mm4: float) -> float:
+        """The change of volume |J - 1| that a hundredth of the soft tissue exceeds once only its gradient is held.
 
-    def sharpness(self, coefficients: FloatArray) -> float:
-        """How sharply the images see a displacement: median over soft tissue of g^2 / s^2 along an axis, 1/mm5."""
-        state = self.at(coefficients)
-        seen = state.images.matrix[self._whole_soft][:, [0, 3, 5]].mean(axis=1)
-        return float(np.median(seen)) / max(state.variance, _LEAST_RESIDUAL**2) / float(self._soft.max())
+        One step from the result that keeps volume. The gradient's weight is `held_mm4` times how sharply the images see
+        a displacement, the median over soft tissue of g^2 / s^2 along an axis, 1/mm5. Held so, a change over 2 cm or
+        more costs little, and noise, or detail that the spline cannot follow without it, moves it by a hundredth.
+        """
+        state, soft = self.at(coefficients), self._soft > 0.99 * self._soft.max()
+        seen = float(np.median(state.images.matrix[soft][:, [0, 3, 5]].mean(axis=1)))
+        sharpness = seen / max(state.variance, _LEAST_RESIDUAL**2) / float(self._soft.max())
+        looking = replace(weights, volume=0.0, volume_gradient=held_mm4 * sharpness)
+        freed = self.at(self.descend(coefficients, looking, steps=1, stop_mm=0.0))
+        return float(np.percentile(np.abs(freed.J - 1.0)[soft], 99.0))
 
     def _unevenness(self, J: FloatArray) -> FloatArray:
         """Derivative by J of half the integral of |grad J|^2 over soft tissue, by differences, mm."""
@@ -205,16 +201,6 @@ class Level:
             before -= flow
             after += flow
         return out
-
-    def _longest(self, step: FloatArray) -> float:
-        """The furthest that a step moves tissue, over the control spacing; air may go where it likes."""
-        moved = self.pair.blocks.evaluate(step)[0][(self._soft > 0) | (self._stiff > 0)]
-        return float((np.abs(moved) / self.control.spacing_mm).max(initial=0.0))
-
-    def _moved_mm(self, step: FloatArray) -> float:
-        moved = self.pair.blocks.evaluate(step)[0]
-        square = np.einsum("...a,...a->...", moved, moved)
-        return float(np.sqrt(_dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)))
 
 
 def _share_at(control: Grid, mask: BoolArray, grid: Grid) -> FloatArray:

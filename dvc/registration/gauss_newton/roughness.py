@@ -39,9 +39,10 @@ class Roughness:
     """
 
     def __init__(
-        self, control: Grid, weights: Sequence[tuple[float, float]], laplacians: int = 1, here: FloatArray | None = None
-    ) -> None:
-        self._control, self._own, self._times = control, weights, laplacians
+        self, control: Grid, weights: Sequence[tuple[float, float]] = ((1.0, REST),), laplacians: int = 1,
+        here: FloatArray | None = None,
+    ) -> None:  # fmt: skip
+        self.control, self._own, self._times = control, weights, laplacians
         cell_mm3 = float(np.prod(control.spacing_mm))
         self._weights = [(p, q * cell_mm3) for p, q in weights]
         length_mm = float(control.spacing_mm.mean()) / np.sqrt(2.0)
@@ -85,14 +86,14 @@ class Roughness:
         curved = sum(p * each for (p, _), each in zip(self._own, square, strict=True))
         all_of_it = float(tissue.sum())
         mean = float((tissue * curved).sum()) / max(all_of_it, _SMALLEST)
-        largest = float(np.abs(coefficients).max() * (2.0 / self._control.spacing_mm**2).sum()) ** 2
+        largest = float(np.abs(coefficients).max() * (2.0 / self.control.spacing_mm**2).sum()) ** 2
         if mean <= _STRAIGHT * largest:
-            return type(self)(self._control, self._own, self._times)
-        share, weighed = (gaussian_filter(f, _NEAR_MM / self._control.spacing_mm) for f in (tissue, tissue * curved))
+            return type(self)(self.control, self._own, self._times)
+        share, weighed = (gaussian_filter(f, _NEAR_MM / self.control.spacing_mm) for f in (tissue, tissue * curved))
         nearby = (weighed + _SMALLEST * mean) / (share + _SMALLEST)
         here = (nearby / mean + _LEAST) ** _POWER
         here /= np.exp((tissue * np.log(here)).sum() / all_of_it)
-        return type(self)(self._control, self._own, self._times, here)
+        return type(self)(self.control, self._own, self._times, here)
 
 
 def _second_differences(count: int, spacing_mm: float) -> FloatArray:

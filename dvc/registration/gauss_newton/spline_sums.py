@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit, prange
 from scipy.sparse import csr_array
 
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.bspline import Axis, Table, spline_table
 from dvc.images.image import Grid
 
@@ -81,11 +81,11 @@ class SplineSums:
         return np.concatenate(diagonals)
 
     def _diagonal(self, image: FloatArray, volume: FloatArray, shear: FloatArray) -> FloatArray:
-        # of each axis, the matrices that sum B B, B' B and B' B'
-        spread = [
-            [_spread(f, weights, n) for weights in (v * v, s * v, s * s)]
-            for (f, v, s), n in zip(self.table, self.control.shape, strict=True)
-        ]
+        spread = []  # of each axis, the matrices (control points, points) that sum B B, B' B and B' B'
+        for (first, v, s), count in zip(self.table, self.control.shape, strict=True):
+            at = (first[:, None] + np.arange(4)).ravel(), np.repeat(np.arange(first.size), 4)
+            products, shape = (v * v, s * v, s * s), (count, first.size)
+            spread.append([csr_array((weights.ravel(), at), shape=shape) for weights in products])
 
         def onto(field: FloatArray, slopes: Sequence[int]) -> FloatArray:
             for axis in range(3):
@@ -113,12 +113,6 @@ class SplineSums:
 
     def _half(self) -> FloatArray:
         return np.empty((self.inside.shape[0], 3 * max(self.factors.shape[3], 1), 2, *self.control.shape[1:]))
-
-
-def _spread(first: IntArray, weights: FloatArray, count: int) -> csr_array:
-    """Matrix (count, n) that puts values at n points onto control points, with four weights for each point."""
-    rows, columns = first[:, None] + np.arange(4), np.repeat(np.arange(first.size), 4)
-    return csr_array((weights.ravel(), (rows.ravel(), columns)), shape=(count, first.size))
 
 
 # The sweeps: planes, rows and lines of the grid, one axis of B-splines after the other.

@@ -27,8 +27,8 @@ from dvc.images.image import Grid, Mask
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.fit import LEVELS, Parameters, brightness_scaled, choose, fit, turned
-from dvc.registration.gauss_newton.level import Level, Splines, Weights
-from dvc.registration.gauss_newton.roughness import REST
+from dvc.registration.gauss_newton.level import Level
+from dvc.registration.gauss_newton.roughness import REST, Roughness
 
 _SKIN = "skin"
 USUAL_SKIN = 3.0
@@ -47,12 +47,9 @@ STAGE = {
 
 
 def fit_with_interfaces(
-    pair: AlignedPair,
-    parameters: Parameters,
-    skin: float | None = None,
-    start: Deformation | None = None,
+    pair: AlignedPair, parameters: Parameters, skin: float | None = None, start: Deformation | None = None,
     progress: Callable[[float], None] = lambda _: None,
-) -> tuple[InterfaceSpline, Choice]:
+) -> tuple[InterfaceSpline, Choice]:  # fmt: skip
     """Find the displacement, LPS mm, that carries the fixed image to the moving one, its gradient free at interfaces.
 
     The pair needs labels; a tissue named "skin" may resist strain, and the bone, if there is one, does not move. The
@@ -69,18 +66,20 @@ def fit_with_interfaces(
     coefficients = stage.whole.descend(coefficients, weights, steps=steps, stop_mm=stop_mm)
     stage.whole.roughness = stage.slab.roughness = stage.whole.following(coefficients)
     progress(_SMOOTH_SHARE + 0.1)
-    in_skin = stage.choose_skin(coefficients, weights, skin)
+    if skin is not None:
+        in_skin = Choice(weights, "rigidity fixed beforehand")
+    elif stage.slab_has_skin:
+        in_skin = choose(stage.slab, coefficients, weights, "rigidity", _SKIN_POWERS, _SKIN_MARGIN)
+    else:
+        in_skin = Choice(weights, "rigidity as usual, as too little of it is in the image")
     progress(_SMOOTH_SHARE + 0.3)
     choice = Choice(in_skin.weights, "bending fixed beforehand")
     if parameters.bending is None:
         choice = choose(stage.slab, coefficients, in_skin.weights)
+    rule = f"{choice.rule}; in skin {in_skin.rule}" if stage.has_skin else choice.rule
+    in_bone = None if pair.bone is None else _moved(smooth, pair.bone)
     choice = replace(
-        choice,
-        rule=f"{choice.rule}; in skin {in_skin.rule}" if stage.has_skin else choice.rule,
-        tried_in_skin=in_skin.tried,
-        at_interfaces=True,
-        asked=first.asked,
-        in_bone=None if pair.bone is None else _moved(smooth, pair.bone),
+        choice, rule=rule, tried_in_skin=in_skin.tried, at_interfaces=True, asked=first.asked, in_bone=in_bone
     )
     progress(_SMOOTH_SHARE + 0.5)
     coefficients = stage.whole.descend(coefficients, choice.weights, steps=steps, stop_mm=stop_mm)
@@ -102,22 +101,12 @@ class _Stage:
         skin = soft & np.isin(labels.labels, named)
         pictures = brightness_scaled(pair)
         rough = ((1.0, REST), (_BENDING * self.interfaces.reach_mm**2, _SQUARE))
-        splines = Splines(self.interfaces.at_voxels(), rough, _LAPLACIANS)
-
-        def level(part: BoolArray) -> Level:
-            return Level(*pictures, inside & part, soft & part, skin & part, control, splines=splines)
-
-        part = _slab(inside)
-        self.whole, self.slab = level(np.ones_like(soft)), level(part)
-        self.has_skin, self._slab_has_skin = bool(skin.any()), bool((skin & part).any())
-
-    def choose_skin(self, coefficients: FloatArray, weights: Weights, fixed: float | None) -> Choice:
-        """Choose the weight of strain in the skin, unless it is fixed or the slab has no skin."""
-        if fixed is not None:
-            return Choice(weights, "rigidity fixed beforehand")
-        if not self._slab_has_skin:
-            return Choice(weights, "rigidity as usual, as too little of it is in the image")
-        return choose(self.slab, coefficients, weights, "rigidity", _SKIN_POWERS, _SKIN_MARGIN)
+        roughness, factors = Roughness(control, rough, _LAPLACIANS), self.interfaces.at_voxels()
+        self.whole, self.slab = (
+            Level(pictures, inside & part, soft & part, skin & part, roughness, factors=factors)
+            for part in (np.ones_like(soft), _slab(inside))
+        )
+        self.has_skin, self.slab_has_skin = bool(skin.any()), bool((skin & _slab(inside)).any())
 
 
 def _moved(smooth: BSpline, bone: Mask) -> tuple[float, float] | None:

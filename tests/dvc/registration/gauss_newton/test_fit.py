@@ -24,6 +24,7 @@ from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.engine import GaussNewton
 from dvc.registration.gauss_newton.fit import USUAL_VOLUME, _level, choose, control_grid, fit, spline_through
 from dvc.registration.gauss_newton.level import Level, Weights
+from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
 from dvc.registration.register import Settings, register
 from tests.textures import GRID, TURNED, everything, pair_of, scanned, texture
@@ -183,7 +184,8 @@ def test_where_a_blurred_image_shows_its_padding_it_is_not_used():
 
     nothing = np.zeros_like(inside)
     used = residual(_level((fixed, moving), inside, inside, nothing, control, 1.6))
-    padded = residual(Level(smoothed(fixed, 1.6), smoothed(moving, 1.6), inside, inside, nothing, control))
+    blurred = smoothed(fixed, 1.6), smoothed(moving, 1.6)
+    padded = residual(Level(blurred, inside, inside, nothing, Roughness(control)))
     assert used < 1e-5
     assert padded > 20.0 * used
 

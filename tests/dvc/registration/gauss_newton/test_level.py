@@ -12,7 +12,8 @@ from dvc.errors import InputError
 from dvc.images.image import Grid, Image
 from dvc.registration.gauss_newton.fit import control_grid, spline_through
 from dvc.registration.gauss_newton.image_term import ImagePair
-from dvc.registration.gauss_newton.level import Level, Splines, Weights, _share_at, cofactors, conjugate_gradients
+from dvc.registration.gauss_newton.level import Level, Weights, _share_at, cofactors, conjugate_gradients
+from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.spline_sums import SplineSums
 from tests.textures import GRID, everything, pair_of
 
@@ -95,18 +96,11 @@ def test_cofactors_are_det_times_inverse_transpose():
 
 @pytest.fixture(scope="module")
 def level() -> Level:
-    fixed, moving = pair_of(Affine(np.eye(3), np.array([0.4, -0.3, 0.2])))
+    pair = pair_of(Affine(np.eye(3), np.array([0.4, -0.3, 0.2])))
     inside, bone = everything().inside, np.zeros(GRID.shape, dtype=bool)
     bone[10:20, 12:24, 10:22] = True
-    return Level(
-        fixed,
-        moving,
-        inside,
-        inside & ~bone,
-        bone,
-        control_grid(GRID, np.full(3, 5.0)),
-        splines=Splines(rough=((1.0, 0.0),)),
-    )
+    roughness = Roughness(control_grid(GRID, np.full(3, 5.0)), ((1.0, 0.0),))
+    return Level(pair, inside, inside & ~bone, bone, roughness)
 
 
 def rotated(level: Level) -> np.ndarray:
@@ -150,7 +144,8 @@ def test_the_images_force_is_the_derivative_of_their_residual(turn_deg):
     motion = Affine(turn, GRID.centre_mm - turn @ GRID.centre_mm + [0.4, -0.3, 0.2])
     inside = np.zeros(GRID.shape, dtype=bool)
     inside[10:-10, 10:-10, 10:-10] = True
-    level = Level(*pair_of(motion), inside, inside, np.zeros_like(inside), control_grid(GRID, np.full(3, 5.0)))
+    roughness = Roughness(control_grid(GRID, np.full(3, 5.0)))
+    level = Level(pair_of(motion), inside, inside, np.zeros_like(inside), roughness)
     true = spline_through(motion, level.control)
     for axis in range(3):
         bump = np.zeros_like(true)
