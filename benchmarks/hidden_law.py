@@ -34,7 +34,7 @@ from dvc import (
     write_labels,
 )
 from dvc.io.result_folder import spline_in
-from dvc.trust.random_field import GaussianField
+from dvc.trust.error_model import GaussianField
 from fe import read_tet_mesh, write_tet_mesh
 from mrstrain import mesh as make_mesh, run, simulate
 from mrstrain.models.loads import LOADS

@@ -243,7 +243,8 @@ def _bands(
     draws = TruthDraws(fields.points_mm[common], shear, tissues, fields.to_bone_mm[common], error, seed)
 
     def truths() -> Iterator[FloatArray]:
-        for truth in draws.many(DRAWS):
+        for _ in range(DRAWS):
+            truth = draws.drawn()
             if len(first) < location.LOCATION_DRAWS:
                 first.append(truth.astype(np.float32))
             yield truth

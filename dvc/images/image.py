@@ -1,10 +1,9 @@
 """Images on a grid in space: Grid, Image, Mask, LabelMap; LPS mm, indexed ``values[i, j, k]`` along the grid's axes."""
 
-from __future__ import annotations
-
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -88,15 +87,9 @@ class Grid:
         return float(np.prod(self.spacing_mm))
 
     @property
-    def size(self) -> int:
-        """Number of voxels."""
-        return int(np.prod(self.shape))
-
-    @property
     def centre_mm(self) -> FloatArray:
         """Centre of the grid, LPS mm."""
-        middle = (np.array(self.shape) - 1) / 2.0
-        return np.asarray(self.origin_mm + self.direction @ (self.spacing_mm * middle))
+        return np.asarray(self.origin_mm + self.direction @ (self.spacing_mm * (np.array(self.shape) - 1) / 2.0))
 
     def points(self, where: BoolArray | None = None) -> FloatArray:
         """Voxel centres in LPS mm: (ni, nj, nk, 3), or (n, 3) for the voxels of the mask ``where``."""
@@ -120,23 +113,22 @@ class Grid:
 
     def corners(self) -> FloatArray:
         """The eight outer corners of the grid's box, (8, 3) LPS mm."""
-        bits = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.float64)
-        return self.points_at(bits * np.array(self.shape) - 0.5)
+        return self.points_at(np.indices((2, 2, 2)).reshape(3, 8).T * np.array(self.shape) - 0.5)
 
     def bounds_mm(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner of the axis-aligned LPS box around the grid, mm."""
         corners = self.corners()
         return corners.min(axis=0), corners.max(axis=0)
 
-    def same_as(self, other: Grid, tolerance_voxels: float = 0.02) -> bool:
+    def same_as(self, other: Self, tolerance_voxels: float = 0.02) -> bool:
         """Whether two grids have the same shape and place their corner voxels within a fraction of a voxel.
 
         Headers written by different programs differ in the last digits; that is the same grid.
         """
         if self.shape != other.shape:
             return False
-        shift = np.abs(self.indices_of(other.corners()) - self.indices_of(self.corners()))
-        return bool(shift.max() <= tolerance_voxels)
+        shift = self.indices_of(other.corners()) - self.indices_of(self.corners())
+        return bool(np.abs(shift).max() <= tolerance_voxels)
 
     def axes_to_lps(self) -> tuple[tuple[int, int, int], tuple[bool, bool, bool]]:
         """Axis of the grid to use as first, second, third, and whether to reverse it, to come closest to L, P, S."""
@@ -149,24 +141,22 @@ class Grid:
         flips = tuple(bool(self.direction[w, a] < 0) for w, a in enumerate(order))
         return (order[0], order[1], order[2]), (flips[0], flips[1], flips[2])
 
-    def toward_lps(self) -> Grid:
+    def toward_lps(self) -> Self:
         """The same voxels with axes ordered and flipped to run closest to L, P, S."""
         order, flips = self.axes_to_lps()
         axes, start, signs = list(order), np.zeros(3), np.where(flips, -1.0, 1.0)
         ni, nj, nk = (self.shape[axis] for axis in axes)
         start[axes] = np.where(flips, [ni - 1, nj - 1, nk - 1], 0)
-        return Grid((ni, nj, nk), self.spacing_mm[axes], self.points_at(start), self.direction[:, axes] * signs)
+        return type(self)((ni, nj, nk), self.spacing_mm[axes], self.points_at(start), self.direction[:, axes] * signs)
 
-    def moved_by(self, rotation: FloatArray, translation_mm: FloatArray) -> Grid:
+    def moved_by(self, rotation: FloatArray, translation_mm: FloatArray) -> Self:
         """The grid carried by the rigid motion x -> rotation @ x + translation_mm."""
         return replace(self, origin_mm=rotation @ self.origin_mm + translation_mm, direction=rotation @ self.direction)
 
-    def part(self, box: tuple[slice, slice, slice]) -> Grid:
+    def part(self, box: tuple[slice, slice, slice]) -> Self:
         """The grid of a box of voxels, given by slices without a step."""
-        bounds = [cut.indices(n)[:2] for cut, n in zip(box, self.shape, strict=True)]
-        start = np.array([low for low, _ in bounds], dtype=np.float64)
-        ni, nj, nk = (high - low for low, high in bounds)
-        return Grid((ni, nj, nk), self.spacing_mm, self.points_at(start), self.direction)
+        start, stop = np.array([cut.indices(n)[:2] for cut, n in zip(box, self.shape, strict=True)]).T
+        return replace(self, shape=tuple(stop - start), origin_mm=self.points_at(start))
 
     def __str__(self) -> str:
         """Shape, spacing and bounding box, for messages."""
@@ -176,9 +166,12 @@ class Grid:
         return f"{' x '.join(map(str, self.shape))} voxels of {spacing} mm, box (LPS mm) {box}"
 
 
-def _check_shape(what: str, shape: tuple[int, ...], grid: Grid) -> None:
-    if shape != grid.shape:
-        raise GeometryError(f"{what} has shape {shape}, its grid has {grid.shape}; they must be equal.")
+def _on(grid: Grid, what: str, values: npt.ArrayLike, kind: type[_T]) -> npt.NDArray[_T]:
+    """Values as a read-only array, one for each voxel of the grid."""
+    array = frozen(values, kind)
+    if array.shape != grid.shape:
+        raise GeometryError(f"{what} has shape {array.shape}, its grid has {grid.shape}; they must be equal.")
+    return array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,8 +195,7 @@ class Image:
     values: Float32Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "values", frozen(self.values, np.float32))
-        _check_shape("The image", self.values.shape, self.grid)
+        object.__setattr__(self, "values", _on(self.grid, "The image", self.values, np.float32))
         if np.isinf(self.values).any():
             raise InputError("The image holds infinite values; set them to NaN (missing) or repair them.")
 
@@ -212,9 +204,9 @@ class Image:
         """Voxels without a value."""
         return np.isnan(self.values)
 
-    def toward_lps(self) -> Image:
+    def toward_lps(self) -> Self:
         """The same image with its axes closest to L, P, S; values are reordered, never resampled."""
-        return Image(self.grid.toward_lps(), reordered_to_lps(self.grid, self.values))
+        return replace(self, grid=self.grid.toward_lps(), values=reordered_to_lps(self.grid, self.values))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,18 +233,16 @@ class Mask:
         given = np.asarray(self.inside)
         if given.dtype.kind == "f" and not np.isin(given, (0.0, 1.0)).all():
             raise InputError("A mask holds 0 and 1; these are grey values. Compare them: Mask(grid, values > level).")
-        object.__setattr__(self, "inside", frozen(self.inside, np.bool_))
-        _check_shape("The mask", self.inside.shape, self.grid)
+        object.__setattr__(self, "inside", _on(self.grid, "The mask", self.inside, np.bool_))
 
     def box(self, around: int = 0) -> tuple[slice, slice, slice]:
         """Slices of the smallest box that holds the mask, and ``around`` voxels beside it; empty for an empty mask."""
-        cuts = []
-        for axis, n in enumerate(self.inside.shape):
-            hit = np.flatnonzero(self.inside.any(axis=tuple(a for a in range(3) if a != axis)))
-            if not hit.size:
-                return (slice(0, 0),) * 3
-            cuts.append(slice(max(int(hit[0]) - around, 0), min(int(hit[-1]) + 1 + around, n)))
-        return cuts[0], cuts[1], cuts[2]
+        hits = [np.flatnonzero(self.inside.any(axis=others)) for others in ((1, 2), (0, 2), (0, 1))]
+        if not hits[0].size:
+            return (slice(0, 0),) * 3
+        ends = ((int(hit[0]) - around, int(hit[-1]) + 1 + around) for hit in hits)
+        i, j, k = (slice(max(low, 0), min(high, n)) for (low, high), n in zip(ends, self.inside.shape, strict=True))
+        return i, j, k
 
     @property
     def volume_mm3(self) -> float:
@@ -263,9 +253,9 @@ class Mask:
         """Centres of the mask's voxels, (n, 3) LPS mm."""
         return self.grid.points(self.inside)
 
-    def toward_lps(self) -> Mask:
+    def toward_lps(self) -> Self:
         """The same mask with its axes closest to L, P, S."""
-        return Mask(self.grid.toward_lps(), reordered_to_lps(self.grid, self.inside))
+        return replace(self, grid=self.grid.toward_lps(), inside=reordered_to_lps(self.grid, self.inside))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,26 +282,22 @@ class LabelMap:
     names: Mapping[int, str]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "labels", frozen(self.labels, np.int64))
-        _check_shape("The label map", self.labels.shape, self.grid)
+        object.__setattr__(self, "labels", _on(self.grid, "The label map", self.labels, np.int64))
         present = np.unique(self.labels).tolist()
         if present and present[0] < 0:
             raise InputError(f"Labels must not be negative; found {present[0]}.")
-        nameless = [v for v in present if v != 0 and v not in self.names]
-        if nameless:
+        if nameless := [v for v in present if v != 0 and v not in self.names]:
             raise InputError(f"Labels without a name: {nameless}. Names given: {dict(self.names)}.")
-        listed = list(self.names.values())
-        twice = sorted({n for n in listed if listed.count(n) > 1})
-        if twice:
+        if twice := sorted(name for name, count in Counter(self.names.values()).items() if count > 1):
             raise InputError(f"Region names used for more than one label: {twice}.")
         object.__setattr__(self, "names", dict(self.names))
 
     def region(self, name: str) -> Mask:
         """The mask of one region; InputError if no label has this name, with the names there are."""
-        for label, known in self.names.items():
-            if known == name:
-                return Mask(self.grid, self.labels == label)
-        raise self.no_region(name)
+        label = next((label for label, known in self.names.items() if known == name), None)
+        if label is None:
+            raise self.no_region(name)
+        return Mask(self.grid, self.labels == label)
 
     def no_region(self, name: str) -> InputError:
         """The error for a name that no label has."""
@@ -321,9 +307,9 @@ class LabelMap:
             f"The label map has no region '{name}'; it has {', '.join(sorted(self.names.values())) or 'none'}.{hint}"
         )
 
-    def toward_lps(self) -> LabelMap:
+    def toward_lps(self) -> Self:
         """The same label map with its axes closest to L, P, S."""
-        return LabelMap(self.grid.toward_lps(), reordered_to_lps(self.grid, self.labels), self.names)
+        return replace(self, grid=self.grid.toward_lps(), labels=reordered_to_lps(self.grid, self.labels))
 
 
 def reordered_to_lps(grid: Grid, values: npt.NDArray[_T]) -> npt.NDArray[_T]:

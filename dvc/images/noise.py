@@ -21,12 +21,9 @@ def noise_sd(image: Image, tissue: Mask) -> float:
     diagonal differences (Haar wavelets; median absolute deviation; Donoho and Johnstone, Biometrika 1994,
     doi:10.1093/biomet/81.3.425), which texture raises and a scanner's filter lowers. InputError as `noise_in_air`.
     """
-    in_air = noise_in_air(image, tissue)
-    if in_air is not None:
+    if (in_air := noise_in_air(image, tissue)) is not None:
         return in_air
-    known = ~image.missing
-    box = tissue.box()
-    finest = np.where(known & tissue.inside, image.values, np.nan)[box].astype(np.float64)
+    finest = np.where(tissue.inside, image.values, np.nan)[tissue.box()].astype(np.float64)
     for axis in range(3):
         if finest.shape[axis] > 1:
             finest = np.diff(finest, axis=axis) / np.sqrt(2.0)
@@ -52,6 +49,5 @@ def signal_to_noise(image: Image, tissue: Mask) -> float:
 
     In a heel the 75th percentile is that of fat, the brightest of its tissues and the most abundant.
     """
-    sigma = noise_sd(image, tissue)
-    level = float(np.percentile(image.values[tissue.inside & ~image.missing], 75))
+    sigma, level = noise_sd(image, tissue), float(np.percentile(image.values[tissue.inside & ~image.missing], 75))
     return level / sigma if sigma > 0 else float("inf")

@@ -16,8 +16,7 @@ def fill_missing(image: Image) -> Image:
 
     A constant would be an edge that is not there, and blurring and splines would carry it into what is known.
     """
-    missing = image.missing
-    if not missing.any():
+    if not (missing := image.missing).any():
         return image
     spacing = image.grid.spacing_mm
     nearest = distance_transform_edt(missing, sampling=spacing, return_distances=False, return_indices=True)

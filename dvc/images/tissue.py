@@ -30,12 +30,9 @@ def tissue_mask(image: Image) -> Mask:
     closed = _closed(binary_opening(bright, structure=_ellipsoid(np.minimum(radius, 1))), radius)
     parts, count = label(closed)
     if count:
-        sizes = np.bincount(parts.ravel())
-        sizes[0] = 0
-        closed = parts == int(np.argmax(sizes))
+        closed = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
     filled = _fill_slices(binary_fill_holes(closed))
-    share = float(filled.mean())
-    if not 0.01 <= share <= 0.99:
+    if not 0.01 <= (share := float(filled.mean())) <= 0.99:
         taken = f"the threshold takes {100 * share:.1f} % of the image"
         raise InputError(f"No tissue mask could be made: {taken}. Give one with --tissue.")
     return Mask(image.grid, filled)
@@ -88,7 +85,7 @@ def _grown(inside: BoolArray, offsets: IntArray) -> BoolArray:
 
 def _ellipsoid(radius: IntArray) -> BoolArray:
     axes = [np.arange(-int(r), int(r) + 1) / max(float(r), 0.5) for r in radius]
-    i, j, k = np.meshgrid(*axes, indexing="ij")
+    i, j, k = np.ix_(*axes)
     return np.asarray(i**2 + j**2 + k**2 <= 1.0 + 1e-9)
 
 
@@ -96,7 +93,6 @@ def _fill_slices(inside: BoolArray) -> BoolArray:
     """Fill holes slice by slice along each axis too: bone that runs out of the image is open in 3D only."""
     filled = inside.copy()
     for axis in range(3):
-        moved = np.moveaxis(filled, axis, 0)
-        for n in range(moved.shape[0]):
-            moved[n] = binary_fill_holes(moved[n])
+        for part in np.moveaxis(filled, axis, 0):
+            part[:] = binary_fill_holes(part)
     return filled

@@ -1,11 +1,9 @@
 """The error bars of a registered load: its preset's error model applied to its strain map."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -36,29 +34,23 @@ class ErrorBars:
         """Plain values for JSON."""
         told: dict[str, object] = {"known": False, "reason": self.told}
         if self.uncertainty is not None:
-            table = self.uncertainty.table
-            told = {"known": True, "source": self.told, "voxel_mm": table.spacing_mm.tolist()}
-            told["snr"] = round(table.snr, 1)
+            voxel, snr = self.uncertainty.table.spacing_mm.tolist(), round(self.uncertainty.table.snr, 1)
+            told = {"known": True, "source": self.told, "voxel_mm": voxel, "snr": snr}
         if self.twin or self.of_twin:
             told |= {"twin": [asdict(row) for row in self.twin], "of_twin": self.of_twin}
         return told
 
     @classmethod
-    def from_dict(cls, told: Mapping[str, Any], uncertainty: Uncertainty | None, model: ErrorModel | None) -> ErrorBars:
+    def from_dict(cls, told: Mapping[str, Any], uncertainty: Uncertainty | None, model: ErrorModel | None) -> Self:
         """The error bars that `as_dict` gave, with their arrays."""
         twin = tuple(Judged(**row) for row in told.get("twin", ()))
         return cls(uncertainty, str(told.get("source", told.get("reason", ""))), model, twin, told.get("of_twin", ""))
 
     @property
-    def missing(self) -> str:
-        """Why there are none; empty where there are, or where no images were registered."""
-        return self.told if self.uncertainty is None else ""
-
-    @property
     def summary(self) -> list[str]:
-        """Why there are none, and what the twin did to them, in lines."""
-        lines = [f"no error bars: {self.missing}"] * bool(self.missing)
-        return lines + [f"error bars: {self.of_twin}"] * bool(self.of_twin)
+        """Why there are none, if images were registered, and what the twin did to them, in lines."""
+        lines = [f"No error bars. {self.told}"] * bool(self.uncertainty is None and self.told)
+        return lines + [f"Error bars: {self.of_twin}"] * bool(self.of_twin)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,8 +79,7 @@ def error_bars(
         again = None if twin is None else twin.max_shear
         rows = () if again is None else judged(maps.max_shear, again, regions)
         return ErrorBars(None, str(reason), twin=rows, of_twin=_of_twin(rows, twin))
-    to_bone = to_surface_mm(bone, grid.spacing_mm)
-    seed, rows = found.settings.seed, tuple[Judged, ...]()
+    to_bone, seed, rows = to_surface_mm(bone, grid.spacing_mm), found.settings.seed, tuple[Judged, ...]()
     if twin is not None and twin.max_shear is not None:
         again = np.where(np.isfinite(maps.max_shear), twin.max_shear, np.float32(np.nan))
         of_twin = uncertainty_of(again, grid, regions, to_bone, table, seed=seed)
@@ -141,15 +132,12 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
     used = found.settings.engine
     if used.without_error_model:
         raise InputError(used.without_error_model)
+    measure = f"`mrstrain accuracy --preset {used.name}`"
     if given is None:
-        raise InputError(
-            f"The error of {used.name} has not been measured; `mrstrain accuracy --preset {used.name}` does that."
-        )
+        raise InputError(f"The error of {used.name} has not been measured; {measure} does that.")
     if given.preset != used.name:
-        raise InputError(
-            f"The error model is that of {given.preset}, and {used.name} was used: `mrstrain accuracy --preset "
-            f"{used.name}` measures that."
-        )
+        both = f"The error model is that of {given.preset}, and {used.name} was used"
+        raise InputError(f"{both}: {measure} measures that.")
     if given.parameters_sha256 != hashlib.sha256(used.text.encode()).hexdigest():
         raise InputError(used.unlike_its_error_model)
     if found.unlike_study:

@@ -79,10 +79,8 @@ def maps_of(found: Registration) -> StrainMaps:
 
 def carried_images(found: Registration) -> CarriedImages:
     """Carry the loaded image to the unloaded one, and compare them."""
-    reference, loaded, motion = found.reference, found.loaded, found.alignment.motion
-    grid = reference.grid
-    before = carry(loaded, grid)
-    aligned = carry(loaded, grid, motion.apply)
+    reference, loaded, motion, grid = found.reference, found.loaded, found.alignment.motion, found.reference.grid
+    before, aligned = carry(loaded, grid), carry(loaded, grid, motion.apply)
     # Beyond the spline, in the air, the image is shown where the bone's motion alone puts it.
     registered = carry(loaded, grid, lambda X: motion.apply(X + np.nan_to_num(found.displacement.displacement(X))))
     both = Mask(grid, found.tissue.inside & np.isfinite(aligned) & np.isfinite(registered))  # the same voxels for both
@@ -137,11 +135,8 @@ def write_images_and_transforms(folder: Path, found: Registration, images: Carri
 
 def motion_as_dict(motion: RigidMotion) -> dict[str, object]:
     """The bone's rigid motion as plain values; `dvc.io.result_folder.motion_in` reads them."""
-    return {
-        "rotation_deg": motion.angle_deg,
-        "rotation": motion.rotation.tolist(),
-        "translation_lps_mm": motion.translation_mm.tolist(),
-    }
+    rotation, translation = motion.rotation.tolist(), motion.translation_mm.tolist()
+    return {"rotation_deg": motion.angle_deg, "rotation": rotation, "translation_lps_mm": translation}
 
 
 def alignment_of(found: Registration) -> dict[str, object]:
@@ -151,8 +146,7 @@ def alignment_of(found: Registration) -> dict[str, object]:
         "on": alignment.on,
         **motion_as_dict(alignment.motion),
         "bone_shift_lps_mm": alignment.bone_shift_mm.tolist(),
-        "similarity_before": plain(alignment.similarity_before),
-        "similarity": plain(alignment.similarity),
+        **plain({"similarity_before": alignment.similarity_before, "similarity": alignment.similarity}),
         "repeatability_rms_mm": plain(alignment.repeatability_mm),
         "control_spacing_mm": found.displacement.spacing_mm.tolist(),
         "engine": found.settings.engine.family,

@@ -1,10 +1,9 @@
 """A pair of images as it was measured: arrays, quality, verdict and error bars; written, read and shown."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -13,16 +12,17 @@ from matplotlib.figure import Figure
 from dvc.arrays import Float32Array
 from dvc.atomic_files import whole_folder, write_json
 from dvc.deformation.protocol import Deformation, RigidMotion, Within
-from dvc.deformation.strain_maps import StrainMaps, strain_maps
+from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps, strain_maps
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
 from dvc.io import result_folder as files
-from dvc.measurement import judgement, notebook, page
+from dvc.measurement import judgement, page
 from dvc.measurement.error_bars import ErrorBars, error_bars
 from dvc.measurement.judgement import Evidence, Source
 from dvc.measurement.subject import Subject
 from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
+from dvc.report.figures import Scale, coloured
 from dvc.report.page import Picture, Section, notebook_html
 from dvc.report.planes import PLANES, Plane, View
 from dvc.report.sheet import png_bytes
@@ -98,7 +98,7 @@ class Measurement:
         *,
         name: str = "load",
         is_repeat: bool = False,
-    ) -> Measurement:
+    ) -> Self:
         """Judge a registered pair by its subject, the unloaded image, and by more evidence.
 
         With ``is_repeat`` the loaded image is a second scan without load, judged by its own strain, the noise floor.
@@ -113,7 +113,7 @@ class Measurement:
         return cls(name, found.deformation, maps, alignment, quality, regions, bars, found.reference, source)
 
     @classmethod
-    def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Measurement:
+    def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Self:
         """Strain of a deformation that was estimated elsewhere; no images are compared.
 
         Parameters
@@ -127,8 +127,7 @@ class Measurement:
         InputError
             If it is not defined in the bone.
         """
-        relative, motion = without_motion(whole, subject.bone)
-        body = subject.body()
+        (relative, motion), body = without_motion(whole, subject.bone), subject.body()
         maps = strain_maps(relative, body)
         alignment = {"on": "none" if subject.bone is None else "bone", **judgement.motion_as_dict(motion)}
         quality, bars, source = assess(maps, body, subject.bone), ErrorBars(None, ""), Source(subject, body)
@@ -136,7 +135,7 @@ class Measurement:
         return cls(name, relative, maps, alignment, quality, regions, bars, subject.reference, source)
 
     @classmethod
-    def read(cls, folder: Path | str, image: Image | None = None) -> Measurement:
+    def read(cls, folder: Path | str, image: Image | None = None) -> Self:
         """Read the folder of one load that `write` or ``mrstrain register`` wrote.
 
         The unloaded image, to show maps over, is not in the folder; without one, the registered image stands for it.
@@ -160,8 +159,10 @@ class Measurement:
             image = files.read_scalar(place / files.REGISTERED, maps.grid)
         regions = tuple(read_regions_csv(place / files.REGIONS))
         bars = ErrorBars.from_dict(told.get("error_of_max_shear", {}), uncertainty, model)
-        name, deformation = place.resolve().name, _deformation_in(place, maps)
-        return cls(name, deformation, maps, alignment, quality, regions, bars, image)
+        deformation = files.ResultFolder(place).deformation()
+        if (place / files.SPLINE).is_file():  # with its own gradient, not its displacement at the voxels
+            deformation = Within(files.spline_in(place), Mask(maps.grid, maps.valid), margin_voxels=0)
+        return cls(place.resolve().name, deformation, maps, alignment, quality, regions, bars, image)
 
     @property
     def verdict(self) -> Verdict:
@@ -237,9 +238,22 @@ class Measurement:
         GeometryError
             If the point lies outside the image.
         """
-        values = notebook.values_of(quantity, self.maps, self.sigma)
+        view, values = self._view(point_mm), self._values_of(quantity)
         outline = None if self.source is None else self.source.subject.labels
-        return notebook.figure(self._view(point_mm), self.image, quantity, values, outline, planes, largest)
+        scale = Scale.of(quantity, view.shown(values), largest)
+        return coloured(view, self.image, values, scale, planes=planes, outline=outline).finished()
+
+    def _values_of(self, quantity: str) -> Float32Array:
+        """A scalar (ni, nj, nk) by its name, NaN where not defined."""
+        if quantity in TENSOR_COMPONENTS:
+            return self.maps.green_lagrange[..., TENSOR_COMPONENTS.index(quantity)]
+        if quantity == "sigma" and self.sigma is None:
+            raise InputError("sigma: the error of this measurement is not known; its `error_bars` tell why.")
+        known = self.maps.by_quantity | ({} if self.sigma is None else {"sigma": self.sigma})
+        if quantity not in known:
+            names = ", ".join((*self.maps.by_quantity, "sigma", *TENSOR_COMPONENTS))
+            raise InputError(f"No quantity '{quantity}'; there are {names}.")
+        return known[quantity]
 
     def _repr_html_(self) -> str:
         picture = Picture("Maximal shear", "", png_bytes(self.plot()))
@@ -252,9 +266,7 @@ class Measurement:
         tables = [page.key_figures(self.quality, self.alignment), page.region_table(self.regions)]
         tables += [] if found is None or not found.choice.rows() else [page.weights_table(found.choice)]
         tables += page.error_tables(bars)
-        notes = ["" if found is None else found.settings.engine.note]
-        notes += [f"No error bars. {bars.missing}"] * bool(bars.missing)
-        notes += [f"Error bars: {bars.of_twin}"] * bool(bars.of_twin)
+        notes = ["" if found is None else found.settings.engine.note, *bars.summary]
         return Section(self.name, self.verdict, tuple(tables), tuple(pictures.values()), tuple(filter(None, notes)))
 
     def pictures(self) -> dict[str, Picture]:
@@ -322,11 +334,4 @@ class Measurement:
         if point is None:
             points = grid.points(valid if valid.any() else np.ones(grid.shape, dtype=bool))
             point = points[int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
-        return View.through(grid, point, valid if valid.any() else None)
-
-
-def _deformation_in(folder: Path, maps: StrainMaps) -> Deformation:
-    """The spline, where it is valid; the displacement at voxels where a deformation was given."""
-    if any((folder / name).is_file() for name in (files.SPLINE, files.SPLINE_WITH_BORDERS)):
-        return Within(files.spline_in(folder), Mask(maps.grid, maps.valid), margin_voxels=0)
-    return files.ResultFolder(folder).deformation()
+        return View.through(grid, point, valid)

@@ -16,7 +16,6 @@ from dvc.report.planes import View
 from dvc.trust.error_model import Interval
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
-from dvc.trust.twin_judgement import Judged
 
 SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
 """Upper ends of the colours for maximal shear and its standard deviation."""
@@ -74,8 +73,8 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
             ("Spacing of the B-spline's control points", spacing, "mm"),
         ]
     if quality.similarity is not None:
-        for said, value in zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True):
-            rows.append((f"Local similarity in the tissue, {said}", float(value), ""))
+        each = zip(("as scanned", "after the rigid part", "after all"), quality.similarity, strict=True)
+        rows += [(f"Local similarity in the tissue, {said}", float(value), "") for said, value in each]
         rows.append(("Local similarity that noise as in the air allows, about", quality.most_similarity, ""))
     bone = "in the bone, before it was held at rest" if quality.bone_held else "left in the bone"
     rows += [
@@ -85,12 +84,12 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
         ("Lowest det F", quality.lowest_jacobian, ""),
         ("Tissue without a result", 100.0 * quality.undefined_fraction, "%"),
     ]
-    if (errors := quality.landmark_errors_mm) is not None:
-        known = errors[np.isfinite(errors)]
+    if quality.landmark_errors_mm is not None:
+        landmarks = quality.landmarks
         rows += [
-            ("Landmark error, median", float(np.median(known)) if known.size else None, "mm"),
-            ("Landmark error, largest", float(known.max()) if known.size else None, "mm"),
-            ("Landmarks without a result", int(errors.size - known.size), f"of {errors.size}"),
+            ("Landmark error, median", landmarks["median_mm"], "mm"),
+            ("Landmark error, largest", landmarks["max_mm"], "mm"),
+            ("Landmarks without a result", landmarks["undefined"], f"of {landmarks['count']}"),
         ]
     if (floor := quality.noise_floor) is not None:
         rows += [
@@ -116,10 +115,10 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
         return r.region, r.volume_ml, 100.0 * r.defined_fraction, r.median, r.p90, r.p95, r.p99, *above
 
     rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
-    columns = ("region", "volume, mL", "defined, %", "median", "p90", "p95", "p99")
-    above = tuple(f"> {t:g}, mL" for t in SHEAR_THRESHOLDS)
+    above = (f"> {t:g}, mL" for t in SHEAR_THRESHOLDS)
+    columns = ("region", "volume, mL", "defined, %", "median", "p90", "p95", "p99", *above)
     note = "Maximal shear (E₁ − E₃)/2 of the Green-Lagrange strain, and volumes above a value."
-    return Table("Maximal shear by region", columns + above, rows, note)
+    return Table("Maximal shear by region", columns, rows, note)
 
 
 def short_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
@@ -148,19 +147,13 @@ def error_tables(bars: ErrorBars) -> list[Table]:
     if bars.twin:
         claims = bars.uncertainty is not None
         head = ("region", "error (rms)", "bias", *(("within the claim", "expected, at least", "wider") * claims))
-        lines = tuple((row.region, row.rms_error, row.bias, *_against_claims(row)) for row in bars.twin)
+        beside = ((f"{row.held:.0%}", f"{row.expected:.0%}", row.factor) if claims else () for row in bars.twin)
+        lines = tuple((row.region, row.rms_error, row.bias, *more) for row, more in zip(bars.twin, beside, strict=True))
         tables.append(Table("The twin of this pair, measured again", head, lines, _TWIN))
     return tables
 
 
-def _against_claims(row: Judged) -> tuple[str | float, ...]:
-    """A tissue's error bars beside the twin, as a table shows them; nothing where there are none."""
-    if row.held is None or row.expected is None or row.factor is None:
-        return ()
-    return f"{row.held:.0%}", f"{row.expected:.0%}", row.factor
-
-
 def _words(figure: str) -> str:
-    if figure.startswith("volume_above_"):
-        return f"volume above {figure.removeprefix('volume_above_').removesuffix('_ml')}, mL"
-    return {"median": "median", "p90": "90th percentile", "p95": "95th percentile"}[figure]
+    percentiles = {"median": "median", "p90": "90th percentile", "p95": "95th percentile"}
+    above = figure.removeprefix("volume_above_").removesuffix("_ml")
+    return percentiles.get(figure, f"volume above {above}, mL")

@@ -7,7 +7,7 @@ zero: the loaded image is dark blue there, a map leaves the image below it plain
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from matplotlib import colormaps
@@ -28,7 +28,12 @@ from dvc.trust.regions import volume_above
 REGION_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MAX_SHEAR = "maximal shear strain (E₁ − E₃)/2, no unit"
 SIGMA = "standard deviation of the maximal shear, no unit"
-VOLUME_RATIO = "volume ratio det F, no unit"
+_DISPLACEMENT = "length of the displacement relative to the bone, mm"
+_COLOURS = {  # what is drawn with its unit, and the name of its colour map
+    "max_shear": (MAX_SHEAR, "viridis"), "sigma": (SIGMA, "cividis"), "displacement_mm": (_DISPLACEMENT, "viridis"),
+    "jacobian": ("volume ratio det F, no unit", "PuOr_r"),
+}  # fmt: skip
+_ENDS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 _STAGES = ("After the rigid alignment", "After the whole registration")
 _CHECK_MM = 12.0
 _LINE_MM = 5.0
@@ -85,9 +90,7 @@ def strain_slices(
 
     Thin white lines are the borders of the regions. The image stays plain grey where there is no result.
     """
-    if not largest > 0:
-        raise InputError(f"The end of the colour bar for maximal shear must be positive; got {largest}.")
-    return coloured(view, reference, max_shear, Scale(MAX_SHEAR, "viridis", 0.0, largest), outline=outline).png()
+    return coloured(view, reference, max_shear, Scale.of("max_shear", max_shear, largest), outline=outline).png()
 
 
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
@@ -95,7 +98,7 @@ def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: flo
 
     The image stays plain grey where there is no result, and in bone.
     """
-    return coloured(view, reference, sigma, Scale(SIGMA, "cividis", 0.0, largest)).png()
+    return coloured(view, reference, sigma, Scale.of("sigma", sigma, largest)).png()
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +110,32 @@ class Scale:
     low: float
     high: float
 
+    @classmethod
+    def of(cls, quantity: str, values: Values, largest: float | None = None) -> Self:
+        """Colours of a quantity, to ``largest`` (positive), or to a round number that 99 % of its values lie within."""
+        if largest is not None and not largest > 0.0:
+            raise InputError(f"The end of the colours must be positive; got {largest}.")
+        component = f"Green-Lagrange strain, component {quantity} in LPS, no unit", "PuOr_r"
+        told, shades = _COLOURS.get(quantity, component)
+        if quantity == "jacobian":
+            reach = largest or volume_reach(values)
+            return cls(told, shades, 1.0 - reach, 1.0 + reach)
+        known = np.abs(values[np.isfinite(values)])
+        end = largest or round_up(float(np.percentile(known, 99.0)) if known.size else 0.0)
+        return cls(told, shades, 0.0 if quantity in _COLOURS else -end, end)
+
+
+def round_up(value: float) -> float:
+    """The next number of one digit or so.
+
+    >>> [round_up(v) for v in (0.173, 0.0449, 7.2, 0.0)]
+    [0.2, 0.05, 8.0, 1.0]
+    """
+    if not value > 0.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(f"{next(s for s in _ENDS if s * power >= value * (1 - 1e-9)) * power:.3g}")
+
 
 def coloured(
     view: View,
@@ -117,8 +146,11 @@ def coloured(
     planes: Sequence[Plane] = PLANES,
     outline: LabelMap | None = None,
 ) -> Sheet:
-    """A scalar in colour over an image, where there is one, in some planes; not yet finished."""
-    sheet = Sheet(view, [""], planes, bar=True)
+    """A scalar in colour over an image, where there is one, in some planes or one; not yet finished."""
+    chosen: tuple[Plane, ...] = (planes,) if isinstance(planes, str) else tuple(planes)  # type: ignore[assignment]
+    if not chosen or any(plane not in PLANES for plane in chosen):
+        raise InputError(f"Planes are among {', '.join(PLANES)}; got {', '.join(map(str, chosen)) or 'none'}.")
+    sheet = Sheet(view, [""], chosen, bar=True)
     colours, norm = colormaps[scale.shades], Normalize(scale.low, scale.high)
     window = (0.0, 1.0) if image is None else window_of(view, image.values)
     for plane, axes in sheet.rows[0].items():
@@ -140,8 +172,7 @@ def jacobian_slices(view: View, reference: Image, jacobian: Float32Array) -> byt
 
     Red, with the number of voxels, is where the deformation folds (det F <= 0): no result can be trusted there.
     """
-    reach = volume_reach(view.shown(jacobian))
-    sheet = coloured(view, reference, jacobian, Scale(VOLUME_RATIO, "PuOr_r", 1.0 - reach, 1.0 + reach))
+    sheet = coloured(view, reference, jacobian, Scale.of("jacobian", view.shown(jacobian)))
     for plane, axes in sheet.rows[0].items():
         folded = view.cut(jacobian, plane) <= 0.0
         if folded.any():
@@ -213,8 +244,7 @@ def carried_lines(view: View, plane: Plane, displacement_mm: Values) -> list[Flo
     carried: list[FloatArray] = []
     for line in straight:
         row = (line[:, 1] - top) / (bottom - top) * u.shape[0] - 0.5
-        column = (line[:, 0] - left) / (right - left) * u.shape[1] - 0.5
-        at = np.stack([row, column])
+        at = np.stack([row, (line[:, 0] - left) / (right - left) * u.shape[1] - 0.5])
         moved = line + np.stack([map_coordinates(u[..., c], at, order=1, cval=np.nan) for c in (0, 1)], axis=-1)
         known = np.isfinite(moved).all(axis=1)
         breaks = np.flatnonzero(np.diff(known.astype(np.int8))) + 1
@@ -236,9 +266,8 @@ def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float |
         if not np.isfinite(values).any():
             continue
         above = volume_above(values, voxel_ml, at)
-        undefined = float(np.isnan(values).mean())
-        told = name if undefined < 0.0005 else f"{name} ({undefined:.1%} without a result)"
-        told = told.replace("$", r"\$")  # a dollar would start a formula
+        told, undefined = name.replace("$", r"\$"), float(np.isnan(values).mean())  # a dollar would start a formula
+        told += "" if undefined < 0.0005 else f" ({undefined:.1%} without a result)"
         colour = REGION_COLOURS[number % len(REGION_COLOURS)]
         dashes = ("-", "--", ":")[number // len(REGION_COLOURS) % 3]
         for axes, shown in zip(panels, (above, np.where(above > 0, above, np.nan)), strict=True):

@@ -1,7 +1,5 @@
 """The building blocks of a report page: verdicts, tables, figures and volumes in one self-contained HTML file."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 from collections.abc import Callable, Mapping, Sequence
@@ -9,6 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import Self
 
 import jinja2
 import nibabel
@@ -51,7 +50,7 @@ class Picture:
             raise InputError(f"The figure '{self.title}' is no PNG file; it begins with {self.png[:8]!r}.")
 
     @classmethod
-    def drawn(cls, title: str, draw: Callable[..., bytes], *shown: object, note: str = "") -> Picture:
+    def drawn(cls, title: str, draw: Callable[..., bytes], *shown: object, note: str = "") -> Self:
         """The figure that ``draw`` makes of ``shown``; its docstring, which says how to read it, is the caption."""
         return cls(title, " ".join(f"{draw.__doc__ or ''} {note}".split()), draw(*shown))
 
@@ -80,10 +79,9 @@ class Table:
     apart: tuple[tuple[Cell, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        wanted = len(self.columns)
         for number, row in enumerate((*self.rows, *self.apart)):
-            if len(row) != wanted:
-                what = f"Row {number} of the table '{self.title}' has {len(row)} cells, its header {wanted}"
+            if len(row) != len(self.columns):
+                what = f"Row {number} of the table '{self.title}' has {len(row)} cells, its header {len(self.columns)}"
                 raise InputError(f"{what}; give one for each column.")
 
     @property
@@ -102,10 +100,9 @@ class Volume:
     most: float
 
     @classmethod
-    def of(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float) -> Volume:
+    def of(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float) -> Self:
         """Values (ni, nj, nk) on a grid, from 0 to ``most``; NaN becomes 0, which an overlay does not show."""
-        known = np.nan_to_num(np.asarray(values, dtype=np.float64), nan=0.0)
-        step = most / _STEPS
+        known, step = np.nan_to_num(np.asarray(values, dtype=np.float64)), most / _STEPS
         image = nibabel.Nifti1Image(np.clip(np.rint(known / step), 0, 255).astype(np.uint8), _TO_RAS @ grid.affine)
         image.header.set_slope_inter(step, 0.0)
         return cls(title, base64.b64encode(gzip.compress(image.to_bytes(), mtime=0)).decode(), most)
@@ -164,10 +161,12 @@ def _line(value: object) -> str:
 @cache
 def script() -> str:
     """The library and what starts it, for a page that has a viewer; with the library's licence."""
-    folder = files("dvc.report") / "templates"
-    licence = (folder / "niivue-LICENSE.txt").read_text(encoding="utf-8")
-    library = (folder / "niivue.umd.js").read_text(encoding="utf-8")
-    return f"/* niivue {NIIVUE}\n{licence}*/\n{library}\n{(folder / 'viewer.js').read_text(encoding='utf-8')}"
+    licence, library, viewer = map(_stored, ("niivue-LICENSE.txt", "niivue.umd.js", "viewer.js"))
+    return f"/* niivue {NIIVUE}\n{licence}*/\n{library}\n{viewer}"
+
+
+def _stored(name: str) -> str:
+    return (files("dvc.report") / "templates" / name).read_text(encoding="utf-8")
 
 
 def write_report(
@@ -204,4 +203,4 @@ def _template(name: str) -> jinja2.Template:
     strict = jinja2.StrictUndefined
     environment = jinja2.Environment(autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
     environment.filters["shown"] = shown
-    return environment.from_string((files("dvc.report") / "templates" / f"{name}.html.j2").read_text(encoding="utf-8"))
+    return environment.from_string(_stored(f"{name}.html.j2"))

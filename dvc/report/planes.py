@@ -5,10 +5,8 @@ left of the page), coronal from the front and axial from below (the patient's ri
 grid's axes, never resampled; where those are oblique the titles say so.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -23,13 +21,9 @@ Values = npt.NDArray[Any]
 PLANES: tuple[Plane, ...] = ("sagittal", "coronal", "axial")
 # Axes of the L, P, S grid: the one cut, the one across the page, the one up or down it.
 AXES: dict[Plane, tuple[int, int, int]] = {"sagittal": (0, 1, 2), "coronal": (1, 0, 2), "axial": (2, 0, 1)}
-LETTERS: dict[Plane, tuple[str, str, str, str]] = {  # left, right, top, bottom of the page
-    "sagittal": ("A", "P", "S", "I"),
-    "coronal": ("R", "L", "S", "I"),
-    "axial": ("R", "L", "A", "P"),
-}
+LETTERS: dict[Plane, str] = {"sagittal": "APSI", "coronal": "RLSI", "axial": "RLAP"}  # left, right, top, bottom
 OBLIQUE_DEG = 3.0
-_SIDES = (("R", "L"), ("A", "P"), ("I", "S"))  # of the axes L, P, S: against it and along it
+_SIDES = ("RL", "AP", "IS")  # of the axes L, P, S: against it and along it
 _LEAST_SHARE = 0.3827  # cosine of 67.5 degrees: half-way between one letter and two
 
 
@@ -39,7 +33,7 @@ def letters(direction: npt.ArrayLike) -> str:
     >>> letters([0.0, -1.0, 0.0]), letters([0.0, -0.8, 0.6]), letters([0.1, 0.0, 0.99])
     ('A', 'AS', 'S')
     """
-    unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(np.asarray(direction, dtype=np.float64))
+    unit = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     shown = [axis for axis in np.argsort(-np.abs(unit)) if abs(unit[axis]) > _LEAST_SHARE]
     return "".join(_SIDES[axis][int(unit[axis] > 0.0)] for axis in shown)
 
@@ -55,7 +49,7 @@ class View:
     @classmethod
     def through(
         cls, grid: Grid, point_mm: npt.ArrayLike, around: BoolArray | None = None, margin_mm: float = 8.0
-    ) -> View:
+    ) -> Self:
         """The slices nearest to a point, LPS mm, cropped to a mask and a margin around it, or the whole of them.
 
         GeometryError if the point lies outside the grid, or the mask has another shape.
@@ -77,39 +71,30 @@ class View:
 
     def cut(self, values: Values, plane: Plane) -> Values:
         """The slice of an array on the grid as it lies on the page: rows downward, columns to the right."""
-        cut = AXES[plane][0]
-        chosen: list[slice | int] = list(self.box)
-        chosen[cut] = self.index[cut]
-        page = _toward_lps(self.grid, values)[tuple(chosen)].swapaxes(0, 1)
-        return page if plane == "axial" else page[::-1]
+        at = AXES[plane][0]
+        page = np.take(self.shown(values), self.index[at] - self.box[at].start, axis=at).swapaxes(0, 1)
+        return np.asarray(page if plane == "axial" else page[::-1])
 
     def shown(self, values: Values) -> Values:
         """The part of an array inside the box, axes closest to L, P, S; GeometryError for one of another shape."""
-        return _toward_lps(self.grid, values)[self.box]
+        if values.shape[:3] != self.grid.shape:
+            shapes = f"of shape {values.shape} cannot be shown on a grid of {self.grid.shape}"
+            raise GeometryError(f"An array {shapes}; bring it there first.")
+        return reordered_to_lps(self.grid, values)[self.box]
 
     def extent_mm(self, plane: Plane) -> tuple[float, float, float, float]:
         """Left, right, bottom and top of the slice, mm along the grid's axes from its first voxel's centre."""
         _, across, along = AXES[plane]
         spacing = self.grid.toward_lps().spacing_mm
-        left, right = ((n - 0.5) * spacing[across] for n in (self.box[across].start, self.box[across].stop))
-        low, high = ((n - 0.5) * spacing[along] for n in (self.box[along].start, self.box[along].stop))
+        ends = [[(n - 0.5) * spacing[a] for n in (self.box[a].start, self.box[a].stop)] for a in (across, along)]
+        (left, right), (low, high) = ends
         return (left, right, high, low) if plane == "axial" else (left, right, low, high)
 
     def title(self, plane: Plane) -> str:
         """The plane with the position of the cut, or with the tilt of oblique axes."""
-        lps = self.grid.toward_lps()
-        cut = AXES[plane][0]
+        lps, cut = self.grid.toward_lps(), AXES[plane][0]
         tilt = float(np.degrees(np.arccos(np.clip(lps.direction[cut, cut], -1.0, 1.0))))
         if tilt > OBLIQUE_DEG:
             return f"{plane.capitalize()}, along image axes (tilted {tilt:.0f}°)"
         at = lps.points_at(np.array(self.index, dtype=np.float64))[cut]
         return f"{plane.capitalize()}, {'xyz'[cut]} = {at:.0f} mm".replace("-", "\u2212")
-
-
-def _toward_lps(grid: Grid, values: Values) -> Values:
-    """A view of values on a grid with the leading axes closest to L, P, S."""
-    if values.shape[:3] != grid.shape:
-        raise GeometryError(
-            f"An array of shape {values.shape} cannot be shown on a grid of {grid.shape}; bring it there first."
-        )
-    return reordered_to_lps(grid, values)

@@ -36,9 +36,8 @@ class Sheet:
 
     def __init__(self, view: View, titles: Sequence[str], planes: Sequence[Plane] = PLANES, bar: bool = False) -> None:
         self.view = view
-        extents = [view.extent_mm(p) for p in planes]
-        widths = [e[1] - e[0] for e in extents]
-        heights = [abs(e[3] - e[2]) for e in extents]
+        sizes = [(right - left, abs(top - bottom)) for left, right, bottom, top in map(view.extent_mm, planes)]
+        widths, heights = zip(*sizes, strict=True)
         gaps = _GAP_IN * (len(planes) - 1)
         tallest = 4.6 if len(titles) == 1 else 3.6
         inches = min((WIDTH_IN - gaps) / sum(widths), tallest / max(heights))  # per mm, everywhere
@@ -48,8 +47,7 @@ class Sheet:
         self.figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
         FigureCanvasAgg(self.figure)
         self.rows: list[dict[Plane, Axes]] = []
-        indent = (width - inches * sum(widths) - gaps) / 2
-        top = height
+        indent, top = (width - inches * sum(widths) - gaps) / 2, height
         for title in titles:
             if title:
                 at = (indent / width, (top - 0.8 * _TITLE_IN) / height)
@@ -93,8 +91,7 @@ class Sheet:
 
     def bar(self, shades: Colormap, norm: Normalize, label: str, extend: str = "neither") -> None:
         """Draw the one colour bar of the sheet, below the panels."""
-        axes = self.figure.add_axes(self._bar)
-        scale = ScalarMappable(norm, shades)
+        axes, scale = self.figure.add_axes(self._bar), ScalarMappable(norm, shades)
         bar = self.figure.colorbar(scale, cax=axes, orientation="horizontal", extend=extend)
         bar.set_label(label, color=INK, labelpad=2, **FONT)
         bar.ax.tick_params(labelsize=9, length=3, pad=2)
@@ -116,14 +113,9 @@ class Sheet:
                 for mark, line in zip(marks, (axes.axvline, axes.axhline), strict=True):
                     for low, high in ((0.0, 0.035), (0.965, 1.0)):
                         line(mark, low, high, color=_MARK, linewidth=1.2)
-                middle_x = _beside((marks[0] - left) / (right - left))
-                middle_y = _beside((marks[1] - bottom) / (top - bottom))
-                spots = (
-                    (0.012, middle_y, "left", "center"),
-                    (0.988, middle_y, "right", "center"),
-                    (middle_x, 0.988, "center", "top"),
-                    (middle_x, 0.012, "center", "bottom"),
-                )
+                x, y = _beside((marks[0] - left) / (right - left)), _beside((marks[1] - bottom) / (top - bottom))
+                sides = (0.012, y, "left", "center"), (0.988, y, "right", "center")
+                spots = *sides, (x, 0.988, "center", "top"), (x, 0.012, "center", "bottom")
                 for letter, (x, y, ha, va) in zip(LETTERS[plane], spots, strict=True):
                     axes.text(x, y, letter, ha=ha, va=va, weight="bold", zorder=9, **white, **FONT)
                 if number == 0:
@@ -177,9 +169,7 @@ def window_of(view: View, image: Values) -> tuple[float, float]:
     """The values drawn black and white: the 0.5th and 99.7th percentile of what is shown."""
     known = view.shown(image)
     known = known[np.isfinite(known)]
-    if not known.size:
-        return 0.0, 1.0
-    low, high = np.percentile(known, (0.5, 99.7))
+    low, high = np.percentile(known, (0.5, 99.7)) if known.size else (0.0, 1.0)
     return float(low), float(high if high > low else low + 1.0)
 
 

@@ -1,6 +1,5 @@
 """How far a registration may be trusted: a verdict by its strain maps, the images' similarity, and more evidence."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +9,6 @@ from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Mask
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.verdict import Verdict, together
-
-_MORE_NOISE = 1.5  # times that in the air: parallel imaging and normalised intensities raise it in the tissue
 
 # Where a figure lowers the verdict: use with care, do not trust; one whose second limit is the lower has to lie above.
 # The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound registrations
@@ -61,15 +58,15 @@ class Similarity:
     ----------
     found : (before, after rigid, after all)
         Pooled local correlations (`dvc.local_correlation`).
-    possible, offset : callable, optional
-        Of a factor on the noise: what it leaves of the last correlation (`dvc.images.similarity.most_similarity`), and
-        the offset between the registered images as a share of brightness (`dvc.images.similarity.brightness_offset`).
-        A registration is not trusted where either is beyond its limit for half as much noise again, too.
+    possible, offset : (noise as in the air, half as much again)
+        What this noise leaves of the last correlation (`dvc.images.similarity.most_similarity`), and the offset between
+        the registered images as a share of brightness (`dvc.images.similarity.brightness_offset`); NaN where not known.
+        A registration is distrusted where either is beyond its limit for the second as well.
     """
 
     found: tuple[float, float, float]
-    possible: Callable[[float], float] | None = None
-    offset: Callable[[float], float] | None = None
+    possible: tuple[float, float] = (np.nan, np.nan)
+    offset: tuple[float, float] = (np.nan, np.nan)
 
 
 def assess(
@@ -101,8 +98,8 @@ def assess(
     bone_shift, bone_shear = _in_bone(maps, bone, in_bone)
     quality = Quality(
         similarity=None if similarity is None else similarity.found,
-        most_similarity=_at(None if similarity is None else similarity.possible, 1.0),
-        offset=_at(None if similarity is None else similarity.offset, 1.0),
+        most_similarity=np.nan if similarity is None else similarity.possible[0],
+        offset=np.nan if similarity is None else similarity.offset[0],
         folded_voxels=int(np.count_nonzero(maps.jacobian[maps.valid] <= 0.0)),
         lowest_jacobian=lowest,
         lowest_jacobian_at_mm=at,
@@ -128,21 +125,16 @@ def assess(
     for figure in ("bone_shift_mm", "bone_shear_p95", "lowest_jacobian", "undefined_fraction"):
         if np.isfinite(value := getattr(quality, figure)):
             findings += _judged(figure, value)
-    if landmark_errors_mm is not None and np.isfinite(landmark_errors_mm).any():
-        findings += _judged("landmark_error_mm", float(np.nanmedian(landmark_errors_mm)))
+    findings += _judged("landmark_error_mm", quality.landmarks["median_mm"])
     if floor is not None:
         findings += _judged("floor_shear_p95", floor.max_shear_p95)
     return replace(quality, verdict=together(findings))
 
 
-def _at(of_noise: Callable[[float], float] | None, factor: float) -> float:
-    return float("nan") if of_noise is None else of_noise(factor)
-
-
 def _in_bone(maps: StrainMaps, bone: Mask | None, told: tuple[float, float] | None) -> tuple[float, float]:
     """Root mean square displacement (mm) and 95th percentile of the maximal shear within the bone; NaN without one."""
     if bone is None or not (kept := maps.valid & bone.inside).any():
-        return float("nan"), float("nan")
+        return np.nan, np.nan
     if told is not None:
         return told
     squared = (maps.displacement_mm[kept].astype(np.float64) ** 2).sum(axis=1)
@@ -152,20 +144,19 @@ def _in_bone(maps: StrainMaps, bone: Mask | None, told: tuple[float, float] | No
 def _lowest(jacobian: Float32Array, grid: Grid) -> tuple[float, tuple[float, float, float]]:
     """Lowest det F, and the centre of its voxel, LPS mm."""
     if not np.isfinite(jacobian).any():
-        return float("nan"), (float("nan"),) * 3
+        return np.nan, (np.nan,) * 3
     index = np.unravel_index(int(np.nanargmin(jacobian)), jacobian.shape)
-    x, y, z = grid.points_at(np.array(index, dtype=np.float64))
-    return float(jacobian[index]), (float(x), float(y), float(z))
+    x, y, z = grid.points_at(np.array(index)).tolist()
+    return float(jacobian[index]), (x, y, z)
 
 
 def _unlike(similarity: Similarity, quality: Quality, slice_mm: float) -> list[Verdict]:
     """Findings from the images: their similarity, their brightness, and the distance of their slices (mm)."""
     _, rigid, after = similarity.found
     findings = _judged("similarity", after)
-    if similarity.possible is not None:
-        surely = similarity.possible(_MORE_NOISE) - after > _LIMITS["unlikeness"][1]
-        findings += _judged("unlikeness", similarity.possible(1.0) - after, surely)
-    findings += _judged("offset", quality.offset, _at(similarity.offset, _MORE_NOISE) > _LIMITS["offset"][1])
+    lacking, surely = (possible - after for possible in similarity.possible)
+    findings += _judged("unlikeness", lacking, surely > _LIMITS["unlikeness"][1])
+    findings += _judged("offset", quality.offset, similarity.offset[1] > _LIMITS["offset"][1])
     findings += _judged("voxel_mm", slice_mm)
     if after < rigid - 0.01:
         told = "The non-rigid registration made the images less alike: local similarity went from"

@@ -14,20 +14,18 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filter1d
 
-from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.trust.quality import plain
-from dvc.trust.random_field import GaussianField
 from dvc.trust.regions import SHEAR_THRESHOLDS
 
 POOLED = "soft tissue"
 """Name of the row for tissue that the study did not have, or that has no label."""
 
-_FOLDER = "error_models"
 _FORMAT = 1
 _FAR = 1.6  # a table is used for voxels and noise within this factor of its own
 _LATTICE = 30_000
@@ -69,11 +67,11 @@ class ErrorTable:
         cells = self.whole if run is None else self.runs[run]
         rows = cells[tissue if tissue in cells else POOLED]
         bins = np.clip(np.searchsorted(self.to_bone_mm, to_bone_mm, side="right") - 1, 0, len(self.to_bone_mm) - 1)
-        found = np.empty((2, len(shear)))
-        for k, (bias, sd) in enumerate(zip(*rows, strict=True)):
+        bias, sd = np.empty((2, len(shear)))
+        for k in range(len(self.to_bone_mm)):
             here = bins == k
-            found[:, here] = [np.interp(shear[here], self.shear, bias), np.interp(shear[here], self.shear, sd)]
-        return found[0], found[1]
+            bias[here], sd[here] = (np.interp(shear[here], self.shear, row[k]) for row in rows)
+        return bias, sd
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,16 +113,10 @@ class ErrorModel:
 
         told = {name: getattr(self, name) for name in ("preset", "parameters_sha256", "source")}
         tables = [
-            {
-                "spacing_mm": t.spacing_mm.tolist(),
-                "snr": t.snr,
-                "shear": t.shear.tolist(),
-                "to_bone_mm": t.to_bone_mm.tolist(),
-                "bias_and_sd": rounded(t.whole),
-                "bias_and_sd_of_each_run": [rounded(run) for run in t.runs],
-                "correlation_mm": t.correlation_mm,
-                "widening": plain(t.widening),
-            }
+            {"spacing_mm": t.spacing_mm.tolist(), "snr": t.snr, "shear": t.shear.tolist()}
+            | {"to_bone_mm": t.to_bone_mm.tolist(), "bias_and_sd": rounded(t.whole)}
+            | {"bias_and_sd_of_each_run": [rounded(run) for run in t.runs]}
+            | {"correlation_mm": t.correlation_mm, "widening": plain(t.widening)}
             for t in self.tables
         ]
         write_whole(path, json.dumps({"format": _FORMAT, **told, "tables": tables}, allow_nan=False) + "\n")
@@ -141,7 +133,7 @@ def read_error_model(path: Path | str) -> ErrorModel:
 
 def error_model_of(preset: str) -> ErrorModel | None:
     """The error model that comes with a named preset; None where there is none."""
-    stored = files("dvc.trust") / _FOLDER / f"{preset}.json"
+    stored = files("dvc.trust") / "error_models" / f"{preset}.json"
     return _parsed(stored.read_text(encoding="utf-8")) if stored.is_file() else None
 
 
@@ -159,7 +151,7 @@ def _parsed(text: str) -> ErrorModel:
             whole=cells(t["bias_and_sd"]),
             runs=tuple(cells(run) for run in t["bias_and_sd_of_each_run"]),
             correlation_mm=float(t["correlation_mm"]),
-            widening=float("nan") if t["widening"] is None else float(t["widening"]),
+            widening=float(np.nan if t["widening"] is None else t["widening"]),
             **{name: np.asarray(t[name], dtype=np.float64) for name in ("spacing_mm", "shear", "to_bone_mm")},
         )
         for t in told["tables"]
@@ -168,11 +160,8 @@ def _parsed(text: str) -> ErrorModel:
         raise ValueError(f"no table, or one without a row '{POOLED}'")
     for t in tables:
         shape = (2, len(t.to_bone_mm), len(t.shear))
-        sound = (
-            rows.shape == shape and np.isfinite(rows).all() and (rows[1] >= 0).all()
-            for cells_of in (t.whole, *t.runs)
-            for rows in cells_of.values()
-        )
+        figures = (rows for cells in (t.whole, *t.runs) for rows in cells.values())
+        sound = (rows.shape == shape and np.isfinite(rows).all() and (rows[1] >= 0).all() for rows in figures)
         if not (t.runs and all(sound)):
             raise ValueError(f"a table without runs, or whose figures are not {shape} finite numbers")
         rising = np.all(np.diff(t.shear) > 0) and np.all(np.diff(t.to_bone_mm) > 0)
@@ -182,8 +171,7 @@ def _parsed(text: str) -> ErrorModel:
 
 
 def _told(spacing_mm: FloatArray) -> str:
-    same = np.ptp(spacing_mm) < 1e-6
-    return f"{spacing_mm[0]:.2g}" if same else " x ".join(f"{s:.2g}" for s in spacing_mm)
+    return " x ".join(f"{s:.2g}" for s in spacing_mm[: 1 if np.ptp(spacing_mm) < 1e-6 else 3])
 
 
 def to_surface_mm(body: BoolArray, spacing_mm: FloatArray) -> Float32Array:
@@ -230,6 +218,27 @@ class Uncertainty:
     table: ErrorTable
 
 
+class GaussianField:
+    """Gaussian fields of unit variance at some voxels ``at`` of a lattice, smooth over ``width`` voxels."""
+
+    def __init__(
+        self, shape: tuple[int, ...], at: tuple[IntArray, ...], width: FloatArray, random: np.random.Generator
+    ) -> None:
+        self._at, self._width, self._random = at, width, random
+        # Room around, so that the field, which is periodic, does not meet itself.
+        self._shape = tuple(int(n + r) for n, r in zip(shape, np.ceil(6.0 * width), strict=True))
+        spread = np.ones(())
+        for w in width:
+            kernel = gaussian_filter1d(np.eye(1, 2 * int(4 * w + 1) + 1, int(4 * w + 1))[0], w, mode="constant")
+            spread = spread * (kernel**2).sum()
+        self._scale = 1.0 / np.sqrt(float(spread))
+
+    def drawn(self) -> FloatArray:
+        """Draw the values at the region's voxels, (n,)."""
+        smooth = gaussian_filter(self._random.standard_normal(self._shape), self._width, mode="wrap")
+        return np.asarray(self._scale * smooth[self._at])
+
+
 def uncertainty_of(
     max_shear: Float32Array,
     grid: Grid,
@@ -237,15 +246,13 @@ def uncertainty_of(
     to_bone_mm: Float32Array,
     table: ErrorTable,
     *,
-    thresholds: Sequence[float] = SHEAR_THRESHOLDS,
     seed: int = 1,
     wider: Mapping[str, float] = MappingProxyType({}),
 ) -> Uncertainty:
     """Error of a map of maximal shear (ni, nj, nk), NaN where not defined, by an error table.
 
-    For each of the soft tissues ``regions``, masks by name, at distances to bone (ni, nj, nk); its volumes are those
-    above ``thresholds``. Beside `ErrorTable.widening`, ``wider`` holds factors on the deviation and the intervals of
-    some regions.
+    For each of the soft tissues ``regions``, masks by name, at distances to bone (ni, nj, nk). Beside
+    `ErrorTable.widening`, ``wider`` holds factors on the deviation and the intervals of some regions.
 
     The truth is drawn 200 times: measured shear, less the bias of one of the study's registrations, drawn anew each
     time, less a Gaussian field of its standard deviation and of the table's correlation length; not below zero. The
@@ -254,7 +261,7 @@ def uncertainty_of(
     """
     sigma = np.full(grid.shape, np.nan, dtype=np.float32)
     intervals, random = list[Interval](), np.random.default_rng(seed)
-    names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in thresholds)]
+    names = ["median", "p90", "p95", *(f"volume_above_{t:g}_ml" for t in SHEAR_THRESHOLDS)]
     for name, inside in regions.items():
         where = inside & np.isfinite(max_shear)
         if not where.any():
@@ -271,10 +278,10 @@ def uncertainty_of(
         drawn = []
         for _ in range(_DRAWS):
             bias, sd = expected[random.integers(len(expected))]
-            drawn.append(figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume, thresholds))
+            drawn.append(figures_of(np.maximum(found - bias - sd * noise.drawn(), 0.0), volume))
         low, middle, high = widened(np.array(drawn), factor * table.factor)
         high[3:] = np.minimum(high[3:], volume)
-        each = zip(names, figures_of(shear, volume, thresholds), middle, low, high, strict=True)
+        each = zip(names, figures_of(shear, volume), middle, low, high, strict=True)
         intervals += [Interval(name, figure, *map(float, numbers)) for figure, *numbers in each]
     return Uncertainty(sigma, tuple(intervals), table)
 
@@ -287,7 +294,7 @@ def _lattice(where: BoolArray) -> tuple[tuple[slice, ...], int]:
     return (lattice, step) if where[lattice].any() else (box, 1)
 
 
-def figures_of(shear: FloatArray, volume_ml: float, thresholds: Sequence[float]) -> FloatArray:
+def figures_of(shear: FloatArray, volume_ml: float, thresholds: Sequence[float] = SHEAR_THRESHOLDS) -> FloatArray:
     """Median, 90th and 95th percentile, and the volumes above thresholds (mL) of a tissue of a volume."""
     above = [volume_ml * np.count_nonzero(shear > t) / len(shear) for t in thresholds]
     return np.array([*np.percentile(shear, [50.0, 90.0, 95.0]), *above])

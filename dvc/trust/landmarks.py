@@ -14,7 +14,7 @@ from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation
 from dvc.errors import ImageFileError, InputError
 
-_log = logging.getLogger("dvc.trust.landmarks")
+_log = logging.getLogger(__name__)
 
 _COLUMNS = ("x0", "y0", "z0", "x1", "y1", "z1")
 _TO_LPS = {"LPS": np.array([1.0, 1.0, 1.0]), "RAS": np.array([-1.0, -1.0, 1.0])}
@@ -65,8 +65,7 @@ def read_landmarks(
     pairs, names = [], []
     rows = csv.DictReader(_text(file).splitlines())
     header = [str(name).strip().casefold() for name in rows.fieldnames or []]
-    missing = [name for name in _COLUMNS if name not in header]
-    if missing:
+    if missing := [name for name in _COLUMNS if name not in header]:
         raise ImageFileError(
             f"{file}: the column {missing[0]} is missing; a file of landmark pairs needs the columns "
             f"{', '.join(_COLUMNS)} in its first line. Found: {', '.join(header) or 'nothing'}."
@@ -122,8 +121,7 @@ def _paired(first: Path, second: Path) -> tuple[FloatArray, FloatArray, tuple[st
     reference, deformed = _slicer_points(first), _slicer_points(second)
     names, others = [name for name, _ in reference], [name for name, _ in deformed]
     if sorted(names) == sorted(others) and len(set(names)) == len(names):
-        by_name = dict(deformed)
-        deformed = [(name, by_name[name]) for name in names]
+        deformed = [(name, dict(deformed)[name]) for name in names]
     elif len(names) != len(others) or set(names) & set(others):
         only = sorted(set(names) ^ set(others))
         repeated = sorted({name for some in (names, others) for name in some if some.count(name) > 1})
@@ -158,14 +156,13 @@ def _from_markups(path: Path) -> _Points:
         raise ImageFileError(f"{path}: coordinates must be LPS or RAS, in mm; the file says {frame}, {unit}.")
     points: _Points = []
     for count, point in enumerate(listed, start=1):
-        name = str(point.get("label") or count)
+        name, position = str(point.get("label") or count), point.get("position")
         if point.get("positionStatus", "defined") != "defined":
             raise ImageFileError(f"{path}: point {name!r} was never placed. Place or delete it in Slicer.")
-        position = point.get("position")
         if not isinstance(position, list) or len(position) != 3:
             raise ImageFileError(f"{path}: point {name!r} has no position.")
-        where = f"{path}, point {name!r}"
-        points.append((name, np.array([_number(where, "position", x) for x in position]) * _TO_LPS[frame]))
+        at = [_number(f"{path}, point {name!r}", "position", x) for x in position]
+        points.append((name, np.array(at) * _TO_LPS[frame]))
     return points
 
 
@@ -176,9 +173,7 @@ def _from_fcsv(path: Path) -> _Points:
     frame = _FCSV_FRAMES.get(header.get("CoordinateSystem", ""))
     columns = [name.strip() for name in header.get("columns", "").split(",")]
     points: _Points = []
-    for line, text in lines:
-        if text.startswith("#"):
-            continue
+    for line, text in (each for each in lines if not each[1].startswith("#")):
         if frame is None or not {"x", "y", "z"} <= set(columns):
             what = "its header does not tell the frame (CoordinateSystem = LPS or RAS) and the columns"
             raise ImageFileError(f"{path}: {what}. Save the list again in Slicer.")

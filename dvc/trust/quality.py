@@ -1,12 +1,10 @@
 """The figures by which a registration is judged: folding, similarity, bone, landmarks, noise floor."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -22,9 +20,8 @@ def _number(value: float | None) -> float:
     return float("nan") if value is None else float(value)
 
 
-def _three(values: Sequence[float | None]) -> tuple[float, float, float]:
-    x, y, z = map(_number, values)
-    return x, y, z
+def _numbers(values: Sequence[float | None]) -> tuple[float, ...]:
+    return tuple(map(_number, values))
 
 
 _FIGURES: dict[str, tuple[str, Callable[[Any], object]]] = {  # fields of Quality: name and reader in quality.json
@@ -32,7 +29,7 @@ _FIGURES: dict[str, tuple[str, Callable[[Any], object]]] = {  # fields of Qualit
     "offset": ("offset_between_images_over_brightness", _number),
     "folded_voxels": ("folded_voxels", int),
     "lowest_jacobian": ("lowest_jacobian", _number),
-    "lowest_jacobian_at_mm": ("lowest_jacobian_at_lps_mm", _three),
+    "lowest_jacobian_at_mm": ("lowest_jacobian_at_lps_mm", _numbers),
     "undefined_fraction": ("undefined_fraction_of_tissue", _number),
     "bone_shift_mm": ("bone_shift_rms_mm", _number),
     "bone_shear_p95": ("bone_shear_p95", _number),
@@ -55,9 +52,9 @@ class NoiseFloor:
     displacement_p95_mm: float
 
     @classmethod
-    def from_dict(cls, told: Mapping[str, Any]) -> NoiseFloor:
+    def from_dict(cls, told: Mapping[str, Any]) -> Self:
         """The noise floor in ``quality.json``."""
-        return cls(**{name: float(told[name]) for name in told})
+        return cls(**{name: float(value) for name, value in told.items()})
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,46 +100,41 @@ class Quality:
 
     def as_dict(self) -> dict[str, object]:
         """Plain values for JSON; NaN becomes None."""
-        alike, errors, floor = self.similarity, self.landmark_errors_mm, self.noise_floor
+        alike, errors, floor, landmarks = self.similarity, self.landmark_errors_mm, self.noise_floor, self.landmarks
         return {
             "verdict": self.verdict.as_dict(),
             "local_similarity": None if alike is None else dict(zip(_SIMILARITIES, plain(alike), strict=True)),
             **{stored: plain(getattr(self, name)) for name, (stored, _) in _FIGURES.items()},
-            "landmarks": None
-            if errors is None
-            else {
-                "count": int(errors.size),
-                "undefined": int(np.count_nonzero(~np.isfinite(errors))),
-                "median_mm": plain(_finite(np.nanmedian, errors)),
-                "max_mm": plain(_finite(np.nanmax, errors)),
-                "each_mm": plain(errors.tolist()),
-            },
+            "landmarks": None if errors is None else plain(landmarks) | {"each_mm": plain(errors.tolist())},
             "noise_floor": None if floor is None else asdict(floor),
         }
 
+    @property
+    def landmarks(self) -> dict[str, float]:
+        """How many landmarks there are, how many are undefined, and median and largest error (mm) of the others."""
+        errors = np.empty(0) if self.landmark_errors_mm is None else self.landmark_errors_mm
+        known = errors[np.isfinite(errors)]
+        median, largest = (float(np.median(known)), float(known.max())) if known.size else (np.nan, np.nan)
+        return {"count": errors.size, "undefined": errors.size - known.size, "median_mm": median, "max_mm": largest}
+
     @classmethod
-    def from_dict(cls, told: Mapping[str, Any]) -> Quality:
+    def from_dict(cls, told: Mapping[str, Any]) -> Self:
         """The quality that `as_dict` gave; KeyError, TypeError or ValueError where something is missing."""
         alike, landmarks, floor = (told[name] for name in ("local_similarity", "landmarks", "noise_floor"))
         figures: dict[str, Any] = {name: read(told[stored]) for name, (stored, read) in _FIGURES.items()}
-        return cls(
-            similarity=None if alike is None else _three([alike[name] for name in _SIMILARITIES]),
-            landmark_errors_mm=None if landmarks is None else np.array([_number(e) for e in landmarks["each_mm"]]),
-            noise_floor=None if floor is None else NoiseFloor.from_dict(floor),
-            verdict=Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"])),
-            **figures,
-        )
+        figures["similarity"] = None if alike is None else _numbers([alike[name] for name in _SIMILARITIES])
+        figures["landmark_errors_mm"] = None if landmarks is None else np.array(_numbers(landmarks["each_mm"]))
+        figures["noise_floor"] = None if floor is None else NoiseFloor.from_dict(floor)
+        return cls(**figures, verdict=Verdict(told["verdict"]["level"], tuple(told["verdict"]["reasons"])))
 
 
 def plain(value: Any) -> Any:
     """A number, or several, for JSON, which knows no NaN: None stands for it."""
+    if isinstance(value, Mapping):
+        return {name: plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
         return [plain(each) for each in value]
     return value if isinstance(value, int) else float(value) if np.isfinite(value) else None
-
-
-def _finite(reduce: Callable[[FloatArray], float], values: FloatArray) -> float:
-    return float(reduce(values)) if np.isfinite(values).any() else float("nan")
 
 
 def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
@@ -151,8 +143,8 @@ def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
     if not kept.any():
         return None
     each = np.abs(maps.green_lagrange[kept]).astype(np.float64).mean(axis=1)
-    shear, length = maps.max_shear[kept], np.linalg.norm(maps.displacement_mm[kept], axis=1)
-    p50, p95 = (float(np.percentile(shear, p)) for p in (50, 95))
+    length = np.linalg.norm(maps.displacement_mm[kept], axis=1)
+    p50, p95 = (float(np.percentile(maps.max_shear[kept], p)) for p in (50, 95))
     return NoiseFloor(float(each.mean()), float(each.std()), p50, p95, float(np.percentile(length, 95)))
 
 

@@ -1,7 +1,7 @@
 """Figures per region: how much tissue, how much of it has a value, and how the values are spread."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -53,8 +53,7 @@ def volume_above(values: npt.ArrayLike, volumes_ml: npt.ArrayLike, thresholds: n
     >>> volume_above([0.1, 0.3, np.nan, 0.3], 2.0, [0.0, 0.1, 0.3]).tolist()
     [6.0, 4.0, 0.0]
     """
-    flat = np.asarray(values, dtype=np.float64).ravel()
-    volumes = np.asarray(volumes_ml, dtype=np.float64)
+    flat, volumes = np.asarray(values, dtype=np.float64).ravel(), np.asarray(volumes_ml, dtype=np.float64)
     if volumes.ndim and volumes.shape != flat.shape:
         raise InputError(f"Got {flat.size} values and volumes of shape {volumes.shape}; give one volume for each.")
     known = ~np.isnan(flat)
@@ -76,12 +75,10 @@ def region_statistics(labels: LabelMap, values: Mapping[str, npt.NDArray[np.floa
             raise GeometryError(
                 f"'{quantity}' has shape {array.shape}, the label map {labels.grid.shape}; they must be on one grid."
             )
-        infinite = int(np.count_nonzero(np.isinf(array)))
-        if infinite:
+        if infinite := int(np.count_nonzero(np.isinf(array))):
             raise InputError(f"'{quantity}' holds {infinite} infinite values; set them to NaN (missing).")
-    flat = labels.labels.ravel()
+    flat, voxel_ml = labels.labels.ravel(), labels.grid.voxel_volume_mm3 / 1000.0
     voxels_of = {name: np.flatnonzero(flat == label) for label, name in labels.names.items()}
-    voxel_ml = labels.grid.voxel_volume_mm3 / 1000.0
     return [
         _row(region, quantity, array.ravel()[voxels], voxel_ml)
         for quantity, array in values.items()
@@ -110,11 +107,12 @@ def write_regions_csv(path: Path, rows: Sequence[RegionRow], verdict: Verdict | 
     told = [] if verdict is None else [verdict.words]
     columns = ("region", "quantity", "voxels", "volume_ml", "defined_voxels", "defined_fraction", *_NUMBERS)
     head = [*columns, *(_ABOVE.format(t) for t in thresholds), *["verdict"] * len(told)]
-    cells = (
-        [*(getattr(row, name) for name in columns), *(row.volume_above_ml.get(t, "") for t in thresholds), *told]
-        for row in rows
-    )
-    write_csv(path, head, ([_plain(cell) for cell in line] for line in cells))
+
+    def cells(row: RegionRow) -> Iterator[str]:
+        above = (row.volume_above_ml.get(t, "") for t in thresholds)
+        return map(_plain, (*(getattr(row, name) for name in columns), *above, *told))
+
+    write_csv(path, head, map(cells, rows))
 
 
 def read_regions_csv(path: Path) -> list[RegionRow]:
@@ -128,18 +126,13 @@ def read_regions_csv(path: Path) -> list[RegionRow]:
 
 
 def _row_of(cells: Mapping[str, str]) -> RegionRow:
-    before, after = _ABOVE.split("{:g}")
-    above = {
-        float(name.removeprefix(before).removesuffix(after)): float(cell)
-        for name, cell in cells.items()
-        if name.startswith(before) and cell
-    }
+    (before, after), given = _ABOVE.split("{:g}"), [name for name, cell in cells.items() if cell]
+    thresholds = {name: name.removeprefix(before).removesuffix(after) for name in given if name.startswith(before)}
+    above = {float(threshold): float(cells[name]) for name, threshold in thresholds.items()}
     voxels, volume_ml, defined = int(cells["voxels"]), float(cells["volume_ml"]), int(cells["defined_voxels"])
     figures = {name: float(cells[name]) for name in _NUMBERS}
     return RegionRow(cells["region"], cells["quantity"], voxels, volume_ml, defined, **figures, volume_above_ml=above)
 
 
 def _plain(cell: object) -> str:
-    if isinstance(cell, float):
-        return "NaN" if np.isnan(cell) else f"{cell:.9g}"
-    return str(cell)
+    return str(cell) if not isinstance(cell, float) else "NaN" if np.isnan(cell) else f"{cell:.9g}"

@@ -1,12 +1,11 @@
 """Draws of the truth behind a strain measured at scattered points, such as the cells of a mesh."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.trust.error_model import ErrorTable
-from dvc.trust.random_field import GaussianField
+from dvc.trust.error_model import ErrorTable, GaussianField
 
 _STEPS = 4  # of the lattice that noise is drawn on, within a correlation length
 
@@ -61,7 +60,3 @@ class TruthDraws:
             kept = max(spread - 2.0 * noise[here].mean(), 0.0) / spread if spread > 0.0 else 0.0
             narrow[here] = mean + np.sqrt(kept) * (truth[here] - mean)
         return narrow
-
-    def many(self, count: int) -> Iterator[FloatArray]:
-        """So many truths, each drawn when it is asked for."""
-        return (self.drawn() for _ in range(count))

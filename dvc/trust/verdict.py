@@ -61,10 +61,9 @@ def worst(verdicts: Iterable[Verdict]) -> Verdict:
     >>> worst([Verdict("trust"), Verdict("distrust", ("It folds.",))])
     Verdict(level='distrust', reasons=('It folds.',))
     """
-    given = list(verdicts)
-    if not given:
+    if not (given := list(verdicts)):
         raise InputError("There is no verdict to choose the worst of; judge at least one result first.")
-    level = max((v.level for v in given), key=LEVELS.index)
+    level = together(given).level
     return Verdict(level, tuple(dict.fromkeys(r for v in given if v.level == level for r in v.reasons)))
 
 

@@ -204,7 +204,7 @@ def test_colours_end_where_they_are_told_to_and_else_above_nearly_all(measured):
         ({"quantity": "von Mises"}, "No quantity 'von Mises'; there are max_shear"),
         ({"planes": ["oblique"]}, "Planes are among sagittal"),
         ({"planes": []}, "got none"),
-        ({"largest": -0.1}, "must be above zero"),
+        ({"largest": -0.1}, "must be positive"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(stretched, given, message):

@@ -156,10 +156,10 @@ def test_intervals_cover_the_truth_as_often_as_they_claim() -> None:
         found = 0.25 + 0.08 * base / base.std()
         noise = gaussian_filter(random.standard_normal(GRID.shape), 2.0)
         truth = found - 0.01 - 0.03 * noise / noise.std() - 0.01 * random.normal()
-        actual = figures_of(truth.ravel(), truth.size / 1000.0, (0.3,))
+        actual = figures_of(truth.ravel(), truth.size / 1000.0)
         row = []
         for one in (table, replace(table, runs=(cells(0.01, 0.03),))):
-            got = uncertainty_of(found.astype(np.float32), GRID, {"x": everywhere}, far, one, thresholds=(0.3,))
+            got = uncertainty_of(found.astype(np.float32), GRID, {"x": everywhere}, far, one)
             row.append(float(np.mean([i.low <= t <= i.high for i, t in zip(got.intervals, actual, strict=True)])))
         hits.append(row)
     covered, without = np.mean(hits, axis=0)

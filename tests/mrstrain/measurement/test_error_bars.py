@@ -93,7 +93,7 @@ def test_where_the_error_is_not_known_the_reason_is_told(used: ErrorModel, label
     assert bars.uncertainty is None
     assert says in bars.told
     assert bars.as_dict() == {"known": False, "reason": bars.told}
-    assert bars.missing == bars.told
+    assert bars.summary == [f"No error bars. {bars.told}"]
     assert error_tables(bars) == []
 
 
