@@ -161,7 +161,7 @@ class Grid:
     def __str__(self) -> str:
         """Shape, spacing and bounding box, for messages."""
         low, high = self.bounds_mm()
-        box = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in zip(low, high, strict=True))
+        box = ", ".join(f"{a:z.1f} to {b:z.1f}" for a, b in zip(low, high, strict=True))
         spacing = " x ".join(f"{s:.4g}" for s in self.spacing_mm)
         return f"{' x '.join(map(str, self.shape))} voxels of {spacing} mm, box (LPS mm) {box}"
 
@@ -301,11 +301,10 @@ class LabelMap:
 
     def no_region(self, name: str) -> InputError:
         """The error for a name that no label has."""
+        listed = ", ".join(sorted(self.names.values())) or "none"
         unnamed = all(known.startswith("label-") for known in self.names.values())
-        hint = " It came without a table of names (--names), so labels go by their numbers." if unnamed else ""
-        return InputError(
-            f"The label map has no region '{name}'; it has {', '.join(sorted(self.names.values())) or 'none'}.{hint}"
-        )
+        told = " It came without a table of names (names; --names on the command line), so labels go by their numbers."
+        return InputError(f"The label map has no region '{name}'; it has {listed}.{told if unnamed else ''}")
 
     def toward_lps(self) -> Self:
         """The same label map with its axes closest to L, P, S."""

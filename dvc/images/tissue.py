@@ -34,7 +34,7 @@ def tissue_mask(image: Image) -> Mask:
     filled = _fill_slices(binary_fill_holes(closed))
     if not 0.01 <= (share := float(filled.mean())) <= 0.99:
         taken = f"the threshold takes {100 * share:.1f} % of the image"
-        raise InputError(f"No tissue mask could be made: {taken}. Give one with --tissue.")
+        raise InputError(f"No tissue mask could be made: {taken}. Give one: tissue (--tissue on the command line).")
     return Mask(image.grid, filled)
 
 

@@ -22,7 +22,7 @@ _MOSTLY = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorBars:
-    """Errors of a load's maximal shear, or why they are not known."""
+    """Errors of a load's maximal shear strain, or why they are not known."""
 
     uncertainty: Uncertainty | None
     told: str  # where the figures come from, or why there are none; empty where no images were registered
@@ -64,7 +64,7 @@ class TwinCheck:
 def error_bars(
     found: Registration, subject: Subject, maps: StrainMaps, model: ErrorModel | None, twin: TwinCheck | None = None
 ) -> ErrorBars:
-    """Error of a registered load's maximal shear, by an error model: the user's own or the preset's, if there is one.
+    """Error of a registered load's maximal shear strain, by an error model, the user's own or the preset's.
 
     Error bars that do not hold in the pair's twin are made wider.
     """

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from dvc.arrays import Float32Array
+from dvc.arrays import Float32Array, FloatArray
 from dvc.atomic_files import whole_folder, write_json
 from dvc.deformation.protocol import Deformation, RigidMotion, Within
 from dvc.deformation.strain_maps import TENSOR_COMPONENTS, StrainMaps, strain_maps
-from dvc.errors import InputError
+from dvc.errors import GeometryError, InputError
 from dvc.images.image import Image, Mask
 from dvc.io import result_folder as files
 from dvc.measurement import judgement, page
@@ -32,6 +32,8 @@ from dvc.trust.quality import Quality, noise_floor
 from dvc.trust.regions import RegionRow, read_regions_csv, region_statistics, write_regions_csv
 from dvc.trust.verdict import Verdict
 
+_SHOWN = "slices_meet_at_lps_mm"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
@@ -46,20 +48,22 @@ class Measurement:
     deformation : Deformation
         Displacement of tissue relative to its bone.
     maps : StrainMaps
-        Displacement, Green-Lagrange strain, maximal shear, det F, and where they are valid.
+        Displacement, Green-Lagrange strain, maximal shear strain (E1 - E3)/2, det F, and where they are valid.
     alignment : mapping
         The bone's rigid motion between the scans and how well it is known, as plain values: "on" (what was aligned
         on), "rotation" (3 x 3) and "translation_lps_mm" (`bone_motion`), "repeatability_rms_mm" and more.
     quality : Quality
         The figures behind the verdict.
     regions : tuple of RegionRow
-        Statistics of maximal shear, det F and displacement by region.
+        Statistics of maximal shear strain, det F and displacement by region.
     error_bars : ErrorBars
-        Standard deviation and intervals of the maximal shear, or why there are none.
+        Standard deviation and intervals of the maximal shear strain, or why there are none.
     image : Image or None
         What maps are shown over: the unloaded image; the registered one where a folder was read.
     source : Source or None
         What it was made from; None where a folder was read.
+    shown_mm : (3,) or None
+        Where the slices of its pictures meet, LPS mm: the bone's lowest point; None: the middle of the tissue.
 
     Examples
     --------
@@ -88,6 +92,7 @@ class Measurement:
     error_bars: ErrorBars
     image: Image | None = None
     source: Source | None = None
+    shown_mm: FloatArray | None = None
 
     @classmethod
     def from_registration(
@@ -109,8 +114,8 @@ class Measurement:
         quality, alignment = judgement.quality_of(found, maps, images.similarity, more), judgement.alignment_of(found)
         regions = tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity))
         bars = error_bars(found, subject, maps, more.error_model, more.twin)
-        source = Source(subject, found.tissue, found, images)
-        return cls(name, found.deformation, maps, alignment, quality, regions, bars, found.reference, source)
+        source, at = Source(subject, found.tissue, found, images), subject.lowest_bone_point_mm
+        return cls(name, found.deformation, maps, alignment, quality, regions, bars, found.reference, source, at)
 
     @classmethod
     def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Self:
@@ -131,30 +136,44 @@ class Measurement:
         maps = strain_maps(relative, body)
         alignment = {"on": "none" if subject.bone is None else "bone", **judgement.motion_as_dict(motion)}
         quality, bars, source = assess(maps, body, subject.bone), ErrorBars(None, ""), Source(subject, body)
-        regions = tuple(region_statistics(subject.regions(body), maps.by_quantity))
-        return cls(name, relative, maps, alignment, quality, regions, bars, subject.reference, source)
+        regions, at = tuple(region_statistics(subject.regions(body), maps.by_quantity)), subject.lowest_bone_point_mm
+        return cls(name, relative, maps, alignment, quality, regions, bars, subject.reference, source, at)
 
     @classmethod
     def read(cls, folder: Path | str, image: Image | None = None) -> Self:
         """Read the folder of one load that `write` or ``mrstrain register`` wrote.
 
-        The unloaded image, to show maps over, is not in the folder; without one, the registered image stands for it.
+        Parameters
+        ----------
+        folder : path
+            Of one load; a series has one for each.
+        image : Image, optional
+            The unloaded image, to show maps over, which the folder does not hold; by default the registered image.
 
         Raises
         ------
         InputError, ImageFileError
-            If a file is missing or damaged, with its name and what to do.
+            If a file is missing or damaged, with its name and what to do; if the folder is that of a series.
+        GeometryError
+            If the image lies on another grid than the maps.
         """
         place = Path(folder)
+        loads = sorted({path.parent.name for path in place.glob(f"*/{files.QUALITY}")} - {files.REPEAT})
+        if loads and not (place / files.QUALITY).is_file():
+            raise InputError(f"{place} holds {', '.join(loads)}: read one of them, e.g. {place / loads[0]}.")
         told = files.read_quality(place)
         try:
             quality, alignment = Quality.from_dict(told), dict(told["alignment"])
             files.motion_in(alignment)
+            at = np.array(told[_SHOWN].split(), dtype=np.float64) if told.get(_SHOWN) else None
         except (KeyError, TypeError, ValueError) as failure:
             what = f"not as `write` leaves it ({failure!r})"
             raise InputError(f"{place / files.QUALITY}: {what}. {files.AGAIN}") from failure
         maps = files.read_maps(place)
         uncertainty, model = files.read_uncertainty(place, maps.grid) or (None, None)
+        if image is not None and not image.grid.same_as(maps.grid):
+            what = f"The image lies on another grid ({image.grid}) than the maps in {place} ({maps.grid})"
+            raise GeometryError(f"{what}: give the unloaded image that was measured.")
         if image is None and (place / files.REGISTERED).is_file():
             image = files.read_scalar(place / files.REGISTERED, maps.grid)
         regions = tuple(read_regions_csv(place / files.REGIONS))
@@ -162,7 +181,7 @@ class Measurement:
         deformation = files.ResultFolder(place).deformation()
         if (place / files.SPLINE).is_file():  # with its own gradient, not its displacement at the voxels
             deformation = Within(files.spline_in(place), Mask(maps.grid, maps.valid), margin_voxels=0)
-        return cls(place.resolve().name, deformation, maps, alignment, quality, regions, bars, image)
+        return cls(place.resolve().name, deformation, maps, alignment, quality, regions, bars, image, None, at)
 
     @property
     def verdict(self) -> Verdict:
@@ -171,12 +190,12 @@ class Measurement:
 
     @property
     def max_shear(self) -> Float32Array:
-        """(ni, nj, nk): (E_1 - E_3) / 2."""
+        """Maximal shear strain (E1 - E3)/2 (ni, nj, nk), no unit; NaN where not defined."""
         return self.maps.max_shear
 
     @property
     def sigma(self) -> Float32Array | None:
-        """(ni, nj, nk): standard deviation of the maximal shear, where its error is known."""
+        """(ni, nj, nk): standard deviation of the maximal shear strain, where its error is known."""
         known = self.error_bars.uncertainty
         return None if known is None else known.sigma
 
@@ -193,10 +212,10 @@ class Measurement:
 
     @property
     def strain_line(self) -> str:
-        """The maximal shear by region, in a line."""
+        """The maximal shear strain by region, in a line."""
         rows = (r for r in self.regions if r.quantity == "max_shear" and np.isfinite(r.median))
-        shear = ", ".join(f"{r.region} {r.median:.3f} / {r.p95:.3f}" for r in rows)
-        return f"maximal shear, median / 95th percentile: {shear}"
+        shear = ", ".join(f"{r.region} {r.median:z.3f} / {r.p95:z.3f}" for r in rows)
+        return f"maximal shear strain (E1 - E3)/2, median / 95th percentile: {shear}"
 
     def summary(self) -> list[str]:
         """The verdict with its reasons and the strain, in lines."""
@@ -256,7 +275,7 @@ class Measurement:
         return known[quantity]
 
     def _repr_html_(self) -> str:
-        picture = Picture("Maximal shear", "", png_bytes(self.plot()))
+        picture = Picture("Maximal shear strain", "", png_bytes(self.plot()))
         table = page.short_table(self.regions, self.intervals)
         return notebook_html(self.name, picture, table, verdict=self.verdict, notes=self.error_bars.summary)
 
@@ -298,6 +317,8 @@ class Measurement:
         made, pictures, verdict, bars = self._made_from(), self.pictures(), self.verdict, self.error_bars
         told = self.quality.as_dict() | {"alignment": dict(self.alignment)}
         found = made.registration
+        if self.shown_mm is not None:
+            told[_SHOWN] = " ".join(map(str, self.shown_mm.tolist()))
         if found is not None:
             if chosen := found.choice.as_dict():
                 told["regularisation"] = chosen
@@ -330,7 +351,7 @@ class Measurement:
     def _view(self, point_mm: npt.ArrayLike | None = None) -> View:
         """The slices through a point, through the bone's lowest point, or through the tissue's middle."""
         grid, valid = self.maps.grid, self.maps.valid
-        point = point_mm if self.source is None or point_mm is not None else self.source.subject.lowest_bone_point_mm
+        point = self.shown_mm if point_mm is None else point_mm
         if point is None:
             points = grid.points(valid if valid.any() else np.ones(grid.shape, dtype=bool))
             point = points[int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]

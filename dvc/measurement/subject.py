@@ -76,15 +76,16 @@ def plate_directions(
     plate_normal: Sequence[float] | None, shear_direction: Sequence[float] | None
 ) -> tuple[FloatArray, FloatArray | None]:
     """The plate's outward unit normal (inferior where none is given), and its axes where a shear direction is given."""
-    normal = _unit("--plate-normal", _INFERIOR if plate_normal is None else plate_normal)
-    return normal, None if shear_direction is None else plate_axes(normal, _unit("--shear-direction", shear_direction))
+    normal = _unit("plate_normal", _INFERIOR if plate_normal is None else plate_normal)
+    return normal, None if shear_direction is None else plate_axes(normal, _unit("shear_direction", shear_direction))
 
 
 def _unit(name: str, vector: Sequence[float]) -> FloatArray:
     direction = np.asarray(vector, dtype=np.float64)
     length = float(np.linalg.norm(direction))
     if direction.shape != (3,) or not np.isfinite(length) or length < 1e-6:
-        raise InputError(f"{name} must be three finite numbers (LPS) that are not all zero; got {list(vector)}.")
+        told = f"{name} (--{name.replace('_', '-')} on the command line)"
+        raise InputError(f"{told} must be three finite numbers (LPS) that are not all zero; got {list(vector)}.")
     return direction / length
 
 

@@ -97,4 +97,4 @@ class View:
         if tilt > OBLIQUE_DEG:
             return f"{plane.capitalize()}, along image axes (tilted {tilt:.0f}°)"
         at = lps.points_at(np.array(self.index, dtype=np.float64))[cut]
-        return f"{plane.capitalize()}, {'xyz'[cut]} = {at:.0f} mm".replace("-", "\u2212")
+        return f"{plane.capitalize()}, {'xyz'[cut]} = {at:z.0f} mm".replace("-", "\u2212")

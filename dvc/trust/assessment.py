@@ -1,5 +1,6 @@
 """How far a registration may be trusted: a verdict by its strain maps, the images' similarity, and more evidence."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,42 +12,44 @@ from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.verdict import Verdict, together
 
 # Where a figure lowers the verdict: use with care, do not trust; one whose second limit is the lower has to lie above.
+# Beside the limits: how a figure is printed, its decimals and its unit.
 # The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound registrations
 # at SNR 10 to 25 stay above 0.8 and failed ones below 0.6. Those of the voxels come from a warp of a knee with added
-# noise (slices of 4 mm: apparent maximal shear 0.1) and a leg's repeat scan (6 mm: 0.3). Unlikeness is what the
+# noise (slices of 4 mm: apparent maximal shear strain 0.1) and a leg's repeat scan (6 mm: 0.3). Unlikeness is what the
 # similarity lacks of the most that noise leaves: it reveals another person's foot. Offsets that rose to 7, 15 and 30 %
 # across a phantom's foot raised the error in fat by 2, 16 and 130 %, in skin by 27, 93 and 380 %.
 _LIMITS = {
-    "similarity": (0.7, 0.45),
-    "unlikeness": (0.05, 0.09),
-    "offset": (0.07, 0.12),
-    "voxel_mm": (2.0, 5.0),
-    "bone_shift_mm": (0.3, 0.8),
-    "bone_shear_p95": (0.1, 0.25),
-    "lowest_jacobian": (0.3, 0.0),
-    "undefined_fraction": (0.15, 0.4),
-    "landmark_error_mm": (1.0, 2.0),
-    "floor_shear_p95": (0.06, 0.15),
+    "similarity": (0.7, 0.45, 2, ""),
+    "unlikeness": (0.05, 0.09, 2, ""),
+    "offset": (0.07, 0.12, 0, "%"),
+    "voxel_mm": (2.0, 5.0, 1, " mm"),
+    "bone_shift_mm": (0.3, 0.8, 2, " mm"),
+    "bone_shear_p95": (0.1, 0.25, 3, ""),
+    "lowest_jacobian": (0.3, 0.0, 2, ""),
+    "undefined_fraction": (0.15, 0.4, 0, "%"),
+    "landmark_error_mm": (1.0, 2.0, 2, " mm"),
+    "floor_shear_p95": (0.06, 0.15, 3, ""),
 }
+_NOISIER = " even if the noise is half as strong again"
 _REASONS = {
-    "similarity": "After registration the images agree poorly: local similarity {value:.2f} (care below {limit:.2f}).",
+    "similarity": "After registration the images agree poorly: local similarity {value} ({limits}).",
     "unlikeness": "After registration the images are less alike than noise as strong as in the air would leave them: "
-    "local similarity lacks {value:.2f} (care above {limit:.2f}). Is it the same foot, scanned in the same way? "
+    "local similarity lacks {value} ({limits}" + _NOISIER + "). Is it the same foot, scanned in the same way? "
     "Parallel imaging and filters change the noise in the tissue.",
-    "offset": "The images' brightness differs by more than a factor: by an offset of {value:.0%} of the tissue's (care "
-    "above {limit:.0%}), which is taken for motion. Scan both in the same way, or take it out of the images.",
-    "voxel_mm": "Slices are {value:.1f} mm apart: strain across them is hardly seen, and strain is found where there "
-    "is none (care above {limit:.0f} mm). A repeat scan without load tells how much.",
-    "bone_shift_mm": "The bone, which is rigid, was deformed: {value:.2f} mm root mean square (care above "
-    "{limit:.2f}).",
-    "bone_shear_p95": "The bone, which is rigid, shows an apparent maximal shear of {value:.3f} (95th percentile; care "
-    "above {limit:.2f}).",
-    "lowest_jacobian": "Somewhere tissue is squeezed to {value:.2f} of its volume (care below {limit:.2f}).",
-    "undefined_fraction": "{value:.0%} of the tissue has no result: it is not shown by the loaded image or not covered "
-    "by the deformation (care above {limit:.0%}).",
-    "landmark_error_mm": "Landmarks are missed by {value:.2f} mm in the median (care above {limit:.2f}).",
-    "floor_shear_p95": "The repeat scan shows an apparent maximal shear of {value:.3f} (95th percentile) where there "
-    "is none (care above {limit:.3f}).",
+    "offset": "The images' brightness differs by more than a factor: by an offset of {value} of the tissue's ({limits}"
+    + _NOISIER
+    + "), which is taken for motion. Scan both in the same way, or take it out of the images.",
+    "voxel_mm": "Slices are {value} apart: strain across them is hardly seen, and strain is found where there is none "
+    "({limits}). A repeat scan without load tells how much.",
+    "bone_shift_mm": "The bone, which is rigid, was deformed: {value} root mean square ({limits}).",
+    "bone_shear_p95": "The bone, which is rigid, shows an apparent maximal shear strain of {value} (95th percentile; "
+    "{limits}).",
+    "lowest_jacobian": "Somewhere tissue is squeezed to {value} of its volume ({limits}).",
+    "undefined_fraction": "{value} of the tissue has no result: it is not shown by the loaded image or not covered by "
+    "the deformation ({limits}).",
+    "landmark_error_mm": "Landmarks are missed by {value} in the median ({limits}).",
+    "floor_shear_p95": "The repeat scan shows an apparent maximal shear strain of {value} (95th percentile) where "
+    "there is none ({limits}).",
 }
 
 
@@ -79,19 +82,41 @@ def assess(
     floor: NoiseFloor | None = None,
     in_bone: tuple[float, float] | None = None,
 ) -> Quality:
-    """Judge a registration by its strain maps and the images' similarity.
+    """Judge a registration by its strain maps, the images' similarity, and more evidence.
 
     Parameters
     ----------
+    maps : StrainMaps
+        Displacement (mm) and strain on the unloaded image's grid, reference configuration (`dvc.strain_maps`).
+    tissue : Mask
+        Soft tissue and bone, on the same grid: how much of it has no result is counted.
     bone : Mask or None
-        The bone that was aligned on: motion within it is error.
+        The bone that was aligned on, on the same grid: motion within it is error. None where there is none.
     similarity : Similarity, optional
-        None where there are no images to compare.
+        None where there are no images to compare; the verdict is then "Use with care" at best.
     landmark_errors_mm : (n,), optional
-        Distance between each registered and each given landmark; NaN where not defined.
-    in_bone : (mm, shear), optional
+        Distance between each registered and each given landmark, mm; NaN where not defined
+        (`dvc.target_registration_error`).
+    floor : NoiseFloor, optional
+        Of a repeat scan without load (`dvc.noise_floor`).
+    in_bone : (mm, no unit), optional
         Where the maps hold the bone at rest: root mean square displacement and 95th percentile of the maximal shear
-        in it before that was imposed.
+        strain in it before that was imposed.
+
+    Returns
+    -------
+    Quality
+        The figures, and the verdict that follows: "distrust" or "caution" where one is beyond its limit, each with a
+        sentence that names figure and limits, else "trust".
+
+    Examples
+    --------
+    >>> import dvc
+    >>> grid = dvc.Grid((5, 5, 5), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    >>> body = dvc.Mask(grid, np.ones(grid.shape, dtype=bool))
+    >>> maps = dvc.strain_maps(dvc.Affine(np.diag([1.1, 1.0, 1.0]), np.zeros(3)), body)
+    >>> assess(maps, body, None, similarity=Similarity((0.5, 0.7, 0.6))).verdict.words
+    'Do not trust'
     """
     lowest, at = _lowest(maps.jacobian, maps.grid)
     known = int(np.count_nonzero(maps.valid & tissue.inside))
@@ -117,8 +142,8 @@ def assess(
     if similarity is None:
         findings.append(Verdict("caution", ("No images were compared: the deformation is taken as it was given.",)))
     if quality.folded_voxels:
-        place = ", ".join(f"{c:.1f}" for c in at)
-        folds = f"The deformation folds: det F <= 0 in {quality.folded_voxels} voxels, lowest {lowest:.2f} at LPS"
+        place, least = ", ".join(f"{c:z.1f}" for c in at), _apart(lowest, (0.0,), 2)
+        folds = f"The deformation folds: det F <= 0 in {quality.folded_voxels} voxels, lowest {least} at LPS"
         findings.append(Verdict("distrust", (f"{folds} ({place}) mm.",)))
     if similarity is not None:
         findings += _unlike(similarity, quality, float(maps.grid.spacing_mm.max()))
@@ -132,7 +157,7 @@ def assess(
 
 
 def _in_bone(maps: StrainMaps, bone: Mask | None, told: tuple[float, float] | None) -> tuple[float, float]:
-    """Root mean square displacement (mm) and 95th percentile of the maximal shear within the bone; NaN without one."""
+    """Root mean square displacement (mm) and 95th percentile of maximal shear strain in the bone; NaN without one."""
     if bone is None or not (kept := maps.valid & bone.inside).any():
         return np.nan, np.nan
     if told is not None:
@@ -160,16 +185,31 @@ def _unlike(similarity: Similarity, quality: Quality, slice_mm: float) -> list[V
     findings += _judged("voxel_mm", slice_mm)
     if after < rigid - 0.01:
         told = "The non-rigid registration made the images less alike: local similarity went from"
-        findings.append(Verdict("distrust", (f"{told} {rigid:.2f} to {after:.2f}.",)))
+        findings.append(Verdict("distrust", (f"{told} {rigid:z.2f} to {after:z.2f}.",)))
     return findings
 
 
 def _judged(figure: str, value: float, distrusted: bool | None = None) -> list[Verdict]:
     """A figure beside its limits: a finding, or none. ``distrusted``: decided by more than the second limit."""
-    care, distrust = _LIMITS[figure]
-    reason = _REASONS[figure].format(value=value, limit=care)
-    if care > distrust:  # not for NaN: a similarity that is not known counts as none
-        return [] if value >= care else [Verdict("caution" if value >= distrust else "distrust", (reason,))]
-    if not value > care:
+    care, distrust, decimals, unit = _LIMITS[figure]
+    falling = care > distrust
+    # NaN: a similarity that is not known counts as none; of the others, what is not finite is not known.
+    if value >= care if falling else not (np.isfinite(value) and value > care):
         return []
-    return [Verdict("distrust" if (value > distrust if distrusted is None else distrusted) else "caution", (reason,))]
+    if distrusted is None:
+        distrusted = not value >= distrust if falling else value > distrust
+    scale, side = 100.0 if unit == "%" else 1.0, "below" if falling else "above"
+    near = [limit * scale for limit in (care, distrust)]
+    limits = f"care {side} {near[0]:g}{unit}, distrust {side} {near[1]:g}{unit}"
+    told = _apart(value * scale, near, decimals) + unit
+    return [Verdict("distrust" if distrusted else "caution", (_REASONS[figure].format(value=told, limits=limits),))]
+
+
+def _apart(value: float, limits: Sequence[float], decimals: int) -> str:
+    """A number with so many decimals, or as many more as it takes to differ from its limits.
+
+    >>> _apart(0.06004, (0.06, 0.15), 3), _apart(0.06, (0.06, 0.15), 3), _apart(-0.0001, (0.3, 0.0), 2)
+    ('0.06004', '0.060', '-0.0001')
+    """
+    different = (d for d in range(decimals, 12) if f"{value:z.{d}f}" not in (f"{limit:z.{d}f}" for limit in limits))
+    return f"{value:z.{next(different, decimals)}f}"

@@ -1,4 +1,4 @@
-"""Uncertainty of a maximal shear: bias and standard deviation measured on phantoms, and the intervals that follow.
+"""Uncertainty of a maximal shear strain: bias and standard deviation measured on phantoms, and intervals from them.
 
 An error model is made by an accuracy study of one registration preset: of voxels in which a shear m was measured, by
 tissue and distance to bone, how far it lay from the truth on average (bias) and how much that varied (standard
@@ -34,7 +34,7 @@ _DRAWS = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorTable:
-    """Error of the maximal shear for one voxel size and signal-to-noise ratio (`dvc.images.noise.signal_to_noise`).
+    """Error of the maximal shear strain for one voxel size and `dvc.images.noise.signal_to_noise`.
 
     It is given at rising measured shears (m,), linear between and constant beyond, and for bins of distance to bone
     whose lower ends (k,) rise from 0: mean and standard deviation (2, k, m) of measured minus true shear by tissue,
@@ -100,8 +100,8 @@ class ErrorModel:
             raise InputError(
                 f"The error of {self.preset} is known for voxels of {known}. These images have voxels of "
                 f"{_told(spacing_mm)} mm at SNR {snr:.0f}, too far from any of these: measure it with `mrstrain "
-                f"accuracy --preset {self.preset}` (--spacing, --slice-spacing, --snr) and give its file as "
-                "--error-model."
+                f"accuracy --preset {self.preset}` (--spacing, --slice-spacing, --snr) and give its file: error_model "
+                "(--error-model on the command line)."
             )
         return nearest
 
@@ -213,7 +213,9 @@ class Interval:
 class Uncertainty:
     """Error of a strain map."""
 
-    sigma: Float32Array  # standard deviation (ni, nj, nk) of the maximal shear about its bias; NaN where not known
+    sigma: (
+        Float32Array  # standard deviation (ni, nj, nk) of the maximal shear strain about its bias; NaN where not known
+    )
     intervals: tuple[Interval, ...]
     table: ErrorTable
 
@@ -249,7 +251,7 @@ def uncertainty_of(
     seed: int = 1,
     wider: Mapping[str, float] = MappingProxyType({}),
 ) -> Uncertainty:
-    """Error of a map of maximal shear (ni, nj, nk), NaN where not defined, by an error table.
+    """Error of a map of maximal shear strain (ni, nj, nk), NaN where not defined, by an error table.
 
     For each of the soft tissues ``regions``, masks by name, at distances to bone (ni, nj, nk). Beside
     `ErrorTable.widening`, ``wider`` holds factors on the deviation and the intervals of some regions.

@@ -41,13 +41,20 @@ _FIGURES: dict[str, tuple[str, Callable[[Any], object]]] = {  # fields of Qualit
 class NoiseFloor:
     """What a repeat scan without load shows: the apparent strain where the truth is zero.
 
-    MAER (mean over voxels of the mean absolute value of the six components of E) and SDER (its standard deviation over
-    voxels) are those of Palanca et al. 2015, doi:10.1115/1.4030533.
+    Attributes
+    ----------
+    maer, sder : float
+        Mean over voxels of the mean absolute value of the six components of the Green-Lagrange strain, no unit, and its
+        standard deviation over voxels (Palanca et al. 2015, doi:10.1115/1.4030533).
+    max_shear_p50, max_shear_p95 : float
+        Median and 95th percentile of the apparent maximal shear strain (E1 - E3)/2, no unit.
+    displacement_p95_mm : float
+        95th percentile of the length of the apparent displacement, mm.
     """
 
     maer: float
     sder: float
-    max_shear_p50: float  # percentiles of the apparent maximal shear
+    max_shear_p50: float
     max_shear_p95: float
     displacement_p95_mm: float
 
@@ -64,24 +71,29 @@ class Quality:
     Attributes
     ----------
     similarity : (before, after rigid, after all) or None
-        Pooled local correlation in the tissue, -1 to 1.
+        Pooled local correlation of the two images in the tissue (`dvc.local_correlation`), -1 to 1, as scanned, after
+        the rigid part and after all; None where no images were compared.
     most_similarity : float
-        What noise as in the air lets the last of these be; NaN where that is not known.
+        What noise as in the air lets the last of these be, 0 to 1; NaN where that is not known.
     offset : float
-        Offset between the images as a share of brightness (`dvc.images.similarity.brightness_offset`), or NaN.
+        Offset between the images as a share of the tissue's brightness, no unit; NaN where that is not known.
     folded_voxels : int
-        Voxels with det F <= 0.
+        Number of voxels with det F <= 0.
     lowest_jacobian, lowest_jacobian_at_mm : float, (x, y, z)
-        Lowest det F, and where, LPS mm, reference configuration.
+        Lowest det F, no unit, and the centre of its voxel, LPS mm, reference configuration; NaN without any value.
     undefined_fraction : float
-        Share of the tissue without a value.
+        Share of the tissue's voxels without a value, 0 to 1.
     bone_shift_mm, bone_shear_p95 : float
-        Root mean square displacement and 95th percentile of the apparent maximal shear left inside the bone, which is
-        rigid: zero is the truth. NaN without a bone.
+        Root mean square displacement, mm, and 95th percentile of the apparent maximal shear strain (E1 - E3)/2, no
+        unit, left inside the bone, which is rigid: zero is the truth. NaN without a bone.
     bone_held : bool
         Whether these two are from before the bone was held at rest, as it is in the maps.
     landmark_errors_mm : (n,) or None
-        Distance between each registered and each given landmark.
+        Distance between each registered and each given landmark, mm; NaN where not defined. None without landmarks.
+    noise_floor : NoiseFloor or None
+        Apparent strain of a repeat scan; None without one.
+    verdict : Verdict
+        What follows: whether the registration may be trusted, with reasons.
     """
 
     similarity: tuple[float, float, float] | None
@@ -138,7 +150,20 @@ def plain(value: Any) -> Any:
 
 
 def noise_floor(maps: StrainMaps, where: BoolArray) -> NoiseFloor | None:
-    """The apparent strain of a repeat scan's maps, in the valid voxels of ``where`` (ni, nj, nk); None without any."""
+    """The apparent strain of a repeat scan without load, whose true strain is zero.
+
+    Parameters
+    ----------
+    maps : StrainMaps
+        Of the second unloaded image against the first, on the grid of the first.
+    where : (ni, nj, nk) bool
+        Voxels to count, such as the soft tissue: of these, all where the maps are valid.
+
+    Returns
+    -------
+    NoiseFloor or None
+        None where no voxel is left.
+    """
     kept = maps.valid & where
     if not kept.any():
         return None

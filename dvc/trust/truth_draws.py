@@ -13,7 +13,8 @@ _STEPS = 4  # of the lattice that noise is drawn on, within a correlation length
 class TruthDraws:
     """Draws of the truth, as `dvc.trust.error_model.uncertainty_of` makes them on a grid.
 
-    At points (n, 3) of the reference configuration, LPS mm: maximal shear (n,), tissue (n,), and distance to bone (n,).
+    At points (n, 3) of the reference configuration, LPS mm: maximal shear strain, tissue and
+    distance to bone, each (n,).
     """
 
     def __init__(

@@ -20,8 +20,9 @@ class Verdict:
     Parameters
     ----------
     level : {"trust", "caution", "distrust"}
+        From the best to the worst; in words "Trust", "Use with care", "Do not trust".
     reasons : tuple of str
-        Full sentences; at least one below "trust".
+        Full sentences, each naming a figure and its limits; at least one below "trust".
 
     Raises
     ------

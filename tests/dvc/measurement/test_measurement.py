@@ -76,7 +76,7 @@ def test_arrays_in_and_arrays_out(measured, tiny_pair):
     assert measured.sigma is not None
     assert {i.region for i in measured.intervals} >= {"fat", "muscle"}
     assert str(measured).startswith(f"Load1: {measured.verdict.words}.\n")
-    assert "maximal shear, median / 95th percentile: " in str(measured)
+    assert "maximal shear strain (E1 - E3)/2, median / 95th percentile: " in str(measured)
 
 
 def test_what_is_written_is_read_again(measured, written):
@@ -169,7 +169,7 @@ def test_a_notebook_shows_the_verdict_a_picture_and_a_table_all_escaped(stretche
 @pytest.mark.parametrize(
     ("quantity", "label"),
     [
-        ("max_shear", "maximal shear"),
+        ("max_shear", "maximal shear strain"),
         ("jacobian", "det F"),
         ("displacement_mm", "mm"),
         ("xy", "component xy"),
@@ -210,6 +210,33 @@ def test_colours_end_where_they_are_told_to_and_else_above_nearly_all(measured):
 def test_what_cannot_be_drawn_is_refused(stretched, given, message):
     with pytest.raises(InputError, match=message):
         stretched.plot(**given)
+
+
+def test_a_measurement_read_again_shows_the_same_slices(stretched, tmp_path):
+    bone = np.zeros(GRID.shape, dtype=bool)
+    bone[4:6, 4:6, 4:7] = True
+    subject = replace(stretched.source.subject, bone=dvc.Mask(GRID, bone))
+    made = dvc.Measurement.from_deformation(dvc.Affine(np.eye(3), np.zeros(3)), subject)
+    made.write(tmp_path / "Load1")
+    again = dvc.Measurement.read(tmp_path / "Load1", stretched.image)
+    titles = [[axes.get_title(loc="left") for axes in one.plot().axes[:3]] for one in (made, again)]
+    assert titles[0] == titles[1]
+    middle = replace(again, shown_mm=None).plot()
+    assert [axes.get_title(loc="left") for axes in middle.axes[:3]] != titles[0]
+    other = dvc.Grid(GRID.shape, GRID.spacing_mm, GRID.origin_mm + 1.0)
+    with pytest.raises(GeometryError, match="image lies on another grid"):
+        dvc.Measurement.read(tmp_path / "Load1", dvc.Image(other, stretched.image.values))
+    (tmp_path / "Load2").mkdir()
+    (tmp_path / "Load2" / files.QUALITY).write_text("{}")
+    with pytest.raises(InputError, match=r"holds Load1, Load2: read one of them, e\.g\. .*Load1\."):
+        dvc.Measurement.read(tmp_path)
+
+
+def test_an_argument_is_called_as_it_was_given(stretched):
+    with pytest.raises(InputError, match=r"plate_normal \(--plate-normal on the command line\) must be three"):
+        dvc.measure(stretched.image, stretched.image, plate_normal=(0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match=r"tissue \(--tissue on the command line\)"):
+        dvc.tissue_mask(dvc.Image(GRID, np.ones(GRID.shape)))
 
 
 def _cut(path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -11,12 +13,14 @@ from dvc.deformation.strain_maps import strain_maps
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.noise import noise_in_air
 from dvc.images.similarity import brightness_offset, local_correlation, most_similarity
+from dvc.report.page import shown
 from dvc.trust.assessment import Similarity, assess
-from dvc.trust.quality import noise_floor
+from dvc.trust.quality import NoiseFloor, noise_floor
 
 GRID = Grid((24, 20, 16), np.array([1.0, 1.2, 1.5]), np.array([-10.0, 5.0, 0.0]))
 WHOLE = Mask(GRID, np.ones(GRID.shape, dtype=bool))
 STRETCH = Affine(np.diag([1.2, 1.0, 1.0]), np.zeros(3))
+ALIKE = Similarity((0.3, 0.5, 0.9))
 
 
 def core() -> Mask:
@@ -217,3 +221,33 @@ def test_a_registration_is_undefined_away_from_its_tissue():
     assert np.isnan(u[1]).all()
     assert np.isnan(H[1]).all()
     assert np.isfinite(H[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("p95", "says"),
+    [
+        (0.06004, "0.06004 (95th percentile) where there is none (care above 0.06, distrust above 0.15)"),
+        (0.15002, "0.15002 (95th percentile)"),
+        (0.0712, "0.071 (95th percentile)"),
+    ],
+)
+def test_a_figure_beyond_its_limit_does_not_read_as_if_it_were_the_limit(p95: float, says: str) -> None:
+    floor = NoiseFloor(0.01, 0.01, 0.02, p95, 0.3)
+    verdict = assess(strain_maps(STRETCH, WHOLE), WHOLE, None, similarity=ALIKE, floor=floor).verdict
+    assert says in verdict.reasons[0]
+
+
+def test_a_figure_that_is_not_finite_is_not_known() -> None:
+    maps, endless = strain_maps(STRETCH, WHOLE), replace(ALIKE, offset=(np.inf, np.inf))
+    assert assess(maps, WHOLE, None, similarity=endless).verdict.level == "trust"
+
+
+def test_a_fold_of_nearly_zero_is_not_called_minus_zero() -> None:
+    maps = strain_maps(STRETCH, WHOLE)
+    jacobian = maps.jacobian.copy()
+    jacobian[2, 2, 2] = -0.0004
+    verdict = assess(replace(maps, jacobian=jacobian), WHOLE, None, similarity=ALIKE).verdict
+    assert verdict.level == "distrust"
+    assert "lowest -0.0004 at" in verdict.reasons[0]
+    assert "-0.00 " not in " ".join(verdict.reasons)
+    assert shown(-0.0) == "0"
