@@ -18,8 +18,7 @@ from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import whole_file
 from dvc.report.figures import REGION_COLOURS
-from dvc.report.planes import letters
-from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
+from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, letters, png_bytes
 from fe.convergence import Limit
 from fe.fitting import Curve, Fit
 from fe.plate import Plate

@@ -142,11 +142,11 @@ def bands(
     Parameters
     ----------
     truths : iterable of (n,)
-        Maximum shear strain of each truth drawn, in the cells; see `dvc.trust.truth_draws.TruthDraws`.
+        Maximum shear strain of each truth drawn, in the cells; see `dvc.trust.error_model.TruthDraws`.
     models, tissues : mapping of name to (n,)
         Maximum shear strain of each model in the cells, and which of the cells belong to each tissue.
     narrowed : callable
-        Narrows a truth drawn (n,) to the spread of a perfect model: `dvc.trust.truth_draws.TruthDraws.narrowed`.
+        Narrows a truth drawn (n,) to the spread of a perfect model: `dvc.trust.error_model.TruthDraws.narrowed`.
     strains : (low, high)
         Range of the areas; the band begins at 0 and ends at one and a half times its upper end.
 

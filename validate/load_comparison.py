@@ -12,7 +12,7 @@ import numpy as np
 from dvc import Deformation, ErrorTable, LabelMap, Measurement, TetMesh, Verdict, plate_axes
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
-from dvc.trust.truth_draws import TruthDraws
+from dvc.trust.error_model import TruthDraws
 from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
 from validate.arguments import check_each, check_kind

@@ -24,8 +24,7 @@ from dvc.registration.align import without_motion
 from dvc.registration.register import Registration
 from dvc.report.figures import Scale, coloured
 from dvc.report.page import Picture, Section, notebook_html
-from dvc.report.planes import PLANES, Plane, View
-from dvc.report.sheet import png_bytes
+from dvc.report.sheet import PLANES, Plane, View, png_bytes
 from dvc.trust.assessment import assess
 from dvc.trust.error_model import Interval
 from dvc.trust.quality import Quality, noise_floor

@@ -12,7 +12,7 @@ from dvc.measurement.judgement import Source
 from dvc.registration.engine import Regularisation
 from dvc.report import figures
 from dvc.report.page import Cell, Picture, Table, shown
-from dvc.report.planes import View
+from dvc.report.sheet import View
 from dvc.trust.error_model import Interval
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow

@@ -1,6 +1,6 @@
 """Figures of a registration, each as PNG bytes: slices in three planes through a point, and curves.
 
-All panels of a figure share one scale, so a length is the same everywhere; `dvc.report.planes` tells how slices lie on
+All panels of a figure share one scale, so a length is the same everywhere; `dvc.report.sheet` tells how slices lie on
 the page. Yellow marks at a panel's edge show where the other planes cut. Voxels without a value are never drawn as
 zero: the loaded image is dark blue there, a map leaves the image below it plain.
 """
@@ -20,8 +20,23 @@ from scipy.ndimage import map_coordinates
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Image, LabelMap
-from dvc.report.planes import AXES, PLANES, Plane, Values, View
-from dvc.report.sheet import FONT, INK, SHADOW, UNSEEN, Sheet, chart, label_axes, levelled, png_bytes, window_of
+from dvc.report.sheet import (
+    AXES,
+    FONT,
+    INK,
+    PLANES,
+    SHADOW,
+    UNSEEN,
+    Plane,
+    Sheet,
+    Values,
+    View,
+    chart,
+    label_axes,
+    levelled,
+    png_bytes,
+    window_of,
+)
 from dvc.trust.regions import volume_above
 
 # The palette of Okabe and Ito, told apart by all common kinds of colour vision.

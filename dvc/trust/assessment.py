@@ -11,46 +11,36 @@ from dvc.images.image import Grid, Mask
 from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.verdict import Verdict, together
 
+_NOISIER = " even if the noise is half as strong again"
 # Where a figure lowers the verdict: use with care, do not trust; one whose second limit is the lower has to lie above.
-# Beside the limits: how a figure is printed, its decimals and its unit.
+# Beside the limits: decimals and unit of the figure in the sentence that tells of it.
 # The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound registrations
 # at SNR 10 to 25 stay above 0.8 and failed ones below 0.6. Those of the voxels come from a warp of a knee with added
 # noise (slices of 4 mm: apparent maximal shear strain 0.1) and a leg's repeat scan (6 mm: 0.3). Unlikeness is what the
 # similarity lacks of the most that noise leaves: it reveals another person's foot. Offsets that rose to 7, 15 and 30 %
 # across a phantom's foot raised the error in fat by 2, 16 and 130 %, in skin by 27, 93 and 380 %.
 _LIMITS = {
-    "similarity": (0.7, 0.45, 2, ""),
-    "unlikeness": (0.05, 0.09, 2, ""),
-    "offset": (0.07, 0.12, 0, "%"),
-    "voxel_mm": (2.0, 5.0, 1, " mm"),
-    "bone_shift_mm": (0.3, 0.8, 2, " mm"),
-    "bone_shear_p95": (0.1, 0.25, 3, ""),
-    "lowest_jacobian": (0.3, 0.0, 2, ""),
-    "undefined_fraction": (0.15, 0.4, 0, "%"),
-    "landmark_error_mm": (1.0, 2.0, 2, " mm"),
-    "floor_shear_p95": (0.06, 0.15, 3, ""),
-}
-_NOISIER = " even if the noise is half as strong again"
-_REASONS = {
-    "similarity": "After registration the images agree poorly: local similarity {value} ({limits}).",
-    "unlikeness": "After registration the images are less alike than noise as strong as in the air would leave them: "
-    "local similarity lacks {value} ({limits}" + _NOISIER + "). Is it the same foot, scanned in the same way? "
-    "Parallel imaging and filters change the noise in the tissue.",
-    "offset": "The images' brightness differs by more than a factor: by an offset of {value} of the tissue's ({limits}"
-    + _NOISIER
-    + "), which is taken for motion. Scan both in the same way, or take it out of the images.",
-    "voxel_mm": "Slices are {value} apart: strain across them is hardly seen, and strain is found where there is none "
-    "({limits}). A repeat scan without load tells how much.",
-    "bone_shift_mm": "The bone, which is rigid, was deformed: {value} root mean square ({limits}).",
-    "bone_shear_p95": "The bone, which is rigid, shows an apparent maximal shear strain of {value} (95th percentile; "
-    "{limits}).",
-    "lowest_jacobian": "Somewhere tissue is squeezed to {value} of its volume ({limits}).",
-    "undefined_fraction": "{value} of the tissue has no result: it is not shown by the loaded image or not covered by "
-    "the deformation ({limits}).",
-    "landmark_error_mm": "Landmarks are missed by {value} in the median ({limits}).",
-    "floor_shear_p95": "The repeat scan shows an apparent maximal shear strain of {value} (95th percentile) where "
-    "there is none ({limits}).",
-}
+    "similarity": (0.7, 0.45, 2, "",
+        "After registration the images agree poorly: local similarity {value} ({limits})."),
+    "unlikeness": (0.05, 0.09, 2, "", "After registration the images are less alike than noise as strong as in the air "
+        f"would leave them: local similarity lacks {{value}} ({{limits}}{_NOISIER}). Is it the same foot, scanned in "
+        "the same way? Parallel imaging and filters change the noise in the tissue."),
+    "offset": (0.07, 0.12, 0, "%", "The images' brightness differs by more than a factor: by an offset of {value} of "
+        f"the tissue's ({{limits}}{_NOISIER}), which is taken for motion. Scan both in the same way, or take it out of the "
+        "images."),
+    "voxel_mm": (2.0, 5.0, 1, " mm", "Slices are {value} apart: strain across them is hardly seen, and strain is found "
+        "where there is none ({limits}). A repeat scan without load tells how much."),
+    "bone_shift_mm": (0.3, 0.8, 2, " mm",
+        "The bone, which is rigid, was deformed: {value} root mean square ({limits})."),
+    "bone_shear_p95": (0.1, 0.25, 3, "", "The bone, which is rigid, shows an apparent maximal shear strain of {value} "
+        "(95th percentile; {limits})."),
+    "lowest_jacobian": (0.3, 0.0, 2, "", "Somewhere tissue is squeezed to {value} of its volume ({limits})."),
+    "undefined_fraction": (0.15, 0.4, 0, "%", "{value} of the tissue has no result: it is not shown by the loaded "
+        "image or not covered by the deformation ({limits})."),
+    "landmark_error_mm": (1.0, 2.0, 2, " mm", "Landmarks are missed by {value} in the median ({limits})."),
+    "floor_shear_p95": (0.06, 0.15, 3, "", "The repeat scan shows an apparent maximal shear strain of {value} (95th "
+        "percentile) where there is none ({limits})."),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,15 +98,6 @@ def assess(
     Quality
         The figures, and the verdict that follows: "distrust" or "caution" where one is beyond its limit, each with a
         sentence that names figure and limits, else "trust".
-
-    Examples
-    --------
-    >>> import dvc
-    >>> grid = dvc.Grid((5, 5, 5), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
-    >>> body = dvc.Mask(grid, np.ones(grid.shape, dtype=bool))
-    >>> maps = dvc.strain_maps(dvc.Affine(np.diag([1.1, 1.0, 1.0]), np.zeros(3)), body)
-    >>> assess(maps, body, None, similarity=Similarity((0.5, 0.7, 0.6))).verdict.words
-    'Do not trust'
     """
     lowest, at = _lowest(maps.jacobian, maps.grid)
     known = int(np.count_nonzero(maps.valid & tissue.inside))
@@ -191,7 +172,7 @@ def _unlike(similarity: Similarity, quality: Quality, slice_mm: float) -> list[V
 
 def _judged(figure: str, value: float, distrusted: bool | None = None) -> list[Verdict]:
     """A figure beside its limits: a finding, or none. ``distrusted``: decided by more than the second limit."""
-    care, distrust, decimals, unit = _LIMITS[figure]
+    care, distrust, decimals, unit, sentence = _LIMITS[figure]
     falling = care > distrust
     # NaN: a similarity that is not known counts as none; of the others, what is not finite is not known.
     if value >= care if falling else not (np.isfinite(value) and value > care):
@@ -202,7 +183,7 @@ def _judged(figure: str, value: float, distrusted: bool | None = None) -> list[V
     near = [limit * scale for limit in (care, distrust)]
     limits = f"care {side} {near[0]:g}{unit}, distrust {side} {near[1]:g}{unit}"
     told = _apart(value * scale, near, decimals) + unit
-    return [Verdict("distrust" if distrusted else "caution", (_REASONS[figure].format(value=told, limits=limits),))]
+    return [Verdict("distrust" if distrusted else "caution", (sentence.format(value=told, limits=limits),))]
 
 
 def _apart(value: float, limits: Sequence[float], decimals: int) -> str:

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, Image, LabelMap
 from dvc.report import figures
-from dvc.report.planes import LETTERS, PLANES, Plane, View
-from dvc.report.sheet import UNSEEN, Sheet
+from dvc.report.sheet import LETTERS, PLANES, UNSEEN, Plane, Sheet, View
 
 # Where a point that lies 12 mm off the centre in one direction must appear: (across, down), -1, 0 or 1.
 SIDES: dict[str, dict[Plane, tuple[int, int]]] = {
