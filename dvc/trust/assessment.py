@@ -26,8 +26,8 @@ _LIMITS = {
         f"would leave them: local similarity lacks {{value}} ({{limits}}{_NOISIER}). Is it the same foot, scanned in "
         "the same way? Parallel imaging and filters change the noise in the tissue."),
     "offset": (0.07, 0.12, 0, "%", "The images' brightness differs by more than a factor: by an offset of {value} of "
-        f"the tissue's ({{limits}}{_NOISIER}), which is taken for motion. Scan both in the same way, or take it out of the "
-        "images."),
+        f"the tissue's ({{limits}}{_NOISIER}), which is taken for motion. Scan both in the same way, or take it out of "
+        "the images."),
     "voxel_mm": (2.0, 5.0, 1, " mm", "Slices are {value} apart: strain across them is hardly seen, and strain is found "
         "where there is none ({limits}). A repeat scan without load tells how much."),
     "bone_shift_mm": (0.3, 0.8, 2, " mm",
