@@ -95,7 +95,8 @@ class Comparison:
         head = ("model", "rank", *loads, *(["all loads"] if len(loads) > 1 else []))
         rows = tuple(row[: len(head)] for row in area_rows(self.areas, self.ranking, loads))
         low, high = self.strains
-        title = f"Area between volume-strain curves, maximum shear strain {low:g} to {high:g}, mL (95 % interval)"
+        interval = " (95 % interval)" if any(np.isfinite(area.low_ml) for area in self.areas) else ""
+        title = f"Area between volume-strain curves, maximum shear strain {low:g} to {high:g}, mL{interval}"
         picture = Picture("Volume-strain curves", "", png_bytes(self.plot()))
         words = [] if self.verdict is None else [f"Verdict on the inputs: {self.verdict.words}.", *self.verdict.reasons]
         return notebook_html(self._answer(), picture, Table(title, head, rows), notes=words)

@@ -150,6 +150,7 @@ def test_a_model_no_nearer_than_no_deformation_is_said_to_be_so_beside_its_rank(
             assert f"): {', '.join(gammas)}" in str(wrong)
             answer = wrong._repr_html_().partition("<table")[0]
             assert "no nearer to the measurement than no deformation at all" in answer
+            assert ("mL (95 % interval)" in wrong._repr_html_()) == (error is not None)
     right = compared({"right": 0.38}, None, 0.4)
     assert "no nearer" not in str(right) + right._repr_html_()
 
