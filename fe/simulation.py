@@ -173,10 +173,10 @@ class Simulation:
         for state in self.states:
             shear = "; ".join(f"{row.region} {row.shear_p50:.3f} / {row.shear_p90:.3f}" for row in self._rows(state))
             (push, pull, _), (moved, along, _) = state.force_n, state.plate_displacement_mm
-            force = f"{push:.1f} N and {pull:.1f} N of shear"
+            force = f"{push:.1f} N and {pull:z.1f} N of shear"
             part = "" if state.reached == 1.0 else f" ONLY {state.reached:.0%} of the load was reached ({force});"
             lines.append(
-                f"{self.name}, {state.load.name}:{part} plate {moved:.2f} mm in, {along:.2f} mm along; max. shear "
+                f"{self.name}, {state.load.name}:{part} plate {moved:z.2f} mm in, {along:z.2f} mm along; max. shear "
                 f"strain, median / 90th percentile: {shear}"
             )
         return "\n".join([*lines, *(f"{self.name}: {note}" for note in self.notes)])

@@ -95,8 +95,8 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
         rows += [
             ("Noise floor (repeat scan): maximal shear strain, median", floor.max_shear_p50, ""),
             ("Noise floor (repeat scan): maximal shear strain, 95th percentile", floor.max_shear_p95, ""),
-            ("Noise floor: MAER", floor.maer, ""),
-            ("Noise floor: SDER", floor.sder, ""),
+            ("Noise floor: mean absolute strain component (MAER), mean over voxels", floor.maer, ""),
+            ("Noise floor: standard deviation of the same (SDER)", floor.sder, ""),
         ]
     return Table("Key figures", ("figure", "value", "unit"), tuple(rows))
 

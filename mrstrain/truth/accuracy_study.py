@@ -122,6 +122,12 @@ def _source(runs: Sequence[ErrorSamples]) -> str:
     return source
 
 
+_OF_FLOOR = (
+    "MAER is the mean over voxels of the mean absolute value of the six strain components, SDER the standard deviation "
+    "of the same."
+)
+
+
 def _by_condition(rows: Sequence[_R], floors: Sequence[FloorRow]) -> Iterator[tuple[list[_R], list[FloorRow]]]:
     """Rows of one condition, and its noise floor."""
     for condition in dict.fromkeys(r.condition for r in rows):
@@ -139,7 +145,7 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -
     if floors:
         of_floor = ("tissue", "MAER", "SDER", "apparent shear, median", "p95")
         noise = tuple((f.tissue, f.maer, f.sder, f.shear_p50, f.shear_p95) for f in floors)
-        tables.append(Table("Noise floor: apparent strain without load", of_floor, noise))
+        tables.append(Table("Noise floor: apparent strain without load", of_floor, noise, _OF_FLOOR))
     pictures = tuple(
         Picture.drawn(f"Error by {by.split(',')[0]}", figures.errors_by_place, errors, by)
         for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
@@ -172,5 +178,5 @@ def _resolution_section(floors: Sequence[FloorRow], rows: Sequence[ResolutionRow
     pictures = [Picture.drawn("Spatial resolution", figures.resolution, rows)]
     if floors:
         pictures.append(Picture.drawn("Noise against resolution", figures.trade_off, floors, rows, POOLED))
-    table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows))
+    table = Table("Spatial resolution and noise in soft tissue", columns, tuple(table_rows), _OF_FLOOR)
     return Section("Spatial resolution", tables=(table,), pictures=tuple(pictures))
