@@ -14,10 +14,9 @@ from fe.assembly import Assembler
 from fe.descent import descend
 from fe.elements import Model
 from fe.linear import Solver
-from fe.load_step import PlateTarget
 from fe.newton import Imposed, Tolerance, equilibrium
 from fe.plate import Contact, ContactStatus, Parallel, Turning
-from fe.problem import Problem
+from fe.problem import PlateTarget, Problem
 from fe.surface_sets import SKIN
 
 _FIRST_STEP = 0.25
