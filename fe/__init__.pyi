@@ -3,13 +3,12 @@ from .decks import write_calculix, write_febio
 from .fitting import LAWS, Curve, Fit, fit, read_curves
 from .from_dvc import InputError, MrstrainError, OutputError, TetMesh, WorkerError
 from .load_path import Checkpoint, PlateState
-from .load_step import LoadStep, paths_of
 from .materials import MODES, Hencky, Material, NeoHooke, Ogden, Yeoh
 from .mesh_file import read_tet_mesh, write_tet_mesh
 from .meshing import MeshQuality, check_meshing, mesh_labels
 from .newton import Tolerance
 from .plate import Plate
-from .problem import Problem, check_loads, check_materials, problems_of
+from .problem import LoadStep, Problem, check_loads, check_materials, paths_of, problems_of
 from .published import MaterialSet, as_toml, material_set, published_names, read_material_sets
 from .result import RegionFigures, cauchy_stress, equivalent_stress, region_figures, write_regions_csv, write_state
 from .simulation import Simulation, simulate

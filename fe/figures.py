@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -18,7 +17,7 @@ from dvc import TetMesh
 from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import whole_file
 from dvc.report.figures import REGION_COLOURS
-from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, letters, png_bytes
+from dvc.report.sheet import FONT, INK, WIDTH_IN, chart, label_axes, letters, panels, png_bytes
 from fe.convergence import Limit
 from fe.fitting import Curve, Fit
 from fe.plate import Plate
@@ -68,11 +67,11 @@ def sagittal_slice(mesh: TetMesh, states: Sequence[LoadState]) -> Figure:
     """
     axes = states[0].plate_axes
     assert axes is not None
-    panels, middle = [], _lowest_bone_point(mesh, axes)
+    fields, middle = [], _lowest_bone_point(mesh, axes)
     for state in states:
         title = f"{state.load.name}: {state.load}{'' if state.reached == 1.0 else f' (ONLY {state.reached:.0%})'}"
-        panels.append(Slice(title, state.u_mm, state.strain.max_shear, _along_plate(mesh, state, axes, middle)))
-    return slice_sheet(mesh, panels, axes, middle)
+        fields.append(Slice(title, state.u_mm, state.strain.max_shear, _along_plate(mesh, state, axes, middle)))
+    return slice_sheet(mesh, fields, axes, middle)
 
 
 def _along_plate(
@@ -99,44 +98,38 @@ class Slice:
     face: tuple[float, float] | None = None  # height along the normal force where the shear's coordinate is 0; slope
 
 
-def slice_sheet(mesh: TetMesh, panels: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> Figure:
+def slice_sheet(mesh: TetMesh, fields: Sequence[Slice], axes: FloatArray, point_mm: FloatArray) -> Figure:
     """Fields on one slice, in one colour scale that ends at the 99th percentile of the volume.
 
     Letters name the sides of the body: A anterior, P posterior, S superior, I inferior, R right, L left. ``axes`` (3,
     3) are the plate's: columns are the directions of the normal force, of shear, and their cross product, LPS.
     ``point_mm`` (3,) lies on the slice, reference configuration, LPS mm.
     """
-    cuts = [cut(mesh, panel.u_mm, axes, point_mm) for panel in panels]
+    cuts = [cut(mesh, field.u_mm, axes, point_mm) for field in fields]
     corners = np.concatenate([corner for _, polygons in cuts for corner in polygons])
     low, high = corners.min(axis=0) - _MARGIN_MM, corners.max(axis=0) + _MARGIN_MM
-    shears = np.concatenate([panel.max_shear for panel in panels])
+    shears = np.concatenate([field.max_shear for field in fields])
     known = np.isfinite(shears)
-    (most,) = volume_percentiles(shears[known], np.tile(mesh.volumes_mm3, len(panels))[known], [0.99])
+    (most,) = volume_percentiles(shears[known], np.tile(mesh.volumes_mm3, len(fields))[known], [0.99])
     largest = max(0.05, float(np.ceil(20.0 * most) / 20.0))
-    rows, columns = (len(panels) + 1) // 2, min(len(panels), 2)
-    tall = 0.9 + (WIDTH_IN / columns - 1.0) * float((high[1] - low[1]) / (high[0] - low[0]))
-    figure = Figure(figsize=(WIDTH_IN, rows * tall), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    spots = figure.subplots(rows, columns, squeeze=False).ravel()
-    for spot in spots[len(panels) :]:
-        spot.set_visible(False)
+    tall = 0.9 + (WIDTH_IN / min(len(fields), 2) - 1.0) * float((high[1] - low[1]) / (high[0] - low[0]))
+    figure, spots = panels(len(fields), size_in=(WIDTH_IN, tall))
     shades = colormaps["viridis"].with_extremes(bad=_UNKNOWN)
     how: dict[str, Any] = {"cmap": shades, "norm": Normalize(0.0, largest), "edgecolors": "face", "linewidths": 0.2}
-    for spot, panel, (cells, polygons) in zip(spots, panels, cuts, strict=False):
-        drawn = PolyCollection(polygons, array=np.ma.masked_invalid(panel.max_shear[cells]), **how)
+    for spot, field, (cells, polygons) in zip(spots, fields, cuts, strict=True):
+        drawn = PolyCollection(polygons, array=np.ma.masked_invalid(field.max_shear[cells]), **how)
         spot.add_collection(drawn)
         spot.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-        if panel.face is not None:
-            spot.axline((0.0, panel.face[0]), slope=panel.face[1], color=INK, linewidth=1.0, linestyle="--")
-        spot.set_title(panel.title, color=INK, **FONT)
-        label_axes(spot, "along the shear, mm", "along the normal force, mm")
+        if field.face is not None:
+            spot.axline((0.0, field.face[0]), slope=field.face[1], color=INK, linewidth=1.0, linestyle="--")
+        label_axes(spot, "along the shear, mm", "along the normal force, mm", field.title)
         for x, y, ha, va, direction in (
             (0.01, 0.5, "left", "center", -axes[:, 1]), (0.99, 0.5, "right", "center", axes[:, 1]),
             (0.5, 0.01, "center", "bottom", -axes[:, 0]), (0.5, 0.99, "center", "top", axes[:, 0]),
         ):  # fmt: skip
-            where = {"transform": spot.transAxes, "ha": ha, "va": va}
-            spot.text(x, y, letters(direction), weight="bold", color=INK, **where, **FONT)
-    bar = figure.colorbar(drawn, ax=list(spots[: len(panels)]), shrink=0.8, extend="max")
+            side, at = letters(direction), spot.transAxes
+            spot.text(x, y, side, weight="bold", color=INK, transform=at, ha=ha, va=va, **FONT)
+    bar = figure.colorbar(drawn, ax=spots, shrink=0.8, extend="max")
     bar.set_label("max. shear strain", color=INK, **FONT)
     return figure
 
@@ -172,13 +165,13 @@ def cut(mesh: TetMesh, u_mm: FloatArray, axes: FloatArray, point_mm: FloatArray)
 
 def force_displacement(states: Sequence[LoadState]) -> Figure:
     """Force of the plate over its displacement from the first touch on, along normal (left) and shear (right)."""
-    figure, panels = chart(2)
-    for axes, axis, name in zip(panels, (0, 1), ("normal", "shear"), strict=True):
+    figure, spots = chart(2)
+    for axes, axis, name in zip(spots, (0, 1), ("normal", "shear"), strict=True):
         for state, colour in zip(states, cycle(REGION_COLOURS), strict=False):
             moved, force = ([getattr(at, what)[axis] for at in state.curve] for what in ("displacement_mm", "force_n"))
             axes.plot(moved, force, marker=".", label=state.load.name, linewidth=1.8, color=colour)
         label_axes(axes, f"{name} displacement, mm", f"{name} force, N")
-    panels[0].legend(fontsize=9, frameon=False)
+    spots[0].legend(fontsize=9, frameon=False)
     return figure
 
 

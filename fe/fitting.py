@@ -259,10 +259,8 @@ def _checked(curves: Sequence[Curve], law: str, nu: float) -> tuple[_Law, list[C
     for mode in dict.fromkeys(curve.mode for curve in curves):
         mine = [curve for curve in curves if curve.mode == mode]
         joined.append(Curve(mode, *(np.concatenate([getattr(c, a) for c in mine]) for a in ("stretch", "stress_mpa"))))
-    count, (stretch, stress) = (
-        len(sought.names),
-        np.hstack([np.empty((2, 0)), *([c.stretch, c.stress_mpa] for c in joined)]),
-    )
+    stretch, stress = np.hstack([np.empty((2, 0)), *([c.stretch, c.stress_mpa] for c in joined)])
+    count = len(sought.names)
     apart = len(np.unique(np.round(stretch[np.abs(stretch - 1.0) > 1e-6], 9)))
     if len(stress) < count + 2 or apart < count:
         raise InputError(

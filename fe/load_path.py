@@ -14,10 +14,9 @@ from fe.assembly import Assembler
 from fe.descent import descend
 from fe.elements import Model
 from fe.linear import Solver
-from fe.load_step import PlateTarget
 from fe.newton import Imposed, Tolerance, equilibrium
 from fe.plate import Contact, ContactStatus, Parallel, Turning
-from fe.problem import Problem
+from fe.problem import PlateTarget, Problem
 from fe.surface_sets import SKIN
 
 _FIRST_STEP = 0.25
@@ -184,19 +183,23 @@ class LoadPath:
         outside = np.zeros(self.assembler.size)
         outside[equations] = np.where(displaced, 0.0, aim)
         self.assembler.share(contact.followers)
+
+        def changed(state: FloatArray, forces: FloatArray) -> bool:
+            if touched := contact.update(state, forces):
+                self.assembler.share(contact.followers)
+            if downhill:  # what touches next does so from where it is now
+                contact.begin(state)
+            return touched
+
+        system = self.assembler, self.solver, self.state
         if downhill:
-            converged = descend(
-                self.assembler, self.solver, self.state, outside, self.tolerance, self._changed_on_the_way, self.log,
-                self.is_over,
-            )  # fmt: skip
+            converged = descend(*system, outside, self.tolerance, changed, self.log, self.is_over)
         else:
             rotation = Parallel()
             if contact.status.turns:
                 rotation = Turning(contact, self.assembler, self.solver, np.broadcast_to(moment_nmm, 3))
             imposed = Imposed(outside, equations[displaced], (aim - self.plate.displacement_mm)[displaced])
-            converged = equilibrium(
-                self.assembler, self.solver, self.state, imposed, self.tolerance, self._changed, self.log, rotation
-            )
+            converged = equilibrium(*system, imposed, self.tolerance, changed, self.log, rotation)
         if converged and np.abs(contact.displacement_mm(converged.state) - self._start_mm).max() > self.extent_mm:
             self.log("the plate would have moved farther than the body is large")
             converged = None
@@ -205,31 +208,17 @@ class LoadPath:
             return False
         self.state = converged.state
         self.iterations += converged.iterations
+        u = self.state[: 3 * len(self.model.space.nodes_mm)].reshape(-1, 3)
+        faces = self._faces[np.isin(self._faces, contact.held).all(axis=1)]  # with every corner on the plate
+        a, b, c = np.moveaxis((self.model.space.nodes_mm + u)[faces], 1, 0)
+        area_mm2 = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
         self.plate = PlateState(
             contact.displacement_mm(self.state), contact.force_n(converged.forces),
             np.degrees(Rotation.from_matrix(contact.status.rotation).as_rotvec()),
-            contact.moment_nmm(self.state, converged.forces), self._area_mm2(),
+            contact.moment_nmm(self.state, converged.forces), area_mm2,
         )  # fmt: skip
         self.curve.append(self.plate)
         return True
-
-    def _area_mm2(self) -> float:
-        """Present area of the faces with every corner on the plate."""
-        u = self.state[: 3 * len(self.model.space.nodes_mm)].reshape(-1, 3)
-        faces = self._faces[np.isin(self._faces, self.contact.held).all(axis=1)]
-        a, b, c = np.moveaxis((self.model.space.nodes_mm + u)[faces], 1, 0)
-        return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-    def _changed(self, state: FloatArray, forces: FloatArray) -> bool:
-        if changed := self.contact.update(state, forces):
-            self.assembler.share(self.contact.followers)
-        return changed
-
-    def _changed_on_the_way(self, state: FloatArray, forces: FloatArray) -> bool:
-        """As `_changed`; what touches next does so from where it is now."""
-        touched = self._changed(state, forces)
-        self.contact.begin(state)
-        return touched
 
     @property
     def increment(self) -> _Increment:

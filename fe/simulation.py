@@ -14,10 +14,9 @@ from dvc.errors import InputError
 from fe import result
 from fe.decks import write_calculix, write_febio
 from fe.elements import CROWDED, DESCRIPTIONS
-from fe.load_step import LoadStep
 from fe.materials import MODES, Materials
 from fe.plate import Plate
-from fe.problem import Problem, check_kinds, problems_of
+from fe.problem import LoadStep, Problem, check_kinds, problems_of
 from fe.published import MaterialSet, as_material_set
 from fe.result import RegionFigures
 from fe.simulation_files import RECORD, read_parts

@@ -17,10 +17,9 @@ from dvc.errors import InputError
 from dvc.mesh import outer_faces
 from dvc.software import software_key
 from fe.load_path import Checkpoint, PlateState
-from fe.load_step import LoadStep
 from fe.materials import from_vector
 from fe.plate import ContactStatus
-from fe.problem import Problem
+from fe.problem import LoadStep, Problem
 from fe.published import MaterialSet
 from fe.result import PLATE_VECTORS, read_curve_csv, read_state
 from fe.solution import LoadState

@@ -10,9 +10,8 @@ from dvc import StrainField, TetMesh
 from dvc.arrays import FloatArray, IntArray
 from fe.elements import Model, element
 from fe.load_path import Checkpoint, Loading, LoadPath, PlateState
-from fe.load_step import LoadStep
 from fe.newton import Tolerance
-from fe.problem import Problem
+from fe.problem import LoadStep, Problem
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,58 +31,34 @@ def borders_of(labels: LabelMap) -> Borders:
     Surface nets (S. F. Frisken 1999, doi:10.1007/10704282_102) meet where three tissues meet and leave no gap; the
     filter (G. Taubin and others 1996, doi:10.1007/BFb0015544) smooths without shrinking.
     """
-    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-    from vtkmodules.vtkFiltersCore import vtkSurfaceNets3D, vtkWindowedSincPolyDataFilter
+    import pyvista
 
     grid = labels.grid
-    padded = np.pad(labels.labels.astype(np.int32), 1)  # closed at the image's edge
-    present = [int(v) for v in np.unique(padded) if v > 0]
-    image = vtkImageData(dimensions=padded.shape, spacing=grid.spacing_mm, origin=-grid.spacing_mm)
-    image.GetPointData().SetScalars(numpy_to_vtk(padded.ravel(order="F"), deep=True))
-    nets = vtkSurfaceNets3D(input_data=image, number_of_labels=len(present), smoothing=False)
-    for number, label in enumerate(present):
-        nets.SetLabel(number, label)
-    nets.SetOutputMeshTypeToTriangles()
-    smooth = vtkWindowedSincPolyDataFilter(
-        input_connection=nets.output_port, number_of_iterations=_PASSES, pass_band=_PASS_BAND,
-        non_manifold_smoothing=True, boundary_smoothing=True, normalize_coordinates=True,
-    )  # fmt: skip
-    smooth.Update()
-    net, made = nets.GetOutput(), smooth.GetOutput()
-    if not made.GetNumberOfPolys():
+    image = pyvista.ImageData(dimensions=grid.shape, spacing=grid.spacing_mm)
+    image["labels"] = labels.labels.astype(np.int32).ravel(order="F")
+    net = image.contour_labels("all", output_mesh_type="triangles", smoothing=False)  # closed at the image's edge
+    if not net.n_cells:
         raise MrstrainError("There is no border between tissues in the label map.")
-    own = vtk_to_numpy(made.GetPoints().GetData()).astype(np.float64)
-    return Borders(
-        own @ grid.direction.T + grid.origin_mm,
-        vtk_to_numpy(made.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64),
-        vtk_to_numpy(net.GetCellData().GetArray("BoundaryLabels")).astype(np.int64),
+    made = net.smooth_taubin(
+        n_iter=_PASSES, pass_band=_PASS_BAND, non_manifold_smoothing=True, normalize_coordinates=True
     )
+    points_mm = np.asarray(made.points, dtype=np.float64) @ grid.direction.T + grid.origin_mm
+    triangles, sides = (np.asarray(of, dtype=np.int64) for of in (made.regular_faces, net["boundary_labels"]))
+    return Borders(points_mm, triangles, sides)
 
 
 def labels_at(borders: Borders, points_mm: FloatArray) -> IntArray:
     """Label of the tissue that encloses each point (n, 3) LPS mm; 0 outside all."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    import pyvista
     from vtkmodules.vtkFiltersModeling import vtkSelectEnclosedPoints
 
-    def points_of(values: FloatArray) -> vtkPolyData:
-        data, points = vtkPolyData(), vtkPoints()
-        points.SetData(numpy_to_vtk(np.ascontiguousarray(values), deep=True))
-        data.SetPoints(points)
-        return data
-
-    enclosing = np.zeros(len(points_mm), dtype=np.int64)
+    cloud, enclosing = pyvista.PolyData(points_mm), np.zeros(len(points_mm), dtype=np.int64)
     for label in np.unique(borders.sides[borders.sides > 0]):
         triangles = borders.triangles[(borders.sides == label).any(axis=1)]
-        starts, corners = np.arange(0, 3 * len(triangles) + 1, 3), triangles.ravel()
-        surface, cells = points_of(borders.points_mm), vtkCellArray()
-        cells.SetData(numpy_to_vtkIdTypeArray(starts, deep=True), numpy_to_vtkIdTypeArray(corners, deep=True))
-        surface.SetPolys(cells)
-        within = vtkSelectEnclosedPoints(input_data=points_of(points_mm), surface_data=surface, tolerance=1e-9)
+        surface = pyvista.PolyData.from_regular_faces(borders.points_mm, triangles)
+        within = vtkSelectEnclosedPoints(input_data=cloud, surface_data=surface, tolerance=1e-9)
         within.Update()
-        enclosing[vtk_to_numpy(within.GetOutput().GetPointData().GetArray("SelectedPoints")) > 0] = label
+        enclosing[pyvista.wrap(within.GetOutput())["SelectedPoints"] > 0] = label
     return enclosing
 
 

@@ -15,6 +15,7 @@ from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.trust.error_model import widened
 from dvc.trust.regions import volume_above
+from validate.extrapolation import LEVELLED
 
 RANGE = (0.2, 0.5)
 """Range of maximum shear strain over which curves are compared by default."""
@@ -86,6 +87,11 @@ class Area:
     low_ml: float = float("nan")
     high_ml: float = float("nan")
     floor_ml: float = float("nan")
+
+    @property
+    def levelled(self) -> bool:
+        """Whether it is of a levelled model, whose areas are of another kind: no bias is removed from them."""
+        return self.model.endswith(LEVELLED)
 
     @property
     def best_ml(self) -> float:

@@ -4,13 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dvc import Deformation
 from dvc.arrays import FloatArray
 from dvc.report.figures import REGION_COLOURS
-from dvc.report.sheet import DPI, FONT, INK, WIDTH_IN, chart, label_axes, png_bytes
+from dvc.report.sheet import INK, WIDTH_IN, chart, label_axes, panels, png_bytes
 from fe.figures import Slice, slice_sheet
 from validate.curves import Area
 from validate.load_comparison import LoadComparison
@@ -32,11 +31,11 @@ def volume_strain(one: LoadComparison, tissues: Sequence[str], colours: Sequence
 
 def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], colours: Sequence[str]) -> Figure:
     """Curves, a panel for each load or tissue."""
-    panels: dict[str, dict[str, Curve]] = {}
+    by_panel: dict[str, dict[str, Curve]] = {}
     for curve in curves:
-        panels.setdefault(getattr(curve, by), {})[curve.field] = curve
-    figure, spots = _panels(len(panels))
-    for axes, (title, of) in zip(spots, panels.items(), strict=True):
+        by_panel.setdefault(getattr(curve, by), {})[curve.field] = curve
+    figure, spots = panels(len(by_panel))
+    for axes, (title, of) in zip(spots, by_panel.items(), strict=True):
         at = of["measured"].max_shear
         if LOWER in of:
             edges = of[LOWER].volume_above_ml, of[UPPER].volume_above_ml
@@ -47,8 +46,7 @@ def _curves(curves: Iterable[Curve], by: str, strains: tuple[float, float], colo
         for edge in strains:
             axes.axvline(edge, color="#9aa5b1", linewidth=0.9, linestyle=":")
         axes.set(xlim=(0.0, at[-1]), ylim=(0.0, None))
-        label_axes(axes, "maximum shear strain", "volume above, mL")
-        axes.set_title(title, color=INK, **FONT)
+        label_axes(axes, "maximum shear strain", "volume above, mL", title)
     spots[0].legend(fontsize=9, frameon=False)
     return figure
 
@@ -87,18 +85,7 @@ def _by_model(count: int) -> tuple[Figure, list[Axes]]:
     """Square panels."""
     columns = min(count, _COLUMNS)
     width = WIDTH_IN if columns > 1 else 0.62 * WIDTH_IN
-    return _panels(count, columns, (width, width / columns))
-
-
-def _panels(count: int, most: int = 2, size_in: tuple[float, float] = (WIDTH_IN, 3.4)) -> tuple[Figure, list[Axes]]:
-    """A figure of so many panels, at ``most`` so many in a row, each row of a width and height."""
-    rows, columns = -(-count // most), min(count, most)
-    figure = Figure(figsize=(size_in[0], size_in[1] * rows), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    spots = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for spot in spots[count:]:
-        spot.set_visible(False)
-    return figure, spots[:count]
+    return panels(count, columns, (width, width / columns))
 
 
 def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatArray], point_mm: FloatArray) -> bytes:
@@ -114,8 +101,8 @@ def slices(one: LoadComparison, measured: Deformation, u_mm: Mapping[str, FloatA
 def slice_panels(fields: MappedFields, measured: Deformation, u_mm: Mapping[str, FloatArray]) -> list[Slice]:
     """Panels of `slices`: the measurement, then each model, with its displacement (n, 3) at the mesh's nodes."""
     u = filled_from_nearest(measured.displacement(fields.mesh.points_mm), fields.mesh.points_mm)
-    panels = [Slice("measured", u, fields.measured.max_shear)]
-    return panels + [Slice(name, u_mm[name], field.max_shear) for name, field in fields.models.items()]
+    measured_panel = Slice("measured", u, fields.measured.max_shear)
+    return [measured_panel] + [Slice(name, u_mm[name], field.max_shear) for name, field in fields.models.items()]
 
 
 def scatter(fields: MappedFields) -> bytes:
@@ -131,9 +118,8 @@ def scatter(fields: MappedFields) -> bytes:
         y, ranges = field.max_shear[where], ((0.0, most), (0.0, most))
         spot.hist2d(x, y, bins=_BINS, range=ranges, weights=volumes, norm="log", cmap="Blues")
         spot.plot([0.0, most], [0.0, most], color=INK, linewidth=0.9)
-        spot.set_title(name, color=INK, **FONT)
         spot.set_aspect("equal")
-        label_axes(spot, "measured", "simulated")
+        label_axes(spot, "measured", "simulated", name)
     return png_bytes(figure)
 
 
@@ -153,8 +139,7 @@ def differences(one: LoadComparison, quantity: str) -> bytes:
         spot.hist2d(0.5 * (x + y), y - x, bins=_BINS, weights=fields.volumes_ml[where], norm="log", cmap="Blues")
         for height, style in ((row.bias, "-"), (row.lower, "--"), (row.upper, "--")):
             spot.axhline(height, color=INK, linewidth=0.9, linestyle=style)
-        spot.set_title(row.model, color=INK, **FONT)
-        label_axes(spot, f"mean of both{unit}", f"simulated - measured{unit}")
+        label_axes(spot, f"mean of both{unit}", f"simulated - measured{unit}", row.model)
     return png_bytes(figure)
 
 

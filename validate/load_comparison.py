@@ -168,7 +168,7 @@ class LoadComparison:
 
         Levelled models are not ranked, since no bias is removed from their areas; nor is `NOTHING`.
         """
-        models = (a for a in self.areas if a.tissue == ALL and a.model != NOTHING and not a.model.endswith(LEVELLED))
+        models = (a for a in self.areas if a.tissue == ALL and a.model != NOTHING and not a.levelled)
         return sorted(models, key=lambda a: a.best_ml)
 
     @property

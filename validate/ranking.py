@@ -42,7 +42,7 @@ class Ranking:
 
     def rank(self, model: str) -> tuple[int, int] | None:
         """First and last rank over all loads that a model may have; None for one that is not ranked."""
-        names = [a.model for a in _ranked(self.areas)]
+        names = [a.model for a in self.areas if not a.levelled]
         if model not in names:
             return None
         rank, pairs = 1 + names.index(model), self.not_distinguishable[ALL_LOADS]
@@ -64,22 +64,23 @@ def rank_over_loads(loads: Sequence[LoadComparison]) -> Ranking:
         normalised = float(np.mean([a.share for a in parts]))
         rows.append(Area(name, ALL_LOADS, ALL, sum(a.ml for a in parts), normalised, *estimated))
     nothing = rows.pop()
-    rows.sort(key=lambda a: (a.model.endswith(LEVELLED), a.best_ml))
+    rows.sort(key=lambda a: (a.levelled, a.best_ml))
+    ranked = [a for a in rows if not a.levelled]
     informative = None if all(one.hardly_strained for one in loads) else band
-    pairs = {ALL_LOADS: _pairs(_ranked(rows), informative)}
+    pairs = {ALL_LOADS: _pairs(ranked, informative)}
     pairs |= {one.load: _pairs(one.ranked(), None if one.hardly_strained else one.bands.get(ALL)) for one in loads}
     statements = [_under(one, pairs[one.load]) for one in loads]
     if len(loads) > 1 and everywhere and informative is not None:
         distrusted = [one.load for one in loads if one.case.verdict and one.case.verdict.level == "distrust"]
         caveat = f" The registration of {', '.join(distrusted)}, which counts in it, is not to be trusted."
         caveat *= bool(distrusted)
-        statements.insert(0, _statement("over all loads", _ranked(rows), nothing, pairs[ALL_LOADS], caveat))
+        statements.insert(0, _statement("over all loads", ranked, nothing, pairs[ALL_LOADS], caveat))
     return Ranking(tuple(rows), nothing, tuple(s for s in statements if s), pairs)
 
 
 def no_nearer(areas: Iterable[Area], nothing: Area) -> list[str]:
     """Ranked models whose area is no smaller than that of `NOTHING` under the same load."""
-    return [a.model for a in areas if a.best_ml >= nothing.best_ml and not a.model.endswith(LEVELLED)]
+    return [a.model for a in areas if a.best_ml >= nothing.best_ml and not a.levelled]
 
 
 def _summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
@@ -90,11 +91,6 @@ def _summed(bands: Sequence[Band | None], models: Sequence[str]) -> Band | None:
     areas = {name: np.sum([band.areas_ml[name] for band in known], axis=0) for name in models}
     floor, first = float(sum(band.floor_ml for band in known)), known[0]
     return Band(first.strains, first.low_ml, first.high_ml, areas, floor, max(b.widening for b in known))
-
-
-def _ranked(areas: Sequence[Area]) -> list[Area]:
-    """All but levelled models, whose areas are of another kind."""
-    return [a for a in areas if not a.model.endswith(LEVELLED)]
 
 
 def _pairs(ranked: Sequence[Area], band: Band | None) -> Pairs:
@@ -188,18 +184,15 @@ def rank_over_subjects(shares: Mapping[str, Mapping[str, float]]) -> tuple[Cohor
     ranks = []
     for at in order:
         row, behind = table[at], float((table[at] - first).mean())
+        mean, each = float(row.mean()), float("nan")
+        if (count := len(row)) > 1:
+            each = float(student.ppf(_LEVEL, count - 1) * row.std(ddof=1) / np.sqrt(count))
         extremes, nearest_in = (float(row.min()), float(row.max())), int(np.count_nonzero(nearest == at))
         differences = behind, behind - half, behind + half
-        ranks.append(CohortRank(names[at], len(subjects), *_mean(row), *extremes, nearest_in, *differences))
+        ranks.append(
+            CohortRank(names[at], len(subjects), mean, mean - each, mean + each, *extremes, nearest_in, *differences)
+        )
     return tuple(ranks)
-
-
-def _mean(values: FloatArray) -> tuple[float, float, float]:
-    mean, count = float(values.mean()), len(values)
-    if count < 2:
-        return mean, float("nan"), float("nan")
-    half = float(student.ppf(_LEVEL, count - 1) * values.std(ddof=1) / np.sqrt(count))
-    return mean, mean - half, mean + half
 
 
 def _simultaneous(table: FloatArray) -> float:

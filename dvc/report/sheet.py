@@ -236,8 +236,20 @@ def chart(panels: int = 1, page_wide: bool = False) -> tuple[Figure, tuple[Axes,
     return figure, tuple(np.atleast_1d(figure.subplots(1, panels)))
 
 
-def label_axes(axes: Axes, x: str, y: str) -> None:
-    """Name the axes of a `chart`, and draw its grid."""
+def panels(count: int, most: int = 2, size_in: tuple[float, float] = (WIDTH_IN, 3.4)) -> tuple[Figure, list[Axes]]:
+    """A figure of so many panels, at ``most`` so many in a row, each row of a width and height."""
+    rows, columns = -(-count // most), min(count, most)
+    figure = Figure(figsize=(size_in[0], size_in[1] * rows), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    spots = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for spot in spots[count:]:
+        spot.set_visible(False)
+    return figure, spots[:count]
+
+
+def label_axes(axes: Axes, x: str, y: str, title: str = "") -> None:
+    """Name the axes of a panel, give it a title, and draw its grid."""
+    axes.set_title(title, color=INK, **FONT)
     axes.set_xlabel(x, color=INK, **FONT)
     axes.set_ylabel(y, color=INK, **FONT)
     axes.grid(True, color="#d9dee4", linewidth=0.6)
