@@ -8,7 +8,7 @@ from scipy.ndimage import map_coordinates
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.errors import RegistrationError
-from dvc.images.image import Image
+from dvc.images.image import Grid, Image
 from dvc.registration.gauss_newton.image_term import ImagePair, Normal
 from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.spline_sums import Stiffness
@@ -71,8 +71,7 @@ class Level:
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / grid.spacing_mm), 1).astype(np.int64)
         self.control, self.roughness = control, roughness
         self.pair = ImagePair(*images, inside, control, block, rim_mm, factors)
-        at = np.moveaxis(grid.indices_of(control.points()), -1, 0)  # interpolated: nearest voxels may be two
-        self._tissue = map_coordinates((soft | stiff).astype(np.float64), at, order=1, mode="grid-constant")
+        self._tissue = _share_at(control, soft | stiff, grid)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0
         self._between = []  # neighbours in soft tissue: the volume that their difference stands for, over its length^2
@@ -202,6 +201,12 @@ class Level:
             before -= flow
             after += flow
         return out
+
+
+def _share_at(control: Grid, mask: BoolArray, grid: Grid) -> FloatArray:
+    """A mask at control points, 0 to 1, interpolated: the same in any frame, where nearest voxels may be two."""
+    at = np.moveaxis(grid.indices_of(control.points()), -1, 0)
+    return np.asarray(map_coordinates(mask.astype(np.float64), at, order=1, mode="grid-constant"))
 
 
 def _neighbours(field: FloatArray, axis: int) -> tuple[FloatArray, FloatArray]:
