@@ -68,13 +68,9 @@ class TetMesh:
     node_ids: IntArray
 
     def __init__(
-        self,
-        points_mm: npt.ArrayLike,
-        cells: npt.ArrayLike,
-        regions: Mapping[str, npt.ArrayLike] | None = None,
-        facets: Mapping[str, npt.ArrayLike] | None = None,
-        node_ids: npt.ArrayLike | None = None,
-    ) -> None:
+        self, points_mm: npt.ArrayLike, cells: npt.ArrayLike, regions: Mapping[str, npt.ArrayLike] | None = None,
+        facets: Mapping[str, npt.ArrayLike] | None = None, node_ids: npt.ArrayLike | None = None,
+    ) -> None:  # fmt: skip
         points = checked_points(points_mm)
         tets = checked_indices("cells", cells, len(points), 4)
         if len(tets) == 0:
@@ -90,7 +86,6 @@ class TetMesh:
         for name, index in [*named_cells.items(), *named_facets.items()]:
             if len(index) == 0:
                 raise InputError(f"{name!r} is empty. Leave it out, or check how the mesh was made.")
-
         tets = _positively_ordered(points, tets, ids)
         used = np.zeros(len(points), dtype=bool)
         used[tets] = True
@@ -106,7 +101,6 @@ class TetMesh:
             points, ids, tets = points[used], ids[used], new_index[tets]
             named_facets = {name: new_index[index] for name, index in named_facets.items()}
         check_extent(points)
-
         object.__setattr__(self, "points_mm", frozen(points, np.float64))
         for name, indices in (("cells", tets), ("node_ids", ids)):
             object.__setattr__(self, name, frozen(indices, np.int64))

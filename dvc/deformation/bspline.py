@@ -103,7 +103,7 @@ class BSpline:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the valid region."""
         indices = self.control.indices_of(np.asarray(points_mm, dtype=np.float64))
         u, per_index = evaluate_spline(self.coefficients_mm, indices, mirror=False)
-        return u, (per_index.reshape(-1, 3) @ self._index_per_mm()).reshape(-1, 3, 3)
+        return u, (per_index.reshape(-1, 3) @ self.control.index_per_mm).reshape(-1, 3, 3)
 
     def evaluate_on_grid(self, grid: Grid, where: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Evaluate u (n, 3) mm and H (n, 3, 3) at voxels of a grid, in the order of ``np.argwhere(where)``.
@@ -122,7 +122,7 @@ class BSpline:
         u, H = np.empty((slabs[-1], 3)), np.empty((slabs[-1], 3, 3))
         coefficients = np.ascontiguousarray(self.coefficients_mm.transpose(0, *(order + 1)))
         i, j, k = (spline_table(t, coefficients.shape[a + 1]) for a, t in enumerate(along))
-        _on_grid(coefficients, where, slabs, (i, j, k), np.ascontiguousarray(self._index_per_mm()[order]), u, H)
+        _on_grid(coefficients, where, slabs, (i, j, k), np.ascontiguousarray(self.control.index_per_mm[order]), u, H)
         return u, H
 
     def plus(self, other: Self) -> Self:
@@ -135,9 +135,6 @@ class BSpline:
                 "reference grid with one FinalGridSpacing."
             )
         return type(self)(self.control, self.coefficients_mm + other.coefficients_mm)
-
-    def _index_per_mm(self) -> FloatArray:
-        return np.asarray(np.linalg.inv(self.control.direction) / self.control.spacing_mm[:, None])
 
     def _axis_indices(self, grid: Grid) -> tuple[IntArray, list[FloatArray]] | None:
         """The control axis of each grid axis, and the control indices along it; None if askew."""

@@ -104,7 +104,7 @@ class Interfaces:
         depths, slopes = evaluate_spline(self.depth, indices, mirror=True, gradient=gradient)
         if not gradient:
             slopes = np.zeros((*depths.shape, 3))
-        slopes = slopes @ (np.linalg.inv(self.grid.direction) / self.grid.spacing_mm[:, None])
+        slopes = slopes @ self.grid.index_per_mm
         own = np.where(np.isnan(depths), -np.inf, depths).argmax(axis=1)
         each = np.arange(len(own))
         away, toward = np.full(len(own), np.inf), np.zeros((len(own), 3))

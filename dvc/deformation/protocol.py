@@ -105,6 +105,12 @@ class Affine:
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "translation_mm", translation)
 
+    @classmethod
+    def about(cls, centre_mm: FloatArray, matrix: FloatArray, translation_mm: FloatArray) -> Self:
+        """The map about a centre, then a translation: x = A (X - c) + c + t."""
+        centre = np.asarray(centre_mm, dtype=np.float64)
+        return cls(matrix, centre - matrix @ centre + translation_mm)
+
     def apply(self, points_mm: FloatArray) -> FloatArray:
         """Where the points (n, 3) mm go."""
         return np.asarray(np.asarray(points_mm) @ self.matrix.T + self.translation_mm)
@@ -151,12 +157,6 @@ class RigidMotion(Affine):
     def identity(cls) -> Self:
         """No motion."""
         return cls(np.eye(3), np.zeros(3))
-
-    @classmethod
-    def about(cls, centre_mm: FloatArray, rotation: FloatArray, translation_mm: FloatArray) -> Self:
-        """Rotation about a centre, then a translation: x = R (X - c) + c + t."""
-        centre = np.asarray(centre_mm, dtype=np.float64)
-        return cls(rotation, centre - rotation @ centre + translation_mm)
 
     @property
     def angle_deg(self) -> float:
@@ -333,7 +333,7 @@ class SampledDisplacement:
 
         indices = self.grid.indices_of(points_mm)
         u, per_index = evaluate_spline(self._coefficients, indices + self._shift, mirror=True)
-        H = per_index @ (np.linalg.inv(self.grid.direction) / self.grid.spacing_mm[:, None])
+        H = per_index @ self.grid.index_per_mm
         outside = ~self._inside(indices)
         u[outside], H[outside] = np.nan, np.nan
         return u, H

@@ -82,6 +82,11 @@ class Grid:
         return affine
 
     @property
+    def index_per_mm(self) -> FloatArray:
+        """Derivative (3, 3) of the voxel indices by LPS mm."""
+        return np.asarray(np.linalg.inv(self.direction) / self.spacing_mm[:, None])
+
+    @property
     def voxel_volume_mm3(self) -> float:
         """Volume of one voxel, mm3."""
         return float(np.prod(self.spacing_mm))

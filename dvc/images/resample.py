@@ -53,12 +53,9 @@ def shows(image: Image, points_mm: FloatArray, margin_mm: float = 0.0) -> BoolAr
 
 
 def carry(
-    image: Image,
-    grid: Grid,
-    points_of: Callable[[FloatArray], FloatArray] | None = None,
-    where: BoolArray | None = None,
-    order: int = 3,
-) -> Float32Array:
+    image: Image, grid: Grid, points_of: Callable[[FloatArray], FloatArray] | None = None,
+    where: BoolArray | None = None, order: int = 3,
+) -> Float32Array:  # fmt: skip
     """Values of ``image`` on ``grid``, NaN where any of the eight voxels around is missing or outside.
 
     ``points_of`` maps points (n, 3) LPS mm of the grid to those of the image whose values they take (default: the

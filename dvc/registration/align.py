@@ -15,7 +15,7 @@ import numpy as np
 from scipy import fft
 from scipy.spatial.transform import Rotation
 
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Composed, Deformation, RigidMotion
 from dvc.errors import InputError, RegistrationError
 from dvc.images.image import Grid, Image, Mask
@@ -229,11 +229,15 @@ def _scored(
     """For each rotation the best translation and its normalised correlation (times ``sign``)."""
     centre = mask.points().mean(axis=0)
     template, weight, template_grid = _template(reference, mask, centre)
-    scene, known = _scene(loaded)
-    values = np.where(known, scene.values, np.median(scene.values[known]))
-    size = [fft.next_fast_len(s + t, real=True) for s, t in zip(scene.grid.shape, template_grid.shape, strict=True)]
+    low, high = loaded.grid.bounds_mm()
+    ni, nj, nk = (int(n) for n in np.maximum(np.ceil((high - low) / _SEARCH_MM) + 1, 2))
+    scene_grid = Grid((ni, nj, nk), np.full(3, _SEARCH_MM), low)  # axes L, P, S
+    scene = carry(smoothed(loaded, _SEARCH_MM / 2.0), scene_grid, order=1)
+    known = np.isfinite(scene)
+    values = np.where(known, scene, np.median(scene[known]))
+    size = [fft.next_fast_len(s + t, real=True) for s, t in zip(scene_grid.shape, template_grid.shape, strict=True)]
     scene_f, square_f, known_f = (fft.rfftn(v, size) for v in (values, values**2, known.astype(np.float64)))
-    places = tuple(slice(0, s) for s in scene.grid.shape)
+    places = tuple(slice(0, s) for s in scene_grid.shape)
     half = (np.array(template_grid.shape) - 1) // 2
     found = []
     for rotation in rotations:
@@ -256,7 +260,7 @@ def _scored(
         best = np.unravel_index(int(np.argmax(score)), score.shape)
         if not np.isfinite(score[best]):
             continue  # nowhere does the loaded image show enough of the mask
-        to = scene.grid.points_at(np.array(best, dtype=np.float64))
+        to = scene_grid.points_at(np.array(best, dtype=np.float64))
         found.append((float(score[best]), RigidMotion(rotation, to - rotation @ centre)))
     return found
 
@@ -269,12 +273,3 @@ def _template(reference: Image, mask: Mask, centre: FloatArray) -> tuple[Image, 
     grid = Grid((2 * half + 1,) * 3, np.full(3, _SEARCH_MM), centre - half * _SEARCH_MM)
     weight = smoothed(Image(mask.grid, near.inside.astype(np.float32)), _SEARCH_MM / 2.0)
     return smoothed(fill_missing(reference), _SEARCH_MM / 2.0), weight, grid
-
-
-def _scene(loaded: Image) -> tuple[Image, BoolArray]:
-    """The loaded image at low resolution on axes L, P, S, and where it is known."""
-    low, high = loaded.grid.bounds_mm()
-    i, j, k = (int(n) for n in np.maximum(np.ceil((high - low) / _SEARCH_MM) + 1, 2))
-    grid = Grid((i, j, k), np.full(3, _SEARCH_MM), low)
-    values = carry(smoothed(loaded, _SEARCH_MM / 2.0), grid, order=1)
-    return Image(grid, np.nan_to_num(values)), np.isfinite(values)

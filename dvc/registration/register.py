@@ -124,17 +124,10 @@ class Registration:
 
 
 def register(
-    reference: Image,
-    loaded: Image,
-    *,
-    bone: Mask | None = None,
-    tissue: Mask | None = None,
-    labels: LabelMap | None = None,
-    settings: Settings | None = None,
-    start: Deformation | None = None,
-    worker: Worker | None = None,
-    progress: Progress | None = None,
-) -> Registration:
+    reference: Image, loaded: Image, *, bone: Mask | None = None, tissue: Mask | None = None,
+    labels: LabelMap | None = None, settings: Settings | None = None, start: Deformation | None = None,
+    worker: Worker | None = None, progress: Progress | None = None,
+) -> Registration:  # fmt: skip
     """Register a loaded image to the unloaded one.
 
     Parameters

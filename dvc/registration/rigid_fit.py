@@ -108,17 +108,16 @@ class RigidFit:
         pairs = []
         for way in _ASIDE_MM * ways.T:
             corner = self._random.uniform(0.0, 2.0 * self._block_mm, 3)
-            halves = [self._divided(level.points, corner) for level in fine]
+            halves = []
+            for level in fine:
+                blocks = np.floor((level.points - self._centre + corner) / self._block_mm).astype(int)
+                half = blocks.sum(axis=1) % 2 == 0
+                if not _LEAST_SHARE <= half.mean() <= 1.0 - _LEAST_SHARE:
+                    half = self._random.permuted(np.arange(len(half)) % 2 == 0)
+                halves.append(np.asarray(half))
             one = self._settled(near.after(self._step(way)), fine, halves)
             pairs.append((one, self._settled(near.after(self._step(-way)), fine, [~half for half in halves])))
         return pairs
-
-    def _divided(self, points: FloatArray, corner: FloatArray) -> BoolArray:
-        blocks = np.floor((points - self._centre + corner) / self._block_mm).astype(int)
-        half = blocks.sum(axis=1) % 2 == 0
-        if not _LEAST_SHARE <= half.mean() <= 1.0 - _LEAST_SHARE:
-            half = self._random.permuted(np.arange(len(half)) % 2 == 0)
-        return np.asarray(half)
 
     def _level(self, reference: Image, mask: Mask, blur_mm: float, scene: Image) -> _Level:
         box = mask.box(int(np.ceil(3.0 * blur_mm / mask.grid.spacing_mm.min())) + 2)

@@ -162,7 +162,11 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     values: npt.NDArray[Any] = getattr(mask_or_labels, field)
     if own.same_as(grid):
         return replace(mask_or_labels, grid=grid)
-    inside, total = _count_inside(own, values, grid)
+    filled, inside = np.flatnonzero(values), 0  # voxels other than 0, and how many centres lie in the image's box
+    total = len(filled)
+    for start in range(0, total, _POINTS_AT_ONCE):
+        indices = np.stack(np.unravel_index(filled[start : start + _POINTS_AT_ONCE], own.shape), axis=-1)
+        inside += int(np.count_nonzero(grid.contains(own.points_at(indices.astype(np.float64)))))
     if total == 0:
         raise GeometryError(f"{what}: it holds no voxel other than 0.")
     share = inside / total
@@ -190,16 +194,6 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
         if lost:
             _log.warning("%s: regions lost by it: %s", what, [mask_or_labels.names[v] for v in lost])
     return replace(mask_or_labels, grid=grid, **{field: fitted})
-
-
-def _count_inside(own: Grid, values: npt.NDArray[Any], grid: Grid) -> tuple[int, int]:
-    """Count the voxels other than 0 with their centre in the box of ``grid``, and all of them."""
-    filled = np.flatnonzero(values)
-    inside = 0
-    for start in range(0, len(filled), _POINTS_AT_ONCE):
-        indices = np.stack(np.unravel_index(filled[start : start + _POINTS_AT_ONCE], own.shape), axis=-1)
-        inside += int(np.count_nonzero(grid.contains(own.points_at(indices.astype(np.float64)))))
-    return inside, len(filled)
 
 
 def _mirrored_axes(own: Grid, grid: Grid) -> str:

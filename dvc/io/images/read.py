@@ -27,13 +27,9 @@ _FORMATS: dict[str, tuple[str, Callable[[Path, int | None, int, bool], StoredVol
 
 
 def read_image(
-    path: StrPath,
-    *,
-    allow_missing: bool = False,
-    series: str | None = None,
-    volume: int | None = None,
+    path: StrPath, *, allow_missing: bool = False, series: str | None = None, volume: int | None = None,
     max_bytes: int = MAX_BYTES,
-) -> Image:
+) -> Image:  # fmt: skip
     """Read a 3D image, whatever its format, into LPS mm: voxels in the order of the file, slope and intercept applied.
 
     Parameters

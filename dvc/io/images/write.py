@@ -111,16 +111,9 @@ def write_labels(path: StrPath, labels: LabelMap) -> None:
 
 
 def write_vectors(
-    path: StrPath,
-    grid: Grid,
-    values: npt.ArrayLike,
-    components: Sequence[str],
-    meaning: str,
-    frame: str = "LPS",
-    *,
-    unit: str,
-    verdict: Verdict | None = None,
-) -> None:
+    path: StrPath, grid: Grid, values: npt.ArrayLike, components: Sequence[str], meaning: str, frame: str = "LPS", *,
+    unit: str, verdict: Verdict | None = None,
+) -> None:  # fmt: skip
     """Write several values per voxel of the reference image, and a JSON file beside them that says what they are.
 
     NIfTI: 5D, (ni, nj, nk, 1, c). Three components in the frame LPS get the intent "vector" (1007) [1]_; the affine is
@@ -204,7 +197,12 @@ def _write(path: Path, grid: Grid, values: npt.NDArray[Any], vector: bool = Fals
     with whole_file(path) as part, part.open("wb") as file:
         if suffix == ".nrrd":
             file.write(header)
-        file.writelines(_deflated(stream) if suffix in (".nrrd", ".nii.gz") else stream)
+        if suffix in (".nrrd", ".nii.gz"):  # gzip without name and time, so that equal images give equal files
+            coder = zlib.compressobj(_LEVEL, wbits=31)
+            file.writelines(map(coder.compress, stream))
+            file.write(coder.flush())
+        else:
+            file.writelines(stream)
 
 
 def _blocks(values: npt.NDArray[Any], together: bool) -> Iterator[bytes]:
@@ -213,13 +211,6 @@ def _blocks(values: npt.NDArray[Any], together: bool) -> Iterator[bytes]:
         step = max(_BLOCK // max(volume[:, :, 0].nbytes, 1), 1)
         for k in range(0, volume.shape[2], step):
             yield volume[:, :, k : k + step].transpose(2, 1, 0, *range(3, volume.ndim)).tobytes()
-
-
-def _deflated(stream: Iterable[bytes]) -> Iterator[bytes]:
-    """Yield a gzip stream without name and time, so that equal images give equal files."""
-    coder = zlib.compressobj(_LEVEL, wbits=31)
-    yield from map(coder.compress, stream)
-    yield coder.flush()
 
 
 def _nifti(grid: Grid, values: npt.NDArray[Any], vector: bool) -> bytes:

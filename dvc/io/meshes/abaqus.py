@@ -65,9 +65,11 @@ def read_abaqus(path: Path) -> RawMesh:
                 if "ELSET" in keyword.options:
                     element_sets.extend(keyword, map(str, numbers))
             elif keyword.name in {"ELSET", "NSET"}:
-                rows = map(_generated, keyword.rows) if "GENERATE" in keyword.options else keyword.rows
                 chosen = element_sets if keyword.name == "ELSET" else node_sets
-                chosen.extend(keyword, (str(x) for row in rows for x in row if x))
+                rows = [[x for x in row if x] for row in keyword.rows]
+                if "GENERATE" in keyword.options:  # first, last, and a step that may be left out
+                    rows = [[*map(str, range(int(a), int(b) + 1, *map(int, step[:1])))] for a, b, *step in rows]
+                chosen.extend(keyword, (x for row in rows for x in row))
     return mesh.by_index(element_sets.resolved(), node_sets.resolved())
 
 
@@ -117,11 +119,6 @@ def _refuse_what_lies_elsewhere(where: str, keyword: _Keyword, parts: int) -> No
     if reason is not None:
         advice = "Write the mesh as one part in global coordinates (an orphan mesh), or as VTU."
         raise ImageFileError(f"{where} {reason}, and that is not read. {advice}")
-
-
-def _generated(row: list[str]) -> range:
-    first, last, *step = (int(x) for x in row if x)
-    return range(first, last + 1, step[0] if step else 1)
 
 
 def _add_elements(where: str, keyword: _Keyword, mesh: NumberedMesh) -> list[int]:

@@ -51,7 +51,10 @@ def read_ansys(path: Path) -> RawMesh:
             if word == "ET" and len(fields) > 2:
                 types[fields[1]] = re.sub(r"\D", "", fields[2])
             elif word == "ETBLOCK":
-                _add_types(lines, types)
+                _, width, *_ = _format(_next(lines, word))
+                while (row := _next(lines, word)).strip() != "-1":
+                    number, kind = _columns(row, width, 2)
+                    types[str(number)] = str(kind)
             elif word == "NBLOCK":
                 _add_nodes(lines, mesh)
             elif word == "EBLOCK" and len(fields) > 2 and fields[2].upper() == "SOLID":
@@ -79,13 +82,6 @@ def _format(line: str) -> list[int]:
 def _columns(line: str, width: int, count: int | None = None) -> list[int]:
     columns = len(line.rstrip()) // width if count is None else count
     return [int(line[i * width : (i + 1) * width]) for i in range(columns)]
-
-
-def _add_types(lines: Iterator[str], types: dict[str, str]) -> None:
-    _, width, *_ = _format(_next(lines, "ETBLOCK"))
-    while (line := _next(lines, "ETBLOCK")).strip() != "-1":
-        number, kind = _columns(line, width, 2)
-        types[str(number)] = str(kind)
 
 
 def _add_nodes(lines: Iterator[str], mesh: NumberedMesh) -> None:

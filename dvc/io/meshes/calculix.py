@@ -34,12 +34,12 @@ def read_frd(path: Path) -> RawMesh:
         with damage_named(f"{path}, after line {number}: a row"):
             if line.startswith("    2C"):
                 for row in _rows(path, lines, "nodes"):
-                    mesh.add_node(int(row[3:13]), _values(row, 3))
+                    mesh.add_node(int(row[3:13]), _values(row))
             elif line.startswith("    3C"):
                 _add_elements(_rows(path, lines, "elements"), mesh, materials)
             elif line.startswith(" -4  DISP"):
                 rows = [row for row in _rows(path, lines, "displacements") if row.startswith(" -1")]
-                at_nodes = {"displacement": {int(row[3:13]): _values(row, 3) for row in rows}}
+                at_nodes = {"displacement": {int(row[3:13]): _values(row) for row in rows}}
     return mesh.by_index(materials, at_nodes=at_nodes)
 
 
@@ -53,11 +53,11 @@ def _rows(path: Path, lines: Iterator[tuple[int, str]], block: str) -> list[str]
     raise ImageFileError(f"{path} ends within its {block}: it is cut short.")
 
 
-def _values(row: str, count: int) -> list[float]:
-    start = 3 + _NODE
-    if len(row) < start + count * _VALUE:
+def _values(row: str) -> list[float]:
+    starts = range(3 + _NODE, 3 + _NODE + 3 * _VALUE, _VALUE)
+    if len(row) < starts.stop:
         raise ValueError("a row is cut short")
-    return [float(row[start + i * _VALUE : start + (i + 1) * _VALUE]) for i in range(count)]
+    return [float(row[start : start + _VALUE]) for start in starts]
 
 
 def _add_elements(rows: list[str], mesh: NumberedMesh, materials: dict[str, list[int]]) -> None:

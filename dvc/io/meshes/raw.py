@@ -52,18 +52,14 @@ class NumberedMesh:
         if number in self.elements:
             raise ImageFileError(f"{self.path}: element {number} is defined twice.")
         if len(nodes) != num_nodes_per_cell[kind]:
-            needed = f"a {kind} has {num_nodes_per_cell[kind]}"
-            raise ImageFileError(
-                f"{self.path}: element {number} has {len(nodes)} nodes; {needed}. The file is damaged."
-            )
+            counts = f"{len(nodes)} nodes; a {kind} has {num_nodes_per_cell[kind]}"
+            raise ImageFileError(f"{self.path}: element {number} has {counts}. The file is damaged.")
         self.elements[number] = kind, nodes
 
     def by_index(
-        self,
-        regions: Mapping[str, Iterable[int]],
-        node_sets: Mapping[str, Iterable[int]] | None = None,
+        self, regions: Mapping[str, Iterable[int]], node_sets: Mapping[str, Iterable[int]] | None = None,
         at_nodes: Mapping[str, Mapping[int, list[float]]] | None = None,
-    ) -> RawMesh:
+    ) -> RawMesh:  # fmt: skip
         """The mesh by indices, cells grouped by kind; sets may name what was left out, elements and fields may not."""
         if not self.nodes:
             raise ImageFileError(f"{self.path} has no nodes: there is no mesh in it.")

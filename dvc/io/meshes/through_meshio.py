@@ -10,7 +10,7 @@ import re
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ topological_dimension.update({"wedge15": 3, "pyramid13": 3})
 # Cell arrays that hold a region's number, in the order in which they are looked for.
 _REGION_ARRAYS = ("region", "regions", "label", "labels", "tissue", "material", "materialids", "part", "part_id")
 _MOST_REGIONS = 256
+_GROUP = re.compile(rb'^[ \t]*(\d+)[ \t]+(\d+)[ \t]+"(.*)"[ \t]*\r?$', re.MULTILINE)
 # Quadratic cells of Gmsh in VTK's order, of those that meshio leaves as they are.
 _TO_VTK = {
     "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
@@ -40,7 +41,10 @@ _TO_VTK = {
 
 def read_gmsh(path: Path) -> RawMesh:
     """Read a .msh file (version 2.2 or 4.1, text or binary): its regions are the physical groups."""
-    names = _group_names(path)
+    names: dict[tuple[int, int], str] = {}  # by dimension and tag; a volume and its surface may share one
+    with suppress(ValueError):  # no section of names
+        named = _GROUP.findall(_section(path.read_bytes(), b"PhysicalNames"))
+        names = {(int(d), int(tag)): name.decode(errors="replace") for d, tag, name in named}
     with _names_apart(path, names) as (place, real):
         mesh = _read(path, lambda _: meshio.gmsh.read(str(place)))
     blocks = [(c.type, c.data[:, _TO_VTK[c.type]] if c.type in _TO_VTK else c.data) for c in mesh.cells]
@@ -87,18 +91,6 @@ def _node_numbers(path: Path, count: int) -> IntArray:
         different = len(np.unique(tags))
         raise ImageFileError(f"{path}: {different} different node numbers for {count} nodes; the file is damaged.")
     return tags
-
-
-_GROUP = re.compile(rb'^[ \t]*(\d+)[ \t]+(\d+)[ \t]+"(.*)"[ \t]*\r?$', re.MULTILINE)
-
-
-def _group_names(path: Path) -> dict[tuple[int, int], str]:
-    """Names of a .msh file's physical groups by dimension and tag; a volume and its surface may share one."""
-    try:
-        named = _section(path.read_bytes(), b"PhysicalNames")
-    except ValueError:
-        return {}
-    return {(int(d), int(tag)): name.decode(errors="replace") for d, tag, name in _GROUP.findall(named)}
 
 
 @contextmanager

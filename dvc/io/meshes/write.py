@@ -19,12 +19,9 @@ VERDICT_FIELD = "verdict_0_trust_1_use_with_care_2_do_not_trust"
 
 
 def write_on_mesh(
-    path: StrPath,
-    mesh: MeshFile,
-    point_data: Mapping[str, FloatArray],
-    cell_data: Mapping[str, FloatArray],
+    path: StrPath, mesh: MeshFile, point_data: Mapping[str, FloatArray], cell_data: Mapping[str, FloatArray],
     verdict: Verdict | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Write results on the user's own mesh as a VTU file (binary), in the mesh file's own frame and unit.
 
     The data, in LPS, have one row for each node of `mesh`, or for each cell through all its blocks. (n,) is a scalar,
@@ -46,7 +43,10 @@ def write_on_mesh(
     with whole_file(path) as part, silenced():
         meshio.vtu.write(part, results, binary=True)
         if verdict is not None:
-            _add_verdict(part, verdict)
+            # meshio writes no field data, and reads none that are text
+            head = f'<DataArray type="Int8" Name="{VERDICT_FIELD}" NumberOfTuples="1" format="ascii">'
+            told, grid = f"{head}{LEVELS.index(verdict.level)}</DataArray>", b"<UnstructuredGrid>"
+            part.write_bytes(part.read_bytes().replace(grid, grid + f"<FieldData>{told}</FieldData>".encode(), 1))
 
 
 def write_nodal_displacements(path: StrPath, mesh: MeshFile, u_mm: FloatArray, verdict: Verdict | None = None) -> int:
@@ -74,14 +74,6 @@ def write_nodal_displacements(path: StrPath, mesh: MeshFile, u_mm: FloatArray, v
     write_csv(path, columns, rows)
     write_json(path.with_suffix(".json"), declared)
     return missing
-
-
-def _add_verdict(vtu: Path, verdict: Verdict) -> None:
-    """Put the verdict into a VTU file; meshio writes no field data, and reads none that are text."""
-    level = LEVELS.index(verdict.level)
-    array = f'<DataArray type="Int8" Name="{VERDICT_FIELD}" NumberOfTuples="1" format="ascii">{level}</DataArray>'
-    grid = b"<UnstructuredGrid>"
-    vtu.write_bytes(vtu.read_bytes().replace(grid, grid + f"<FieldData>{array}</FieldData>".encode(), 1))
 
 
 def _own_points(mesh: MeshFile) -> FloatArray:

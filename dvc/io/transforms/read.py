@@ -178,14 +178,10 @@ def _affine_from_elastix(parameters: Parameters) -> Affine:
     centre = _numbers(parameters, "CenterOfRotationPoint", 3)
     if kind == "AffineTransform":
         numbers = _numbers(parameters, "TransformParameters", 12)
-        return _about(centre, numbers[:9].reshape(3, 3), numbers[9:])
+        return Affine.about(centre, numbers[:9].reshape(3, 3), numbers[9:])
     numbers = _numbers(parameters, "TransformParameters", 7)  # SimilarityTransform: versor, translation, scale
     versor = sitk.VersorTransform(tuple(float(v) for v in (*numbers[:3], np.sqrt(1.0 - numbers[:3] @ numbers[:3]))))
-    return _about(centre, numbers[6] * np.reshape(versor.GetMatrix(), (3, 3)), numbers[3:6])
-
-
-def _about(centre: FloatArray, matrix: FloatArray, translation: FloatArray) -> Affine:
-    return Affine(matrix, centre - matrix @ centre + translation)
+    return Affine.about(centre, numbers[6] * np.reshape(versor.GetMatrix(), (3, 3)), numbers[3:6])
 
 
 _ELASTIX: dict[str, Callable[[Parameters], Deformation]] = {
@@ -314,7 +310,7 @@ def _from_sitk(transform: Any) -> Deformation:
     matrix = np.reshape(transform.GetMatrix(), (3, 3))
     shift = transform.GetTranslation() if hasattr(transform, "GetTranslation") else np.zeros(3)
     rigid = isinstance(transform, sitk.Euler3DTransform | sitk.VersorRigid3DTransform | sitk.VersorTransform)
-    return (RigidMotion.about if rigid else _about)(np.array(transform.GetCenter()), matrix, np.array(shift))
+    return (RigidMotion if rigid else Affine).about(np.array(transform.GetCenter()), matrix, np.array(shift))
 
 
 def _frame_beside(path: Path) -> str | None:

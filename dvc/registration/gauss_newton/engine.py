@@ -4,7 +4,6 @@ import json
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -200,16 +199,12 @@ def _run(
         done = Path(folder) / "share done"
         done.write_text("0")
         found = worker.run(
-            "registering with gauss-newton", fitting, pair.cut(), *given, start, partial(_note, str(done)),
+            "registering with gauss-newton", fitting, pair.cut(), *given, start,
+            lambda share: done.write_text(f"{share:.3f}"),
             watch=lambda: tell("registering", float(done.read_text() or 0)),
         )  # fmt: skip
     tell("registering", 1.0)
     return found
-
-
-def _note(path: str, share: float) -> None:
-    """Write the share that is done where the process that waits looks for it."""
-    Path(path).write_text(f"{share:.3f}")
 
 
 def _unlike(name: str, used: Parameters) -> str:

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.interface_spline import NUMBERS, Interfaces, InterfaceSpline
 from dvc.deformation.protocol import Deformation
@@ -102,11 +102,14 @@ class _Stage:
         pictures = brightness_scaled(pair)
         rough = ((1.0, REST), (_BENDING * self.interfaces.reach_mm**2, _SQUARE))
         roughness, factors = Roughness(control, rough, _LAPLACIANS), self.interfaces.at_voxels()
+        share = np.cumsum(np.count_nonzero(inside, axis=(1, 2))) / max(np.count_nonzero(inside), 1)
+        slab = np.zeros_like(inside)  # the middle third of the voxels along the first axis, from skin to skin
+        slab[(share > 1.0 / 3.0) & (share <= 2.0 / 3.0)] = True
         self.whole, self.slab = (
             Level(pictures, inside & part, soft & part, skin & part, roughness, factors=factors)
-            for part in (np.ones_like(soft), _slab(inside))
+            for part in (np.ones_like(soft), slab)
         )
-        self.has_skin, self.slab_has_skin = bool(skin.any()), bool((skin & _slab(inside)).any())
+        self.has_skin, self.slab_has_skin = bool(skin.any()), bool((skin & slab).any())
 
 
 def _moved(smooth: BSpline, bone: Mask) -> tuple[float, float] | None:
@@ -117,11 +120,3 @@ def _moved(smooth: BSpline, bone: Mask) -> tuple[float, float] | None:
         return None
     shear = StrainField.from_gradient(H[known]).max_shear
     return float(np.sqrt((u[known] ** 2).sum(axis=1).mean())), float(np.percentile(shear, 95))
-
-
-def _slab(inside: BoolArray) -> BoolArray:
-    """The middle third of a mask's voxels along the first axis, from skin to skin."""
-    share = np.cumsum(np.count_nonzero(inside, axis=(1, 2))) / max(np.count_nonzero(inside), 1)
-    part = np.zeros_like(inside)
-    part[(share > 1.0 / 3.0) & (share <= 2.0 / 3.0)] = True
-    return part
