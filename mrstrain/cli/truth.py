@@ -15,18 +15,14 @@ SliceSpacing = Annotated[float | None, typer.Option(help="Their edge along the t
 
 @takes_options
 def phantom(
-    out: Out,
-    seed: Annotated[int, typer.Option(min=0, help="Of shapes, textures, noise and the foot's motions.")] = 1,
+    out: Out, seed: Annotated[int, typer.Option(min=0, help="Of shapes, textures, noise and the foot's motions.")] = 1,
     load: Annotated[
         list[str] | None, typer.Option(help="Load1, Load2, Load3 or Load4; repeat for several. Default: all.")
     ] = None,
-    spacing: Annotated[float, typer.Option(help="Edge of the voxels, mm.")] = 0.8,
-    slice_spacing: SliceSpacing = None,
+    spacing: Annotated[float, typer.Option(help="Edge of the voxels, mm.")] = 0.8, slice_spacing: SliceSpacing = None,
     snr: Annotated[float, typer.Option(help="Fat's signal over the noise's standard deviation.")] = 25.0,
-    no_noise: Annotated[bool, typer.Option("--no-noise", help="Images without noise.")] = False,
-    *,
-    shape: HeelShape,
-) -> None:
+    no_noise: Annotated[bool, typer.Option("--no-noise", help="Images without noise.")] = False, *, shape: HeelShape,
+) -> None:  # fmt: skip
     """Images of a synthetic heel under Load0 to Load4, with their exactly known strain."""
     from phantoms import LOADS
 
@@ -44,11 +40,9 @@ def twin(
         Path,
         typer.Argument(help="The whole motion: elastix .txt, ITK transform (.h5, .tfm), or a displacement image."),
     ],
-    out: Out,
-    subject_files: SubjectFiles,
-    frame: FieldFrame = None,
+    out: Out, subject_files: SubjectFiles, frame: FieldFrame = None,
     seed: Annotated[int, typer.Option(min=0, help="Of noise and shading.")] = 1,
-) -> None:
+) -> None:  # fmt: skip
     """A loaded image made of your own unloaded one, with the truth beside it: to see how well that is found."""
     tell(mrstrain.twin.with_options(load0, deformation, out=out, subject_files=subject_files, frame=frame, seed=seed))
 

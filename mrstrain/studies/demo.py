@@ -68,13 +68,9 @@ class Demonstration:
 
 
 def demo(
-    out: Path | str,
-    *,
-    seed: int = 1,
-    full: bool = False,
-    workers: int | None = None,
+    out: Path | str, *, seed: int = 1, full: bool = False, workers: int | None = None,
     progress: OnProgress | None = None,
-) -> Demonstration:
+) -> Demonstration:  # fmt: skip
     """Make a heel phantom under four loads, run its study, and compare the measurement with the truth.
 
     out: The study's folder: images and truth of the phantom, ``study.toml``, ``results`` and ``error.csv``. A second
