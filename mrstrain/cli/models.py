@@ -9,7 +9,6 @@ import typer
 import mrstrain
 from mrstrain.cli.options import Out, Workers, carry_out, takes_options, tell
 from mrstrain.options import modelling
-from mrstrain.options.comparison import ComparisonOn, ModelReading
 from mrstrain.options.measurement import Cores, EngineOptions, Seeded, SubjectFiles
 
 LabelMap = Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")]
@@ -50,7 +49,7 @@ def simulate(
     coordinates: modelling.MeshCoordinates, cores: Cores, load: Loads = None,
 ) -> None:  # fmt: skip
     """A rigid plate presses and shears soft tissue on fixed bone: displacement, strain and stress for each load."""
-    from mrstrain.models.loads import loads_named
+    from mrstrain.models.simulate import loads_named
 
     carry_out(
         mrstrain.simulate.with_options, mesh, out=out, simulation=simulation, loads=loads_named(load),
@@ -65,8 +64,8 @@ def compare(
         list[Path],
         typer.Argument(help="For each model a folder with a file for each load (Load1.vtu, .frd, .csv ...)."),
     ],
-    out: Out, labelling: modelling.LabelMapFile, reading: ModelReading, directions: modelling.Directions,
-    comparison: ComparisonOn,
+    out: Out, labelling: modelling.LabelMapFile, reading: modelling.ModelReading, directions: modelling.Directions,
+    comparison: modelling.ComparisonOn,
     to_image: Annotated[
         Path | None,
         typer.Option(help="Text file: 4 x 4 map of the models' frame to the image's, LPS mm.", rich_help_panel="Model"),
@@ -95,7 +94,7 @@ def drive(
 def level(
     load0: Annotated[Path, typer.Argument(help="The unloaded image.")],
     model: Annotated[Path, typer.Argument(help="Folder of a model, with a file for each load, as in compare.")],
-    out: Out, subject_files: SubjectFiles, engine: EngineOptions, reading: ModelReading, seeded: Seeded,
+    out: Out, subject_files: SubjectFiles, engine: EngineOptions, reading: modelling.ModelReading, seeded: Seeded,
     load: Annotated[
         list[str] | None,
         typer.Option(help="Name of a load; repeat. Default: all of the model's.", rich_help_panel="Model"),
@@ -116,7 +115,7 @@ def converge(
     workers: Workers = None,
 ) -> None:  # fmt: skip
     """The same loads on meshes of several sizes: percentiles of strain and plate travel, and what they tend to."""
-    from mrstrain.models.loads import loads_named
+    from mrstrain.models.simulate import loads_named
 
     carry_out(
         mrstrain.converge.with_options, labels, edge_mm, out=out, labelling=labelling, followed=followed,

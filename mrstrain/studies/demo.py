@@ -8,7 +8,7 @@ from dvc import read_labels, read_mask, write_labels
 from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
 from dvc.io.result_folder import REPORT, VALID, spline_in
-from mrstrain.models.loads import LOADS
+from mrstrain.models.simulate import LOADS
 from mrstrain.records.progress import OnProgress
 from mrstrain.studies.file import FILE
 from mrstrain.studies.page import write_run_report
