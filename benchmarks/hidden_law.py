@@ -37,7 +37,7 @@ from dvc.io.result_folder import spline_in
 from dvc.trust.error_model import GaussianField
 from fe import read_tet_mesh, write_tet_mesh
 from mrstrain import mesh as make_mesh, run, simulate
-from mrstrain.models.loads import LOADS
+from mrstrain.models.simulate import LOADS
 from mrstrain.records.provenance import versions
 from phantoms import (
     Heel,

@@ -71,15 +71,10 @@ class HeelPair:
 
 
 def heel_pair(
-    seed: int = 1,
-    shape: tuple[int, int, int] = (126, 140, 132),
-    spacing_mm: float | Sequence[float] = 0.8,
-    snr: float | None = 25.0,
-    load: float = 1.0,
-    motion: Motion | None = None,
-    foot_motion: RigidMotion | None = None,
+    seed: int = 1, shape: tuple[int, int, int] = (126, 140, 132), spacing_mm: float | Sequence[float] = 0.8,
+    snr: float | None = 25.0, load: float = 1.0, motion: Motion | None = None, foot_motion: RigidMotion | None = None,
     loaded_grid: Grid | None = None,
-) -> HeelPair:
+) -> HeelPair:  # fmt: skip
     """Images of a heel: unloaded, loaded, and unloaded again.
 
     Parameters
@@ -121,14 +116,9 @@ def heel_pair(
 
 
 def scan(
-    heel: Heel,
-    grid: Grid,
-    motion: Motion | None = None,
-    foot_motion: RigidMotion | None = None,
-    *,
-    snr: float | None,
+    heel: Heel, grid: Grid, motion: Motion | None = None, foot_motion: RigidMotion | None = None, *, snr: float | None,
     number: int,
-) -> Image:
+) -> Image:  # fmt: skip
     """MR image of a heel on a grid (LPS mm) after a motion of its tissue, followed by a rigid motion of the foot.
 
     I(y) = I0(phi^-1(R^T (y - t))), where I0 is the closed form of the anatomy, so that no sampled image is ever

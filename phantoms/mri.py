@@ -16,14 +16,9 @@ _CHUNK = 200_000
 
 
 def acquire(
-    signal: Callable[[FloatArray], FloatArray] | FloatArray,
-    grid: Grid,
-    *,
-    snr: float | None,
-    reference_signal: float,
-    seed: int,
-    bias_seed: int | None,
-) -> Image:
+    signal: Callable[[FloatArray], FloatArray] | FloatArray, grid: Grid, *, snr: float | None, reference_signal: float,
+    seed: int, bias_seed: int | None,
+) -> Image:  # fmt: skip
     """Magnitude image of a noise-free signal.
 
     The signal is sampled at half the spacing of `sampled_by`. Only spatial frequencies that the voxels can represent

@@ -56,14 +56,9 @@ class SyntheticWarp:
 
 
 def synthetic_warp(
-    reference: Image,
-    tissue: Mask,
-    motion: Deformation,
-    acquisition: Acquisition,
-    *,
-    near: RigidMotion | None = None,
+    reference: Image, tissue: Mask, motion: Deformation, acquisition: Acquisition, *, near: RigidMotion | None = None,
     beyond_missing: bool = False,
-) -> SyntheticWarp:
+) -> SyntheticWarp:  # fmt: skip
     """Form the image of a subject's tissue after a deformation.
 
     I1(x) = D(phi^-1(x)) b(x) with Rician noise, where D is the denoised unloaded image (non-local means), interpolated

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from mrstrain.cli import measurement, models, studies, truth
+from mrstrain.cli import measurement, models, studies
 from mrstrain.cli.options import Grouped
 
 app = typer.Typer(
@@ -41,8 +41,8 @@ def _options(
 
 for _command in (
     studies.init, studies.check, studies.run, studies.cohort, studies.demo, measurement.register, measurement.strain,
-    truth.phantom, truth.twin, truth.accuracy, models.mesh, models.simulate, models.compare, models.drive,
-    models.level, models.converge, models.fit,
+    measurement.phantom, measurement.twin, measurement.accuracy, models.mesh, models.simulate, models.compare,
+    models.drive, models.level, models.converge, models.fit,
 ):  # fmt: skip
     app.command(cls=Grouped)(_command)
 

@@ -9,7 +9,6 @@ import typer
 import mrstrain
 from mrstrain.cli.options import Out, Workers, carry_out, takes_options, tell
 from mrstrain.options import modelling
-from mrstrain.options.comparison import ComparisonOn, ModelReading
 from mrstrain.options.measurement import Cores, EngineOptions, Seeded, SubjectFiles
 
 LabelMap = Annotated[Path, typer.Argument(help="Label map of the tissues on the unloaded image.")]
@@ -45,16 +44,12 @@ def mesh(
 
 @takes_options
 def simulate(
-    mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra with facets 'bone' and 'skin'.")],
-    out: Out,
-    simulation: modelling.SimulationOptions,
-    plate_options: modelling.PlateOptions,
-    coordinates: modelling.MeshCoordinates,
-    cores: Cores,
-    load: Loads = None,
-) -> None:
+    mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra with facets 'bone' and 'skin'.")], out: Out,
+    simulation: modelling.SimulationOptions, plate_options: modelling.PlateOptions,
+    coordinates: modelling.MeshCoordinates, cores: Cores, load: Loads = None,
+) -> None:  # fmt: skip
     """A rigid plate presses and shears soft tissue on fixed bone: displacement, strain and stress for each load."""
-    from mrstrain.models.loads import loads_named
+    from mrstrain.models.simulate import loads_named
 
     carry_out(
         mrstrain.simulate.with_options, mesh, out=out, simulation=simulation, loads=loads_named(load),
@@ -69,16 +64,13 @@ def compare(
         list[Path],
         typer.Argument(help="For each model a folder with a file for each load (Load1.vtu, .frd, .csv ...)."),
     ],
-    out: Out,
-    labelling: modelling.LabelMapFile,
-    reading: ModelReading,
-    directions: modelling.Directions,
-    comparison: ComparisonOn,
+    out: Out, labelling: modelling.LabelMapFile, reading: modelling.ModelReading, directions: modelling.Directions,
+    comparison: modelling.ComparisonOn,
     to_image: Annotated[
         Path | None,
         typer.Option(help="Text file: 4 x 4 map of the models' frame to the image's, LPS mm.", rich_help_panel="Model"),
     ] = None,
-) -> None:
+) -> None:  # fmt: skip
     """Finite-element models of any code against a measurement: curves, areas, location, agreement, and a report."""
     from mrstrain.records.inputs import read_matrix
 
@@ -91,12 +83,9 @@ def compare(
 
 @takes_options
 def drive(
-    mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra; facets 'bone' do not move.")],
-    dvc: Measured,
-    out: Out,
-    material: modelling.MaterialSets,
-    coordinates: modelling.MeshCoordinates,
-) -> None:
+    mesh: Annotated[Path, typer.Argument(help="Mesh of tetrahedra; facets 'bone' do not move.")], dvc: Measured,
+    out: Out, material: modelling.MaterialSets, coordinates: modelling.MeshCoordinates,
+) -> None:  # fmt: skip
     """A model whose outside goes where the measurement puts it: laws are judged apart from the plate."""
     carry_out(mrstrain.drive.with_options, mesh, dvc, out=out, material=material, coordinates=coordinates)
 
@@ -105,16 +94,12 @@ def drive(
 def level(
     load0: Annotated[Path, typer.Argument(help="The unloaded image.")],
     model: Annotated[Path, typer.Argument(help="Folder of a model, with a file for each load, as in compare.")],
-    out: Out,
-    subject_files: SubjectFiles,
-    engine: EngineOptions,
-    reading: ModelReading,
-    seeded: Seeded,
+    out: Out, subject_files: SubjectFiles, engine: EngineOptions, reading: modelling.ModelReading, seeded: Seeded,
     load: Annotated[
         list[str] | None,
         typer.Option(help="Name of a load; repeat. Default: all of the model's.", rich_help_panel="Model"),
     ] = None,
-) -> None:
+) -> None:  # fmt: skip
     """A model sent through the measurement itself (it moves the image, which is registered): like against like."""
     carry_out(
         mrstrain.level.with_options, load0, model, out=out, subject_files=subject_files, loads=load or (),
@@ -124,17 +109,13 @@ def level(
 
 @takes_options
 def converge(
-    labels: LabelMap,
-    out: Out,
+    labels: LabelMap, out: Out,
     edge_mm: Annotated[list[float], typer.Option(help="Length of edges, mm; three or more.", rich_help_panel="Model")],
-    labelling: modelling.Labelling,
-    directions: modelling.Directions,
-    followed: modelling.Followed,
-    load: Loads = None,
+    labelling: modelling.Labelling, directions: modelling.Directions, followed: modelling.Followed, load: Loads = None,
     workers: Workers = None,
-) -> None:
+) -> None:  # fmt: skip
     """The same loads on meshes of several sizes: percentiles of strain and plate travel, and what they tend to."""
-    from mrstrain.models.loads import loads_named
+    from mrstrain.models.simulate import loads_named
 
     carry_out(
         mrstrain.converge.with_options, labels, edge_mm, out=out, labelling=labelling, followed=followed,

@@ -76,11 +76,9 @@ def _refuse_idle(why: str, given: Mapping[str, object]) -> None:
 
 
 def cohort(
-    studies: Annotated[list[Path], typer.Argument(help="Study files, or their folders.")],
-    out: Out,
-    scheduler: Scheduler = None,
-    workers: Workers = None,
-) -> None:
+    studies: Annotated[list[Path], typer.Argument(help="Study files, or their folders.")], out: Out,
+    scheduler: Scheduler = None, workers: Workers = None,
+) -> None:  # fmt: skip
     """The studies of many subjects on one cluster: one table, one report, and the models ranked over all."""
     _carry_out(mrstrain.cohort, studies, out=out, scheduler=scheduler, workers=workers)
 

@@ -1,6 +1,6 @@
 """`compare`: finite-element models of any code against a measurement, from files to a report."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,11 +16,11 @@ from dvc.report.page import Section
 from fe import read_tet_mesh
 from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import ModelFile, model_files
-from mrstrain.options.comparison import ComparisonOn, ModelReading
 from mrstrain.options.door import door
 from mrstrain.options.model import Vector
-from mrstrain.options.modelling import Directions, LabelMapFile
+from mrstrain.options.modelling import ComparisonOn, Directions, LabelMapFile, ModelReading
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 
 
@@ -43,7 +43,7 @@ def compare(
     dvc: Path | str, models: Sequence[Path | str], *, out: Path | str, labelling: LabelMapFile,
     loads: Sequence[str] = (), reading: ModelReading, to_image: FloatArray | None = None, directions: Directions,
     towards: Mapping[str, tuple[Vector, Vector]] | None = None, comparison: ComparisonOn,
-    progress: Callable[[str, str, float], None] | None = None,
+    progress: OnProgress | None = None,
 ) -> Compared:  # fmt: skip
     """Compare finite-element models of any code with a measurement; see `validate.compare`.
 

@@ -1,6 +1,6 @@
 """`drive`: constitutive models under measured (Dirichlet) boundary conditions, free of plate, contact and friction."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from mrstrain.models.simulate import material_sets
 from mrstrain.options.door import door
 from mrstrain.options.modelling import MaterialSets, MeshCoordinates
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from validate import boundary_displacement, simulate_driven, write_boundary_conditions
 
@@ -37,8 +38,7 @@ class Driven:
 @door
 def drive(
     mesh: Path | str, dvc: Path | str, *, out: Path | str, material: MaterialSets, loads: Sequence[str] = (),
-    threads: int | None = None, coordinates: MeshCoordinates,
-    progress: Callable[[str, str, float], None] | None = None,
+    threads: int | None = None, coordinates: MeshCoordinates, progress: OnProgress | None = None,
 ) -> Driven:  # fmt: skip
     """Simulate a mesh with the measured displacement prescribed on its surface.
 

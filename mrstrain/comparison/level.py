@@ -1,6 +1,6 @@
 """`level`: forward-model comparison, the measurement simulated on the displacement of a model (levelling)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +15,10 @@ from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS, loads_of, model_
 from mrstrain.measurement.engines import engine_of, volume_kept
 from mrstrain.measurement.register import register
 from mrstrain.options import measurement as options
-from mrstrain.options.comparison import ModelReading
 from mrstrain.options.door import door
+from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
 from validate import LEVELLED, FeResult, extrapolated, filled_from_nearest
@@ -41,7 +42,7 @@ class Levelled:
 def level(
     load0: Path | str, model: Path | str, *, out: Path | str, subject_files: options.SubjectFiles,
     loads: Sequence[str] = (), engine: options.EngineOptions, reading: ModelReading, seeded: options.Seeded,
-    progress: Callable[[str, str, float], None] | None = None,
+    progress: OnProgress | None = None,
 ) -> Levelled:  # fmt: skip
     """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
 

@@ -13,7 +13,7 @@ from dvc import Grid
 from dvc.arrays import FloatArray
 from dvc.errors import ExtentError, InputError
 from dvc.mesh import box_told
-from mrstrain.options.comparison import ModelReading
+from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import read_matrix
 from validate import FeResult, check_overlap, read_result
 

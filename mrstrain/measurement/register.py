@@ -33,17 +33,10 @@ _BYTES_PER_VOXEL = 30  # of one image's results: 22 as measured, 5 with the plat
 
 @door
 def register(
-    load0: Path | str,
-    loads: Sequence[Path | str],
-    *,
-    out: Path | str,
-    subject_files: SubjectFiles,
-    registration: RegistrationOptions,
-    scans: Scans,
-    onto: MeshAndAxes,
-    running: Running,
+    load0: Path | str, loads: Sequence[Path | str], *, out: Path | str, subject_files: SubjectFiles,
+    registration: RegistrationOptions, scans: Scans, onto: MeshAndAxes, running: Running,
     progress: OnProgress | None = None,
-) -> Series:
+) -> Series:  # fmt: skip
     """Register loaded images to the unloaded one and write displacement, strain, quality and a report.
 
     A load that fails is named in ``failures``; the others are finished.
@@ -115,16 +108,9 @@ class InSeries(Running):
 
 @door
 def register_one(
-    load0: Path,
-    load: Path,
-    *,
-    out: Path,
-    subject_files: SubjectFiles,
-    registration: RegistrationOptions,
-    onto: MeshAndAxes,
-    series: InSeries,
-    tell: Callable[[str, float], None] = lambda *_: None,
-) -> Case:
+    load0: Path, load: Path, *, out: Path, subject_files: SubjectFiles, registration: RegistrationOptions,
+    onto: MeshAndAxes, series: InSeries, tell: Callable[[str, float], None] = lambda *_: None,
+) -> Case:  # fmt: skip
     """Register one loaded image by itself, as `register` does it in a series, for a study's worker of its own.
 
     A folder ``out`` that is called "repeat" is that of a repeat scan. ``tell(stage, fraction)`` reports progress. Other

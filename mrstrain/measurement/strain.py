@@ -25,14 +25,9 @@ def read_any(deformation: Path | str, frame: str | None = None) -> Deformation:
 
 @door
 def strain(
-    reference: Path | str,
-    deformation: Path | str,
-    *,
-    out: Path | str,
-    subject_files: SubjectFiles,
-    frame: Frame | None = None,
-    onto: MeshAndAxes,
-) -> Series:
+    reference: Path | str, deformation: Path | str, *, out: Path | str, subject_files: SubjectFiles,
+    frame: Frame | None = None, onto: MeshAndAxes,
+) -> Series:  # fmt: skip
     """Strain maps of a deformation that another tool measured.
 
     Parameters

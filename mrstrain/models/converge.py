@@ -11,13 +11,13 @@ from dvc import read_labels
 from dvc.atomic_files import write_csv, write_json
 from dvc.errors import InputError, MrstrainError
 from fe import Limit, LoadStep, Simulation, cell_size_mm, extrapolate, figures, material_set, read_tet_mesh
-from mrstrain.models.loads import LOADS
 from mrstrain.models.mesh import mesh as make_mesh
-from mrstrain.models.simulate import Progress, simulate
+from mrstrain.models.simulate import LOADS, simulate
 from mrstrain.options import modelling as options
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import file_hash, provenance
 
 _FEWEST = 3
@@ -56,7 +56,7 @@ class Converged:
 def converge(
     labels: Path | str, edges_mm: Sequence[float], *, out: Path | str, labelling: options.Labelling,
     followed: options.Followed, loads: Sequence[LoadStep] = LOADS, directions: options.Directions,
-    workers: int | None = None, progress: Progress | None = None,
+    workers: int | None = None, progress: OnProgress | None = None,
 ) -> Converged:  # fmt: skip
     """Mesh a label map with several edge lengths, simulate the same loads on each, and extrapolate.
 

@@ -1,6 +1,7 @@
 """`simulate`: a mesh under a plate's loads, for one or more material parameter sets."""
 
 import json
+import re
 import tempfile
 import threading
 import time
@@ -15,15 +16,19 @@ from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError, OutputError
 from dvc.worker import Worker, each_in_workers, usable_cores
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint, write_checkpoint
-from mrstrain.models.loads import LOADS
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import MeshCoordinates, PlateOptions, SimulationOptions
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 
-Progress = Callable[[str, str, float], None]
+LOADS = (
+    fe.LoadStep("Load1", 140.0), fe.LoadStep("Load2", 15.0),
+    fe.LoadStep("Load3", 15.0, 45.0), fe.LoadStep("Load4", 15.0, 12.0),
+)  # fmt: skip
+"""Loads of the published experiment."""
 _EVERY_S = 30.0  # at most so often is an increment on the way to a load written, to resume from
 
 
@@ -51,7 +56,7 @@ class Simulations:
 def simulate(
     mesh: Path | str, *, out: Path | str, simulation: SimulationOptions, loads: Sequence[fe.LoadStep] = LOADS,
     plate_options: PlateOptions, towards: Mapping[str, tuple[Vector, Vector]] | None = None,
-    coordinates: MeshCoordinates, cores: Cores, progress: Progress | None = None,
+    coordinates: MeshCoordinates, cores: Cores, progress: OnProgress | None = None,
 ) -> Simulations:  # fmt: skip
     """Simulate a plate that presses and shears soft tissue on fixed bone.
 
@@ -114,6 +119,33 @@ def simulate(
     return Simulations(target, tuple(run.done[one.name] for one in chosen if one.name in run.done), run.failures)
 
 
+def load_named(text: str) -> fe.LoadStep:
+    """A load from NAME=NORMAL or NAME=NORMAL,SHEAR: forces in N or, with mm after them, the plate's displacements."""
+    name, _, asked = text.partition("=")
+    found = [re.fullmatch(r"\s*([^\s]+?)\s*(mm|N)?\s*", part) for part in asked.split(",")]
+    try:
+        values = {
+            f"{axis}_{'mm' if match[2] == 'mm' else 'n'}": float(match[1])
+            for axis, match in zip(("normal", "shear"), found, strict=False)
+            if match
+        }
+        if len(values) < len(found) or not np.isfinite(list(values.values())).all():
+            raise ValueError("not finite numbers")
+    except ValueError as failure:
+        raise InputError(
+            "A load is NAME=NORMAL or NAME=NORMAL,SHEAR in N, such as Load3=15,45, or the plate's displacement in mm, "
+            f"such as Load3=15,8mm; got '{text}'."
+        ) from failure
+    if not name.strip() or not re.fullmatch(r"[\w. -]+", name.strip()):
+        raise InputError(f"A load needs a name of letters, digits, dots, blanks or dashes; got '{name}'.")
+    return fe.LoadStep(name.strip(), **values)
+
+
+def loads_named(texts: Sequence[str] | None) -> Sequence[fe.LoadStep]:
+    """The loads that a person types, as `load_named` reads each; the published experiment's where none is typed."""
+    return [load_named(text) for text in texts] if texts else LOADS
+
+
 def material_sets(names: Sequence[str]) -> list[fe.MaterialSet]:
     """Material parameter sets by the names of published ones or of files; one or more are needed, each once."""
     chosen = [fe.material_set(name) for name in names]
@@ -130,7 +162,7 @@ class _Run:
     jobs: Sequence[tuple[fe.MaterialSet, fe.Problem]]
     record: Callable[[fe.Simulation], dict[str, object]]
     decks: bool
-    progress: Progress
+    progress: OnProgress
     done: dict[str, fe.Simulation] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
     ended: dict[int, list[fe.LoadState]] = field(default_factory=dict)

@@ -17,7 +17,7 @@ from dvc.worker import usable_cores
 from fe import MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of
-from mrstrain.options.comparison import ModelReading
+from mrstrain.options.modelling import ModelReading
 from mrstrain.studies.costs import costs, mesh_given, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger

@@ -54,13 +54,9 @@ class Cohort:
 
 
 def cohort(
-    studies: Sequence[Path | str],
-    *,
-    out: Path | str,
-    scheduler: str | None = None,
-    workers: int | None = None,
+    studies: Sequence[Path | str], *, out: Path | str, scheduler: str | None = None, workers: int | None = None,
     progress: OnProgress | None = None,
-) -> Cohort:
+) -> Cohort:  # fmt: skip
     """Run the studies of many subjects, and rank the models over them.
 
     Parameters

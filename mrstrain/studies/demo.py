@@ -8,7 +8,7 @@ from dvc import read_labels, read_mask, write_labels
 from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
 from dvc.io.result_folder import REPORT, VALID, spline_in
-from mrstrain.models.loads import LOADS
+from mrstrain.models.simulate import LOADS
 from mrstrain.records.progress import OnProgress
 from mrstrain.studies.file import FILE
 from mrstrain.studies.page import write_run_report
@@ -68,13 +68,9 @@ class Demonstration:
 
 
 def demo(
-    out: Path | str,
-    *,
-    seed: int = 1,
-    full: bool = False,
-    workers: int | None = None,
+    out: Path | str, *, seed: int = 1, full: bool = False, workers: int | None = None,
     progress: OnProgress | None = None,
-) -> Demonstration:
+) -> Demonstration:  # fmt: skip
     """Make a heel phantom under four loads, run its study, and compare the measurement with the truth.
 
     out: The study's folder: images and truth of the phantom, ``study.toml``, ``results`` and ``error.csv``. A second

@@ -12,7 +12,6 @@ from pydantic.fields import FieldInfo
 
 from dvc.errors import InputError
 from mrstrain.options import modelling
-from mrstrain.options.comparison import ComparisonOptions
 from mrstrain.options.measurement import Frame, RegistrationOptions, SubjectFiles, Unit
 from mrstrain.options.model import Count, Flag, Names, Positive, Real, Vector, reason
 
@@ -146,7 +145,7 @@ class Study(_Part):
     registration: Registering = Registering()
     mesh: Mesh = Mesh()
     models: Models = Models()
-    compare: ComparisonOptions = ComparisonOptions()
+    compare: modelling.ComparisonOptions = modelling.ComparisonOptions()
     _lines: dict[tuple[str, str], int] = PrivateAttr(default_factory=dict)
 
     def at(self, table: str, key: str) -> str:

@@ -12,7 +12,7 @@ from dvc.errors import InputError, OutputError
 from dvc.io.images.dicom import is_dicom, is_multiframe
 from fe import published_names
 from mrstrain.comparison.model_files import ENDINGS
-from mrstrain.models.loads import LOADS
+from mrstrain.models.simulate import LOADS
 from mrstrain.records.inputs import IMAGE_ENDINGS, image_stem
 from mrstrain.studies.file import FILE
 

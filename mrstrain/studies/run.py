@@ -72,14 +72,9 @@ class StudyRun:
 
 
 def run(
-    study: Path | str | Study,
-    *,
-    only: Sequence[str] = (),
-    force: Sequence[str] = (),
-    scheduler: str | None = None,
-    workers: int | None = None,
-    progress: OnProgress | None = None,
-) -> StudyRun:
+    study: Path | str | Study, *, only: Sequence[str] = (), force: Sequence[str] = (), scheduler: str | None = None,
+    workers: int | None = None, progress: OnProgress | None = None,
+) -> StudyRun:  # fmt: skip
     """Run a study: register, mesh, simulate, compare and report.
 
     Parameters

@@ -34,11 +34,9 @@ _MEGABYTES = 5.0  # measured for one run's samples at 0.8 mm
 
 
 def accuracy_cases(
-    presets: Sequence[str] = (DEFAULT,),
-    conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
-    motions: Sequence[str] = (*MOTIONS, *WAVES),
-    seeds: Sequence[int] = SEEDS,
-) -> list[AccuracyCase]:
+    presets: Sequence[str] = (DEFAULT,), conditions: Sequence[tuple[tuple[float, float, float], float]] = CONDITIONS,
+    motions: Sequence[str] = (*MOTIONS, *WAVES), seeds: Sequence[int] = SEEDS,
+) -> list[AccuracyCase]:  # fmt: skip
     """Every preset with every condition (voxel in mm, SNR), motion and seed; shear waves with the first seed only.
 
     By default seven motions with two heels each and eight waves, at five conditions: 110 registrations. For an engine
@@ -61,13 +59,9 @@ def expected_minutes(cases: Sequence[AccuracyCase], workers: int) -> float:
 
 
 def accuracy(
-    out: Path | str,
-    *,
-    cases: Sequence[AccuracyCase] | None = None,
-    workers: int | None = None,
-    tell_plan: Callable[[str], None] | None = None,
-    progress: OnProgress | None = None,
-) -> AccuracyStudy:
+    out: Path | str, *, cases: Sequence[AccuracyCase] | None = None, workers: int | None = None,
+    tell_plan: Callable[[str], None] | None = None, progress: OnProgress | None = None,
+) -> AccuracyStudy:  # fmt: skip
     """Measure the error of registration presets on phantoms; an interrupted study resumes.
 
     Parameters

@@ -47,15 +47,9 @@ class PhantomFiles:
 
 @door
 def phantom(
-    out: Path | str,
-    *,
-    seed: int = 1,
-    loads: Sequence[str] = tuple(LOADS),
-    spacing_mm: float | Sequence[float] = 0.8,
-    snr: float | None = 25.0,
-    progress: OnProgress | None = None,
-    shape: HeelShape,
-) -> PhantomFiles:
+    out: Path | str, *, seed: int = 1, loads: Sequence[str] = tuple(LOADS), spacing_mm: float | Sequence[float] = 0.8,
+    snr: float | None = 25.0, progress: OnProgress | None = None, shape: HeelShape,
+) -> PhantomFiles:  # fmt: skip
     """Make images of a synthetic heel, unloaded and loaded, with exactly known strain.
 
     Parameters

@@ -38,14 +38,9 @@ class TwinFiles:
 
 @door
 def twin(
-    load0: Path | str,
-    deformation: Path | str,
-    *,
-    out: Path | str,
-    subject_files: SubjectFiles,
-    frame: Frame | None = None,
-    seed: int = 1,
-) -> TwinFiles:
+    load0: Path | str, deformation: Path | str, *, out: Path | str, subject_files: SubjectFiles,
+    frame: Frame | None = None, seed: int = 1,
+) -> TwinFiles:  # fmt: skip
     """Warp an unloaded image by a deformation, as if it had been scanned under load, and write the truth.
 
     Parameters

@@ -11,7 +11,7 @@ import pytest
 from dvc.errors import ExtentError, GeometryError
 from dvc.images.image import Grid
 from mrstrain.comparison.model_files import ModelFile
-from mrstrain.options.comparison import ModelReading
+from mrstrain.options.modelling import ModelReading
 from tests.validate.test_comparison import SIDE, cube, labels, result, sheared
 from tests.validate.test_fe_result import written
 from validate import Field, MappedFields, displacement_slip, map_fields, misfits

@@ -18,8 +18,7 @@ from fe import LoadStep, Plate, Problem, paths_of, published_names, read_tet_mes
 from fe.figures import _along_plate
 from fe.result import patch_volumes, volume_percentiles
 from mrstrain.cli.app import app
-from mrstrain.models.loads import load_named
-from mrstrain.models.simulate import simulate as run
+from mrstrain.models.simulate import load_named, simulate as run
 from tests.blocks import block
 from tests.fe.test_mesh_names import abaqus, ansys
 from tests.fe.test_simulate import DOWN, FAT, PRESS, block_under_plate, dome, nodal_forces, press

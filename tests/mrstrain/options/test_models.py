@@ -16,8 +16,7 @@ import mrstrain
 from dvc.errors import InputError, ParameterError
 from mrstrain.cli.app import app
 from mrstrain.cli.options import _plain, takes_options
-from mrstrain.options import comparison, measurement, modelling
-from mrstrain.options.comparison import ComparisonOn, ComparisonOptions, ModelReading
+from mrstrain.options import measurement, modelling
 from mrstrain.options.measurement import (
     Cores,
     EngineOptions,
@@ -31,6 +30,8 @@ from mrstrain.options.measurement import (
 )
 from mrstrain.options.model import Options
 from mrstrain.options.modelling import (
+    ComparisonOn,
+    ComparisonOptions,
     Directions,
     Followed,
     HeelShape,
@@ -39,6 +40,7 @@ from mrstrain.options.modelling import (
     MaterialSets,
     MeshCoordinates,
     Meshing,
+    ModelReading,
     PlateOptions,
     SimulationOptions,
 )
@@ -87,7 +89,7 @@ NOT_IN_A_STUDY = {  # what a study has in its own way
 }
 MODELS = [
     one
-    for room in (measurement, modelling, comparison)
+    for room in (measurement, modelling)
     for one in vars(room).values()
     if isinstance(one, type) and issubclass(one, Options) and one.__module__ == room.__name__
 ]

@@ -15,7 +15,7 @@ from dvc import StrainField, evaluate_on_grid, read_labels, read_mask
 from dvc.errors import OutputError
 from dvc.report.page import Section
 from dvc.trust.verdict import Verdict
-from mrstrain.models.loads import LOADS
+from mrstrain.models.simulate import LOADS
 from mrstrain.studies.demo import _make, _reached, _summary
 from mrstrain.studies.file import read_study
 from mrstrain.studies.ledger import StageRecord
