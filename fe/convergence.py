@@ -62,13 +62,14 @@ def extrapolate(sizes_mm: FloatArray, values: FloatArray) -> Limit:
             f"cells of {', '.join(f'{s:.2f}' for s in h)} mm. Where borders lie close together they, and not the edge "
             "length asked for, set the size: ask for shorter edges."
         )
-    fits = []
+    best = (np.inf, 0.0, 0.0)
     for order in _ORDERS:
         columns = np.column_stack([np.ones_like(h), h**order])
         coefficients, *_ = np.linalg.lstsq(columns, f, rcond=None)
         cost = float(np.sqrt(np.mean((columns @ coefficients - f) ** 2)))
-        fits.append((cost, float(order), float(coefficients[0])))
-    scatter, order, limit = min(fits, key=lambda fitted: round(fitted[0], 15))
+        if cost < best[0] - 1e-15:
+            best = cost, float(order), float(coefficients[0])
+    scatter, order, limit = best
     steps = np.diff(f[np.argsort(h)])
     finest, coarsest = float(f[int(np.argmin(h))]), float(f[int(np.argmax(h))])
     steady = bool(np.all(steps >= 0.0) or np.all(steps <= 0.0))

@@ -74,10 +74,8 @@ def measure(
 
     Raises
     ------
-    GeometryError
-        If the labels lie on another grid.
-    InputError, ParameterError, RegistrationError, WorkerError
-        As `dvc.register`.
+    GeometryError, InputError, ParameterError, RegistrationError, WorkerError
+        As `dvc.register`, and if the labels lie on another grid.
     """
     if labels is not None and not labels.grid.same_as(reference.grid):
         raise GeometryError("The labels lie on another grid than the unloaded image: `fit_mask` brings them onto it.")

@@ -177,9 +177,11 @@ class Measurement:
             image = files.read_scalar(place / files.REGISTERED, maps.grid)
         regions = tuple(read_regions_csv(place / files.REGIONS))
         bars = ErrorBars.from_dict(told.get("error_of_max_shear", {}), uncertainty, model)
-        deformation = files.ResultFolder(place).deformation()
         if (place / files.SPLINE).is_file():  # with its own gradient, not its displacement at the voxels
-            deformation = Within(files.spline_in(place), Mask(maps.grid, maps.valid), margin_voxels=0)
+            mask = Mask(maps.grid, maps.valid)
+            deformation: Deformation = Within(files.spline_in(place), mask, margin_voxels=0)
+        else:
+            deformation = files.ResultFolder(place).deformation()
         return cls(place.resolve().name, deformation, maps, alignment, quality, regions, bars, image, None, at)
 
     @property
