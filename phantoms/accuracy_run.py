@@ -232,23 +232,15 @@ def _sampled_errors(
         return np.asarray(values[known], dtype=np.float32)
 
     return ErrorSamples(
-        case=case,
-        estimated_snr=signal_to_noise(registration.reference, registration.tissue),
-        seconds=registration.seconds,
-        unknown=int(np.count_nonzero(~known)),
-        folded=int(np.count_nonzero(strain.jacobian[known] <= 0)),
-        tissue=labels.labels[sampled][known],
-        to_bone_mm=to_bone[sampled][known],
-        to_border_mm=to_border[sampled][known],
-        true_shear=single(truth.max_shear),
-        shear=single(strain.max_shear),
-        u_error_mm=single(u - true_u),
+        case=case, estimated_snr=signal_to_noise(registration.reference, registration.tissue),
+        seconds=registration.seconds, unknown=int(np.count_nonzero(~known)),
+        folded=int(np.count_nonzero(strain.jacobian[known] <= 0)), tissue=labels.labels[sampled][known],
+        to_bone_mm=to_bone[sampled][known], to_border_mm=to_border[sampled][known],
+        true_shear=single(truth.max_shear), shear=single(strain.max_shear), u_error_mm=single(u - true_u),
         mean_abs_strain=single(np.abs(components).mean(axis=1)),
-        true_slope=single(np.einsum("i,nij,j->n", d, true_H, n)),
-        slope=single(np.einsum("i,nij,j->n", d, H, n)),
-        correlation=correlation,
-        lag_mm=lag_mm,
-    )
+        true_slope=single(np.einsum("i,nij,j->n", d, true_H, n)), slope=single(np.einsum("i,nij,j->n", d, H, n)),
+        correlation=correlation, lag_mm=lag_mm,
+    )  # fmt: skip
 
 
 def distances_mm(labels: LabelMap) -> tuple[Float32Array, Float32Array]:

@@ -66,15 +66,10 @@ def record_of(
 ) -> dict[str, object]:
     """What a registration is made from; ``more`` are parameters beside those of the registration."""
     parameters = {
-        "align": settings.align_on,
-        "seed": settings.seed,
-        "threads": settings.threads,
-        "plate_normal_lps": subject.plate_normal.tolist(),
-        "engine": settings.engine.family,
-        **settings.engine.record(),
-        **{name: value for name, value in how.plain().items() if name not in _SETTINGS},
-        **more,
-    }
+        "align": settings.align_on, "seed": settings.seed, "threads": settings.threads,
+        "plate_normal_lps": subject.plate_normal.tolist(), "engine": settings.engine.family,
+        **settings.engine.record(), **{name: of for name, of in how.plain().items() if name not in _SETTINGS}, **more,
+    }  # fmt: skip
     given: _Files = {**subject.files, **files, "error_model": how.files.get("error_model", [])}
     return provenance("register", given, parameters)
 

@@ -53,12 +53,9 @@ def strain(
     target, source = Path(out), Path(deformation)
     subject = read_subject(reference, subject_files, onto)
     parameters = {
-        "frame": frame,
-        "bone_label": subject_files.bone_label,
-        "plate_normal_lps": subject.plate_normal.tolist(),
-        "shear_direction_lps": onto.plain()["shear_direction"],
-        **onto.model_dump(include={"mesh_unit", "mesh_frame"}),
-    }
+        "frame": frame, "bone_label": subject_files.bone_label, "plate_normal_lps": subject.plate_normal.tolist(),
+        "shear_direction_lps": onto.plain()["shear_direction"], **onto.model_dump(include={"mesh_unit", "mesh_frame"}),
+    }  # fmt: skip
     total = read_any(source, frame)
     record = provenance("strain", {**subject.files, "deformation": source}, parameters)
     name = case_names([source])[0].removesuffix(source.suffix) or "strain"

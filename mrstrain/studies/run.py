@@ -63,12 +63,8 @@ class StudyRun:
         if comparison := self.outcomes.get("compare"):
             lines += comparison.result.lines
         reused = sum(outcome.reused and outcome.record is not None for outcome in self.outcomes.values())
-        return [
-            *lines,
-            *left_out_of(self.outcomes),
-            f"{len(self.outcomes)} stages, {reused} of them there already. Log: {self.study.out / LOG}",
-            f"Report: {self.study.out / REPORT}",
-        ]
+        stages = f"{len(self.outcomes)} stages, {reused} of them there already. Log: {self.study.out / LOG}"
+        return [*lines, *left_out_of(self.outcomes), stages, f"Report: {self.study.out / REPORT}"]
 
 
 def run(
