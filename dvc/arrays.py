@@ -7,6 +7,9 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from dvc.arguments import shown
+from dvc.errors import InputError
+
 _T = TypeVar("_T", bound=np.generic)
 
 FloatArray = npt.NDArray[np.float64]
@@ -24,6 +27,17 @@ copyreg.pickle(MappingProxyType, lambda proxy: (_sealed, (dict(proxy),)))  # val
 
 def frozen(values: npt.ArrayLike, dtype: type[_T]) -> npt.NDArray[_T]:
     """``values`` as a read-only, C-ordered array of ``dtype``, copied only if needed; the caller's stays writable."""
-    array = np.ascontiguousarray(values, dtype=dtype).view()
+    try:
+        array = np.ascontiguousarray(values, dtype=dtype).view()
+    except (TypeError, ValueError) as failure:
+        raise InputError(f"Numbers are needed; got {shown(values)}.") from failure
     array.flags.writeable = False
     return array
+
+
+def as_points(points_mm: npt.ArrayLike) -> FloatArray:
+    """Points (n, 3), C-ordered; InputError for any other shape, which compiled loops would read past."""
+    points = np.ascontiguousarray(points_mm, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"Points are an array (n, 3), LPS mm; got shape {points.shape}. One point is [[x, y, z]].")
+    return points

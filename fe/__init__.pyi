@@ -4,7 +4,7 @@ from .fitting import LAWS, Curve, Fit, fit, read_curves
 from .from_dvc import InputError, MrstrainError, OutputError, TetMesh, WorkerError
 from .load_path import Checkpoint, PlateState
 from .materials import MODES, Hencky, Material, NeoHooke, Ogden, Yeoh
-from .mesh_file import read_tet_mesh, write_tet_mesh
+from .mesh_file import BONE, CUT, SKIN, fixed_facets, read_tet_mesh, write_tet_mesh
 from .meshing import MeshQuality, check_meshing, mesh_labels
 from .newton import Tolerance
 from .plate import Plate
@@ -14,7 +14,6 @@ from .result import RegionFigures, cauchy_stress, equivalent_stress, region_figu
 from .simulation import Simulation, simulate
 from .simulation_files import clear_simulation
 from .solution import LoadState, Observer, SolverOptions, solve
-from .surface_sets import BONE, CUT, SKIN, fixed_facets
 
 __all__ = [
     "BONE", "CUT", "LAWS", "MODES", "SKIN", "Checkpoint", "Curve", "Fit", "Hencky", "InputError", "Limit",

@@ -18,8 +18,8 @@ from dvc.errors import InputError
 from fe.elements import Space, edges_of
 from fe.hyperelastic import OGDEN
 from fe.materials import Material, Materials, NeoHooke, Ogden, Yeoh
+from fe.mesh_file import BONE
 from fe.solution import LoadState
-from fe.surface_sets import BONE
 
 _UNUSED = 1e30  # D of a volumetric term that is not wanted: its stiffness is 1 / D
 _PER_LINE = 12

@@ -20,10 +20,10 @@ from dvc.report.figures import REGION_COLOURS
 from dvc.report.sheet import FONT, INK, WIDTH_IN, chart, label_axes, letters, panels, png_bytes
 from fe.convergence import Limit
 from fe.fitting import Curve, Fit
+from fe.mesh_file import BONE
 from fe.plate import Plate
 from fe.result import volume_percentiles
 from fe.solution import LoadState
-from fe.surface_sets import BONE
 
 _POINTS = 200
 _FLAT_MM = 0.1

@@ -14,10 +14,10 @@ from fe.assembly import Assembler
 from fe.descent import descend
 from fe.elements import Model
 from fe.linear import Solver
+from fe.mesh_file import SKIN
 from fe.newton import Imposed, Tolerance, equilibrium
 from fe.plate import Contact, ContactStatus, Parallel, Turning
 from fe.problem import PlateTarget, Problem
-from fe.surface_sets import SKIN
 
 _FIRST_STEP = 0.25
 _LEAST_STEP, _SOFT_STEP = 1.0 / 512.0, 1.0 / 32.0

@@ -178,7 +178,7 @@ def _kpa(value_mpa: float) -> str:
 
 
 def _terms(mu_mpa: npt.ArrayLike, alpha: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    moduli, exponents = np.atleast_1d(mu_mpa).astype(float), np.atleast_1d(alpha).astype(float)
+    moduli, exponents = frozen(np.atleast_1d(mu_mpa), np.float64), frozen(np.atleast_1d(alpha), np.float64)
     if moduli.shape != exponents.shape or moduli.ndim != 1 or not len(moduli):
         raise InputError(f"Ogden: {moduli.size} moduli and {exponents.size} exponents; as many of each are needed.")
     return moduli, exponents

@@ -1,8 +1,8 @@
-"""Meshes made here, kept as files that ParaView opens and that are read back with every name."""
+"""Meshes made here, kept as files that ParaView opens and that are read back with every name; names of surfaces."""
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -10,15 +10,19 @@ import meshio
 import numpy as np
 
 from dvc import TetMesh, read_mesh
+from dvc.arguments import checked
 from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import whole_file, write_json
 from dvc.errors import InputError
-from fe.surface_sets import BONE, CUT, SKIN
+
+BONE, SKIN, CUT = "bone", "skin", "cut"
+"""The interface with bone, which is fixed; the outer surface, which the plate may touch; and where a label map ends."""
 
 _FIRST_FACET = 101  # numbers of facets in the array "region"; those of tissues begin at 1
 _MATERIAL = re.compile(r"material \d+")  # what ANSYS divides the cells by, beside its components
 
 
+@checked
 def write_tet_mesh(
     path: Path | str, mesh: TetMesh, about: Mapping[str, object] = MappingProxyType({}),
     at_nodes: Mapping[str, FloatArray] | None = None,
@@ -37,10 +41,12 @@ def write_tet_mesh(
 
     Raises
     ------
-    OutputError
-        If a file cannot be written.
+    InputError, OutputError
+        If the name does not end in .vtu; if a file cannot be written.
     """
     place = Path(path)
+    if place.suffix.lower() != ".vtu":
+        raise InputError(f"{place}: a mesh is written as VTU; let its name end in .vtu.")
     blocks, numbers = [("tetra", mesh.cells)], [np.zeros(len(mesh.cells), dtype=np.int64)]
     for number, cells in enumerate(mesh.regions.values(), start=1):
         numbers[0][cells] = number
@@ -97,3 +103,9 @@ def _without(regions: dict[str, IntArray], names: set[str], cell_count: int) -> 
     others = {name: cells for name, cells in regions.items() if name not in names}
     held = np.unique(np.concatenate([*others.values(), np.empty(0, dtype=np.int64)]))
     return others if len(held) == cell_count else regions
+
+
+def fixed_facets(mesh: TetMesh, beside: Sequence[str]) -> tuple[str, ...]:
+    """Names of the facets that do not move: the bone's and those ``beside`` it, as the mesh spells them."""
+    spelt = {name.casefold(): name for name in mesh.facets} | {name: name for name in mesh.facets}
+    return tuple(dict.fromkeys([BONE, *(spelt.get(name, spelt.get(name.casefold(), name)) for name in beside)]))

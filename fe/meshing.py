@@ -9,12 +9,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dvc import Grid, LabelMap, TetMesh
+from dvc.arguments import checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError, WorkerError
 from dvc.mesh import FACES, signed_volumes
 from dvc.worker import Worker
+from fe.mesh_file import BONE, CUT, SKIN
 from fe.slivers import dihedral_angles_deg, without_slivers
-from fe.surface_sets import BONE, CUT, SKIN
 from fe.tissue_surfaces import Borders, borders_of, labels_at, with_volumes
 
 _ENVELOPE = 0.2  # of the smallest voxel edge: how far the mesh's surfaces may lie from the borders
@@ -79,6 +80,7 @@ def check_meshing(
     return numbers
 
 
+@checked
 def mesh_labels(
     labels: LabelMap, edge_mm: float, *, bones: Sequence[str] = ("bone",), finer: tuple[str, float] | None = None,
     limit_s: float = 3600.0, watch: Callable[[float], None] = lambda _: None,

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from dvc import plate_axes
-from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
 from dvc.errors import InputError
 from fe.assembly import Assembler
 from fe.linear import SingularError, Solver
@@ -78,7 +78,7 @@ class Plate:
             pivot = np.asarray(self.pivot_mm, dtype=np.float64)
             if pivot.shape != (3,) or not np.isfinite(pivot).all():
                 raise InputError(f"The plate's pivot is a point, three finite coordinates in mm; got {self.pivot_mm}.")
-        object.__setattr__(self, "axes", plate_axes(-np.asarray(self.normal, dtype=np.float64), self.shear))
+        object.__setattr__(self, "axes", plate_axes(-frozen(self.normal, np.float64), self.shear))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,19 +3,20 @@
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from dvc import TetMesh
+from dvc.arguments import check_fields, checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from fe.elements import element as formulation
 from fe.materials import Materials
+from fe.mesh_file import BONE, SKIN
 from fe.plate import Contact, Plate
-from fe.surface_sets import BONE, SKIN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +60,7 @@ class LoadStep:
     shear_mm: float | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if (self.normal_n is None) == (self.normal_mm is None):
             raise InputError(f"{self.name}: give either the normal force or the plate's displacement along it.")
         if self.shear_n is not None and self.shear_mm is not None:
@@ -153,8 +155,8 @@ class Problem:
 
     def __post_init__(self) -> None:
         formulation(self.element)
+        check_fields(self)
         mesh, fixed = self.mesh, self.fixed
-        check_kinds(mesh, self.plate, self.loads)
         if not fixed:
             raise InputError("No surface set is fixed: tissue that nothing holds cannot be pressed.")
         for name in (*fixed, SKIN):
@@ -173,6 +175,7 @@ class Problem:
         Contact(self.plate, mesh.points_mm @ self.plate.axes, on_surface)
 
 
+@checked
 def problems_of(
     mesh: TetMesh, materials: Materials, plate: Plate | Mapping[str, Plate], loads: Sequence[LoadStep],
     fixed: Sequence[str] = (BONE,), element: str = "P1",
@@ -184,26 +187,11 @@ def problems_of(
     InputError
         As `Problem`, or if a load has no plate.
     """
-    check_kinds(mesh, plate, loads)
+    if isinstance(plate, Mapping) and (bare := [load.name for load in loads if load.name not in plate]):
+        raise InputError(f"plate has none for {', '.join(bare)}; it has one for {', '.join(plate) or 'no load'}.")
     plate_of = {load.name: plate if isinstance(plate, Plate) else plate[load.name] for load in loads}
     paths = paths_of(loads, {name: tuple(one.axes.round(9).ravel()) for name, one in plate_of.items()})
     return [Problem(mesh, materials, plate_of[path[0].name], path, fixed, element) for path in paths]
-
-
-def check_kinds(mesh: object, plate: object, loads: Any) -> None:
-    """Refuse what is no mesh, plate or sequence of loads with an `InputError` that says what to give."""
-    _expect(TetMesh, mesh, "The mesh must be a TetMesh, as fe.read_tet_mesh(path) or fe.mesh_labels gives it")
-    _expect(Sequence, loads, "The loads must be a list of fe.LoadStep")
-    for load in loads:
-        _expect(LoadStep, load, "The loads must be a list of fe.LoadStep")
-        one = plate.get(load.name) if isinstance(plate, Mapping) else plate
-        _expect(Plate, one, f"{load.name}: the plate must be an fe.Plate, or a dict with one for each load's name")
-
-
-def _expect(kind: type, given: object, wanted: str) -> None:
-    if not isinstance(given, kind):
-        got = "nothing" if given is None else f"{given!r}" if isinstance(given, str) else f"a {type(given).__name__}"
-        raise InputError(f"{wanted}; got {got}.")
 
 
 def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
@@ -223,9 +211,9 @@ def check_loads(plate: Plate, loads: Sequence[LoadStep]) -> None:
             raise InputError(f"{load.name}: a plate without friction carries no shear; got {load}.")
 
 
+@checked
 def check_materials(mesh: TetMesh, materials: Materials) -> None:
     """Refuse a mesh of which a cell has no material, or more than one, with an `InputError`."""
-    _expect(Mapping, materials, "Materials must be a dict of region to material, as MaterialSet.for_regions gives it")
     times = np.zeros(len(mesh.cells), dtype=int)
     for region in materials:
         if region not in mesh.regions:

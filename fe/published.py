@@ -114,18 +114,11 @@ def material_set(name: str | Path) -> MaterialSet:
     return known[str(name)]
 
 
-def as_material_set(given: object) -> MaterialSet:
-    """A set as it is, by its name or file, or of materials by region; `InputError` for anything else."""
-    if isinstance(given, MaterialSet):
-        return given
+def as_material_set(given: MaterialSet | Materials | Path | str) -> MaterialSet:
+    """A set as it is, by its name or file, or of materials by region."""
     if isinstance(given, (str, Path)):
         return material_set(given)
-    if isinstance(given, Mapping) and all(isinstance(material, Material) for material in given.values()):
-        return MaterialSet("materials", "", "", dict(given))
-    raise InputError(
-        "Materials must be a set (fe.material_set), the name of a published one, or a dict of region to material, such "
-        f"as {{'fat': fe.Ogden.from_ansys(0.0034, 6.2)}}; got {given!r:.80}."
-    )
+    return given if isinstance(given, MaterialSet) else MaterialSet("materials", "", "", dict(given))
 
 
 def read_material_sets(path: str | Path) -> dict[str, MaterialSet]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from dvc import TetMesh
+from dvc.arguments import checked
 from dvc.arrays import FloatArray
 from dvc.atomic_files import write_json
 from dvc.deformation.nodal import OnMesh
@@ -15,13 +16,13 @@ from fe import result
 from fe.decks import write_calculix, write_febio
 from fe.elements import CROWDED, DESCRIPTIONS
 from fe.materials import MODES, Materials
+from fe.mesh_file import BONE
 from fe.plate import Plate
-from fe.problem import LoadStep, Problem, check_kinds, problems_of
+from fe.problem import LoadStep, Problem, problems_of
 from fe.published import MaterialSet, as_material_set
 from fe.result import RegionFigures
 from fe.simulation_files import RECORD, read_parts
 from fe.solution import LoadState, Observer, SolverOptions, solve
-from fe.surface_sets import BONE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -180,6 +181,7 @@ class Simulation:
             )
         return "\n".join([*lines, *(f"{self.name}: {note}" for note in self.notes)])
 
+    @checked
     def plot(self, loads: Sequence[str] | None = None) -> "Figure":
         """Maximum shear strain on a slice through the bone's lowest point, a panel for each load; all by default."""
         from fe.figures import sagittal_slice
@@ -314,6 +316,7 @@ class Simulation:
         return cls(**read_parts(Path(folder), mesh))
 
 
+@checked
 def simulate(
     mesh: TetMesh, materials: MaterialSet | Materials | Path | str, plate: Plate | Mapping[str, Plate],
     loads: Sequence[LoadStep], *, fixed: Sequence[str] = (BONE,), element: str = "P1",
@@ -329,8 +332,10 @@ def simulate(
         A set, the name of a published one or the path of a file with one (`fe.material_set`), or a material for each
         region of the mesh.
     plate : Plate, or mapping of load's name to Plate
+        Its outward normal and direction of shear, LPS; both are needed, even to press alone.
     loads : sequence of LoadStep
-        Those with the same normal force lie on one path, in the order of their shear (`fe.paths_of`).
+        Forces (N) or plate displacements (mm) along these. Those with the same normal force lie on one path, in the
+        order of their shear (`fe.paths_of`).
     fixed : sequence of str
         Surface sets that do not move.
     element : {"P1", "MINI", "P2"}
@@ -358,7 +363,6 @@ def simulate(
     A load that cannot be reached is no error: its state is the last converged increment, with ``reached`` below 1,
     and `Simulation.complete` is False.
     """
-    check_kinds(mesh, plate, loads)
     chosen = as_material_set(materials)
     problems = problems_of(mesh, chosen.for_regions(mesh.regions)[0], plate, loads, fixed, element)
     return Simulation.of(chosen, problems, [s for one in problems for s in solve(one, options, observer)])

@@ -18,12 +18,12 @@ from dvc.mesh import outer_faces
 from dvc.software import software_key
 from fe.load_path import Checkpoint, PlateState
 from fe.materials import from_vector
+from fe.mesh_file import BONE, SKIN
 from fe.plate import ContactStatus
 from fe.problem import LoadStep, Problem
 from fe.published import MaterialSet
 from fe.result import PLATE_VECTORS, read_curve_csv, read_state
 from fe.solution import LoadState
-from fe.surface_sets import BONE, SKIN
 
 RECORD = "simulation.json"
 ENDING = ".restart.npz"

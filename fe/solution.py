@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dvc import StrainField, TetMesh
+from dvc.arguments import checked
 from dvc.arrays import FloatArray, IntArray
 from fe.elements import Model, element
 from fe.load_path import Checkpoint, Loading, LoadPath, PlateState
@@ -112,6 +113,7 @@ class LoadState:
         return StrainField.from_gradient(self.gradients)
 
 
+@checked
 def solve(
     problem: Problem, options: SolverOptions | None = None, observer: Observer | None = None,
     earlier: Sequence[Checkpoint] = (),

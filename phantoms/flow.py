@@ -6,7 +6,7 @@ from typing import Literal, Self
 import numpy as np
 from numba import njit, prange
 
-from dvc.arrays import FloatArray, frozen
+from dvc.arrays import FloatArray, as_points, frozen
 from dvc.errors import InputError
 from phantoms.bodies import EllipsoidUnion
 
@@ -287,7 +287,7 @@ class Flow:
             raise InputError(f"A flow needs one step or more; got {self.steps}.")
 
     def _follow(self, points_mm: FloatArray, gradient: bool) -> tuple[FloatArray, FloatArray]:
-        points = np.ascontiguousarray(points_mm, dtype=np.float64).reshape(-1, 3)
+        points = as_points(points_mm)
         window = np.array([self.centre_mm, self.width_mm])
         skin = _NO_BORDER if self.skin is None else self.skin._numbers()
         u, H = _carry(

@@ -11,6 +11,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from dvc import Composed, Grid, Image, LabelMap, Mask, RigidMotion
+from dvc.arguments import checked
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.protocol import Motion
 from dvc.errors import InputError
@@ -69,7 +70,11 @@ class HeelPair:
     deformation: Motion
     foot_motion: RigidMotion
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.reference.grid})"
 
+
+@checked
 def heel_pair(
     seed: int = 1, shape: tuple[int, int, int] = (126, 140, 132), spacing_mm: float | Sequence[float] = 0.8,
     snr: float | None = 25.0, load: float = 1.0, motion: Motion | None = None, foot_motion: RigidMotion | None = None,
@@ -83,7 +88,7 @@ def heel_pair(
         Seed of shapes, textures, noise and bias fields; 0 or more.
     shape, spacing_mm
         Voxels along each axis, and voxel size in mm (one or three), of a grid centred just below the middle of the
-        calcaneus.
+        calcaneus. Neither follows from the other: a heel in larger voxels needs fewer, ``heel_grid(1.6).shape``.
     snr
         As in `scan`.
     load : float
@@ -95,6 +100,12 @@ def heel_pair(
     loaded_grid : Grid, optional
         Grid of the loaded and the repeat image; by default that of the reference, extended where the bone would leave
         it.
+
+    Returns
+    -------
+    HeelPair
+        ``reference``, ``loaded`` and ``repeat`` images; ``labels`` and ``bone`` on the reference grid; and the truth:
+        ``deformation`` (relative to the bone, reference configuration) and ``foot_motion``, LPS mm.
 
     Raises
     ------
@@ -115,6 +126,7 @@ def heel_pair(
     return HeelPair(reference, loaded, repeat, labels, bone, flow, foot)
 
 
+@checked
 def scan(
     heel: Heel, grid: Grid, motion: Motion | None = None, foot_motion: RigidMotion | None = None, *, snr: float | None,
     number: int,
@@ -241,6 +253,7 @@ def swelling(heel: Heel) -> Flow:
     return _flow(heel, (0.0, -2.4, -0.8), _CONTACT_MM, _around_bones(heel), window, keeps_volume=False)
 
 
+@checked
 def under_load(heel: Heel, load: str) -> Motion:
     """Isochoric motion of a heel under one of `LOADS`: the pad slides inside its skin, then the plate moves all tissue.
 
@@ -326,11 +339,11 @@ def _may_show(heel: Heel, grid: Grid, back: Motion | None, home: RigidMotion) ->
 def centred_grid(shape: tuple[int, int, int], spacing_mm: float | Sequence[float]) -> Grid:
     """Grid of so many voxels along LPS x, y and z, centred 6 mm below the middle of the calcaneus of a heel of size 1.
 
-    InputError unless ``spacing_mm`` is one positive length or three.
+    InputError unless ``spacing_mm`` is one length or three between 0.05 and 20 mm.
     """
     spacing = np.asarray(spacing_mm, dtype=np.float64)
-    if spacing.shape not in {(), (3,)}:
-        raise InputError(f"Voxel spacing must be one length or three, mm; got {spacing_mm}.")
+    if spacing.shape not in {(), (3,)} or not ((spacing >= 0.05) & (spacing <= 20.0)).all():
+        raise InputError(f"Voxel spacing must be one length or three between 0.05 and 20 mm; got {spacing_mm}.")
     return Grid(shape, np.broadcast_to(spacing, 3), _CENTRE_MM - 0.5 * (np.array(shape) - 1) * spacing)
 
 

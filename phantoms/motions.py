@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from dvc import Affine
-from dvc.arrays import FloatArray, frozen
+from dvc.arrays import FloatArray, as_points, frozen
 from dvc.errors import InputError
 
 _UNIT = 1e-6
@@ -99,7 +99,7 @@ class ShearWave:
             raise InputError(f"A wave needs a positive wavelength in mm; got {self.wavelength_mm} and {self.peak}.")
 
     def _angle(self, points_mm: FloatArray) -> FloatArray:
-        points = np.asarray(points_mm, dtype=np.float64)
+        points = as_points(points_mm)
         return np.asarray(2.0 * np.pi * (points @ self.normal) / self.wavelength_mm + self.phase)
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
@@ -166,7 +166,7 @@ class Bending:
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H (n, 3, 3) at points X (n, 3) LPS mm; NaN where undefined."""
         A, R = self._axes(), self.radius_mm
-        local = (np.asarray(points_mm, dtype=np.float64) - self.centre_mm) @ A
+        local = (as_points(points_mm) - self.centre_mm) @ A
         squared = R * R + 2.0 * R * local[:, 1]
         r = np.sqrt(np.where(squared > 0.0, squared, np.nan))
         theta = local[:, 0] / R
@@ -191,7 +191,7 @@ class _Straightening:
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         A, R = self.bending._axes(), self.bending.radius_mm
-        local = (np.asarray(points_mm, dtype=np.float64) - self.bending.centre_mm) @ A
+        local = (as_points(points_mm) - self.bending.centre_mm) @ A
         up = local[:, 1] + R
         r2 = local[:, 0] ** 2 + up**2
         back = np.column_stack([R * np.arctan2(local[:, 0], up), (r2 - R * R) / (2.0 * R), local[:, 2]])

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dvc import LabelMap, TetMesh, Verdict
+from dvc.arguments import checked
 from dvc.atomic_files import whole_folder, write_json
 from dvc.errors import InputError
 from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
@@ -17,7 +18,6 @@ from dvc.report.sheet import png_bytes
 from dvc.trust.verdict import LEVELS, worst
 from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
-from validate.arguments import check_kind
 from validate.curves import Area
 from validate.extrapolation import LEVELLED
 from validate.load_comparison import NOTHING, Criteria, LoadCase, LoadComparison, compare_load
@@ -216,21 +216,24 @@ class Comparison:
         )
 
 
+@checked
 def compare(
     cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",), *,
     mesh: TetMesh | None = None, criteria: Criteria | None = None, notes: Sequence[str] = (),
-    warnings: Sequence[str] | None = None, progress: Callable[[float], None] = lambda _: None,
+    warnings: Sequence[str] | None = None, progress: Callable[[float], None] | None = None,
 ) -> Comparison:  # fmt: skip
     """Compare models with a measurement of one or several loads.
 
     Parameters
     ----------
     cases : sequence of LoadCase
-        Each with at least one model.
+        Each with at least one model (`LoadCase.of`).
     labels, bones : LabelMap, sequence of str
         Tissues of the unloaded image, and which of them are bone.
     mesh : TetMesh, optional
         Where fields are compared; by default the mesh of each load's first model.
+    criteria : Criteria, optional
+        Range of strains, thresholds, and seed of the draws.
     notes : sequence of str
         What else is known about the models.
     warnings : sequence of str, optional
@@ -238,19 +241,24 @@ def compare(
     progress : callable
         Gets the fraction done.
 
+    Returns
+    -------
+    Comparison
+        ``areas`` (mL) between the volume-strain curves, ``ranking`` over all loads, ``overlaps``, ``agreements``, the
+        ``verdict`` and more, as tables of rows; `Comparison.write` makes the report.
+
     Raises
     ------
     InputError, GeometryError
-        As `check_models` and `map_fields`.
+        If two loads or two models of one share a name, the label map lacks a bone, or a model does not lie in the
+        imaged tissue (a slip of unit, frame or configuration); see `check_models`.
     """
     by = Criteria() if criteria is None else criteria
-    check_kind("criteria", by, Criteria)
-    if mesh is not None:
-        check_kind("mesh", mesh, TetMesh)
     odd = list(check_models(cases, labels, bones) if warnings is None else warnings)
     loads: list[LoadComparison] = []
     for number, case in enumerate(cases):
-        progress(number / len(cases))
+        if progress is not None:
+            progress(number / len(cases))
         loads.append(compare_load(case, labels, bones, mesh=mesh, criteria=by))
         fields = loads[-1].fields
         odd += [f"{case.load}: {slip}" for name in fields.models if (slip := displacement_slip(fields, name))]
@@ -308,7 +316,7 @@ def _limitations(loads: Sequence[LoadComparison]) -> list[str]:
             if volumes[name] < _COVERED * volumes["mesh"]
         ]
     if unknown := ", ".join(one.load for one in loads if one.case.error is None):
-        what = "the measurement uncertainty is unknown (no error_model.json beside the results)"
+        what = "the measurement uncertainty is unknown (the measurement has no error model)"
         notes.append(f"{unknown}: {what}: no difference counts as significant.")
     return notes
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from dvc import Affine, Grid, MeshFile, TetMesh, read_mesh
+from dvc.arguments import checked
 from dvc.arrays import FloatArray
 from dvc.deformation.nodal import OnMesh
 from dvc.errors import GeometryError, InputError
 from dvc.io.meshes.read import MM_PER_UNIT, TO_LPS
 from dvc.mesh import box_told
-from validate.arguments import check_kind
 from validate.tetrahedra import linear_tetrahedra
 
 _NAMES = ("displacement_mm", "displacement", "displacements", "disp", "u")
@@ -52,12 +52,12 @@ class FeResult:
     deformation: OnMesh
 
     @classmethod
+    @checked
     def of(cls, name: str, deformation: OnMesh) -> "FeResult":
         """The result of a model in memory, by its name in tables: ``simulation.deformation("Load1")``, say.
 
         Another class than `fe.Simulation.deformation` gives is an `InputError`.
         """
-        check_kind("deformation", deformation, OnMesh)
         return cls(name, Path(name), deformation)
 
     @property

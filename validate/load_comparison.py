@@ -10,12 +10,12 @@ from typing import Self
 import numpy as np
 
 from dvc import Deformation, ErrorTable, LabelMap, Measurement, TetMesh, Verdict, plate_axes
+from dvc.arguments import check, check_fields, checked
 from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.trust.error_model import TruthDraws
 from validate import location
 from validate.agreement import Agreement, SkinDisplacement, agreements, skin_displacement
-from validate.arguments import check_each, check_kind
 from validate.curves import DRAWS, RANGE, Area, Band, area_between, bands, check_range
 from validate.extrapolation import LEVELLED
 from validate.fe_result import FeResult
@@ -89,11 +89,10 @@ class LoadCase:
     image: Path | None = None
 
     def __post_init__(self) -> None:
-        check_kind("read", self.read, Callable)
-        if self.error is not None:
-            check_kind("error", self.error, ErrorTable)
+        check_fields(self)
 
     @classmethod
+    @checked
     def of(
         cls, load: str, measured: Deformation | Measurement, results: Sequence[FeResult],
         error: ErrorTable | None = None,
@@ -110,15 +109,24 @@ class LoadCase:
         error : ErrorTable, optional
             Error of the measured maximum shear strain, in place of the measurement's own.
         """
-        check_each("results", results, FeResult)
         if not isinstance(measured, Measurement):
-            check_kind("measured", measured, Deformation)
             return cls(load, partial(_given, measured, results), error=error)
         known, axes = measured.error_bars.uncertainty, None if measured.source is None else measured.source.subject.axes
         error = known.table if error is None and known is not None else error
         on, read = str(measured.alignment.get("on", "")), partial(_given, measured.deformation, results)
         case = cls(load, read, error=error, verdict=measured.verdict, aligned_on=on)
         return case if axes is None else replace(case, axes=axes)
+
+    def fields(self) -> Fields:
+        """The measured deformation and the models' results; InputError without a model, or for two of one name."""
+        measured, results = self.read()
+        check(f"{self.load}: results", results, Sequence[FeResult])
+        if not results:
+            raise InputError(f"{self.load}: no model is given.")
+        names = [NOTHING, *(result.name for result in results)]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise InputError(f"{self.load}: two models are called '{twice}'; give each a name of its own.")
+        return measured, results
 
 
 def _given(measured: Deformation, results: Sequence[FeResult]) -> Fields:
@@ -177,6 +185,7 @@ class LoadComparison:
         return next(a for a in self.areas if (a.model, a.tissue) == (NOTHING, ALL))
 
 
+@checked
 def compare_load(
     case: LoadCase, labels: LabelMap, bones: Sequence[str] = ("bone",), *,
     mesh: TetMesh | None = None, criteria: Criteria | None = None,
@@ -186,8 +195,7 @@ def compare_load(
     Parameters as in `validate.compare`, errors as in `validate.map_fields`.
     """
     by = criteria or Criteria()
-    check_kind("case", case, LoadCase)
-    measured, results = case.read()
+    measured, results = case.fields()
     models = {result.name: result.deformation for result in results}
     fields = map_fields(mesh if mesh is not None else results[0].mesh, labels, bones, measured, models)
     truths: list[FloatArray] = []

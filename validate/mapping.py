@@ -7,10 +7,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dvc import Deformation, LabelMap, StrainField, TetMesh
+from dvc.arguments import checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.trust.regions import volume_above
-from validate.arguments import check_each, check_kind
 
 ALL = "all soft tissue"
 """Name of all compared tissue together."""
@@ -107,15 +107,14 @@ def filled_from_nearest(values: FloatArray, points_mm: FloatArray) -> FloatArray
     return filled
 
 
+@checked
 def check_bones(labels: LabelMap, bones: Sequence[str]) -> None:
     """Refuse bones that are not in the label map, with an `InputError` that names its labels."""
-    check_kind("labels", labels, LabelMap)
-    check_each("bones", bones, str)
     known = labels.names.values()
     if missing := [name for name in bones if name not in known]:
         raise InputError(
-            f"The label map has no '{missing[0]}'; it has {', '.join(known)}. Bones are named with --bone, labels by "
-            "the table --names."
+            f"The label map has no '{missing[0]}'; it has {', '.join(known)}. Bones are named by bones (--bone on the "
+            "command line), labels by their table (--names)."
         )
 
 
@@ -125,6 +124,7 @@ def _sampled(deformation: Deformation, points_mm: FloatArray) -> Field:
     return Field(u, strain.max_shear, strain.jacobian)
 
 
+@checked
 def map_fields(
     mesh: TetMesh, labels: LabelMap, bones: Sequence[str], measured: Deformation, models: Mapping[str, Deformation]
 ) -> MappedFields:
@@ -144,7 +144,6 @@ def map_fields(
     InputError
         If a bone is not in the label map, or measurement and models have no tissue in common.
     """
-    check_kind("mesh", mesh, TetMesh)
     check_bones(labels, bones)
     tissue = tissues_of(mesh, labels)
     soft = ~np.isin(tissue, list(bones))

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dvc import Deformation, TetMesh
+from dvc.arguments import checked
 from dvc.arrays import FloatArray, IntArray
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError
@@ -22,7 +23,6 @@ from fe.assembly import Assembler
 from fe.elements import Model, element
 from fe.linear import Solver
 from fe.newton import Imposed, equilibrium
-from validate.arguments import check_kind
 from validate.mapping import filled_from_nearest
 
 _FIRST_STEP, _LEAST_STEP = 0.25, 1.0 / 64.0
@@ -45,10 +45,9 @@ def boundary_displacement(mesh: TetMesh, measured: Deformation) -> tuple[IntArra
     return nodes, u[nodes]
 
 
+@checked
 def _boundary(mesh: TetMesh, measured: Deformation) -> tuple[IntArray, FloatArray]:
     """Surface nodes (k,), and the measured displacement of all nodes (n, 3), zero on the surface of bone."""
-    check_kind("mesh", mesh, TetMesh)
-    check_kind("measured", measured, Deformation)
     nodes = np.unique(outer_faces(mesh.cells))
     u = measured.displacement(mesh.points_mm)
     known = np.isfinite(u).all(axis=1)

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dvc import LabelMap, TetMesh
+from dvc.arguments import checked
 from dvc.errors import GeometryError, InputError
 from dvc.mesh import box_told
-from validate.arguments import check_each
 from validate.fe_result import FeResult, check_overlap
 from validate.load_comparison import LoadCase
 from validate.mapping import MappedFields, check_bones, tissues_of
@@ -20,27 +20,26 @@ _NEAR_BONE_MM, _RIGID_MM = 1.5, 1.0
 _ALONG, _TURNED, _TIED, _UNIT = 0.7, 0.5, 0.02, 1000.0
 
 
+@checked
 def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",)) -> list[str]:
     """Check that every model lies in the imaged tissue; a sentence for each thing that looks wrong.
 
     Raises
     ------
     InputError
-        If there is no case, a case has no model, or the label map has no such bone.
+        If there is no case, two loads or two models of a load share a name, a case has no model, or the label map has
+        no such bone.
     GeometryError
         If a model does not lie in the image, or less than 85 % of it in the labelled soft tissue.
     """
     check_bones(labels, bones)
-    check_each("cases", cases, LoadCase)
     if not cases:
         raise InputError("No load is given to compare.")
+    if len({case.load for case in cases}) < len(cases):
+        raise InputError(f"Each load needs a name of its own; got {', '.join(case.load for case in cases)}.")
     warnings = []
     for case in cases:
-        _, results = case.read()
-        if not results:
-            raise InputError(f"{case.load}: no model is given.")
-        check_each(f"{case.load}: results", results, FeResult)
-        for result in results:
+        for result in case.fields()[1]:
             check_overlap(result.path, result.mesh, labels.grid)
             warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones)]
     return warnings

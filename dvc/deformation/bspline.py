@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numba import njit, prange
 
-from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
+from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid
 
@@ -96,12 +96,12 @@ class BSpline:
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the valid region."""
-        indices = self.control.indices_of(np.asarray(points_mm, dtype=np.float64))
+        indices = self.control.indices_of(as_points(points_mm))
         return evaluate_spline(self.coefficients_mm, indices, mirror=False, gradient=False)[0]
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the valid region."""
-        indices = self.control.indices_of(np.asarray(points_mm, dtype=np.float64))
+        indices = self.control.indices_of(as_points(points_mm))
         u, per_index = evaluate_spline(self.coefficients_mm, indices, mirror=False)
         return u, (per_index.reshape(-1, 3) @ self.control.index_per_mm).reshape(-1, 3, 3)
 

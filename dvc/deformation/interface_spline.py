@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
 from scipy.special import ndtri
 
-from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
+from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.deformation.bspline import BSpline, evaluate_spline
 from dvc.deformation.protocol import CHUNK, in_chunks
 from dvc.errors import GeometryError, InputError
@@ -204,7 +204,7 @@ class InterfaceSpline:
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm LPS, at points X (n, 3) LPS mm; NaN outside the splines' valid region."""
-        points = np.asarray(points_mm, dtype=np.float64)
+        points = as_points(points_mm)
         u = np.zeros((len(points), 3))
         for some in in_chunks(len(points)):
             here, factors = points[some], self.borders.at(points[some], gradient=False)
@@ -214,7 +214,7 @@ class InterfaceSpline:
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3), LPS; NaN outside the splines' valid region."""
-        points = np.asarray(points_mm, dtype=np.float64)
+        points = as_points(points_mm)
         u, H = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
         for some in in_chunks(len(points)):
             here = points[some]

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from dvc.arrays import FloatArray, IntArray, frozen
+from dvc.arrays import FloatArray, IntArray, as_points, frozen
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
 
@@ -40,7 +40,7 @@ class Locator:
 
         Where a point lies on a face, edge or node, the cell with the lowest number is taken.
         """
-        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        points = as_points(points_mm)
         cells, inside = np.full(len(points), -1), np.full((len(points), 3), np.nan)
         _find(points, self._bins, self.inverse, cells, inside)
         return cells, inside

@@ -11,7 +11,7 @@ from typing import ClassVar, Protocol, Self, runtime_checkable
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinates, spline_filter
 
-from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
+from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.errors import InputError
 from dvc.images.image import Grid, Mask
 
@@ -117,7 +117,7 @@ class Affine:
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm."""
-        return np.asarray(np.asarray(points_mm) @ (self.matrix - np.eye(3)).T + self.translation_mm)
+        return np.asarray(as_points(points_mm) @ (self.matrix - np.eye(3)).T + self.translation_mm)
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and the constant H (n, 3, 3)."""
@@ -167,7 +167,7 @@ class RigidMotion(Affine):
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm."""
-        return self.apply(points_mm) - np.asarray(points_mm)
+        return self.apply(points_mm) - as_points(points_mm)
 
     def inverse(self) -> "RigidMotion":
         """The motion back."""
@@ -194,14 +194,14 @@ class Composed:
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm; NaN where any part is undefined."""
-        x = start = np.asarray(points_mm, dtype=np.float64)
+        x = start = as_points(points_mm)
         for part in self.parts:
             x = x + part.displacement(x)
         return np.asarray(x - start)
 
     def evaluate(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """u(X) (n, 3) mm and H = F_n ... F_1 - I; NaN where any part is undefined."""
-        start = np.asarray(points_mm, dtype=np.float64)
+        start = as_points(points_mm)
         x, H = self.parts[0].evaluate(start)
         x = x + start
         for part in self.parts[1:]:
@@ -322,7 +322,7 @@ class SampledDisplacement:
 
     def displacement(self, points_mm: FloatArray) -> FloatArray:
         """u(X), (n, 3) mm; NaN where not defined."""
-        indices = self.grid.indices_of(points_mm)
+        indices = self.grid.indices_of(as_points(points_mm))
         at = (indices + self._shift).T
         along = [map_coordinates(c, at, order=3, mode="mirror", prefilter=False) for c in self._coefficients]
         return np.where(self._inside(indices)[:, None], np.stack(along, axis=-1), np.nan)
@@ -331,7 +331,7 @@ class SampledDisplacement:
         """u(X) (n, 3) mm and H = du/dX (n, 3, 3) of the interpolating spline; NaN where not defined."""
         from dvc.deformation.bspline import evaluate_spline
 
-        indices = self.grid.indices_of(points_mm)
+        indices = self.grid.indices_of(as_points(points_mm))
         u, per_index = evaluate_spline(self._coefficients, indices + self._shift, mirror=True)
         H = per_index @ self.grid.index_per_mm
         outside = ~self._inside(indices)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import BoolArray, FloatArray, frozen
 from dvc.errors import InputError
 
 _ORTHONORMAL = 1e-9
@@ -174,7 +174,7 @@ def plate_axes(normal: npt.ArrayLike, shear: npt.ArrayLike) -> FloatArray:
 
 
 def _unit(direction: npt.ArrayLike, name: str) -> FloatArray:
-    vector = np.asarray(direction, dtype=np.float64)
+    vector = frozen(direction, np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
         raise InputError(f"The plate's {name} must be three finite numbers, not all zero; got {vector.tolist()}.")
     vector = vector / np.abs(vector).max()

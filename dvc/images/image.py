@@ -8,6 +8,7 @@ from typing import Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from dvc.arguments import expect
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, InputError
 
@@ -163,6 +164,9 @@ class Grid:
         start, stop = np.array([cut.indices(n)[:2] for cut, n in zip(box, self.shape, strict=True)]).T
         return replace(self, shape=tuple(stop - start), origin_mm=self.points_at(start))
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self})"
+
     def __str__(self) -> str:
         """Shape, spacing and bounding box, for messages."""
         low, high = self.bounds_mm()
@@ -173,6 +177,7 @@ class Grid:
 
 def _on(grid: Grid, what: str, values: npt.ArrayLike, kind: type[_T]) -> npt.NDArray[_T]:
     """Values as a read-only array, one for each voxel of the grid."""
+    expect("grid", grid, Grid, "a dvc.Grid (it comes first), such as that of another image (image.grid)")
     array = frozen(values, kind)
     if array.shape != grid.shape:
         raise GeometryError(f"{what} has shape {array.shape}, its grid has {grid.shape}; they must be equal.")
@@ -204,6 +209,9 @@ class Image:
         if np.isinf(self.values).any():
             raise InputError("The image holds infinite values; set them to NaN (missing) or repair them.")
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.grid})"
+
     @property
     def missing(self) -> BoolArray:
         """Voxels without a value."""
@@ -228,7 +236,7 @@ class Mask:
     Raises
     ------
     GeometryError, InputError
-        If voxels and grid differ in shape; for grey values, which are neither 0 nor 1.
+        If voxels and grid differ in shape; for values that are neither 0 nor 1.
     """
 
     grid: Grid
@@ -236,9 +244,15 @@ class Mask:
 
     def __post_init__(self) -> None:
         given = np.asarray(self.inside)
-        if given.dtype.kind == "f" and not np.isin(given, (0.0, 1.0)).all():
-            raise InputError("A mask holds 0 and 1; these are grey values. Compare them: Mask(grid, values > level).")
+        if given.dtype.kind in "iuf" and not ((given == 0) | (given == 1)).all():
+            kind = "grey values. Compare them: Mask(grid, values > level)"
+            if given.dtype.kind != "f":
+                kind = "labels. Choose one: Mask(grid, labels == number), or label_map.region(name)"
+            raise InputError(f"A mask holds 0 and 1; these are {kind}.")
         object.__setattr__(self, "inside", _on(self.grid, "The mask", self.inside, np.bool_))
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({np.count_nonzero(self.inside)} of {self.grid})"
 
     def box(self, around: int = 0) -> tuple[slice, slice, slice]:
         """Slices of the smallest box that holds the mask, and ``around`` voxels beside it; empty for an empty mask."""
@@ -279,7 +293,8 @@ class LabelMap:
     Raises
     ------
     GeometryError, InputError
-        If labels and grid differ in shape; if a label is negative or has no name, or two labels share a name.
+        If labels and grid differ in shape; if a label is no whole number, is negative or has no name, or two labels
+        share a name.
     """
 
     grid: Grid
@@ -287,6 +302,9 @@ class LabelMap:
     names: Mapping[int, str]
 
     def __post_init__(self) -> None:
+        given = np.asarray(self.labels)
+        if given.dtype.kind == "f" and not (given == np.rint(given)).all():
+            raise InputError("Labels are whole numbers; these are not. Resample a label map by nearest neighbour.")
         object.__setattr__(self, "labels", _on(self.grid, "The label map", self.labels, np.int64))
         present = np.unique(self.labels).tolist()
         if present and present[0] < 0:
@@ -296,6 +314,9 @@ class LabelMap:
         if twice := sorted(name for name, count in Counter(self.names.values()).items() if count > 1):
             raise InputError(f"Region names used for more than one label: {twice}.")
         object.__setattr__(self, "names", dict(self.names))
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(self.names.values())}; {self.grid})"
 
     def region(self, name: str) -> Mask:
         """The mask of one region; InputError if no label has this name, with the names there are."""

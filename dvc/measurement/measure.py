@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+from dvc.arguments import checked
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Deformation
 from dvc.errors import GeometryError
@@ -16,6 +17,7 @@ from dvc.trust.error_model import ErrorModel, error_model_of
 from dvc.worker import Worker
 
 
+@checked
 def measure(
     reference: Image,
     loaded: Image,
@@ -44,7 +46,7 @@ def measure(
     reference, loaded : Image
         Unloaded and loaded image, each in the frame of its own file (LPS mm).
     bone : Mask, optional
-        The bone whose motion is taken out, on the reference grid; needed unless ``settings.align_on`` is not "bone".
+        The bone whose motion is taken out, on the reference grid; may be missing if ``settings.align_on`` is another.
     tissue : Mask, optional
         Body on the reference grid, bone included; found by a threshold where it is not given.
     labels : LabelMap, optional
@@ -71,6 +73,12 @@ def measure(
         Process to compute in; a new one by default.
     progress : callable, optional
         ``progress(stage, fraction)``.
+
+    Returns
+    -------
+    Measurement
+        ``maps``: displacement (mm), Green-Lagrange strain and det F at the voxels of the unloaded image, reference
+        configuration, LPS, NaN where not defined; ``max_shear`` and its ``sigma``; ``verdict``, ``regions`` and more.
 
     Raises
     ------

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import BoolArray, FloatArray, frozen
 from dvc.deformation.strain import plate_axes
 from dvc.errors import InputError
 from dvc.images.image import Image, LabelMap, Mask
@@ -81,7 +81,7 @@ def plate_directions(
 
 
 def _unit(name: str, vector: Sequence[float]) -> FloatArray:
-    direction = np.asarray(vector, dtype=np.float64)
+    direction = frozen(vector, np.float64)
     length = float(np.linalg.norm(direction))
     if direction.shape != (3,) or not np.isfinite(length) or length < 1e-6:
         told = f"{name} (--{name.replace('_', '-')} on the command line)"

@@ -15,6 +15,7 @@ from typing import Any, Self, TypeVar, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dvc.arguments import check, checked
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Composed, Deformation, RigidMotion, Within
@@ -60,6 +61,7 @@ class Settings:
     def __post_init__(self) -> None:
         if not hasattr(self.engine, "of_repeat"):
             raise ParameterError(f"`engine` is an Engine; for one by its name: Settings.of({self.engine!r}).")
+        check("threads", self.threads, int)
         if self.align_on not in get_args(AlignOn):
             raise ParameterError(f"`align_on` is one of {', '.join(get_args(AlignOn))}; got {self.align_on!r}.")
         if self.threads < 1:
@@ -123,6 +125,7 @@ class Registration:
         return Composed([self.displacement, self.alignment.motion])
 
 
+@checked
 def register(
     reference: Image, loaded: Image, *, bone: Mask | None = None, tissue: Mask | None = None,
     labels: LabelMap | None = None, settings: Settings | None = None, start: Deformation | None = None,
@@ -132,24 +135,17 @@ def register(
 
     Parameters
     ----------
-    reference, loaded : Image
-        Unloaded and loaded image, each in the frame of its own file (LPS mm).
-    bone : Mask
-        The bone to align on, on the reference grid; needed unless ``settings.align_on`` is not "bone".
-    tissue : Mask, optional
-        Body on the reference grid, bone included; found by a threshold where it is not given.
-    labels : LabelMap, optional
-        Tissues on the reference grid; needed by an engine that lets strain jump at their interfaces, and unused by the
-        others.
-    settings : Settings, optional
-        The engine gauss-newton, seed 1, one thread by default.
+    reference, loaded, bone, tissue, labels, settings, worker, progress
+        As in `dvc.measure`. Labels are needed by an engine that lets strain jump at their interfaces, and unused by the
+        others; by default that is gauss-newton without them, on one thread.
     start : Deformation, optional
         Result of another load (its ``displacement``) to start from: the first guess, which the registration then
         corrects against these two images, so no error is carried on. elastix starts from a `BSpline` alone.
-    worker : Worker, optional
-        Process to compute in; a new one by default.
-    progress : callable, optional
-        ``progress(stage, fraction)``, about twice a second.
+
+    Returns
+    -------
+    Registration
+        The ``alignment`` of the bone and the ``deformation`` of tissue relative to it, reference configuration, LPS mm.
 
     Raises
     ------
@@ -231,9 +227,12 @@ def refuse_one_image_twice(images: Sequence[tuple[str, Image]]) -> None:
 
 def _check(reference: Image, body: Mask, bone: Mask | None, labels: LabelMap | None, settings: Settings) -> None:
     if settings.align_on == "bone" and bone is None:
-        raise InputError("Alignment on bone needs a mask on the unloaded image: give --bone, or --align image or none.")
+        raise InputError(
+            "Alignment on bone needs a mask on the unloaded image: give bone (--bone on the command line), or align on "
+            "something else: Settings(align_on='image') or 'none' (--align)."
+        )
     if settings.engine.needs_labels and labels is None:
-        raise InputError("Strain may jump at tissue interfaces only where a label map tells them: give --labels, too.")
+        raise InputError("Strain discontinuities need a label map with their interfaces: give labels (--labels), too.")
     for name, given in (("tissue mask", body), ("bone mask", bone), ("label map", labels)):
         if given is None:
             continue

@@ -135,7 +135,7 @@ class Scale:
         if quantity == "jacobian":
             reach = largest or volume_reach(values)
             return cls(told, shades, 1.0 - reach, 1.0 + reach)
-        known = np.abs(values[np.isfinite(values)])
+        known = np.empty(0) if largest else np.abs(values[np.isfinite(values)])
         end = largest or round_up(float(np.percentile(known, 99.0)) if known.size else 0.0)
         return cls(told, shades, 0.0 if quantity in _COLOURS else -end, end)
 

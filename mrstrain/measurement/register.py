@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dvc import Deformation, Engine, Evidence, Image, Settings, read_error_model, read_image, read_landmarks
+from dvc.arguments import path_of
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
 from dvc.io.result_folder import QUALITY, REPEAT, spline_in
 from dvc.registration.align import without_motion
@@ -58,12 +59,12 @@ def register(
     target = Path(out)
     if isinstance(loads, str | Path):
         raise InputError(f"`loads` is a list of files; for one give [{str(loads)!r}].")
-    places = _places([Path(p) for p in loads], scans)
+    load0, places = path_of(load0), _places([path_of(p) for p in loads], scans)
     cases, paths = list(places), list(places.values())
     chosen = engine_of(registration, labelled=subject_files.labels is not None)
     _check_start(scans, chosen)
     given = [p for of in (subject_files, registration, scans, onto) for p in of.paths]
-    refuse_touching_inputs(target, cases, [Path(load0), *paths, *given])
+    refuse_touching_inputs(target, cases, [load0, *paths, *given])
     subject = read_subject(load0, subject_files, onto, allow_missing=scans.allow_missing)
     align = registration.align
     if align == "bone" and subject.bone is None:

@@ -46,6 +46,7 @@ Text = Annotated[str, BeforeValidator(lambda v: fspath(v) if isinstance(v, PathL
 Names = Annotated[tuple[Text, ...], AfterValidator(_once)]
 
 _M = TypeVar("_M", bound="Options")
+_SHORT = 100  # characters: a longer value is told by its type
 
 
 class Options(BaseModel):
@@ -115,7 +116,8 @@ def reason(error: Mapping[str, Any]) -> str:
     why = error["msg"].removeprefix("Value error, ")
     if error["type"] == "literal_error":
         why = f"there are {error['ctx']['expected'].replace(' or ', ' and ').replace(chr(39), '')}"
-    return f"{why}; got {error['input']!r}"
+    given = repr(error["input"])
+    return f"{why}; got {given if len(given) < _SHORT else type(error['input']).__name__}"
 
 
 def bare(annotation: Any, metadata: list[Any]) -> Any:

@@ -22,11 +22,12 @@ _RIVALS["validate"] = ("validate", "")
 _NEEDED = (
     "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "meshio", "nibabel", "pydicom", "numba",
     "matplotlib", "jinja2", "lazy-loader", "rich", "typer", "loky", "distributed", "filelock", "pydantic", "pytetwild",
-    "pyvista", "vtk",
+    "pyvista", "vtk", "psutil",
 )  # fmt: skip
 _ELASTIX = "0.25."  # the series that parameters are checked against
 _OLDEST_PYTHON = (3, 11)
 _GIB = 1024**3
+_CONTAINER = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _LEAST_MEMORY_GIB = 6.0  # a pair of 256^3 images
 _LEAST_DISK_GIB = 2.0  # results of one loaded image of that size
 
@@ -147,28 +148,13 @@ def _memory() -> Finding:
 
 
 def usable_memory_bytes() -> int | None:
-    """Memory that this process may use, bytes: the machine's, or the limit of its container; None if unknown."""
-    try:
-        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return _memory_bytes_windows()
-    for limit_file in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        try:
-            total = min(total, int(Path(limit_file).read_text()))
-        except (OSError, ValueError):  # no such file, or "max"
-            continue
-    return total
-
-
-def _memory_bytes_windows() -> int | None:
-    import ctypes
-
-    if not hasattr(ctypes, "windll"):
+    """Memory that this process may use, bytes: the machine's, or the limit of its container; None without psutil."""
+    if importlib.util.find_spec("psutil") is None:
         return None
-    kilobytes = ctypes.c_ulonglong()
-    if not ctypes.windll.kernel32.GetPhysicallyInstalledSystemMemory(ctypes.byref(kilobytes)):
-        return None
-    return kilobytes.value * 1024
+    import psutil
+
+    limits = [Path(file).read_text().strip() for file in _CONTAINER if os.access(file, os.R_OK)]
+    return min([int(psutil.virtual_memory().total), *(int(limit) for limit in limits if limit.isdigit())])
 
 
 def _disk(folder: Path) -> Finding:

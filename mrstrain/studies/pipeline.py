@@ -1,7 +1,5 @@
 """Runs the stages of a study: finished stages are reused, and a failed stage does not stop the others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -153,7 +151,7 @@ class Pipeline:
         forecast = self.forecast()
         return [stage for stage in self.stages if forecast[stage.name] == "run"]
 
-    def start(self, runner: Callable[[], StageRunner], log: Log, prefix: str = "") -> None:
+    def start(self, runner: "Callable[[], StageRunner]", log: Log, prefix: str = "") -> None:
         """Settle what can be settled, log it, and hand the stages that have to be run to the cluster."""
         before = set(self.outcomes)
         ready = self.settle()
@@ -203,7 +201,7 @@ def run_all(pipelines: Mapping[str, Pipeline], pool: Callable[[], Any], logs: Ma
     with ExitStack() as stack:
         runners: list[StageRunner] = []
 
-        def runner() -> StageRunner:
+        def runner() -> "StageRunner":
             if not runners:
                 runners.append(stack.enter_context(pool()))
             return runners[0]

@@ -172,16 +172,16 @@ def test_materials_may_be_given_by_region_or_by_the_name_of_their_set() -> None:
 @pytest.mark.parametrize(
     ("argument", "given", "said"),
     [
-        (0, "heel.vtu", r"The mesh must be a TetMesh, as fe\.read_tet_mesh\(path\) .*got 'heel\.vtu'"),
-        (0, np.zeros((4, 3)), "The mesh must be a TetMesh.*got a ndarray"),
+        (0, "heel.vtu", r"^mesh must be a TetMesh, as fe\.read_tet_mesh\(file\) .*; got 'heel\.vtu'"),
+        (0, np.zeros((4, 3)), r"^mesh must be a TetMesh.*; got ndarray of shape \(4, 3\)"),
         (1, "trebi", "No material set 'trebi'; the nearest is 'trebbi'"),
-        (1, {"fat": "trebbi"}, r"Materials must be .*fe\.Ogden.*got {'fat': 'trebbi'}"),
-        (1, 0.0034, "Materials must be a set .*got 0.0034"),
-        (2, (DOWN, ALONG), r"pressed: the plate must be an fe\.Plate, .*got a tuple"),
-        (2, {"other": fe.Plate(DOWN, ALONG)}, "pressed: the plate must be .*one for each load's name; got nothing"),
-        (3, LOADS[0], r"The loads must be a list of fe\.LoadStep; got a LoadStep"),
-        (3, [{"name": "pressed", "normal_n": 2.0}], r"The loads must be a list of fe\.LoadStep; got a dict"),
-        (3, "pressed", "The loads must be .*got 'p"),
+        (1, {"fat": "trebbi"}, r"^materials\['fat'\] must be a material, such as fe\.Ogden.*; got 'trebbi'"),
+        (1, 0.0034, r"^materials must be a set .*fe\.material_set.*; got 0.0034"),
+        (2, (DOWN, ALONG), r"^plate must be a fe\.Plate, .*; got tuple"),
+        (2, {"other": fe.Plate(DOWN, ALONG)}, "plate has none for pressed; it has one for other"),
+        (3, LOADS[0], r"^loads must be a list, with each a fe\.LoadStep.*; got LoadStep"),
+        (3, [{"name": "pressed", "normal_n": 2.0}], r"^loads\[0\] must be a fe\.LoadStep.*; got dict"),
+        (3, "pressed", "^loads must be a list.*; got 'pressed'"),
     ],
 )
 def test_what_is_of_another_kind_is_refused_with_what_to_give(argument: int, given: object, said: str) -> None:

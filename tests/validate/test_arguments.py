@@ -19,8 +19,8 @@ MODEL = result("a", MESH, sheared(0.2))
 CASE = case("Load1", sheared(0.4), [MODEL], None)
 
 REFUSED: dict[str, tuple[Callable[[Any], object], str]] = {
-    "bones": (lambda v: v.compare([CASE], labels(), bones="bone"), "bones must be a list.*a name; got 'bone'"),
-    "number": (lambda v: v.compare([CASE], labels(), bones=[3]), r"bones\[0\] must be a name; got 3"),
+    "bones": (lambda v: v.compare([CASE], labels(), bones="bone"), "bones must be a list.*text.*; got 'bone'"),
+    "number": (lambda v: v.compare([CASE], labels(), bones=[3]), r"bones\[0\] must be text \(str\); got 3"),
     "one case": (lambda v: v.compare(CASE, labels()), "cases must be a list.*LoadCase.*; got LoadCase"),
     "folder": (lambda v: v.compare("results", labels()), r"cases must be a list.*LoadCase\.of.*; got 'results'"),
     "folders": (lambda v: v.compare([Path("results")], labels()), r"cases\[0\] must .*LoadCase\.of.*; got .*results"),
@@ -35,7 +35,7 @@ REFUSED: dict[str, tuple[Callable[[Any], object], str]] = {
     "array": (lambda v: v.LoadCase.of("a", np.zeros((4, 3)), [MODEL]), "measured must .*; got ndarray"),
     "error": (lambda v: v.LoadCase.of("a", sheared(0.1), [MODEL], "e.json"), r"error must .*tables; got 'e\.json'"),
     "model": (lambda v: v.FeResult.of("a", MESH), r"deformation must .*simulation\.deformation.*; got TetMesh"),
-    "read": (lambda v: v.LoadCase("a", [MODEL]), r"read must be a function.*LoadCase\.of.*; got list"),
+    "read": (lambda v: v.LoadCase("a", [MODEL]), "read must be a function; got list"),
     "boundary": (lambda v: v.boundary_displacement("a.vtu", sheared(0.1)), r"mesh must .*tet_mesh.*; got 'a\.vtu'"),
     "driven": (lambda v: v.simulate_driven(MESH, {}, "Load1", "Load1"), "measured must .*; got 'Load1'"),
     "fields": (lambda v: v.map_fields("a", labels(), ["bone"], sheared(0.1), {}), "mesh must .*; got 'a'"),
@@ -51,8 +51,21 @@ def test_another_kind_of_argument_is_refused_with_what_to_pass(name: str) -> Non
 
 def test_a_result_that_reading_gives_is_checked_as_well() -> None:
     wrong = replace(CASE, read=lambda: (sheared(0.4), ["a.vtu"]))  # type: ignore[list-item]
-    with pytest.raises(MrstrainError, match=r"Load1: results\[0\] must be a FeResult.*; got 'a\.vtu'"):
+    with pytest.raises(MrstrainError, match=r"Load1: results\[0\] must be a validate\.FeResult.*; got 'a\.vtu'"):
         validate.compare([wrong], labels())
+
+
+def test_two_models_and_two_loads_have_names_of_their_own() -> None:
+    other = result("a", MESH, sheared(0.9))
+    twice = validate.LoadCase.of("Load1", sheared(0.4), [MODEL, other])
+    with pytest.raises(MrstrainError, match="Load1: two models are called 'a'"):
+        validate.compare([twice], labels())
+    with pytest.raises(MrstrainError, match="Each load needs a name of its own; got Load1, Load1"):
+        validate.compare([CASE, CASE], labels())
+    with pytest.raises(MrstrainError, match="two models are called 'no deformation'"):
+        validate.compare_load(
+            validate.LoadCase.of("a", sheared(0.4), [replace(MODEL, name="no deformation")]), labels()
+        )
 
 
 def test_any_collection_of_names_will_do() -> None:

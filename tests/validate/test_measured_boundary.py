@@ -147,7 +147,7 @@ def test_the_command_writes_what_compare_takes(tmp_path: Path) -> None:
     grid = labels().grid
     folder = tmp_path / "measured" / "Load1"
     folder.mkdir(parents=True)
-    u = SHEAR.displacement(grid.points()).reshape(*grid.shape, 3)
+    u = SHEAR.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
     write_displacement(folder, grid, u.astype(np.float32))
     argv = ["drive", tmp_path / "heel.vtu", tmp_path / "measured", "--set", "luboz", "--out", tmp_path / "out"]
     ran = CliRunner().invoke(app, [str(a) for a in argv])

@@ -75,10 +75,8 @@ def write_mask(path: StrPath, mask: Mask) -> None:
 
     Raises
     ------
-    InputError
-        If an argument is of another kind.
-    OutputError
-        If the file cannot be written; nothing is left under its name.
+    InputError, OutputError
+        If an argument is of another kind; if the file cannot be written, and nothing is left under its name.
     """
     expect("mask", mask, Mask, "a dvc.Mask, such as dvc.Mask(grid, inside) of an array on a dvc.Grid")
     _write(path_of(path), mask.grid, mask.inside.view(np.uint8))

@@ -11,7 +11,7 @@ import numpy as np
 
 from dvc.deformation.protocol import Deformation
 from dvc.errors import ParameterError
-from dvc.registration.engine import AlignedPair, Cost, Displacement, Engine, Found, Progress, other_parameters
+from dvc.registration.engine import AlignedPair, Cost, Displacement, Engine, Found, Progress
 from dvc.registration.gauss_newton.choice import Choice
 from dvc.registration.gauss_newton.fit import Parameters, fit
 from dvc.registration.gauss_newton.with_interfaces import STAGE, USUAL_SKIN, fit_with_interfaces
@@ -210,10 +210,10 @@ def _run(
 def _unlike(name: str, used: Parameters) -> str:
     """Why the error model of that name does not hold for other weights than its own."""
     if used.bending is None:
-        return other_parameters(name)
+        return f"The error of {name} was measured with other weights than these."
     return (
         f"The error of {name} was measured with the weight of the bending chosen by its rule, as for a loaded image; "
-        f"here it was fixed at {used.bending:g}/mm, as for a repeat scan or by --bending."
+        f"here it was fixed at {used.bending:g}/mm, as for a repeat scan, or as you gave it."
     )
 
 

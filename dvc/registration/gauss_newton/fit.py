@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import solve_banded
 from scipy.ndimage import distance_transform_edt
 
+from dvc.arguments import check_fields
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Deformation
@@ -56,6 +57,7 @@ class Parameters:
     rigidity: float = 1000.0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not (np.isfinite(self.spacing_mm) and self.spacing_mm > 0):
             raise ParameterError(f"Control points need a spacing above 0 mm; got {self.spacing_mm}.")
         if self.bending is not None and not (np.isfinite(self.bending) and self.bending > 0):
@@ -176,7 +178,9 @@ def _level(
     pictures: tuple[Image, Image], inside: BoolArray, soft: BoolArray, bone: BoolArray, control: Grid, sigma_mm: float
 ) -> Level:
     """Images smoothed, and every so manyth voxel of them: a smooth image needs no more."""
-    fixed, moving = (thinned(smoothed(i, sigma_mm), _every(i.grid, sigma_mm)) for i in pictures)
+    fixed, moving = pictures
+    if sigma_mm > 0.0:
+        fixed, moving = (thinned(smoothed(i, sigma_mm), _every(i.grid, sigma_mm)) for i in pictures)
     every, rim_mm = _every(pictures[0].grid, sigma_mm), _BLURRED * sigma_mm
     return Level((fixed, moving), inside[every], soft[every], bone[every], Roughness(control), rim_mm)
 
