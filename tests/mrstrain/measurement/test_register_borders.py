@@ -313,7 +313,7 @@ def test_a_result_with_borders_may_be_a_start(layers, worker):
 
 def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
     missing = {**layers, "labels": None}
-    with pytest.raises(InputError, match="give --labels"):
+    with pytest.raises(InputError, match=r"give labels \(--labels\)"):
         register(**missing)
     labels = layers["labels"]
     aside = labels.grid.moved_by(np.eye(3), np.array([50.0, 0.0, 0.0]))
