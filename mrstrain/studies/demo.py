@@ -141,8 +141,8 @@ def _errors(
 
 
 def _reached(outcome: StageOutcome) -> bool:
-    """Whether a stage has a complete result, or one that only its time limit cut short."""
-    return outcome.complete or (outcome.result.timed_out and not outcome.reason)
+    """Whether a stage has a result that no failure cut short; how much of a load a model carries is a result itself."""
+    return outcome.record is not None and not outcome.reason and not outcome.result.retry
 
 
 def _summary(errors: dict[str, tuple[TissueError, ...]], done: StudyRun) -> list[str]:

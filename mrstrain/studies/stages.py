@@ -25,7 +25,6 @@ class StageResult:
     closing: tuple[Section, ...] = ()  # at the report's end: how to read its part
     complete: bool = True  # everything was reached; False for a model that carried a part of its load
     retry: bool = False  # a part failed in a way that may not recur: it is run again next time
-    timed_out: bool = False  # all that is missing is due to the time limit
 
     @property
     def verdicts(self) -> list[Verdict]:
@@ -61,10 +60,7 @@ def simulate(tell: Tell, *, mesh: Path, loads: Sequence[Mapping[str, Any]], **op
         tell(stage, sum(begun.values()) / max(len(begun), 2 if len(loads) > 1 else 1))
 
     done = run(mesh, loads=steps, workers=1, threads=1, progress=told, **options)
-    timed_out = any(one.timed_out for one in done.sets)  # one set, if it did not fail
-    return StageResult(
-        tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures), timed_out=timed_out
-    )
+    return StageResult(tuple(done.summary()[:-1]), complete=done.complete, retry=bool(done.failures))
 
 
 def drive(tell: Tell, *, sets: Sequence[str], **options: Any) -> StageResult:
