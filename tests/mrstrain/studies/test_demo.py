@@ -118,7 +118,6 @@ def test_a_load_that_a_model_does_not_carry_is_no_failure_of_the_demonstration()
     assert not reached(there=False)
 
 
-
 def test_it_makes_the_phantom_runs_its_study_and_tells_the_error_against_the_truth(tmp_path, monkeypatch):
     """Load2 alone, voxels of 2.3 mm, and nothing but its registration."""
     (load2,) = (load for load in LOADS if load.name == "Load2")
