@@ -126,11 +126,12 @@ class TetMesh:
 
 def outer_faces(cells: IntArray) -> IntArray:
     """Faces (k, 3) of tetrahedra (m, 4) that belong to one of them alone, by their nodes in rising order."""
-    different, times = np.unique(_faces(cells), axis=0, return_counts=True)
+    different, times = np.unique(faces_of(cells), axis=0, return_counts=True)
     return np.asarray(different[times == 1])
 
 
-def _faces(cells: IntArray) -> IntArray:
+def faces_of(cells: IntArray) -> IntArray:
+    """The faces (4 m, 3) of tetrahedra (m, 4), the first of each, then the second and so on; nodes in rising order."""
     return np.sort(np.concatenate([cells[:, face] for face in FACES]), axis=1)
 
 
@@ -234,7 +235,7 @@ def _positively_ordered(points: FloatArray, cells: IntArray, node_ids: IntArray)
 
 def _overlapping(points: FloatArray, cells: IntArray) -> BoolArray:
     """Which cells have a face whose cells do not lie one on either side of it (or that three cells share)."""
-    faces = _faces(cells)
+    faces = faces_of(cells)
     opposite, owner = cells.T.ravel(), np.tile(np.arange(len(cells)), 4)
     which = np.unique(faces, axis=0, return_inverse=True)[1].ravel()
     side = np.sign(signed_volumes(points[np.column_stack([faces, opposite])]))

@@ -12,7 +12,7 @@ from dvc import Grid, LabelMap, TetMesh
 from dvc.arguments import checked
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError, MrstrainError, WorkerError
-from dvc.mesh import FACES, signed_volumes
+from dvc.mesh import faces_of, signed_volumes
 from dvc.worker import Worker
 from fe.mesh_file import BONE, CUT, SKIN
 from fe.slivers import dihedral_angles_deg, without_slivers
@@ -241,11 +241,11 @@ def _named(
 ) -> TetMesh:
     kept = np.isin(cell_labels, list(soft.values()))
     body, tissue = cells[kept], cell_labels[kept]
-    faces = np.sort(np.concatenate([body[:, face] for face in FACES]), axis=1)
+    faces = faces_of(body)
     _, first, count = np.unique(faces, axis=0, return_index=True, return_counts=True)
     outer = first[count == 1]
     triangles, owner = faces[outer], np.tile(tissue, 4)[outer]
-    bone_faces = np.sort(np.concatenate([cells[np.isin(cell_labels, bones)][:, face] for face in FACES]), axis=1)
+    bone_faces = faces_of(cells[np.isin(cell_labels, bones)])
     which = np.unique(np.concatenate([bone_faces, triangles]), axis=0, return_inverse=True)[1].ravel()
     at_bone = np.isin(which[len(bone_faces) :], which[: len(bone_faces)])
     free: BoolArray = np.logical_not(at_bone)

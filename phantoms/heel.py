@@ -1,7 +1,7 @@
 """A heel under a plate: its motions under Load1 to Load4, and its MR images, with exactly known strain."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -67,11 +67,8 @@ class HeelPair:
     repeat: Image
     labels: LabelMap
     bone: Mask
-    deformation: Motion
+    deformation: Motion = field(repr=False)
     foot_motion: RigidMotion
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.reference.grid})"
 
 
 @checked

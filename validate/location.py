@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from dvc import TetMesh
 from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
-from dvc.mesh import FACES
+from dvc.mesh import faces_of
 from dvc.trust.error_model import widened
 
 LEAST_ML = 0.1
@@ -90,7 +90,7 @@ class CellGraph:
     def of(cls, mesh: TetMesh) -> Self:
         """All cells of a mesh."""
         count = len(mesh.cells)
-        faces = np.sort(np.concatenate([mesh.cells[:, face] for face in FACES]), axis=1)
+        faces = faces_of(mesh.cells)
         order = np.lexsort(faces.T)
         same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
         first, second = order[:-1][same] % count, order[1:][same] % count

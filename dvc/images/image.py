@@ -202,15 +202,12 @@ class Image:
     """
 
     grid: Grid
-    values: Float32Array
+    values: Float32Array = field(repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", _on(self.grid, "The image", self.values, np.float32))
         if np.isinf(self.values).any():
             raise InputError("The image holds infinite values; set them to NaN (missing) or repair them.")
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.grid})"
 
     @property
     def missing(self) -> BoolArray:
@@ -240,7 +237,7 @@ class Mask:
     """
 
     grid: Grid
-    inside: BoolArray
+    inside: BoolArray = field(repr=False)
 
     def __post_init__(self) -> None:
         given = np.asarray(self.inside)
@@ -250,9 +247,6 @@ class Mask:
                 kind = "labels. Choose one: Mask(grid, labels == number), or label_map.region(name)"
             raise InputError(f"A mask holds 0 and 1; these are {kind}.")
         object.__setattr__(self, "inside", _on(self.grid, "The mask", self.inside, np.bool_))
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({np.count_nonzero(self.inside)} of {self.grid})"
 
     def box(self, around: int = 0) -> tuple[slice, slice, slice]:
         """Slices of the smallest box that holds the mask, and ``around`` voxels beside it; empty for an empty mask."""
@@ -298,7 +292,7 @@ class LabelMap:
     """
 
     grid: Grid
-    labels: IntArray
+    labels: IntArray = field(repr=False)
     names: Mapping[int, str]
 
     def __post_init__(self) -> None:
@@ -314,9 +308,6 @@ class LabelMap:
         if twice := sorted(name for name, count in Counter(self.names.values()).items() if count > 1):
             raise InputError(f"Region names used for more than one label: {twice}.")
         object.__setattr__(self, "names", dict(self.names))
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(self.names.values())}; {self.grid})"
 
     def region(self, name: str) -> Mask:
         """The mask of one region; InputError if no label has this name, with the names there are."""

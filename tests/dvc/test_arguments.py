@@ -138,7 +138,8 @@ def test_labels_are_no_mask_and_grey_values_no_labels() -> None:
 
 
 def test_what_lies_on_a_grid_is_shown_in_a_line() -> None:
-    assert repr(IMAGE) == f"Image({GRID})"
-    assert repr(LABELS) == f"LabelMap(bone; {GRID})"
-    assert repr(MASK) == f"Mask(17 of {GRID})"
+    grid = f"grid=Grid({GRID})"
+    assert repr(IMAGE) == f"Image({grid})"
+    assert repr(MASK) == f"Mask({grid})"
+    assert repr(LABELS) == f"LabelMap({grid}, names={{1: 'bone'}})"
     assert repr(GRID) == f"Grid({GRID})"
