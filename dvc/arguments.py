@@ -7,7 +7,7 @@ from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
 from types import NoneType, SimpleNamespace, UnionType
-from typing import Any, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -26,6 +26,7 @@ _WANTED = {
     "ErrorModel": "a dvc.ErrorModel, as dvc.read_error_model(file) gives it",
     "ErrorTable": "a dvc.ErrorTable, one of dvc.read_error_model(file).tables",
     "FeResult": "a validate.FeResult: read_result(name, file) or FeResult.of(name, simulation.deformation(load))",
+    "Grid": "a dvc.Grid, such as that of an image (image.grid)",
     "Image": "a dvc.Image: dvc.read_image(file), or dvc.Image(grid, values) of an array on a dvc.Grid",
     "LabelMap": "a dvc.LabelMap: dvc.read_labels(file, names), or dvc.LabelMap(grid, labels, {1: 'fat'}) of an array",
     "LoadCase": "a validate.LoadCase: LoadCase.of(load, measured, results)",
@@ -80,8 +81,10 @@ def shown(value: object) -> str:
 
 def _misfit(name: str, value: object, hint: Any) -> tuple[str, object, Any] | None:
     """What of a value is not of the kind of a hint; arrays and literal values are left to who takes them."""
+    if isinstance(hint, TypeVar):
+        hint = Union[hint.__constraints__]  # noqa: UP007 - of a tuple
     origin, inner = get_origin(hint), get_args(hint)
-    if origin is UnionType or str(origin) == "typing.Union":
+    if origin in (UnionType, Union):
         misfits = [_misfit(name, value, each) for each in inner]
         inside = [each for each in misfits if each is not None and each[1] is not value]
         return None if None in misfits else inside[0] if inside else (name, value, hint)
@@ -111,10 +114,10 @@ def _first(parts: Iterable[tuple[str, object, Any]]) -> tuple[str, object, Any] 
 def _words(hint: Any) -> str:
     """What a type hint asks for."""
     origin, inner = get_origin(hint), get_args(hint)
-    if inner and (origin is UnionType or str(origin) == "typing.Union"):
-        if {Path, str} <= set(inner):
-            inner = (*(each for each in inner if each not in (Path, str, PathLike)), PathLike)
-        return ", or ".join(_words(each) for each in inner if each is not NoneType)
+    if origin in (UnionType, Union):
+        paths = {each for each in inner if PathLike in (each, get_origin(each)) or each is Path}
+        others = [each for each in inner if each is not NoneType and not (paths and each in {*paths, str})]
+        return ", or ".join(_words(each) for each in [*others, PathLike][: len(others) + bool(paths)])
     if origin is tuple and inner and Ellipsis not in inner:
         return f"({', '.join(_words(each) for each in inner)})"
     if origin in (Sequence, tuple, list) and inner:
@@ -124,18 +127,6 @@ def _words(hint: Any) -> str:
     if hint is PathLike or origin is PathLike:
         return "the path of a file or folder (str or pathlib.Path)"
     if origin is Mapping and len(inner) == 2:
-        return f"a dict of names, with each {_words(inner[1])}"
+        return f"a dict, with each value {_words(inner[1])}"
     name = getattr(origin or hint, "__name__", str(hint))
     return _WANTED.get(name, f"a {getattr(origin or hint, '__module__', '').split('.')[0]}.{name}")
-
-
-def expect(name: str, value: object, kind: type | UnionType, wanted: str) -> None:
-    """InputError unless `value` is of a kind: the argument's `name`, what is `wanted`, and what was passed."""
-    if not isinstance(value, kind):
-        raise InputError(f"{name} must be {wanted}; got {shown(value)}.")
-
-
-def path_of(path: str | PathLike[str]) -> Path:
-    """The argument `path` as a path; InputError for anything else, such as an array or what was read from a file."""
-    expect("path", path, str | PathLike, "the path of a file or folder (str or pathlib.Path)")
-    return Path(path)

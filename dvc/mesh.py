@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
-from dvc.arguments import expect
+from dvc.arguments import check
 from dvc.arrays import BoolArray, FloatArray, IntArray, frozen
 from dvc.errors import ExtentError, GeometryError, InputError
 
@@ -80,7 +80,7 @@ class TetMesh:
             got = f"got shape {ids.shape} of {ids.dtype}, {len(np.unique(ids))} of them different"
             raise InputError(f"node_ids must be a whole number of its own for each of the {len(points)} nodes; {got}.")
         for name, named in (("regions", regions), ("facets", facets)):
-            expect(name, named, Mapping | None, "a mapping of names to indices, such as {'fat': [0, 1]}")
+            check(name, named, Mapping[str, IntArray] | None)
         named_cells = {n: checked_indices(f"region {n!r}", i, len(tets)) for n, i in (regions or {}).items()}
         named_facets = {n: checked_indices(f"facets {n!r}", i, len(points), 3) for n, i in (facets or {}).items()}
         for name, index in [*named_cells.items(), *named_facets.items()]:

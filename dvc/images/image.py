@@ -8,7 +8,7 @@ from typing import Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from dvc.arguments import expect
+from dvc.arguments import check
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, InputError
 
@@ -177,7 +177,7 @@ class Grid:
 
 def _on(grid: Grid, what: str, values: npt.ArrayLike, kind: type[_T]) -> npt.NDArray[_T]:
     """Values as a read-only array, one for each voxel of the grid."""
-    expect("grid", grid, Grid, "a dvc.Grid (it comes first), such as that of another image (image.grid)")
+    check("grid", grid, Grid)
     array = frozen(values, kind)
     if array.shape != grid.shape:
         raise GeometryError(f"{what} has shape {array.shape}, its grid has {grid.shape}; they must be equal.")

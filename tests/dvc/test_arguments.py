@@ -56,7 +56,7 @@ def test_what_fits_is_taken(given: dict[str, Any]) -> None:
         ({"pair": ("a", "b")}, r"^pair\[1\] must be a number; got 'b'"),
         ({"pair": ("a", 1.0, 2.0)}, r"^pair must be \(text \(str\), a number\); got tuple"),
         ({"by_name": {"a": IMAGE}}, r"^by_name\['a'\] must be a dvc\.Mask.*; got Image"),
-        ({"by_name": [MASK]}, "^by_name must be a dict of names, with each a dvc.Mask.*; got list"),
+        ({"by_name": [MASK]}, "^by_name must be a dict, with each value a dvc.Mask.*; got list"),
         ({"file": 3}, "^file must be the path of a file or folder .*; got 3"),
         ({"values": "z"}, "^values must be an array of numbers; got 'z'"),
     ],

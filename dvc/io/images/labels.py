@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from dvc.arguments import expect, path_of
+from dvc.arguments import checked
 from dvc.arrays import IntArray
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, LabelMap, Mask
@@ -34,6 +34,7 @@ _NAME_COLUMNS = ("name", "structure", "label")  # "label" may head the names bes
 _OnGrid = TypeVar("_OnGrid", Mask, LabelMap)
 
 
+@checked
 def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
     """Read a mask: a file of zeros and one other value (0/1, 0/255, ...).
 
@@ -52,7 +53,7 @@ def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
     GeometryError
         If it does not lie on ``grid``.
     """
-    place = path_of(path)
+    place = Path(path)
     own, labels, counts = _integers(place, "mask")
     if len(counts) > 1:
         names = _segment_names(place)
@@ -65,6 +66,7 @@ def read_mask(path: StrPath, grid: Grid | None = None) -> Mask:
     return mask if grid is None else fit_mask(mask, grid, f"{place}")
 
 
+@checked
 def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None) -> LabelMap:
     """Read a label map and the names of its regions.
 
@@ -81,8 +83,7 @@ def read_labels(path: StrPath, names: StrPath | Mapping[int, str] | None = None)
     InputError
         If the map is empty, a value is negative or not a whole number, or a label has no name.
     """
-    place = path_of(path)
-    expect("names", names, str | PathLike | Mapping | None, "a mapping such as {1: 'fat'}, or the file of a table")
+    place = Path(path)
     grid, labels, present = _integers(place, "label map")
     if min(present) < 0:
         raise InputError(f"{place}: labels must not be negative; found {_shortened([v for v in present if v < 0])}.")
@@ -126,6 +127,7 @@ def read_names(path: StrPath) -> dict[int, str]:
     return names
 
 
+@checked
 def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid:
     """Bring a mask or label map onto an image's grid.
 
@@ -155,8 +157,6 @@ def fit_mask(mask_or_labels: _OnGrid, grid: Grid, what: str = "mask") -> _OnGrid
     >>> int(fitted.inside.sum()), coarse.volume_mm3
     (64, 64.0)
     """
-    expect("mask_or_labels", mask_or_labels, Mask | LabelMap, "a dvc.Mask or dvc.LabelMap (read_mask, read_labels)")
-    expect("grid", grid, Grid, "a dvc.Grid, such as that of an image (image.grid)")
     own = mask_or_labels.grid
     field = "inside" if isinstance(mask_or_labels, Mask) else "labels"
     values: npt.NDArray[Any] = getattr(mask_or_labels, field)

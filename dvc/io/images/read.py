@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvc.arguments import expect, path_of
+from dvc.arguments import checked
 from dvc.errors import ImageFileError, InputError
 from dvc.images.image import Grid, Image
 from dvc.io import StrPath
@@ -78,14 +78,12 @@ def read_image(
     return Image(grid, values)
 
 
+@checked
 def read_voxels(
     path: StrPath, *, series: str | None = None, volume: int | None = None, max_bytes: int = MAX_BYTES
 ) -> tuple[Grid, Voxels]:
     """Grid (LPS mm) and voxels (ni, nj, nk), unchecked, in the file's own number type; otherwise as `read_image`."""
-    place = path_of(path)
-    expect("series", series, str | None, "the end of a DICOM series' name")
-    expect("volume", volume, int | np.integer | None, "the number of a volume, from 0")
-    expect("max_bytes", max_bytes, int | float | np.integer, "a number of bytes")
+    place = Path(path)
     if not place.exists():
         raise InputError(f"{place}: no such file or folder. Check the path.")
     if place.is_dir() or (_known_suffix(place.name) is None and is_dicom(place)):

@@ -16,7 +16,7 @@ import nibabel
 import numpy as np
 import numpy.typing as npt
 
-from dvc.arguments import expect, path_of
+from dvc.arguments import checked
 from dvc.atomic_files import whole_file, write_csv, write_json
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, Image, LabelMap, Mask
@@ -31,6 +31,7 @@ _NRRD_TYPES = {"f4": "float", "u1": "uint8", "u2": "uint16", "i4": "int32"}
 _META_TYPES = {"f4": "MET_FLOAT", "u1": "MET_UCHAR", "u2": "MET_USHORT", "i4": "MET_INT"}
 
 
+@checked
 def write_image(path: StrPath, image: Image) -> None:
     """Write an image in single precision; missing voxels are NaN in the file.
 
@@ -59,10 +60,10 @@ def write_image(path: StrPath, image: Image) -> None:
     >>> bool((back.values == image.values).all()), back.grid.same_as(image.grid)
     (True, True)
     """
-    expect("image", image, Image, "a dvc.Image, such as dvc.Image(grid, values) of an array on a dvc.Grid")
-    _write(path_of(path), image.grid, image.values)
+    _write(Path(path), image.grid, image.values)
 
 
+@checked
 def write_mask(path: StrPath, mask: Mask) -> None:
     """Write a mask as 0 and 1, in 8 bits.
 
@@ -78,10 +79,10 @@ def write_mask(path: StrPath, mask: Mask) -> None:
     InputError, OutputError
         If an argument is of another kind; if the file cannot be written, and nothing is left under its name.
     """
-    expect("mask", mask, Mask, "a dvc.Mask, such as dvc.Mask(grid, inside) of an array on a dvc.Grid")
-    _write(path_of(path), mask.grid, mask.inside.view(np.uint8))
+    _write(Path(path), mask.grid, mask.inside.view(np.uint8))
 
 
+@checked
 def write_labels(path: StrPath, labels: LabelMap) -> None:
     """Write a label map, and its names in a table beside it: stem and ``.csv``, columns label and name.
 
@@ -99,8 +100,7 @@ def write_labels(path: StrPath, labels: LabelMap) -> None:
     OutputError
         If a label is 2**31 or more, or a file cannot be written; nothing is left under its name.
     """
-    expect("labels", labels, LabelMap, "a dvc.LabelMap, such as dvc.LabelMap(grid, labels, {1: 'fat'})")
-    place, largest = path_of(path), int(labels.labels.max())
+    place, largest = Path(path), int(labels.labels.max())
     dtype = np.min_scalar_type(largest) if largest < 2**16 else np.int32
     if largest >= 2**31:
         raise OutputError(f"{place}: label {largest} is too large for the file format; number the labels anew.")
@@ -108,6 +108,7 @@ def write_labels(path: StrPath, labels: LabelMap) -> None:
     write_csv(_beside(place, ".csv"), ("label", "name"), sorted(labels.names.items()))
 
 
+@checked
 def write_vectors(
     path: StrPath, grid: Grid, values: npt.ArrayLike, components: Sequence[str], meaning: str, frame: str = "LPS", *,
     unit: str, verdict: Verdict | None = None,
@@ -144,10 +145,7 @@ def write_vectors(
     ----------
     .. [1] NIfTI-1 intent codes: https://nifti.nimh.nih.gov/nifti-1/documentation/nifti1fields
     """
-    place, array = path_of(path), np.asarray(values)
-    expect("grid", grid, Grid, "a dvc.Grid, such as that of the reference image (image.grid)")
-    expect("components", components, Sequence, "a name for each component, such as ('x', 'y', 'z')")
-    expect("verdict", verdict, Verdict | None, "a dvc.Verdict, such as that of a measurement's quality")
+    place, array = Path(path), np.asarray(values)
     needed = (*grid.shape, len(components))
     if array.shape != needed:
         what = f"the grid and {len(components)} components need {needed}"

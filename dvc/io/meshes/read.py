@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from meshio._common import num_nodes_per_cell
 
-from dvc.arguments import path_of
+from dvc.arguments import checked
 from dvc.arrays import FloatArray, IntArray, frozen
 from dvc.errors import GeometryError, ImageFileError, InputError
 from dvc.io import StrPath
@@ -101,6 +101,7 @@ class MeshFile:
         return np.stack([self.points_mm.min(axis=0), self.points_mm.max(axis=0)])
 
 
+@checked
 def read_mesh(path: StrPath, *, unit: str = "mm", frame: str = "LPS") -> MeshFile:
     """Read a volume mesh: VTU, VTK, Gmsh (.msh 2.2, 4.1), Abaqus (.inp), ANSYS (.cdb), CalculiX (.frd), FEBio (.xplt).
 
@@ -129,7 +130,7 @@ def read_mesh(path: StrPath, *, unit: str = "mm", frame: str = "LPS") -> MeshFil
     GeometryError
         If the mesh is not usable; see `dvc.TetMesh`.
     """
-    path = path_of(path)
+    path = Path(path)
     if unit not in [*MM_PER_UNIT]:
         raise InputError(f"The unit of a mesh is mm or m; got {unit!r}.")
     if frame not in [*TO_LPS]:

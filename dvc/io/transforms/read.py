@@ -11,7 +11,7 @@ import numpy as np
 import SimpleITK as sitk
 from scipy.spatial.transform import Rotation
 
-from dvc.arguments import expect, path_of
+from dvc.arguments import checked
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Affine, Composed, Deformation, RigidMotion, SampledDisplacement
@@ -46,6 +46,7 @@ class Added:
         return np.asarray(sum(u for u, _ in evaluated)), np.asarray(sum(H for _, H in evaluated))
 
 
+@checked
 def read_transform(path: StrPath) -> Deformation:
     """Read a transform file: elastix' TransformParameters (.txt), ITK's (.h5, .tfm, .mat, .txt), or ours (.npz).
 
@@ -71,7 +72,7 @@ def read_transform(path: StrPath) -> Deformation:
     ParameterError
         If an elastix file contradicts itself or lacks something.
     """
-    place = path_of(path)
+    place = Path(path)
     if not place.is_file():
         raise InputError(f"{place}: no such transform file. Check the path.")
     if place.suffix.lower() == ".npz":
@@ -81,6 +82,7 @@ def read_transform(path: StrPath) -> Deformation:
     return _read_elastix(place, ())
 
 
+@checked
 def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplacement:
     """Read a displacement image, in mm: three components per voxel (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd).
 
@@ -106,8 +108,7 @@ def read_displacement(path: StrPath, frame: str | None = None) -> SampledDisplac
         If the file is damaged, not a 3D image of three components, in another unit than mm, or holds infinite
         values, or if its geometry or frame is missing or contradictory.
     """
-    place = path_of(path)
-    expect("frame", frame, str | None, "'LPS' or 'RAS'")
+    place = Path(path)
     if not place.is_file():
         raise InputError(f"{place}: no such displacement image. Check the path.")
     declared = {frame, _frame_beside(place)}
