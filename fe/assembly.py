@@ -216,6 +216,30 @@ def _add_products(cells: IntArray, local: FloatArray, directions: FloatArray, pr
                 pair += 1
 
 
+@njit(inline="always", error_model="numpy")
+def _add_stiffness(
+    K: FloatArray, weight: float, h: FloatArray, U: FloatArray, direct: FloatArray, swapped: FloatArray,
+    block: FloatArray, half: FloatArray,
+) -> None:  # fmt: skip
+    """Add the stiffness between the nodes of a cell at one quadrature point, by gradients in the principal frame."""
+    for a in range(len(h)):
+        for b in range(a, len(h)):
+            left, right = h[a], h[b]
+            for i in range(3):
+                d = direct[i]
+                for k in range(3):
+                    block[i, k] = swapped[i, k, 0] * left[i] * right[k] + swapped[i, k, 1] * left[k] * right[i]
+                block[i, i] = d[0] * left[0] * right[0] + d[1] * left[1] * right[1] + d[2] * left[2] * right[2]
+            for i in range(3):
+                for k in range(3):
+                    half[i, k] = block[i, 0] * U[k, 0] + block[i, 1] * U[k, 1] + block[i, 2] * U[k, 2]
+            for i in range(3):
+                for k in range(3):
+                    K[3 * a + i, 3 * b + k] += weight * (
+                        U[i, 0] * half[0, k] + U[i, 1] * half[1, k] + U[i, 2] * half[2, k]
+                    )
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
 def _elements(
     cells: IntArray, pressure_cells: IntArray, volumes: FloatArray, inverse: FloatArray, law: IntArray,
@@ -272,22 +296,8 @@ def _elements(
                 f[3 * nodes + c] += weight * pressure[q, c] * (J - 1.0)
             if not with_tangent:
                 continue
+            _add_stiffness(K, weight, h, U, direct, swapped, block, half)
             for a in range(nodes):
-                for b in range(a, nodes):
-                    left, right = h[a], h[b]
-                    for i in range(3):
-                        d = direct[i]
-                        for k in range(3):
-                            block[i, k] = swapped[i, k, 0] * left[i] * right[k] + swapped[i, k, 1] * left[k] * right[i]
-                        block[i, i] = d[0] * left[0] * right[0] + d[1] * left[1] * right[1] + d[2] * left[2] * right[2]
-                    for i in range(3):
-                        for k in range(3):
-                            half[i, k] = block[i, 0] * U[k, 0] + block[i, 1] * U[k, 1] + block[i, 2] * U[k, 2]
-                    for i in range(3):
-                        for k in range(3):
-                            K[3 * a + i, 3 * b + k] += weight * (
-                                U[i, 0] * half[0, k] + U[i, 1] * half[1, k] + U[i, 2] * half[2, k]
-                            )
                 for i in range(3):
                     value = 0.0
                     for k in range(3):

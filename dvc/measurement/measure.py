@@ -54,8 +54,7 @@ def measure(
     start : Deformation, optional
         A first guess of the displacement of tissue relative to its bone, such as another load's.
     settings : Settings, optional
-        By default the Gauss-Newton engine, with strain discontinuities at tissue interfaces where there are labels; one
-        thread.
+        By default Gauss-Newton, with strain discontinuities at tissue interfaces if there are labels; one thread.
     repeat : Image, optional
         A second unloaded image: its apparent strain is the noise floor.
     landmarks : ((n, 3), (n, 3)), optional
@@ -65,14 +64,9 @@ def measure(
     mesh : MeshFile, optional
         Displacement and strain are written at its nodes and cells.
     plate_normal, shear_direction : (3,), optional
-        LPS. The plate's outward normal (default: inferior) finds the bone's lowest point; with a shear direction,
-        strain is written in the plate's axes as well.
-    name : str
-        Of the load.
-    worker : Worker, optional
-        Process to compute in; a new one by default.
-    progress : callable, optional
-        ``progress(stage, fraction)``.
+        LPS. The plate's outward normal (default: inferior); with a shear direction, strain also in the plate's axes.
+    name, worker, progress : optional
+        Name of the load; the process to compute in (a new one by default); ``progress(stage, fraction)``.
 
     Returns
     -------
@@ -101,6 +95,6 @@ def measure(
     finally:
         if own is not None:
             own.close()
-    points = None if landmarks is None else landmarks[:2]
-    evidence = Evidence(points, floor, error_model or error_model_of(chosen.engine.name))
+    model = error_model or error_model_of(chosen.engine.name)
+    evidence = Evidence(landmarks[:2] if landmarks else None, floor, model)
     return Measurement.from_registration(found, subject, evidence, name=name)

@@ -1,7 +1,6 @@
 """`drive`: constitutive models under measured (Dirichlet) boundary conditions, free of plate, contact and friction."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import fe
@@ -15,6 +14,7 @@ from mrstrain.models.simulate import material_sets
 from mrstrain.options.door import door
 from mrstrain.options.modelling import MaterialSets, MeshCoordinates
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
+from mrstrain.records.outcome import Outcome
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from validate import boundary_displacement, simulate_driven, write_boundary_conditions
@@ -22,24 +22,11 @@ from validate import boundary_displacement, simulate_driven, write_boundary_cond
 BOUNDARY, ENDING = "boundary", "-driven"  # folder of the boundary conditions for other codes; end of a set's folder
 
 
-@dataclass(frozen=True, slots=True)
-class Driven:
-    """What `drive` gave."""
-
-    out: Path
-    complete: bool
-    lines: tuple[str, ...]
-
-    def summary(self) -> list[str]:
-        """A few lines for a person."""
-        return [*self.lines, f"Results: {self.out}"]
-
-
 @door
 def drive(
     mesh: Path | str, dvc: Path | str, *, out: Path | str, material: MaterialSets, loads: Sequence[str] = (),
     threads: int | None = None, coordinates: MeshCoordinates, progress: OnProgress | None = None,
-) -> Driven:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Simulate a mesh with the measured displacement prescribed on its surface.
 
     Parameters
@@ -101,7 +88,7 @@ def drive(
         about |= {"laws": {region: law.description for region, law in materials.items()}}
         write_json(folders[name] / "simulation.json", about | record)
     tell("drive", "simulating", 1.0)
-    return Driven(target, complete, tuple(lines))
+    return Outcome(target, (*lines, f"Results: {target}"), complete)
 
 
 def _drive_set(

@@ -1,7 +1,6 @@
 """`level`: forward-model comparison, the measurement simulated on the displacement of a model (levelling)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from mrstrain.options import measurement as options
 from mrstrain.options.door import door
 from mrstrain.options.modelling import ModelReading
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.outcome import Outcome
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
@@ -26,24 +26,12 @@ from validate import LEVELLED, FeResult, extrapolated, filled_from_nearest
 _CHANGED_MM, _FEW = 0.1, 0.01
 
 
-@dataclass(frozen=True, slots=True)
-class Levelled:
-    """What `level` gave."""
-
-    folder: Path
-    lines: tuple[str, ...]
-
-    def summary(self) -> list[str]:
-        """A few lines for a person."""
-        return [*self.lines, f"Levelled model, for compare: {self.folder}"]
-
-
 @door
 def level(
     load0: Path | str, model: Path | str, *, out: Path | str, subject_files: options.SubjectFiles,
     loads: Sequence[str] = (), engine: options.EngineOptions, reading: ModelReading, seeded: options.Seeded,
     progress: OnProgress | None = None,
-) -> Levelled:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Simulate the measurement on a model: its displacement warps the unloaded image, and the pair is registered.
 
     Parameters
@@ -103,7 +91,8 @@ def level(
             _write(target / name / f"{load}.vtu", result.mesh, registered)
     if len(failures) == len(results):
         raise RegistrationError(" ".join(failures))
-    return Levelled(target / name, (*notes, *smoothed, *failures))
+    told = f"Levelled model, for compare: {target / name}"
+    return Outcome(target / name, (*notes, *smoothed, *failures, told))
 
 
 def _warped_images(subject: Subject, results: Mapping[str, FeResult], seed: int) -> tuple[dict[str, Image], list[str]]:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from dvc import Deformation, Engine, Evidence, Image, Settings, read_error_model, read_image, read_landmarks
-from dvc.arguments import check
 from dvc.errors import InputError, MrstrainError, ParameterError, RegistrationError
 from dvc.io.result_folder import QUALITY, REPEAT, spline_in
 from dvc.registration.align import without_motion
@@ -57,10 +56,6 @@ def register(
         For any input that cannot be used, before anything is computed; or if every load failed.
     """
     target = Path(out)
-    if isinstance(loads, str | Path):
-        raise InputError(f"`loads` is a list of files; for one give [{str(loads)!r}].")
-    check("load0", load0, Path | str)
-    check("loads", loads, Sequence[Path | str])
     load0, places = Path(load0), _places([Path(p) for p in loads], scans)
     cases, paths = list(places), list(places.values())
     chosen = engine_of(registration, labelled=subject_files.labels is not None)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from types import NoneType, UnionType
 from typing import Any, Literal, ParamSpec, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
+from dvc.arguments import checked
 from mrstrain.options.model import Options, bare
 
 P = ParamSpec("P")
@@ -41,7 +42,7 @@ def door(function: Callable[P, R_co]) -> Door[P, R_co]:
 
     They stand in its signature, and with type, default and help in its docstring, as if they were written there.
     """
-    models = models_of(function)
+    models, refusing = models_of(function), checked(function)
 
     @functools.wraps(function)
     def flat(*given: Any, **options: Any) -> Any:
@@ -49,7 +50,7 @@ def door(function: Callable[P, R_co]) -> Door[P, R_co]:
             name: model.of({field: options.pop(field) for field in model.model_fields if field in options})
             for name, model in models.items()
         }
-        return function(*given, **options, **made)
+        return refusing(*given, **options, **made)
 
     flat.__signature__ = _flat_signature(function, models)  # type: ignore[attr-defined]
     flat.__doc__ = _flat_docstring(inspect.cleandoc(function.__doc__ or ""), models)

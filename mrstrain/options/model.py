@@ -89,7 +89,9 @@ class Options(BaseModel):
     @property
     def files(self) -> dict[str, list[Path]]:
         """Fields that are given as paths."""
-        return {name: paths for name, value in self if (paths := _paths(value))}
+        each = {name: value if isinstance(value, tuple) else (value,) for name, value in self}
+        paths = {name: [one for one in of if isinstance(one, Path)] for name, of in each.items()}
+        return {name: of for name, of in paths.items() if of}
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -103,10 +105,6 @@ class Options(BaseModel):
     def plain(self) -> dict[str, Any]:
         """The fields as values that JSON can hold."""
         return self.model_dump(mode="json")
-
-
-def _paths(value: Any) -> list[Path]:
-    return [one for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, Path)]
 
 
 def reason(error: Mapping[str, Any]) -> str:

@@ -57,7 +57,10 @@ def examine(
     A failed check does not stop the others. ``folder`` is to hold results: the disk of its nearest existing parent is
     checked. ``trials`` are short trial runs by name; each returns a line on how it went, or raises.
     """
-    findings = [_python(), _foreign(), *map(_package, _NEEDED), _cores(), _memory(), _disk(Path(folder)), _temporary()]
+    foreign = " ".join(_foreign_packages())
+    detail = foreign or f"{', '.join(_OURS)} are mrstrain's own"
+    own = Finding("package names", not foreign, detail, "Install mrstrain in an environment of its own.")
+    findings = [_python(), own, *map(_package, _NEEDED), _cores(), _memory(), _disk(Path(folder)), _temporary()]
     return [*findings, *(_tried(what, trial) for what, trial in (trials or {}).items())]
 
 
@@ -104,12 +107,6 @@ def _brings(distribution: importlib.metadata.Distribution, package: str) -> bool
     if files is None:  # no record of files: some system packages
         return package in (distribution.read_text("top_level.txt") or package).split()
     return any(file.parts[0] in {package, f"{package}.py"} for file in files)
-
-
-def _foreign() -> Finding:
-    reasons = _foreign_packages()
-    detail = " ".join(reasons) or f"{', '.join(_OURS)} are mrstrain's own"
-    return Finding("package names", not reasons, detail, "Install mrstrain in an environment of its own.")
 
 
 def _python() -> Finding:

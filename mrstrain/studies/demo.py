@@ -1,7 +1,6 @@
 """`demo`: a heel phantom of known strain, taken through a whole study, with the error by tissue."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 from dvc import read_labels, read_mask, write_labels
@@ -9,6 +8,7 @@ from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
 from dvc.io.result_folder import REPORT, VALID, spline_in
 from mrstrain.models.simulate import LOADS
+from mrstrain.records.outcome import Outcome
 from mrstrain.records.progress import OnProgress
 from mrstrain.studies.file import FILE
 from mrstrain.studies.page import write_run_report
@@ -52,25 +52,10 @@ shear_n = {shear_n}
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Demonstration:
-    """Result of `demo`: its summary, the report's path last, and whether every stage has a result.
-
-    A stage that was ended only by its time limit counts as one that has.
-    """
-
-    lines: tuple[str, ...]
-    complete: bool
-
-    def summary(self) -> list[str]:
-        """The lines."""
-        return list(self.lines)
-
-
 def demo(
     out: Path | str, *, seed: int = 1, full: bool = False, workers: int | None = None,
     progress: OnProgress | None = None,
-) -> Demonstration:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Make a heel phantom under four loads, run its study, and compare the measurement with the truth.
 
     out: The study's folder: images and truth of the phantom, ``study.toml``, ``results`` and ``error.csv``. A second
@@ -78,6 +63,7 @@ def demo(
     seed: Seed of the phantom.
     full: The published size: all seven material sets on some 75,000 tetrahedra; otherwise three on a coarser mesh.
     workers, progress: As in `mrstrain.run`.
+    Returns the summary; a stage that only its time limit ended counts as one that has a result.
     Raises OutputError if the folder holds another phantom, or other files that would be replaced.
     """
     target = Path(out)
@@ -86,7 +72,8 @@ def demo(
     errors = _errors(target, seed, done, read_errors(target / TABLE, done.outcomes))
     write_errors(target / TABLE, errors, done.outcomes)
     write_run_report(target / "results" / REPORT, done.study, done.outcomes)
-    return Demonstration(tuple(_summary(errors, done)), all(_reached(outcome) for outcome in done.outcomes.values()))
+    complete = all(_reached(outcome) for outcome in done.outcomes.values())
+    return Outcome(done.study.out, tuple(_summary(errors, done)), complete)
 
 
 def _make(target: Path, seed: int, full: bool, progress: OnProgress | None) -> None:

@@ -75,7 +75,8 @@ def plan(study: Study) -> tuple[Stage, ...]:
         if folder in models.values():
             raise InputError(f"[models] two sets are called '{folder.name}'; each needs a name of its own.")
         if study.models.drive:
-            own.append(_driven(study, one, folder.name, measured))
+            driven, dvc = study.out / MODELS / (folder.name + ENDING), {"dvc": study.out / REGISTRATION}
+            own.append(_on_mesh(study, f"drive {folder.name}", one, driven, dvc, {"loads": measured}))
         models |= {stage.name: stage.gives[0] for stage in own}
         if study.models.level:
             own += [_levelled(study, folder, load) for load in load_steps(study)]
@@ -207,11 +208,6 @@ def load_steps(study: Study) -> dict[str, LoadStep]:
     why = "A plate that shears has to press." if lacking else "No load has a force or travel to simulate sets under."
     places = [study.at(f"loads.{name}", "normal_n") for name in lacking or study.loads]
     raise InputError("\n  ".join([f"{why} In the study file normal_n (N) or normal_mm is missing:", *places]))
-
-
-def _driven(study: Study, one: str, name: str, measured: Mapping[str, str]) -> Stage:
-    folder, dvc = study.out / MODELS / (name + ENDING), {"dvc": study.out / REGISTRATION}
-    return _on_mesh(study, f"drive {name}", one, folder, dvc, {"loads": measured})
 
 
 def _levelled(study: Study, folder: Path, load: str) -> Stage:

@@ -1,6 +1,6 @@
 """`twin`: synthetic warp of a subject's own unloaded image by a given deformation, with the truth beside it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from dvc import Measurement, write_image
@@ -10,6 +10,7 @@ from mrstrain.measurement.strain import read_any
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Frame, SubjectFiles
 from mrstrain.records.inputs import make_output, read_subject, refuse_touching_inputs
+from mrstrain.records.outcome import Outcome
 from mrstrain.records.provenance import provenance
 from phantoms import Acquisition, synthetic_warp
 
@@ -17,30 +18,11 @@ _TRUTH = Path("truth") / "twin"
 _IMAGE = "twin.nii.gz"
 
 
-@dataclass(frozen=True, slots=True)
-class TwinFiles:
-    """Files that `twin` wrote: the warped image and the folder of the truth; and its strain in a line."""
-
-    image: Path
-    truth: Path
-    strain: str
-    shown: float
-    register: str
-
-    def summary(self) -> list[str]:
-        """Summary, with the command that registers the image."""
-        return [
-            f"Warped image: {self.image}; it shows {self.shown:.0%} of the tissue. Truth: {self.truth}",
-            f"True {self.strain}",
-            f"To register it: {self.register}",
-        ]
-
-
 @door
 def twin(
     load0: Path | str, deformation: Path | str, *, out: Path | str, subject_files: SubjectFiles,
     frame: Frame | None = None, seed: int = 1,
-) -> TwinFiles:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Warp an unloaded image by a deformation, as if it had been scanned under load, and write the truth.
 
     Parameters
@@ -78,5 +60,9 @@ def twin(
     write_json(target / PROVENANCE, record | {"noise_sd": made.noise_sd, "tissue_in_view": made.shown})
     told = " ".join(f"{subject_files.option(name)} {value}" for name, value in subject_files if value is not None)
     align = " --align none" if subject.bone is None else ""
-    command = f"mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}"
-    return TwinFiles(target / _IMAGE, target / _TRUTH, measured.strain_line, made.shown, command)
+    lines = (
+        f"Warped image: {target / _IMAGE}; it shows {made.shown:.0%} of the tissue. Truth: {target / _TRUTH}",
+        f"True {measured.strain_line}",
+        f"To register it: mrstrain register {load0} {target / _IMAGE} {told}{align} --out {target / 'results'}",
+    )
+    return Outcome(target, lines)

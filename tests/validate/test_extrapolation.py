@@ -116,8 +116,8 @@ def test_what_comes_back_is_the_model_as_the_measurement_shows_it(bumped: Bumped
         folder / "Load0.nii.gz", folder / "model", out=folder / "out", bone=folder / "bone.nii.gz",
         parameters=[folder / "mine.txt"],
     )  # fmt: skip
-    assert done.folder.name == "model" + LEVELLED
-    back = read_result("levelled", done.folder / "Load1.vtu")
+    assert done.out.name == "model" + LEVELLED
+    back = read_result("levelled", done.out / "Load1.vtu")
     moved = np.linalg.norm(u, axis=1) > 1.0
     size, apart = (np.linalg.norm(v, axis=1)[body & moved] for v in (u, back.deformation.u_mm - u))
     assert np.median(apart) < 0.5 * np.median(size)  # voxels of 1.6 mm
