@@ -20,6 +20,9 @@ _SUPPORT = 4
 _ALIGNED_INDEX = 1e-6
 _ON_FACE = 1e-9
 
+Four = tuple[int, int, int, int]
+Weights = tuple[float, float, float, float]
+"""Of the four B-splines along an axis that are not zero at a point: their control points, and values or slopes."""
 Axis = tuple[IntArray, FloatArray, FloatArray]
 """Of points along an axis the first control points (n,), and the spline's values and slopes there, (n, 4)."""
 Table = tuple[Axis, Axis, Axis]
@@ -170,7 +173,7 @@ def evaluate_spline(
 
 
 @njit(cache=True)
-def spline_basis(f: float) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float]]:
+def spline_basis(f: float) -> tuple[Weights, Weights]:
     """Values and slopes of the four cubic B-splines that are not zero at a fraction f of an interval."""
     g = 1.0 - f
     value = (g * g * g / 6.0, 2.0 / 3.0 - f * f * (1.0 - 0.5 * f), 2.0 / 3.0 - g * g * (1.0 - 0.5 * g), f * f * f / 6.0)
@@ -186,6 +189,41 @@ def _reflected(index: int, count: int) -> int:
     period = 2 * (count - 1)
     inside = index % period
     return period - inside if inside >= count else inside
+
+
+@njit(cache=True)
+def indices_around(below: float, count: int) -> Four:
+    """The four coefficients along an axis that reach the interval above an index, reflected beyond the borders."""
+    first = int(below) - 1
+    if first >= 0 and first + 4 <= count:
+        return first, first + 1, first + 2, first + 3
+    a, b = _reflected(first, count), _reflected(first + 1, count)
+    return a, b, _reflected(first + 2, count), _reflected(first + 3, count)
+
+
+@njit(cache=True)
+def summed_spline(
+    coefficients: FloatArray, at: tuple[Four, Four, Four], value: tuple[Weights, Weights, Weights],
+    slope: tuple[Weights, Weights, Weights],
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """The sum of 4 x 4 x 4 coefficients by their weights along each axis, and its slopes along these."""
+    total, by_x, by_y, by_z = 0.0, 0.0, 0.0, 0.0
+    for p in range(4):
+        plane, plane_y, plane_z = 0.0, 0.0, 0.0
+        for q in range(4):
+            line, line_z = 0.0, 0.0
+            for r in range(4):
+                coefficient = coefficients[at[0][p], at[1][q], at[2][r]]
+                line += value[2][r] * coefficient
+                line_z += slope[2][r] * coefficient
+            plane += value[1][q] * line
+            plane_y += slope[1][q] * line
+            plane_z += value[1][q] * line_z
+        total += value[0][p] * plane
+        by_x += slope[0][p] * plane
+        by_y += value[0][p] * plane_y
+        by_z += value[0][p] * plane_z
+    return total, by_x, by_y, by_z
 
 
 @njit(cache=True)
@@ -230,28 +268,9 @@ def _at_indices(
         a, da = spline_basis(x - i)
         b, db = spline_basis(y - j)
         c, dc = spline_basis(z - k)
-        i0, j0, k0 = np.int64(i) - 1, np.int64(j) - 1, np.int64(k) - 1
+        at = indices_around(i, ni), indices_around(j, nj), indices_around(k, nk)
         for m in range(components):
-            total, by_x, by_y, by_z = 0.0, 0.0, 0.0, 0.0
-            for p in range(4):
-                ip = _reflected(i0 + p, ni) if mirror else i0 + p
-                plane, plane_y, plane_z = 0.0, 0.0, 0.0
-                for q in range(4):
-                    jq = _reflected(j0 + q, nj) if mirror else j0 + q
-                    line, line_z = 0.0, 0.0
-                    for r in range(4):
-                        kr = _reflected(k0 + r, nk) if mirror else k0 + r
-                        coefficient = coefficients[m, ip, jq, kr]
-                        line += c[r] * coefficient
-                        line_z += dc[r] * coefficient
-                    plane += b[q] * line
-                    plane_y += db[q] * line
-                    plane_z += b[q] * line_z
-                total += a[p] * plane
-                by_x += da[p] * plane
-                by_y += a[p] * plane_y
-                by_z += a[p] * plane_z
-            values[n, m] = total
+            values[n, m], by_x, by_y, by_z = summed_spline(coefficients[m], at, (a, b, c), (da, db, dc))
             if gradient:
                 slopes[n, m, 0], slopes[n, m, 1], slopes[n, m, 2] = by_x, by_y, by_z
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from numba import njit, prange
 from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
 from scipy.special import ndtri
 
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
-from dvc.deformation.bspline import BSpline, evaluate_spline
+from dvc.deformation.bspline import BSpline, evaluate_spline, indices_around, spline_basis, summed_spline
 from dvc.deformation.protocol import CHUNK, in_chunks
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, LabelMap, Mask
@@ -101,16 +102,11 @@ class Interfaces:
     def at(self, points_mm: FloatArray, gradient: bool = True) -> FloatArray:
         """Factors at points (n, 3) LPS mm, (n, 2, 4): of m and psi the value, and the gradient in LPS, or 0 for it."""
         indices = self.grid.indices_of(np.asarray(points_mm, dtype=np.float64))
-        depths, slopes = evaluate_spline(self.depth, indices, mirror=True, gradient=gradient)
-        if not gradient:
-            slopes = np.zeros((*depths.shape, 3))
-        slopes = slopes @ self.grid.index_per_mm
-        own = np.where(np.isnan(depths), -np.inf, depths).argmax(axis=1)
-        each = np.arange(len(own))
-        away, toward = np.full(len(own), np.inf), np.zeros((len(own), 3))
-        if self.rest >= 0:
-            away, toward = -depths[:, self.rest], -slopes[:, self.rest]
-        return self._factors(depths[each, own], slopes[each, own], away, toward, own)
+        own, depth = np.empty(len(indices), dtype=np.int64), np.empty((2, len(indices)))
+        slope = np.zeros((2, len(indices), 3))
+        _depths_at(self.depth, self.own, self.rest, indices, gradient, own, depth, slope)
+        slope = slope @ self.grid.index_per_mm
+        return self._factors(depth[0], slope[0], -depth[1], -slope[1], own)
 
     def _factors(
         self, depth: FloatArray, slope: FloatArray, away: FloatArray, away_slope: FloatArray, own: IntArray
@@ -133,6 +129,45 @@ class Interfaces:
         indices = np.argwhere(where).astype(np.float64)
         depth, per_voxel = evaluate_spline(self.depth[number : number + 1], indices, mirror=True)
         return depth[:, 0], per_voxel[:, 0] / self.grid.spacing_mm
+
+
+@njit(parallel=True, cache=True)
+def _depths_at(
+    depth: FloatArray, own: IntArray, rest: int, indices: FloatArray, gradient: bool, tissue: IntArray,
+    value: FloatArray, slope: FloatArray,
+) -> None:  # fmt: skip
+    """Each point's own tissue, the depth (2, n) in it and in the bone at rest, and their slopes (2, n, 3) by index.
+
+    A tissue that none of the eight voxels around a point belongs to is not its own. Without a bone, or a number for an
+    index, its depth is -inf.
+    """
+    ni, nj, nk = own.shape
+    for n in prange(len(indices)):
+        x, y, z = indices[n, 0], indices[n, 1], indices[n, 2]
+        tissue[n], value[:, n] = 0, -np.inf
+        if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
+            value[0, n] = np.nan
+            continue
+        i, j, k = np.floor(x), np.floor(y), np.floor(z)
+        a, da = spline_basis(x - i)
+        b, db = spline_basis(y - j)
+        c, dc = spline_basis(z - k)
+        at = indices_around(i, ni), indices_around(j, nj), indices_around(k, nk)
+        tried = -1
+        for corner in range(8):
+            number = own[at[0][1 + (corner >> 2)], at[1][1 + (corner >> 1 & 1)], at[2][1 + (corner & 1)]]
+            if number == tried or (corner and number == tissue[n]):
+                continue
+            tried = number
+            mm, by_x, by_y, by_z = summed_spline(depth[number], at, (a, b, c), (da, db, dc))
+            if mm > value[0, n]:
+                tissue[n], value[0, n] = number, mm
+                if gradient:
+                    slope[0, n, 0], slope[0, n, 1], slope[0, n, 2] = by_x, by_y, by_z
+        if rest >= 0:
+            value[1, n], by_x, by_y, by_z = summed_spline(depth[rest], at, (a, b, c), (da, db, dc))
+            if gradient:
+                slope[1, n, 0], slope[1, n, 1], slope[1, n, 2] = by_x, by_y, by_z
 
 
 def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
