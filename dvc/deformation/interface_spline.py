@@ -273,10 +273,21 @@ class InterfaceSpline:
         self, points: FloatArray, smooth: tuple[FloatArray, FloatArray], jump: tuple[FloatArray, FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
         """Join u and H of both splines at the same points."""
-        factors = self.borders.at(points)
-        u, H = np.zeros_like(smooth[0]), np.zeros_like(smooth[1])
-        for f, (each, gradient) in enumerate((smooth, jump)):
-            value, slope = factors[:, f, 0, None], factors[:, f, None, 1:]
-            u += value * each
-            H += value[..., None] * gradient + each[:, :, None] * slope
+        u, H = np.empty_like(smooth[0]), np.empty_like(smooth[1])
+        _join(self.borders.at(points), *smooth, *jump, u, H)
         return u, H
+
+
+@njit(parallel=True, cache=True)
+def _join(
+    factors: FloatArray, v: FloatArray, v_gradient: FloatArray, w: FloatArray, w_gradient: FloatArray, u: FloatArray,
+    H: FloatArray,
+) -> None:  # fmt: skip
+    """Write u = m v + psi w and its gradient (n, 3, 3) from the factors (n, 2, 4) and both splines."""
+    for n in prange(len(u)):
+        m, psi = factors[n]
+        for i in range(3):
+            u[n, i] = m[0] * v[n, i] + psi[0] * w[n, i]
+            for j in range(3):
+                by_v = m[0] * v_gradient[n, i, j] + v[n, i] * m[1 + j]
+                H[n, i, j] = by_v + (psi[0] * w_gradient[n, i, j] + w[n, i] * psi[1 + j])

@@ -69,6 +69,16 @@ def evaluate_on_grid(
     return u, H
 
 
+def displacement_on_grid(deformation: Deformation, grid: Grid) -> FloatArray:
+    """U (ni, nj, nk, 3) mm at the voxels of a grid; NaN where not defined."""
+    u = np.empty((*grid.shape, 3))
+    step = max(1, CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: gradients come along
+    for start in range(0, grid.shape[0], step):
+        part = grid.part((slice(start, start + step), slice(None), slice(None)))
+        u[start : start + step] = evaluate_on_grid(deformation, part)[0].reshape(*part.shape, 3)
+    return u
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Affine:
     """x = matrix @ X + translation_mm, defined everywhere.

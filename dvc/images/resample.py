@@ -54,13 +54,13 @@ def shows(image: Image, points_mm: FloatArray, margin_mm: float = 0.0) -> BoolAr
 
 def carry(
     image: Image, grid: Grid, points_of: Callable[[FloatArray], FloatArray] | None = None,
-    where: BoolArray | None = None, order: int = 3,
+    where: BoolArray | None = None, order: int = 3, displacement_mm: FloatArray | None = None,
 ) -> Float32Array:  # fmt: skip
     """Values of ``image`` on ``grid``, NaN where any of the eight voxels around is missing or outside.
 
     ``points_of`` maps points (n, 3) LPS mm of the grid to those of the image whose values they take (default: the
-    identity; NaN points give NaN); ``where`` (ni, nj, nk) are the voxels wanted; ``order`` is 1 for linear, 3 for cubic
-    spline interpolation.
+    identity; NaN points give NaN), after a ``displacement_mm`` (ni, nj, nk, 3) of the grid's voxels, LPS, where one is
+    given; ``where`` (ni, nj, nk) are the voxels wanted; ``order`` is 1 for linear, 3 for cubic spline interpolation.
     """
     gaps = image.missing.astype(np.float32) if image.missing.any() else None
     coefficients = fill_missing(image).values
@@ -77,6 +77,8 @@ def carry(
         indices = np.argwhere(wanted).astype(np.float64)
         indices[:, 0] += start
         points = grid.points_at(indices)
+        if displacement_mm is not None:
+            points = points + displacement_mm[start : start + step][wanted]
         at = image.grid.indices_of(points if points_of is None else points_of(points))
         known = np.all((at >= -1e-6) & (at <= last + 1e-6), axis=1)  # False for NaN as well
         values = np.full(len(at), np.nan, dtype=np.float32)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from dvc.arrays import Float32Array, FloatArray
-from dvc.deformation.protocol import RigidMotion
+from dvc.deformation.protocol import RigidMotion, displacement_on_grid
 from dvc.deformation.strain_maps import StrainMaps, strain_maps
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
@@ -82,7 +82,8 @@ def carried_images(found: Registration) -> CarriedImages:
     reference, loaded, motion, grid = found.reference, found.loaded, found.alignment.motion, found.reference.grid
     before, aligned = carry(loaded, grid), carry(loaded, grid, motion.apply)
     # Beyond the spline, in the air, the image is shown where the bone's motion alone puts it.
-    registered = carry(loaded, grid, lambda X: motion.apply(X + np.nan_to_num(found.displacement.displacement(X))))
+    u = np.nan_to_num(displacement_on_grid(found.displacement, grid), copy=False)
+    registered = carry(loaded, grid, motion.apply, displacement_mm=u)
     both = Mask(grid, found.tissue.inside & np.isfinite(aligned) & np.isfinite(registered))  # the same voxels for both
     _, as_scanned = local_correlation(reference, before, found.tissue)
     local_rigid, rigid = local_correlation(reference, aligned, both)

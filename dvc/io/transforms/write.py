@@ -11,7 +11,7 @@ from dvc.arrays import FloatArray
 from dvc.atomic_files import whole_file, write_whole
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.interface_spline import InterfaceSpline
-from dvc.deformation.protocol import Deformation, RigidMotion
+from dvc.deformation.protocol import Deformation, RigidMotion, displacement_on_grid
 from dvc.errors import InputError
 from dvc.images.image import Grid
 from dvc.images.itk_image import to_sitk
@@ -111,8 +111,9 @@ def _itk_part(displacement: Deformation, grid: Grid | None) -> sitk.Transform:
             grid = borders.grid
     if grid is None:
         raise InputError(f"To write a {type(displacement).__name__} for ITK, give the grid of its displacement field.")
-    u = displacement.displacement(grid.points().reshape(-1, 3)).reshape(*grid.shape, 3)
-    return sitk.DisplacementFieldTransform(to_sitk(grid, np.nan_to_num(u)))
+    return sitk.DisplacementFieldTransform(
+        to_sitk(grid, np.nan_to_num(displacement_on_grid(displacement, grid), copy=False))
+    )
 
 
 def write_displacement_as_found(found: Deformation, folder: Path, then: RigidMotion | None, reference: Grid) -> None:
