@@ -36,6 +36,7 @@ from dvc import (
     strain_maps,
     tissue_mask,
 )
+from dvc.deformation.protocol import displacement_on_grid
 from dvc.errors import MrstrainError
 from dvc.images.resample import carry
 from dvc.worker import Worker, usable_cores
@@ -46,7 +47,8 @@ def floor_of(found: Registration) -> dict[str, float]:
     maps = strain_maps(found.deformation, found.tissue)
     floor = noise_floor(maps, found.tissue.inside)
     loaded, motion = found.loaded, found.alignment.motion
-    after = carry(loaded, found.reference.grid, lambda X: motion.apply(X + found.displacement.displacement(X)))
+    grid = found.reference.grid
+    after = carry(loaded, grid, motion, displacement_mm=displacement_on_grid(found.displacement, grid))
     E = maps.green_lagrange[maps.valid & found.tissue.inside].astype(float)
     half = np.sqrt(((E[:, 0] - E[:, 3]) / 2) ** 2 + E[:, 1] ** 2)  # in-plane maximal shear, x and y
     return {

@@ -13,6 +13,7 @@ from numba import njit, prange
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid
+from dvc.images.interpolation import Four, Weights, indices_around, spline_basis
 
 _SUPPORT = 4
 # Lengths in control spacings: how far a voxel may lie from the place that the separable way gives it, and how
@@ -20,9 +21,6 @@ _SUPPORT = 4
 _ALIGNED_INDEX = 1e-6
 _ON_FACE = 1e-9
 
-Four = tuple[int, int, int, int]
-Weights = tuple[float, float, float, float]
-"""Of the four B-splines along an axis that are not zero at a point: their control points, and values or slopes."""
 Axis = tuple[IntArray, FloatArray, FloatArray]
 """Of points along an axis the first control points (n,), and the spline's values and slopes there, (n, 4)."""
 Table = tuple[Axis, Axis, Axis]
@@ -170,35 +168,6 @@ def evaluate_spline(
     slopes = np.empty((len(places) if gradient else 0, len(coefficients), 3))
     _at_indices(np.ascontiguousarray(coefficients), places, mirror, gradient, values, slopes)
     return values, slopes
-
-
-@njit(cache=True)
-def spline_basis(f: float) -> tuple[Weights, Weights]:
-    """Values and slopes of the four cubic B-splines that are not zero at a fraction f of an interval."""
-    g = 1.0 - f
-    value = (g * g * g / 6.0, 2.0 / 3.0 - f * f * (1.0 - 0.5 * f), 2.0 / 3.0 - g * g * (1.0 - 0.5 * g), f * f * f / 6.0)
-    slope = (-0.5 * g * g, f * (1.5 * f - 2.0), g * (2.0 - 1.5 * g), 0.5 * f * f)
-    return value, slope
-
-
-@njit(cache=True)
-def _reflected(index: int, count: int) -> int:
-    """Reflect an index beyond the borders about the outermost until it is inside."""
-    if count == 1:
-        return 0
-    period = 2 * (count - 1)
-    inside = index % period
-    return period - inside if inside >= count else inside
-
-
-@njit(cache=True)
-def indices_around(below: float, count: int) -> Four:
-    """The four coefficients along an axis that reach the interval above an index, reflected beyond the borders."""
-    first = int(below) - 1
-    if first >= 0 and first + 4 <= count:
-        return first, first + 1, first + 2, first + 3
-    a, b = _reflected(first, count), _reflected(first + 1, count)
-    return a, b, _reflected(first + 2, count), _reflected(first + 3, count)
 
 
 @njit(cache=True)

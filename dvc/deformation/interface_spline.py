@@ -13,10 +13,11 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
 from scipy.special import ndtri
 
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
-from dvc.deformation.bspline import BSpline, evaluate_spline, indices_around, spline_basis, summed_spline
+from dvc.deformation.bspline import BSpline, evaluate_spline, summed_spline
 from dvc.deformation.protocol import CHUNK, in_chunks
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, LabelMap, Mask
+from dvc.images.interpolation import indices_around, spline_basis
 
 _BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
 _SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off

@@ -1,10 +1,13 @@
 """Noise of a magnitude MR image: its standard deviation, and the signal-to-noise ratio of the tissue."""
 
+from dataclasses import dataclass
+from typing import Self
+
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
+from dvc.images.tissue import widened
 
 _RAYLEIGH_MEDIAN = np.sqrt(2.0 * np.log(2.0))
 _AIR_MM = 4.0
@@ -21,8 +24,12 @@ def noise_sd(image: Image, tissue: Mask) -> float:
     diagonal differences (Haar wavelets; median absolute deviation; Donoho and Johnstone, Biometrika 1994,
     doi:10.1093/biomet/81.3.425), which texture raises and a scanner's filter lowers. InputError as `noise_in_air`.
     """
-    if (in_air := noise_in_air(image, tissue)) is not None:
-        return in_air
+    in_air = noise_in_air(image, tissue)
+    return _finest_differences(image, tissue) if in_air is None else in_air
+
+
+def _finest_differences(image: Image, tissue: Mask) -> float:
+    """The noise that the tissue's finest diagonal differences tell, as in `noise_sd`."""
     finest = np.where(tissue.inside, image.values, np.nan)[tissue.box()].astype(np.float64)
     for axis in range(3):
         if finest.shape[axis] > 1:
@@ -38,8 +45,7 @@ def noise_in_air(image: Image, tissue: Mask) -> float | None:
     """
     if not tissue.grid.same_as(image.grid) or not tissue.inside.any():
         raise InputError("The noise needs a tissue mask that is on the image's grid and not empty.")
-    far = distance_transform_edt(~tissue.inside, sampling=image.grid.spacing_mm) > _AIR_MM
-    air = image.values[~image.missing & far]
+    air = image.values[~image.missing & ~widened(tissue, _AIR_MM).inside]
     air = air[air > 0] if np.count_nonzero(air > 0) > 0.9 * max(air.size, 1) else air[:0]
     return float(np.median(air) / _RAYLEIGH_MEDIAN) if air.size >= _LEAST and np.ptp(air) > 0 else None
 
@@ -49,5 +55,20 @@ def signal_to_noise(image: Image, tissue: Mask) -> float:
 
     In a heel the 75th percentile is that of fat, the brightest of its tissues and the most abundant.
     """
-    sigma, level = noise_sd(image, tissue), float(np.percentile(image.values[tissue.inside & ~image.missing], 75))
-    return level / sigma if sigma > 0 else float("inf")
+    return Noise.of(image, tissue).snr
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Noise of a magnitude image: its standard deviation in the air (`noise_in_air`), and `signal_to_noise`."""
+
+    in_air: float | None
+    snr: float
+
+    @classmethod
+    def of(cls, image: Image, tissue: Mask, body: Mask | None = None) -> Self:
+        """The noise beside the signal of a tissue, which may be a part of the body."""
+        in_air = noise_in_air(image, body or tissue)
+        sigma = _finest_differences(image, tissue) if in_air is None else in_air
+        level = float(np.percentile(image.values[tissue.inside & ~image.missing], 75))
+        return cls(in_air, level / sigma if sigma > 0 else float("inf"))

@@ -1,14 +1,26 @@
 """Image values at points in space, and images carried to another grid."""
 
-from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.images.image import Grid, Image
+from dvc.images.interpolation import carry_values, sample_values
 
-_SLAB_VOXELS = 500_000
+
+class Motion(Protocol):
+    """An affine motion of points, LPS mm, such as `dvc.RigidMotion`: x = matrix @ X + translation_mm."""
+
+    @property
+    def matrix(self) -> FloatArray:
+        """The (3, 3) matrix."""
+
+    @property
+    def translation_mm(self) -> FloatArray:
+        """The (3,) translation."""
 
 
 def fill_missing(image: Image) -> Image:
@@ -53,40 +65,52 @@ def shows(image: Image, points_mm: FloatArray, margin_mm: float = 0.0) -> BoolAr
 
 
 def carry(
-    image: Image, grid: Grid, points_of: Callable[[FloatArray], FloatArray] | None = None,
-    where: BoolArray | None = None, order: int = 3, displacement_mm: FloatArray | None = None,
+    image: Image, grid: Grid, motion: Motion | None = None, where: BoolArray | None = None, order: int = 3,
+    displacement_mm: npt.ArrayLike | None = None,
 ) -> Float32Array:  # fmt: skip
     """Values of ``image`` on ``grid``, NaN where any of the eight voxels around is missing or outside.
 
-    ``points_of`` maps points (n, 3) LPS mm of the grid to those of the image whose values they take (default: the
-    identity; NaN points give NaN), after a ``displacement_mm`` (ni, nj, nk, 3) of the grid's voxels, LPS, where one is
-    given; ``where`` (ni, nj, nk) are the voxels wanted; ``order`` is 1 for linear, 3 for cubic spline interpolation.
+    A voxel of the grid takes the image's value at the place where ``motion`` (default: the identity) takes its centre,
+    after a ``displacement_mm`` (ni, nj, nk, 3) of the grid's voxels, LPS (NaN gives NaN), where one is given; ``where``
+    (ni, nj, nk) are the voxels wanted; ``order`` is 1 for linear, 3 for cubic spline interpolation.
     """
-    gaps = image.missing.astype(np.float32) if image.missing.any() else None
-    coefficients = fill_missing(image).values
-    if order > 1:
-        coefficients = spline_filter(coefficients, order=order, output=np.float32, mode="mirror")
-    carried = np.full(grid.shape, np.nan, dtype=np.float32)
-    inside = np.ones(grid.shape, dtype=bool) if where is None else where
-    step = max(1, _SLAB_VOXELS // (grid.shape[1] * grid.shape[2]))
-    last = np.array(image.grid.shape) - 1
-    for start in range(0, grid.shape[0], step):
-        wanted = inside[start : start + step]
-        if not wanted.any():
-            continue
-        indices = np.argwhere(wanted).astype(np.float64)
-        indices[:, 0] += start
-        points = grid.points_at(indices)
-        if displacement_mm is not None:
-            points = points + displacement_mm[start : start + step][wanted]
-        at = image.grid.indices_of(points if points_of is None else points_of(points))
-        known = np.all((at >= -1e-6) & (at <= last + 1e-6), axis=1)  # False for NaN as well
-        values = np.full(len(at), np.nan, dtype=np.float32)
-        values[known] = map_coordinates(
-            coefficients, at[known].T, order=order, mode="mirror", prefilter=False, output=np.float32
-        )
-        if gaps is not None:
-            touched = map_coordinates(gaps, at[known].T, order=1, mode="nearest") > 1e-6
-            values[np.flatnonzero(known)[touched]] = np.nan
-        carried[start : start + step][wanted] = values
-    return carried
+    return Carrier(image, order).onto(grid, motion, where, displacement_mm)
+
+
+def sampled(
+    coefficients: Float32Array, grid: Grid, points_mm: FloatArray, motion: Motion, order: int
+) -> FloatArray:  # fmt: skip
+    """Values (n,) of an image where a motion takes points (n, 3) LPS mm; NaN beyond its voxels' centres.
+
+    ``coefficients`` on the image's grid are those of cubic splines with mode "mirror" (``order`` 3), or its values, to
+    be interpolated linearly (1).
+    """
+    per_mm, values = np.ascontiguousarray(grid.index_per_mm @ motion.matrix), np.empty(len(points_mm))
+    sample_values(coefficients, order == 3, points_mm, per_mm, grid.indices_of(motion.translation_mm), values)
+    return values
+
+
+class Carrier:
+    """An image that is carried to other grids more than once; as in `carry`."""
+
+    def __init__(self, image: Image, order: int = 3) -> None:
+        values = fill_missing(image).values
+        self.image, self._cubic = image, order > 1
+        self._values = spline_filter(values, 3, np.float32, "mirror") if self._cubic else np.ascontiguousarray(values)
+        self._gaps = image.missing.astype(np.float32) if image.missing.any() else np.zeros((0, 0, 0), np.float32)
+
+    def onto(
+        self, grid: Grid, motion: Motion | None = None, where: BoolArray | None = None,
+        displacement_mm: npt.ArrayLike | None = None,
+    ) -> Float32Array:  # fmt: skip
+        """Values on a grid."""
+        matrix, shift = (np.eye(3), np.zeros(3)) if motion is None else (motion.matrix, motion.translation_mm)
+        per_mm = np.ascontiguousarray(self.image.grid.index_per_mm @ matrix)
+        step = np.ascontiguousarray(per_mm @ (grid.direction * grid.spacing_mm))
+        start = self.image.grid.indices_of(matrix @ grid.origin_mm + shift)
+        wanted = np.ones(grid.shape, dtype=bool) if where is None else np.ascontiguousarray(where)
+        u = np.zeros((0, 0, 0, 3)) if displacement_mm is None else displacement_mm
+        carried = np.full(grid.shape, np.nan, dtype=np.float32)
+        moved = np.ascontiguousarray(u, dtype=np.float32)
+        carry_values(self._values, self._gaps, self._cubic, wanted, step, start, moved, per_mm, carried)
+        return carried

@@ -1,17 +1,74 @@
 """How alike two images on one grid are: in local structure, beside what their noise allows, and but for an offset."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from dvc.arrays import BoolArray, Float32Array
+from dvc.arrays import Float32Array
 from dvc.images.image import Image, Mask
-from dvc.images.resample import fill_missing
 
 _WINDOW_MM = 2.5
 _BRIGHT = 75.0  # percentile of the tissue that stands for its brightness
 _FEWEST = 1000  # voxels
 _LEAST = 1e-5  # eigenvalue of normal equations, over their trace, below which there is no contrast
 _NOISES = 1.0, 1.5  # times that in the air: parallel imaging and normalised intensities raise it in the tissue
+
+
+class Windows:
+    """Gaussian windows (sigma 2.5 mm) over the voxels of a mask that each of the images ``shown`` on its grid knows."""
+
+    def __init__(self, mask: Mask, *shown: Float32Array) -> None:
+        self.shape, self.box = mask.inside.shape, mask.box()
+        self.known = np.logical_and.reduce([mask.inside[self.box], *(np.isfinite(v[self.box]) for v in shown)])
+        self._sigma = _WINDOW_MM / mask.grid.spacing_mm
+        weight = gaussian_filter(self.known.astype(np.float32), self._sigma, mode="constant")
+        self._weight = np.where(self.known, np.maximum(weight, 1e-3), 1.0)
+
+    def mean(self, values: Float32Array) -> Float32Array:
+        """Local means of values in the box, zero where not known."""
+        return np.asarray(gaussian_filter(values, self._sigma, mode="constant") / self._weight, dtype=np.float32)
+
+    def structure(self, image: Float32Array) -> "Structure":
+        """An image (ni, nj, nk) as the windows see it."""
+        values = np.where(self.known, image[self.box], 0.0).astype(np.float32)
+        scale = max(float(values.std()), 1e-12)
+        values = values / scale
+        mean = self.mean(values)
+        return Structure(values, mean, np.maximum(self.mean(values * values) - mean * mean, 0.0), scale)
+
+    def correlation(self, one: "Structure", other: "Structure") -> tuple[Float32Array, float]:
+        """Local correlation of two images; as in `local_correlation`."""
+        known, cov = self.known, self.mean(one.values * other.values) - one.mean * other.mean
+        variances = [each.variance[known].sum(dtype=np.float64) for each in (one, other)]
+        total = float(np.sqrt(np.prod(variances)))
+        pooled = float(cov[known].sum(dtype=np.float64)) / total if total > 0 else float("nan")
+        whole = np.full(self.shape, np.nan, dtype=np.float32)
+        local = cov / np.sqrt(np.maximum(one.variance * other.variance, 1e-12))
+        whole[self.box] = np.where(known, local, np.nan)
+        return whole, pooled
+
+    def most_similarity(self, one: "Structure", other: "Structure", noise: tuple[float, float]) -> tuple[float, float]:
+        """Pooled local correlation of two images of the same tissue that differ in nothing but their noise.
+
+        sqrt((1 - s_a^2 / v_a) (1 - s_b^2 / v_b)), where s is the standard deviation of an image's noise
+        (`dvc.images.noise.noise_in_air`) and v its mean local variance; with the noise as given, and with half as much
+        again.
+        """
+        variances = [float(each.variance[self.known].mean(dtype=np.float64)) * each.scale**2 for each in (one, other)]
+        shares = [s**2 / max(variance, 1e-12) for s, variance in zip(noise, variances, strict=True)]
+        as_given, more = (float(np.sqrt(np.prod([max(0.0, 1.0 - n**2 * share) for share in shares]))) for n in _NOISES)
+        return as_given, more
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Structure:
+    """An image in the box of `Windows`, over its known voxels' standard deviation: its local mean and variance."""
+
+    values: Float32Array
+    mean: Float32Array
+    variance: Float32Array
+    scale: float
 
 
 def local_correlation(a: Image, carried: Float32Array, mask: Mask) -> tuple[Float32Array, float]:
@@ -24,50 +81,8 @@ def local_correlation(a: Image, carried: Float32Array, mask: Mask) -> tuple[Floa
     pooled : float
         sum(cov) / sqrt(sum(var_a) sum(var_b)) over the mask: one figure, weighted by local structure.
     """
-    (box, known), sigma = _known(a, carried, mask), _WINDOW_MM / a.grid.spacing_mm
-    x = np.where(known, fill_missing(a).values[box], 0.0).astype(np.float32)
-    y = np.where(known, carried[box], 0.0).astype(np.float32)
-    weight = gaussian_filter(known.astype(np.float32), sigma, mode="constant")
-    weight = np.where(known, np.maximum(weight, 1e-3), 1.0)
-
-    def mean(values: Float32Array) -> Float32Array:
-        return np.asarray(gaussian_filter(values, sigma, mode="constant") / weight, dtype=np.float32)
-
-    scale_x, scale_y = max(float(x.std()), 1e-12), max(float(y.std()), 1e-12)
-    x, y = x / scale_x, y / scale_y
-    mx, my = mean(x), mean(y)
-    vx, vy = np.maximum(mean(x * x) - mx * mx, 0.0), np.maximum(mean(y * y) - my * my, 0.0)
-    cov = mean(x * y) - mx * my
-    local = np.where(known, cov / np.sqrt(np.maximum(vx * vy, 1e-12)), np.nan)
-    total = float(np.sqrt(vx[known].sum(dtype=np.float64) * vy[known].sum(dtype=np.float64)))
-    pooled = float(cov[known].sum(dtype=np.float64)) / total if total > 0 else float("nan")
-    whole = np.full(a.grid.shape, np.nan, dtype=np.float32)
-    whole[box] = local
-    return whole, pooled
-
-
-def _known(a: Image, carried: Float32Array, mask: Mask) -> tuple[tuple[slice, ...], BoolArray]:
-    """The mask's box, and the voxels of the mask in it that both images know."""
-    box = mask.box()
-    return box, np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
-
-
-def most_similarity(a: Image, carried: Float32Array, mask: Mask, noise: tuple[float, float]) -> tuple[float, float]:
-    """Pooled local correlation of two images of the same tissue that differ in nothing but their noise.
-
-    sqrt((1 - s_a^2 / v_a) (1 - s_b^2 / v_b)), where s is the standard deviation of an image's noise
-    (`dvc.images.noise.noise_in_air`) and v the mean local variance in the mask, in the windows of `local_correlation`;
-    with the noise as given, and with half as much again.
-    """
-    (box, known), sigma = _known(a, carried, mask), _WINDOW_MM / a.grid.spacing_mm
-    weight = np.maximum(gaussian_filter(known.astype(np.float64), sigma, mode="constant"), 1e-3)
-    shares = []
-    for values, s in zip((fill_missing(a).values, carried), noise, strict=True):
-        x = np.where(known, values[box], 0.0).astype(np.float64)
-        mean, square = (gaussian_filter(part, sigma, mode="constant") / weight for part in (x, x * x))
-        shares.append(s**2 / max(float((square - mean**2)[known].mean()), 1e-12))
-    as_given, more = (float(np.sqrt(np.prod([max(0.0, 1.0 - n**2 * share) for share in shares]))) for n in _NOISES)
-    return as_given, more
+    windows = Windows(mask, a.values, carried)
+    return windows.correlation(windows.structure(a.values), windows.structure(carried))
 
 
 def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float) -> tuple[float, float]:
@@ -79,7 +94,8 @@ def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float)
     percentile of ``carried``), with the noise as given and with half as much again; NaN where the mask has too few
     voxels that both know, or no contrast beyond the noise.
     """
-    box, known = _known(a, carried, mask)
+    box = mask.box()
+    known = np.isfinite(carried[box]) & mask.inside[box] & ~a.missing[box]
     at = np.argwhere(known)
     if len(at) < _FEWEST:
         return float("nan"), float("nan")

@@ -1,11 +1,11 @@
 """Where the body is: a tissue mask made from the image, and masks widened in space."""
 
 import numpy as np
-from numba import njit
-from scipy.ndimage import binary_fill_holes, binary_opening, distance_transform_edt, label
+from numba import njit, prange
+from scipy.ndimage import binary_fill_holes, binary_opening, label
 from skimage.filters import threshold_otsu
 
-from dvc.arrays import BoolArray, IntArray
+from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
 from dvc.images.resample import fill_missing, smoothed
@@ -47,8 +47,39 @@ def bright_voxels(image: Image) -> BoolArray:
 
 def widened(mask: Mask, margin_mm: float) -> Mask:
     """The mask and all voxels within ``margin_mm`` of it."""
-    distance = distance_transform_edt(~mask.inside, sampling=mask.grid.spacing_mm)
-    return Mask(mask.grid, distance <= margin_mm)
+    return Mask(mask.grid, within(mask.inside, mask.grid.spacing_mm, margin_mm))
+
+
+def within(inside: BoolArray, spacing_mm: FloatArray, margin_mm: float) -> BoolArray:
+    """Voxels (ni, nj, nk) whose centres lie within a distance of the centre of one that is inside.
+
+    Exact, by the squares of distances along one axis after the other (T. Saito and J. Toriwaki 1994,
+    doi:10.1016/0031-3203(94)90133-3); for margins of a few voxels faster than a distance transform.
+    """
+    squares = np.where(inside, 0.0, np.inf)  # of the distance along the axes that were looked along, mm2
+    for axis, spacing in enumerate(spacing_mm):
+        away = (np.arange(1, int(margin_mm / spacing + 1e-9) + 1) * spacing) ** 2
+        nearer = np.empty_like(squares)
+        _nearer(np.moveaxis(squares, axis, 0), away, np.moveaxis(nearer, axis, 0))
+        squares = nearer
+    return np.asarray(np.sqrt(squares) <= margin_mm)
+
+
+@njit(parallel=True, cache=True)
+def _nearer(squares: FloatArray, away: FloatArray, nearer: FloatArray) -> None:
+    """The least of each value and of those so many places before and after it along the first axis, plus ``away``."""
+    n = squares.shape[0]
+    for j in prange(squares.shape[1]):
+        for i in range(n):
+            here, onto = squares[i, j], nearer[i, j]
+            for k in range(squares.shape[2]):
+                onto[k] = here[k]
+            for d in range(1, len(away) + 1):
+                for other in (i - d, i + d):
+                    if 0 <= other < n:
+                        there = squares[other, j]
+                        for k in range(squares.shape[2]):
+                            onto[k] = min(onto[k], there[k] + away[d - 1])
 
 
 def _closed(mask: BoolArray, radius: IntArray) -> BoolArray:

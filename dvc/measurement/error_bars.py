@@ -10,8 +10,6 @@ import numpy as np
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.errors import InputError
-from dvc.images.noise import signal_to_noise
-from dvc.images.tissue import tissue_mask
 from dvc.measurement.subject import Subject, is_bones_name
 from dvc.registration.register import Registration
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable, Uncertainty, to_surface_mm, uncertainty_of
@@ -62,17 +60,19 @@ class TwinCheck:
 
 
 def error_bars(
-    found: Registration, subject: Subject, maps: StrainMaps, model: ErrorModel | None, twin: TwinCheck | None = None
-) -> ErrorBars:
+    found: Registration, subject: Subject, maps: StrainMaps, snr: float, model: ErrorModel | None,
+    twin: TwinCheck | None = None,
+) -> ErrorBars:  # fmt: skip
     """Error of a registered load's maximal shear strain, by an error model, the user's own or the preset's.
 
+    ``snr`` is the lower signal-to-noise ratio of the two images (`dvc.images.noise.signal_to_noise`).
     Error bars that do not hold in the pair's twin are made wider.
     """
     grid = maps.grid
     bone, regions = _bone_and_tissues(subject, found.tissue.inside, model)
     try:
         chosen = _model_for(found, model)
-        table = chosen.table_for(*_poorer(found))
+        table = chosen.table_for(_larger_voxel(found), snr)
         if not bone.any():
             raise InputError("The error depends on the distance to bone, and no bone was given.")
     except InputError as reason:
@@ -145,14 +145,9 @@ def _model_for(found: Registration, given: ErrorModel | None) -> ErrorModel:
     return given
 
 
-def _poorer(found: Registration) -> tuple[FloatArray, float]:
-    """The larger voxel, edge by edge, and the lower signal-to-noise ratio of the two images."""
-    spacing = np.maximum(np.sort(found.reference.grid.spacing_mm), np.sort(found.loaded.grid.spacing_mm))
-    ratio = signal_to_noise(found.reference, found.tissue)
-    try:
-        return spacing, min(ratio, signal_to_noise(found.loaded, tissue_mask(found.loaded)))
-    except InputError:  # no threshold finds the body there; the unloaded image has to do
-        return spacing, ratio
+def _larger_voxel(found: Registration) -> FloatArray:
+    """The larger voxel of the two images, edge by edge, mm."""
+    return np.maximum(np.sort(found.reference.grid.spacing_mm), np.sort(found.loaded.grid.spacing_mm))
 
 
 def _bone_and_tissues(

@@ -10,9 +10,9 @@ from dvc.deformation.protocol import RigidMotion, displacement_on_grid
 from dvc.deformation.strain_maps import StrainMaps, strain_maps
 from dvc.errors import InputError
 from dvc.images.image import Image, Mask
-from dvc.images.noise import noise_in_air
-from dvc.images.resample import carry, shows
-from dvc.images.similarity import brightness_offset, local_correlation, most_similarity
+from dvc.images.noise import Noise
+from dvc.images.resample import Carrier, shows
+from dvc.images.similarity import Windows, brightness_offset, local_correlation
 from dvc.images.tissue import tissue_mask
 from dvc.io import result_folder as files
 from dvc.io.images.write import write_image
@@ -77,34 +77,44 @@ def maps_of(found: Registration) -> StrainMaps:
     return strain_maps(found.deformation, found.tissue, lambda x: shows(loaded, motion.apply(x), edge))
 
 
-def carried_images(found: Registration) -> CarriedImages:
+def noise_of(found: Registration) -> tuple[Noise, Noise | None]:
+    """The noise of both images; None for a loaded one in which no threshold finds the body."""
+
+    def body_in(image: Image) -> Mask | None:
+        try:
+            return tissue_mask(image)
+        except InputError:
+            return None
+
+    seen, loaded = body_in(found.reference), body_in(found.loaded)
+    body = None if seen is None else Mask(found.reference.grid, found.tissue.inside | seen.inside)
+    of_loaded = None if loaded is None else Noise.of(found.loaded, loaded)
+    return Noise.of(found.reference, found.tissue, body), of_loaded
+
+
+def carried_images(found: Registration, noise: tuple[Noise, Noise | None]) -> CarriedImages:
     """Carry the loaded image to the unloaded one, and compare them."""
-    reference, loaded, motion, grid = found.reference, found.loaded, found.alignment.motion, found.reference.grid
-    before, aligned = carry(loaded, grid), carry(loaded, grid, motion.apply)
+    reference, motion, grid = found.reference, found.alignment.motion, found.reference.grid
+    loaded = Carrier(found.loaded)
     # Beyond the spline, in the air, the image is shown where the bone's motion alone puts it.
     u = np.nan_to_num(displacement_on_grid(found.displacement, grid), copy=False)
-    registered = carry(loaded, grid, motion.apply, displacement_mm=u)
-    both = Mask(grid, found.tissue.inside & np.isfinite(aligned) & np.isfinite(registered))  # the same voxels for both
+    before, aligned, registered = loaded.onto(grid), loaded.onto(grid, motion), loaded.onto(grid, motion, None, u)
+    del u
     _, as_scanned = local_correlation(reference, before, found.tissue)
-    local_rigid, rigid = local_correlation(reference, aligned, both)
-    local_after, after = local_correlation(reference, registered, both)
-    similarity = Similarity((as_scanned, rigid, after))
-    if (noise := _noise_in_air(found)) is not None:
-        similarity = replace(similarity, possible=most_similarity(reference, registered, both, noise))
+    both = Mask(grid, found.tissue.inside & np.isfinite(aligned) & np.isfinite(registered))  # the same voxels for both
+    windows = Windows(both, reference.values)
+    unloaded, rigid, after = (windows.structure(values) for values in (reference.values, aligned, registered))
+    local_rigid, pooled_rigid = windows.correlation(unloaded, rigid)
+    local_after, pooled_after = windows.correlation(unloaded, after)
+    similarity = Similarity((as_scanned, pooled_rigid, pooled_after))
+    in_air = [None if one is None else one.in_air for one in noise]
+    if in_air[0] is not None and in_air[1] is not None:
+        possible = windows.most_similarity(unloaded, after, (in_air[0], in_air[1]))
+        similarity = replace(similarity, possible=possible)
         if found.settings.engine.sees_brightness:
-            similarity = replace(similarity, offset=brightness_offset(reference, registered, both, noise[0]))
+            offset = brightness_offset(reference, registered, both, in_air[0])
+            similarity = replace(similarity, offset=offset)
     return CarriedImages(aligned, registered, local_rigid, local_after, similarity)
-
-
-def _noise_in_air(found: Registration) -> tuple[float, float] | None:
-    """Noise of both images in the air; None where there is no such air."""
-    reference, loaded = found.reference, found.loaded
-    try:
-        body = Mask(reference.grid, found.tissue.inside | tissue_mask(reference).inside)
-        noise = noise_in_air(reference, body), noise_in_air(loaded, tissue_mask(loaded))
-    except InputError:  # no threshold finds the body
-        return None
-    return None if noise[0] is None or noise[1] is None else (noise[0], noise[1])
 
 
 def quality_of(found: Registration, maps: StrainMaps, similarity: Similarity, evidence: Evidence) -> Quality:

@@ -1,6 +1,7 @@
 """A pair of images as it was measured: arrays, quality, verdict and error bars; written, read and shown."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
@@ -107,12 +108,16 @@ class Measurement:
 
         With ``is_repeat`` the loaded image is a second scan without load, judged by its own strain, the noise floor.
         """
-        more, maps, images = evidence or Evidence(), judgement.maps_of(found), judgement.carried_images(found)
+        more = evidence or Evidence()
+        with ThreadPoolExecutor(1) as pool:  # on two cores: NumPy and SciPy let go of the interpreter
+            strain, noise = pool.submit(judgement.maps_of, found), judgement.noise_of(found)
+            snr = min(one.snr for one in noise if one is not None)
+            drawn = pool.submit(lambda: error_bars(found, subject, strain.result(), snr, more.error_model, more.twin))
+            images, maps, bars = judgement.carried_images(found, noise), strain.result(), drawn.result()
         if is_repeat:
             more = replace(more, noise_floor=noise_floor(maps, subject.soft(found.tissue)))
         quality, alignment = judgement.quality_of(found, maps, images.similarity, more), judgement.alignment_of(found)
         regions = tuple(region_statistics(subject.regions(found.tissue), maps.by_quantity))
-        bars = error_bars(found, subject, maps, more.error_model, more.twin)
         source, at = Source(subject, found.tissue, found, images), subject.lowest_bone_point_mm
         return cls(name, found.deformation, maps, alignment, quality, regions, bars, found.reference, source, at)
 
@@ -315,7 +320,7 @@ class Measurement:
         OutputError
             If it cannot be written.
         """
-        made, pictures, verdict, bars = self._made_from(), self.pictures(), self.verdict, self.error_bars
+        made, verdict, bars = self._made_from(), self.verdict, self.error_bars
         told = self.quality.as_dict() | {"alignment": dict(self.alignment)}
         found = made.registration
         if self.shown_mm is not None:
@@ -324,15 +329,19 @@ class Measurement:
             if chosen := found.choice.as_dict():
                 told["regularisation"] = chosen
             told["error_of_max_shear"] = bars.as_dict()
-        with whole_folder(Path(folder)) as partial:
-            files.write_maps(partial, self.maps, made.subject.axes, verdict)
+        with whole_folder(Path(folder)) as partial, ThreadPoolExecutor(1) as pool:
+            writing = [pool.submit(files.write_maps, partial, self.maps, made.subject.axes, verdict)]
+            if found is not None and made.images is not None:
+                writing.append(pool.submit(judgement.write_images_and_transforms, partial, found, made.images))
+            if bars.uncertainty is not None:
+                sure, grid = bars.uncertainty, self.maps.grid
+                writing.append(pool.submit(files.write_uncertainty, partial, grid, sure, bars.model, verdict))
+            pictures = self.pictures()  # while files are compressed
             write_regions_csv(partial / files.REGIONS, self.regions, verdict)
             if made.subject.mesh is not None:
                 told["mesh"] = files.write_mesh_results(partial, made.subject.mesh, self.deformation, verdict)
-            if found is not None and made.images is not None:
-                judgement.write_images_and_transforms(partial, found, made.images)
-            if bars.uncertainty is not None:
-                files.write_uncertainty(partial, self.maps.grid, bars.uncertainty, bars.model, verdict)
+            for one in writing:
+                one.result()
             write_json(partial / files.QUALITY, told)
             if provenance is not None:
                 write_json(partial / files.PROVENANCE, provenance)

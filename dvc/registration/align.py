@@ -1,12 +1,14 @@
 """Rigid alignment of a loaded image on a bone of the unloaded one.
 
-First a search that cannot be trapped: the bone is placed everywhere in the loaded image in many orientations, at low
-resolution, and normalised correlation is taken by FFT (masked template matching; D. Padfield, Masked object
-registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Gauss-Newton refines the best places
-(`dvc.registration.rigid_fit`); around the best of these, halves of the bone are fitted each by itself, begun to either
-side along each of the six ways to move. Their mean is the result; the largest distance of two is its repeatability.
+Gauss-Newton (`dvc.registration.rigid_fit`) begins where the headers put the bone. Unless that ends where only the bone
+itself can lie, a search follows that cannot be trapped: the bone is placed everywhere in the loaded image in many
+orientations, at low resolution, and normalised correlation is taken by FFT (masked template matching; D. Padfield,
+Masked object registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402); its best places are refined.
+Around the best of all, halves of the bone are fitted each by itself, begun to either side along each of the six ways
+to move. Their mean is the result; the largest distance of two is its repeatability.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal, Self
@@ -19,7 +21,7 @@ from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Composed, Deformation, RigidMotion
 from dvc.errors import InputError, RegistrationError
 from dvc.images.image import Grid, Image, Mask
-from dvc.images.resample import carry, fill_missing, smoothed
+from dvc.images.resample import Carrier, carry, fill_missing, smoothed
 from dvc.images.similarity import local_correlation
 from dvc.images.tissue import widened
 from dvc.registration.rigid_fit import RigidFit, apart_mm
@@ -33,6 +35,7 @@ _ROTATION_LIMIT_DEG = 27.0
 _CANDIDATES = 3
 _SCORE_MARGIN_MM = 2.0
 _SCORE_BLUR_MM = 1.0
+_BLUR_REACH = 4.5  # standard deviations of a blur, beyond which it takes nothing from
 _LOWEST_SIMILARITY = 0.5
 _CERTAIN_SIMILARITY = 0.9
 _LARGEST_SPREAD_MM = 0.5
@@ -81,7 +84,7 @@ class Alignment:
 
 def not_aligned(reference: Image, loaded: Image, mask: Mask) -> Alignment:
     """The alignment that leaves both images where their headers put them."""
-    similarity = _similarity(reference, loaded, mask, RigidMotion.identity())
+    similarity = _Likeness(reference, loaded, mask).at(RigidMotion.identity())
     return Alignment(RigidMotion.identity(), "none", similarity, similarity, float("nan"), np.zeros(3))
 
 
@@ -91,7 +94,7 @@ def refuse_turned_contrast(reference: Image, loaded: Image, tissue: Mask, motion
     Two images of one contrast correlate locally by more than zero even 15 mm apart (phantoms: 0.03 to 0.84), those
     of inverted contrast by as much below zero.
     """
-    _, found = local_correlation(reference, carry(loaded, reference.grid, motion.apply), tissue)
+    _, found = local_correlation(reference, carry(loaded, reference.grid, motion), tissue)
     if found < -_CLEARLY:
         raise RegistrationError(
             f"The local correlation of the two images in the tissue is {found:.2f} before the non-rigid registration, "
@@ -109,20 +112,13 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
     """
     if not mask.inside.any():
         raise InputError("The mask to align on is empty.")
-    fit = RigidFit(reference, loaded, mask, seed)
-    starts, highest = _search(reference, loaded, mask)
-    score, best = -np.inf, RigidMotion.identity()
-    for start in starts:
-        try:
-            motion = fit.whole(start)
-        except RegistrationError:
-            continue  # not the place
-        if (similarity := _similarity(reference, loaded, mask, motion)) > score:
-            score, best = similarity, motion
-        if score >= _CERTAIN_SIMILARITY:
-            break  # only the right place looks like this
-    if score < _LOWEST_SIMILARITY:
-        raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
+    fit, likeness = RigidFit(reference, loaded, mask, seed), _Likeness(reference, loaded, mask)
+    score, best = _best(fit, likeness, [RigidMotion.identity()])
+    if score < _CERTAIN_SIMILARITY:
+        starts, highest = _search(reference, loaded, mask)
+        score, best = max((score, best), _best(fit, likeness, starts), key=lambda found: found[0])
+        if score < _LOWEST_SIMILARITY:
+            raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
     points = mask.points()
     advice = f"the {on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly "
     advice += "inside the loaded one."
@@ -138,7 +134,7 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
     centroid, halves = points.mean(axis=0)[None], [half for pair in pairs for half in pair]
     R = Rotation.from_matrix(np.stack([half.rotation for half in halves])).mean().as_matrix()
     motion = RigidMotion(R, np.mean([half.apply(centroid)[0] for half in halves], axis=0) - R @ centroid[0])
-    before, after = (_similarity(reference, loaded, mask, m) for m in (RigidMotion.identity(), motion))
+    before, after = likeness.at(RigidMotion.identity()), likeness.at(motion)
     return Alignment(motion, on, before, after, spread, motion.displacement(centroid)[0])
 
 
@@ -163,18 +159,43 @@ def without_motion(whole: Deformation, bone: Mask | None) -> tuple[Deformation, 
     return Composed([whole, motion.inverse()]), motion
 
 
-def _similarity(reference: Image, loaded: Image, mask: Mask, motion: RigidMotion) -> float:
-    """Normalised correlation of the slightly blurred images in and 2 mm around the mask; NaN without overlap."""
-    where = widened(mask, _SCORE_MARGIN_MM).inside
-    fixed = smoothed(reference, _SCORE_BLUR_MM).values[where]
-    moved = carry(smoothed(loaded, _SCORE_BLUR_MM), reference.grid, motion.apply, where, order=1)[where]
-    known = np.isfinite(moved) & np.isfinite(fixed)
-    if np.count_nonzero(known) < 0.5 * known.size:
-        return float("nan")
-    a, b = fixed[known].astype(np.float64), moved[known].astype(np.float64)
-    a, b = a - a.mean(), b - b.mean()
-    norm = np.sqrt((a * a).sum() * (b * b).sum())
-    return float((a * b).sum() / norm) if norm > 0 else float("nan")
+def _best(fit: RigidFit, likeness: "_Likeness", starts: Sequence[RigidMotion]) -> tuple[float, RigidMotion]:
+    """The most similar place to which fits from ``starts`` lead, as soon as one is certain; and its similarity."""
+    score, best = -np.inf, RigidMotion.identity()
+    for start in starts:
+        try:
+            motion = fit.whole(start)
+        except RegistrationError:
+            continue  # not the place
+        if (similarity := likeness.at(motion)) > score:
+            score, best = similarity, motion
+        if score >= _CERTAIN_SIMILARITY:
+            break  # only the right place looks like this
+    return score, best
+
+
+class _Likeness:
+    """Normalised correlation of the slightly blurred images in and 2 mm around a mask."""
+
+    def __init__(self, reference: Image, loaded: Image, mask: Mask) -> None:
+        wide = widened(mask, _SCORE_MARGIN_MM)
+        reach = int(np.ceil(_BLUR_REACH * _SCORE_BLUR_MM / mask.grid.spacing_mm.min()))
+        box = wide.box(reach)
+        part = Image(reference.grid.part(box), reference.values[box])
+        self._grid, self._where = part.grid, wide.inside[box]
+        self._fixed = smoothed(part, _SCORE_BLUR_MM).values[self._where]
+        self._loaded = Carrier(smoothed(loaded, _SCORE_BLUR_MM), order=1)
+
+    def at(self, motion: RigidMotion) -> float:
+        """The correlation after a motion; NaN without overlap."""
+        moved = self._loaded.onto(self._grid, motion, self._where)[self._where]
+        known = np.isfinite(moved) & np.isfinite(self._fixed)
+        if np.count_nonzero(known) < 0.5 * known.size:
+            return float("nan")
+        a, b = self._fixed[known].astype(np.float64), moved[known].astype(np.float64)
+        a, b = a - a.mean(), b - b.mean()
+        norm = np.sqrt((a * a).sum() * (b * b).sum())
+        return float((a * b).sum() / norm) if norm > 0 else float("nan")
 
 
 def _why_failed(reference: Image, loaded: Image, mask: Mask, score: float, highest: float, on: AlignOn) -> str:
@@ -209,7 +230,7 @@ def _rotations() -> list[FloatArray]:
 
 
 def _search(reference: Image, loaded: Image, mask: Mask) -> tuple[list[RigidMotion], float]:
-    """The place of the header and the best few others, far enough apart to be different; and the highest score."""
+    """The best few places, far enough apart to be different; and the highest score."""
     scored = sorted(_scored(reference, loaded, mask, _rotations()), key=lambda s: -s[0])
     centre = mask.points().mean(axis=0)[None]
     chosen: list[RigidMotion] = []
@@ -220,7 +241,7 @@ def _search(reference: Image, loaded: Image, mask: Mask) -> tuple[list[RigidMoti
             for other in chosen
         ):
             chosen.append(motion)
-    return [*chosen, RigidMotion.identity()], scored[0][0] if scored else -1.0
+    return chosen, scored[0][0] if scored else -1.0
 
 
 def _scored(
@@ -242,7 +263,7 @@ def _scored(
     found = []
     for rotation in rotations:
         back = RigidMotion.about(centre, rotation.T, np.zeros(3))
-        carried = (carry(image, template_grid, back.apply, order=1) for image in (template, weight))
+        carried = (carry(image, template_grid, back, order=1) for image in (template, weight))
         t, w = (np.nan_to_num(each.astype(np.float64)) for each in carried)
         count = w.sum()
         deviation = t - (t * w).sum() / count

@@ -198,9 +198,8 @@ def _aligned(
         return replace(scan, grid=scan.grid.moved_by(turn.T, np.zeros(3)))
 
     tell("aligning", 0.0)
-    fixed = turned(worker.run("correcting the shading", without_shading, upright))
-    tell("aligning", 0.2)
-    moving = turned(worker.run("correcting the shading", without_shading, loaded.toward_lps()))
+    scans = [upright, loaded.toward_lps()]
+    fixed, moving = map(turned, worker.run("correcting the shading", without_shading, scans, settings.threads))
     tell("aligning", 0.4)
     body, labels = turned(body.toward_lps()), labels and turned(labels.toward_lps())
     on = settings.align_on

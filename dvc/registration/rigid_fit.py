@@ -12,18 +12,19 @@ between voxels, which correlates with the noise beside it: the gradient of the u
 difference of two neighbours, is correlated neither with the voxel between them nor with the neighbours' mean.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
-from scipy.ndimage import binary_erosion, convolve, map_coordinates, spline_filter
+from scipy.ndimage import binary_erosion, convolve, spline_filter
 from scipy.spatial.transform import Rotation
 
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.protocol import RigidMotion
 from dvc.errors import InputError, RegistrationError
 from dvc.images.image import Grid, Image, Mask
-from dvc.images.resample import fill_missing, smoothed, thinned
+from dvc.images.resample import fill_missing, sampled, smoothed, thinned
 
 _BLURS_MM = (4.0, 2.0, 1.0, 0.0)
 _FINE_FROM = 1  # of these, for fits that begin near the end
@@ -57,6 +58,11 @@ class _Level:
     changes: FloatArray  # (n, 6), grad I0 . d for unit steps of the six unknowns
     scene: Image  # the loaded image, as coefficients of splines
     order: int  # of these splines
+
+    def part(self, which: BoolArray) -> Self:
+        """The same with some of the points, (n,)."""
+        names = ("points", "values", "around", "places", "changes")
+        return self if which.all() else replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
 class RigidFit:
@@ -140,32 +146,29 @@ class RigidFit:
 
     def _settled(self, motion: RigidMotion, levels: list[_Level], parts: list[BoolArray]) -> RigidMotion:
         """Where steps over some of each level's points, one level after the other, come to rest."""
-        for level, part in zip(levels, parts, strict=True):
-            small = max(_SMALL_MM, _SMALL_SHARE * level.blur_mm)
+        for whole, which in zip(levels, parts, strict=True):
+            level, small = whole.part(which), max(_SMALL_MM, _SMALL_SHARE * whole.blur_mm)
             for _ in range(_STEPS):
-                step = self._next(level, motion, part)
+                step = self._next(level, motion)
                 length = float(np.linalg.norm(step))
                 motion = motion.after(self._step(step * min(1.0, _LONGEST_MM / max(length, 1e-12))))
                 if length < small:
                     break
         return motion
 
-    def _next(self, level: _Level, motion: RigidMotion, part: BoolArray) -> FloatArray:
+    def _next(self, level: _Level, motion: RigidMotion) -> FloatArray:
         """The next step (6,), mm: along the axes, and turns about them times the mask's radius."""
-        moved = motion.apply(level.points[part])
-        at = level.scene.grid.indices_of(moved).T
-        last = np.array(level.scene.grid.shape)[:, None] - 1
-        shown = np.all((at >= 0) & (at <= last), axis=0)
+        carried = sampled(level.scene.values, level.scene.grid, level.points, motion, level.order)
+        shown = ~np.isnan(carried)
         if self._gaps is not None:
-            here = self._gaps.grid.indices_of(moved[shown]).T
-            shown[shown] = map_coordinates(self._gaps.values, here, order=1, mode="nearest") < 1e-6
+            shown &= sampled(self._gaps.values, self._gaps.grid, level.points, motion, order=1) < 1e-6
         if np.count_nonzero(shown) < _LEAST_SHOWN * len(shown):
             raise RegistrationError("The bone leaves the loaded image.")
-        carried = map_coordinates(level.scene.values, at[:, shown], order=level.order, prefilter=False, mode="mirror")
-        values, places, changes = level.values[part][shown], level.places[part][shown], level.changes[part][shown]
+        level, carried = level.part(shown), carried[shown]
+        values, places, changes = level.values, level.places, level.changes
         if not ((values - values.mean()) * (carried - carried.mean())).sum() > 0.0:
             raise RegistrationError("What is brighter in the unloaded image is not brighter in the loaded one.")
-        both = values, level.around[part][shown]
+        both = values, level.around
         columns, by = (np.column_stack([places * seen[:, None], np.ones(len(seen))]) for seen in both)
         found = _regressed(columns, carried, by)
         gain = np.einsum("ni,i->n", places, found[:-1])

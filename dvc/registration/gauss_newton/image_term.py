@@ -13,8 +13,9 @@ from numba import njit, prange
 from scipy.ndimage import binary_dilation, gaussian_filter, spline_filter
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from dvc.deformation.bspline import Table, spline_basis
+from dvc.deformation.bspline import Table
 from dvc.images.image import Grid, Image
+from dvc.images.interpolation import cubic_at
 from dvc.images.resample import fill_missing
 from dvc.registration.gauss_newton.spline_sums import SplineSums, plane_sums
 
@@ -128,29 +129,7 @@ def _interpolated(image: Float32Array, gaps: BoolArray, x: float, y: float, z: f
         return np.nan
     if gaps[int(x + 0.5), int(y + 0.5), int(z + 0.5)]:
         return np.nan
-    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-    a, _ = spline_basis(x - i)
-    b, _ = spline_basis(y - j)
-    c, _ = spline_basis(z - k)
-    total = 0.0
-    for p in range(4):
-        ip = abs(i - 1 + p)
-        ip = ip if ip < ni else 2 * ni - 2 - ip
-        plane = 0.0
-        for q in range(4):
-            jq = abs(j - 1 + q)
-            jq = jq if jq < nj else 2 * nj - 2 - jq
-            if 1 <= k < nk - 2:
-                row = image[ip, jq]
-                line = c[0] * row[k - 1] + c[1] * row[k] + c[2] * row[k + 1] + c[3] * row[k + 2]
-            else:
-                line = 0.0
-                for r in range(4):
-                    kr = abs(k - 1 + r)
-                    line += c[r] * image[ip, jq, kr if kr < nk else 2 * nk - 2 - kr]
-            plane += b[q] * line
-        total += a[p] * plane
-    return total
+    return float(cubic_at(image, x, y, z))
 
 
 @njit(parallel=True, cache=True)

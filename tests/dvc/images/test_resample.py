@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 
-from dvc.deformation.protocol import RigidMotion
+from dvc.deformation.protocol import Affine, RigidMotion
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import carry, fill_missing, shows, smoothed
 from dvc.images.shading import without_shading
@@ -25,9 +25,9 @@ def test_a_linear_image_is_carried_exactly_and_is_nan_outside(order):
     image = Image(GRID, linear(GRID.points()))
     fine = Grid((12, 12, 12), np.full(3, 0.7), np.array([0.0, 8.0, 14.0]))
     shift = np.array([0.3, -0.4, 0.9])
-    got = carry(image, fine, lambda X: X + shift, order=order)
+    got = carry(image, fine, Affine(np.eye(3), shift), order=order)
     np.testing.assert_allclose(got, linear(fine.points() + shift), rtol=2e-3 if order == 3 else 1e-6)
-    beyond = carry(image, GRID, lambda X: X + np.array([5.0, 0.0, 0.0]), order=order)
+    beyond = carry(image, GRID, Affine(np.eye(3), np.array([5.0, 0.0, 0.0])), order=order)
     assert np.isnan(beyond[-4:]).all()
     assert np.isfinite(beyond[:14]).all()
 
@@ -35,10 +35,10 @@ def test_a_linear_image_is_carried_exactly_and_is_nan_outside(order):
 @pytest.mark.parametrize("order", [1, 3])
 def test_a_gap_is_nan_and_bends_nothing_beside_it(order):
     values = linear(GRID.points())
-    whole = carry(Image(GRID, values), GRID, lambda X: X + 0.4, order=order)
+    whole = carry(Image(GRID, values), GRID, Affine(np.eye(3), np.full(3, 0.4)), order=order)
     values[:6] = np.nan
     holed = Image(GRID, values)
-    got = carry(holed, GRID, lambda X: X + 0.4, order=order)
+    got = carry(holed, GRID, Affine(np.eye(3), np.full(3, 0.4)), order=order)
     assert np.isnan(got[:6]).all()
     np.testing.assert_allclose(got[9:-1, :-1, :-1], whole[9:-1, :-1, :-1], rtol=3e-3)
     seen = shows(holed, GRID.points()[2:9].reshape(-1, 3)).reshape(7, 18, 16)
@@ -79,7 +79,8 @@ def test_shading_is_removed_whatever_the_images_zero(offset):
     tissue = np.where(body, np.where(random.random(grid.shape) < 0.5, 100.0, 60.0), 0.0)
     field = 1.0 + 0.3 * (X[..., 0] - 0.5) + 0.2 * np.sin(3.0 * X[..., 1])
     noisy = tissue * field + random.normal(scale=1.0, size=grid.shape)
-    corrected = without_shading(Image(grid, noisy + offset)).values - offset
+    (whole,) = without_shading([Image(grid, noisy + offset)])
+    corrected = whole.values - offset
 
     def unevenness(values: np.ndarray) -> float:
         bright = body & (tissue == 100.0)
@@ -90,8 +91,9 @@ def test_shading_is_removed_whatever_the_images_zero(offset):
     try:
         for threads in (1, 2, 4):
             sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(threads)
-            again = without_shading(Image(grid, noisy + offset)).values - offset
-            assert np.array_equal(again, corrected)
+            for again in without_shading([Image(grid, noisy + offset)] * 2, threads):
+                assert np.array_equal(again.values, whole.values)
+            assert sitk.ProcessObject.GetGlobalDefaultNumberOfThreads() == threads
     finally:
         sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(usual)
 

@@ -160,7 +160,7 @@ def test_row_9_another_centre_is_no_obstacle(small_pair):
 
 
 def aligned(reference: Image, loaded: Image, bone: Mask) -> Alignment:
-    return align(without_shading(reference), without_shading(loaded), bone, "bone", 1)
+    return align(*without_shading([reference, loaded]), bone, "bone", 1)
 
 
 @pytest.mark.parametrize("noise", [0.0, 3.0])

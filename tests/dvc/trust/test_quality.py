@@ -12,7 +12,7 @@ from dvc.deformation.protocol import Affine, RigidMotion, SampledDisplacement, W
 from dvc.deformation.strain_maps import strain_maps
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.noise import noise_in_air
-from dvc.images.similarity import brightness_offset, local_correlation, most_similarity
+from dvc.images.similarity import Windows, brightness_offset, local_correlation
 from dvc.report.page import shown
 from dvc.trust.assessment import Similarity, assess
 from dvc.trust.quality import NoiseFloor, noise_floor
@@ -96,7 +96,10 @@ def test_noise_says_how_alike_two_scans_can_be():
     first, again, another = scan(one), scan(one), scan(other)
     noise = noise_in_air(first, mask), noise_in_air(again, mask)
     assert noise == pytest.approx((12.0, 12.0), rel=0.02)
-    most, with_more_noise = most_similarity(first, again.values, mask, noise)
+    windows = Windows(mask, first.values, again.values)
+    most, with_more_noise = windows.most_similarity(
+        windows.structure(first.values), windows.structure(again.values), noise
+    )
     assert 0.8 < most < 0.97
     assert local_correlation(first, again.values, mask)[1] == pytest.approx(most, abs=0.02)
     assert local_correlation(first, another.values, mask)[1] < with_more_noise - 0.3

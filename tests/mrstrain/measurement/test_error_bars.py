@@ -13,7 +13,7 @@ from scipy.stats import foldnorm
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Image, LabelMap, Mask
 from dvc.measurement.error_bars import TwinCheck, error_bars
-from dvc.measurement.judgement import with_caution
+from dvc.measurement.judgement import noise_of, with_caution
 from dvc.measurement.page import error_tables
 from dvc.measurement.subject import Subject
 from dvc.registration.elastix.engine import Elastix
@@ -58,9 +58,14 @@ def given(with_labels: bool = True, with_bone: bool = True):
     return found, subject, maps
 
 
+def bars_of(found, subject, maps, model, twin=None):
+    snr = min(one.snr for one in noise_of(found) if one is not None)
+    return error_bars(found, subject, maps, snr, model, twin)
+
+
 def test_every_bone_is_left_out_whatever_its_name() -> None:
     found, subject, maps = given()
-    bars = error_bars(found, subject, maps, model())
+    bars = bars_of(found, subject, maps, model())
     assert bars.uncertainty is not None
     assert {i.region for i in bars.uncertainty.intervals} == {"fat"}
     known = np.isfinite(bars.uncertainty.sigma)
@@ -71,7 +76,7 @@ def test_every_bone_is_left_out_whatever_its_name() -> None:
 
 def test_without_labels_all_but_bone_is_soft_tissue() -> None:
     found, subject, maps = given(with_labels=False)
-    bars = error_bars(found, subject, maps, model())
+    bars = bars_of(found, subject, maps, model())
     assert bars.uncertainty is not None
     assert {i.region for i in bars.uncertainty.intervals} == {POOLED}
     assert np.nanmax(np.abs(bars.uncertainty.sigma - 0.03)) < 1e-6
@@ -89,7 +94,7 @@ def test_without_labels_all_but_bone_is_soft_tissue() -> None:
 )
 def test_where_the_error_is_not_known_the_reason_is_told(used: ErrorModel, labels: bool, bone: bool, says: str) -> None:
     found, subject, maps = given(labels, bone)
-    bars = error_bars(found, subject, maps, used)
+    bars = bars_of(found, subject, maps, used)
     assert bars.uncertainty is None
     assert says in bars.told
     assert bars.as_dict() == {"known": False, "reason": bars.told}
@@ -102,7 +107,7 @@ def test_a_muscle_named_after_a_bone_is_no_bone() -> None:
     assert subject.labels is not None
     names = {1: "Calcaneus", 2: "Tibialis posterior", 3: "ankle fat"}
     subject = replace(subject, labels=replace(subject.labels, names=names))
-    bars = error_bars(found, subject, maps, model())
+    bars = bars_of(found, subject, maps, model())
     assert bars.uncertainty is not None
     assert {i.region for i in bars.uncertainty.intervals} == {"Tibialis posterior", "ankle fat"}
 
@@ -112,19 +117,19 @@ def test_the_noisier_image_counts() -> None:
     random = np.random.default_rng(1)
     noise = 60.0 * random.standard_normal((2, *GRID.shape))
     found.loaded = Image(GRID, np.hypot(found.reference.values + noise[0], noise[1]).astype(np.float32))
-    assert "too far" in error_bars(found, subject, maps, model()).told
+    assert "too far" in bars_of(found, subject, maps, model()).told
 
 
 def test_several_stages_have_no_known_error() -> None:
     found, subject, maps = given()
     found.settings = Settings(Elastix((load_preset("heel-mr"), load_preset("heel-mr"))))
-    assert "several stages" in error_bars(found, subject, maps, model()).told
+    assert "several stages" in bars_of(found, subject, maps, model()).told
 
 
 def test_a_preset_without_a_model_is_told() -> None:
     found, subject, maps = given()
     found.settings = Settings(Elastix((replace(load_preset("heel-mr"), name="mine"),)))
-    bars = error_bars(found, subject, maps, error_model_of("mine"))
+    bars = bars_of(found, subject, maps, error_model_of("mine"))
     assert "mine has not been measured" in bars.told
 
 
@@ -132,16 +137,16 @@ def test_the_error_of_our_engine_is_that_of_its_own_weights() -> None:
     found, subject, maps = given()
     found.settings = Settings.of("gauss-newton")
     own = model("gauss-newton", text=found.settings.engine.text)
-    assert error_bars(found, subject, maps, own).uncertainty is not None
-    assert "that of heel-mr" in error_bars(found, subject, maps, model()).told
+    assert bars_of(found, subject, maps, own).uncertainty is not None
+    assert "that of heel-mr" in bars_of(found, subject, maps, model()).told
     found.unlike_study = "This pair is unlike any phantom."
-    assert error_bars(found, subject, maps, own).told == found.unlike_study
+    assert bars_of(found, subject, maps, own).told == found.unlike_study
     found.settings = Settings(GaussNewton(bending=2.0))
-    assert "fixed at 2/mm" in error_bars(found, subject, maps, own).told
+    assert "fixed at 2/mm" in bars_of(found, subject, maps, own).told
     found.settings, found.unlike_study = Settings(GaussNewtonWithInterfaces()), ""
-    assert "gauss-newton-borders was used" in error_bars(found, subject, maps, own).told
+    assert "gauss-newton-borders was used" in bars_of(found, subject, maps, own).told
     with_interfaces = model("gauss-newton-borders", text=found.settings.engine.text)
-    assert error_bars(found, subject, maps, with_interfaces).uncertainty is not None
+    assert bars_of(found, subject, maps, with_interfaces).uncertainty is not None
 
 
 def test_an_error_model_is_for_pairs_like_those_of_its_study() -> None:
@@ -174,8 +179,8 @@ def test_error_bars_that_hold_in_the_pairs_twin_stay_and_others_are_made_wider(s
     errors = foldnorm(0.02 / sd, scale=sd)
     claimed = np.hypot(0.02, 0.02)
     found, subject, maps = given()
-    bars = error_bars(found, subject, maps, model(), twin_of(maps, sd, 0.02))
-    alone = error_bars(found, subject, maps, model())
+    bars = bars_of(found, subject, maps, model(), twin_of(maps, sd, 0.02))
+    alone = bars_of(found, subject, maps, model())
     (row,) = bars.twin
     assert row.region == "fat"
     assert row.held == pytest.approx(errors.cdf(1.96 * claimed), abs=0.01)
@@ -209,11 +214,11 @@ def test_error_bars_that_hold_in_the_pairs_twin_stay_and_others_are_made_wider(s
 def test_a_percentile_outside_of_its_interval_makes_error_bars_wider_though_voxels_hold() -> None:
     found, subject, maps = given()
     # voxels are off by two deviations all alike: each is within what is claimed of it, and the median is not
-    bars = error_bars(found, subject, maps, model(), twin_of(maps, 0.0, 0.04))
+    bars = bars_of(found, subject, maps, model(), twin_of(maps, 0.0, 0.04))
     (row,) = bars.twin
     assert row.held == 1.0
     assert row.factor > 1.4
-    alone = error_bars(found, subject, maps, model())
+    alone = bars_of(found, subject, maps, model())
     for now, before in zip(bars.uncertainty.intervals, alone.uncertainty.intervals, strict=True):
         assert now.high - now.low >= before.high - before.low
 
@@ -222,7 +227,7 @@ def test_voxels_that_only_the_twin_has_do_not_count() -> None:
     found, subject, maps = given()
     twin = twin_of(maps, 0.01, 0.02)
     maps.max_shear[:, :, :24] = np.nan  # the loaded scan ends there: what is left is the stronger part
-    (row,) = error_bars(found, subject, maps, model(), twin).twin
+    (row,) = bars_of(found, subject, maps, model(), twin).twin
     assert row.factor == 1.0
 
 
@@ -248,7 +253,7 @@ def test_a_model_as_it_was_made_is_seldom_doubted() -> None:
 
 def test_without_an_error_model_the_twin_tells_the_least_error() -> None:
     found, subject, maps = given()
-    bars = error_bars(found, subject, maps, None, twin_of(maps, 0.05))
+    bars = bars_of(found, subject, maps, None, twin_of(maps, 0.05))
     assert bars.uncertainty is None
     (row,) = bars.twin
     assert (row.held, row.factor) == (None, None)
@@ -256,7 +261,7 @@ def test_without_an_error_model_the_twin_tells_the_least_error() -> None:
     (table,) = error_tables(bars)
     assert table.columns == ("region", "error (rms)", "bias")
     assert bars.of_twin.startswith("not known; the twin of this pair came back with an error (rms) of fat 0.05")
-    failed = error_bars(found, subject, maps, model(), TwinCheck(None, "The deformation folds."))
+    failed = bars_of(found, subject, maps, model(), TwinCheck(None, "The deformation folds."))
     assert failed.twin == ()
     assert failed.of_twin == "there is no twin of this pair. The deformation folds."
     assert failed.uncertainty is not None

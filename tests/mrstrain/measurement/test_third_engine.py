@@ -78,8 +78,8 @@ def without_bias_field(monkeypatch):
     monkeypatch.setattr("dvc.registration.register.without_shading", unchanged)
 
 
-def unchanged(image: Image) -> Image:
-    return image
+def unchanged(images: list[Image], threads: int) -> list[Image]:
+    return images
 
 
 BODY = Mask(GRID, block(np.zeros(3, dtype=int)).values > 50.0)

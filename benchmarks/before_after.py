@@ -1,0 +1,92 @@
+"""Time, memory and results of `mrstrain register` in two source trees, side by side.
+
+    git worktree add ../before COMMIT
+    python -m benchmarks.before_after --before ../before --sizes 64 128 256 --out benchmarks/results/before_after.json
+
+Heel phantom 1 under load, in n^3 voxels with noise of their own, with and without the label map, as a command of its
+own on all cores: each round runs the command of the tree before and of this one, in turn. Wall and processor time of
+all its processes, the peak of their memory (Linux only), the median over rounds of the ratios of time, and the root
+mean square difference of the maximal shear in all voxels where both measure it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.memory import peak_kib
+from benchmarks.register_scaling import written
+from dvc import read_image
+from mrstrain.records.provenance import versions
+from phantoms import heel_pair
+
+HERE = Path(__file__).resolve().parents[1]
+
+
+def run(tree: Path, folder: Path, labels: bool, out: Path) -> dict[str, float]:
+    """One run of the command with a tree's code."""
+    command = [sys.executable, "-m", "mrstrain", "register", "Load0.nii.gz", "Load1.nii.gz"]
+    command += ["--bone", "bone.nii.gz", "--out", str(out)]
+    command += ["--labels", "tissues.nii.gz", "--names", "tissues.csv"] if labels else []
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    process = subprocess.Popen(
+        command, cwd=folder, env=os.environ | {"PYTHONPATH": str(tree)}, stdout=subprocess.DEVNULL
+    )
+    peak = peak_kib(process)
+    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if process.returncode:
+        raise RuntimeError(f"{' '.join(command)} in {tree} ended with status {process.returncode}")
+    processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"wall_s": round(wall, 2), "processor_s": round(processor, 2), "peak_gib": round(peak / 2**20, 2)}
+
+
+def compared(before: Path, count: int, labels: bool, rounds: int) -> dict[str, object]:
+    """Both trees on one pair, in turn; the first round of each only warms its compiled kernels and caches."""
+    trees = {"before": before, "after": HERE}
+    runs: dict[str, list[dict[str, float]]] = {name: [] for name in trees}
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        written(heel_pair(seed=1, load=0.6), count, folder)
+        for number in range(rounds + 1):
+            for name, tree in trees.items():
+                one = run(tree, folder, labels, folder / name)
+                if number:
+                    runs[name].append(one)
+        shear = [read_image(folder / name / "Load1" / "max_shear.nii.gz", allow_missing=True).values for name in trees]
+    both = np.isfinite(shear[0]) & np.isfinite(shear[1])
+    ratios = {
+        key: round(float(np.median([b[key] / a[key] for b, a in zip(*runs.values(), strict=True)])), 2)
+        for key in ("wall_s", "processor_s", "peak_gib")
+    }
+    return {
+        "voxels": count**3, "labels": labels, **runs, "before_over_after": ratios,
+        "rms_difference_of_max_shear": float(np.sqrt(np.mean((shear[0][both] - shear[1][both]) ** 2.0))),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--before", type=Path, required=True)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    done: list[dict[str, object]] = []
+    for count in given.sizes:
+        for labels in (False, True):
+            done.append(compared(given.before.resolve(), count, labels, given.rounds))
+            print(json.dumps(done[-1]), flush=True)
+            given.out.write_text(json.dumps({"versions": versions(), "cores": os.cpu_count(), "runs": done}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
