@@ -112,7 +112,7 @@ class BSpline:
         Where the grid's axes are those of the control grid, up to order and direction, the sums are done
         axis by axis; else point by point. Both give the same to rounding. InputError if the shapes differ.
         """
-        where = np.ascontiguousarray(where, dtype=np.bool_)
+        where = frozen(where, np.bool_)
         if where.shape != grid.shape:
             raise InputError(f"The mask 'where' has shape {where.shape}; its grid has {grid.shape}.")
         placed = self._axis_indices(grid)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter
 
-from dvc.arrays import BoolArray, Float32Array, FloatArray
+from dvc.arrays import BoolArray, Float32Array, FloatArray, frozen
 from dvc.images.image import Grid, Image
 from dvc.images.interpolation import carry_values, sample_values
 
@@ -86,7 +86,9 @@ def sampled(
     be interpolated linearly (1).
     """
     per_mm, values = np.ascontiguousarray(grid.index_per_mm @ motion.matrix), np.empty(len(points_mm))
-    sample_values(coefficients, order == 3, points_mm, per_mm, grid.indices_of(motion.translation_mm), values)
+    sample_values(
+        frozen(coefficients, np.float32), order == 3, points_mm, per_mm, grid.indices_of(motion.translation_mm), values
+    )
     return values
 
 
@@ -96,7 +98,7 @@ class Carrier:
     def __init__(self, image: Image, order: int = 3) -> None:
         values = fill_missing(image).values
         self.image, self._cubic = image, order > 1
-        self._values = spline_filter(values, 3, np.float32, "mirror") if self._cubic else np.ascontiguousarray(values)
+        self._values = frozen(spline_filter(values, 3, np.float32, "mirror") if self._cubic else values, np.float32)
         self._gaps = image.missing.astype(np.float32) if image.missing.any() else np.zeros((0, 0, 0), np.float32)
 
     def onto(

@@ -1,7 +1,7 @@
 """Where the body is: a tissue mask made from the image, and masks widened in space."""
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy.ndimage import binary_fill_holes, binary_opening, label
 from skimage.filters import threshold_otsu
 
@@ -65,11 +65,11 @@ def within(inside: BoolArray, spacing_mm: FloatArray, margin_mm: float) -> BoolA
     return np.asarray(np.sqrt(squares) <= margin_mm)
 
 
-@njit(parallel=True, cache=True)
+@njit(cache=True)
 def _nearer(squares: FloatArray, away: FloatArray, nearer: FloatArray) -> None:
     """The least of each value and of those so many places before and after it along the first axis, plus ``away``."""
     n = squares.shape[0]
-    for j in prange(squares.shape[1]):
+    for j in range(squares.shape[1]):
         for i in range(n):
             here, onto = squares[i, j], nearer[i, j]
             for k in range(squares.shape[2]):

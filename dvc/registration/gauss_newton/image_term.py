@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit, prange
 from scipy.ndimage import binary_dilation, gaussian_filter, spline_filter
 
-from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
 from dvc.deformation.bspline import Table
 from dvc.images.image import Grid, Image
 from dvc.images.interpolation import cubic_at
@@ -55,7 +55,8 @@ class ImagePair:
     ) -> None:  # fmt: skip
         self.grid, self.block = fixed.grid, block
         missing = fixed.missing
-        self.inside = inside & ~binary_dilation(missing) if missing.any() else inside
+        # Read-only and in C order, as images are: of each kind of array a kernel is compiled anew.
+        self.inside = frozen(inside & ~binary_dilation(missing) if missing.any() else inside, np.bool_)
         self._fixed = np.ascontiguousarray(fill_missing(fixed).values)
         filled = fill_missing(moving).values
         splines = np.ascontiguousarray(spline_filter(filled, order=3, mode="mirror", output=np.float32))

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit, prange
 from scipy.sparse import csr_array
 
-from dvc.arrays import BoolArray, FloatArray
+from dvc.arrays import BoolArray, FloatArray, frozen
 from dvc.deformation.bspline import Axis, Table, spline_table
 from dvc.images.image import Grid
 
@@ -36,7 +36,7 @@ class SplineSums:
         self, control: Grid, along: Sequence[FloatArray], inside: BoolArray, factors: FloatArray | None = None
     ) -> None:
         self.control = control
-        self.inside = np.ascontiguousarray(inside)
+        self.inside = frozen(inside, np.bool_)
         self.factors = _ALONE if factors is None else factors
         rows = [spline_table(np.ascontiguousarray(t), n) for t, n in zip(along, control.shape, strict=True)]
         i, j, k = ((first, value, slope / h) for (first, value, slope), h in zip(rows, control.spacing_mm, strict=True))
