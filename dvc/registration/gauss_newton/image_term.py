@@ -20,6 +20,7 @@ from dvc.images.resample import fill_missing
 from dvc.registration.gauss_newton.spline_sums import SplineSums, plane_sums
 
 _GAIN_MM = 10.0
+_FINE = 3.0  # blocks: a window of a larger standard deviation is laid on coarser ones
 _CUBE = 4  # voxels; finer halves share the noise of neighbours through gradients and interpolation
 
 _Scene = tuple[Float32Array, BoolArray, FloatArray, FloatArray]
@@ -101,9 +102,7 @@ class ImagePair:
             coefficients, self.inside, self.sums.table, self.sums.factors, self._fixed, self._scene, self._step,
             self.block, self._carried, both, own,
         )  # fmt: skip
-        sigma = _GAIN_MM / (self.block * self.grid.spacing_mm)
-        smooth = gaussian_filter(own, sigma, mode="constant")
-        gain = gaussian_filter(both, sigma, mode="constant") / np.maximum(smooth, 1e-9 * smooth.max() + 1e-30)
+        gain = _gain(both, own, _GAIN_MM / (self.block * self.grid.spacing_mm))
         matrix, sums = np.zeros((*shape, 6)), np.zeros((shape[0], 2))
         half = np.zeros((self.grid.shape[0], coefficients.shape[0], 2, *self.sums.control.shape[1:]))
         _normal(
@@ -112,6 +111,33 @@ class ImagePair:
         )  # fmt: skip
         square, count = sums.sum(axis=0)
         return Normal(matrix, self.sums.closed(half), float(square), int(count))
+
+
+def _gain(both: FloatArray, own: FloatArray, sigma: FloatArray) -> FloatArray:
+    """The gain at blocks: sums of I0 I1 over sums of I0 I0, each in a Gaussian window of so many blocks.
+
+    Where that is wide, windows are laid on coarser blocks, and the gain is linear between their centres.
+    """
+    times = np.maximum((sigma / _FINE).astype(int), 1)
+    shape = own.shape
+
+    def windowed(sums: FloatArray) -> FloatArray:
+        padded = np.pad(sums, [(0, -n % t) for n, t in zip(shape, times, strict=True)])
+        i, j, k = padded.shape // times
+        coarse = padded.reshape(i, times[0], j, times[1], k, times[2]).sum(axis=(1, 3, 5))
+        return np.asarray(gaussian_filter(coarse, sigma / times, mode="constant"))
+
+    smooth = windowed(own)
+    gain = windowed(both) / np.maximum(smooth, 1e-9 * smooth.max() + 1e-30)
+    for axis, (count, t) in enumerate(zip(shape, times, strict=True)):
+        if t == 1:
+            continue
+        last = gain.shape[axis] - 1
+        at = np.clip((np.arange(count) + 0.5) / t - 0.5, 0.0, last)
+        low = np.minimum(at.astype(int), max(last - 1, 0))
+        share = (at - low).reshape([-1 if a == axis else 1 for a in range(3)])
+        gain = (1.0 - share) * gain.take(low, axis) + share * gain.take(np.minimum(low + 1, last), axis)
+    return np.ascontiguousarray(gain)
 
 
 def _gaps(image: Image, rim_mm: float) -> BoolArray:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from scipy.ndimage import map_coordinates
 
 from dvc.arrays import BoolArray, FloatArray
@@ -74,6 +75,7 @@ class Level:
         self._tissue = _share_at(control, soft | stiff, grid)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0
+        self._diagonals: dict[str, FloatArray] = {}
         self._between = []  # neighbours in soft tissue: the volume that their difference stands for, over its length^2
         self._alone = np.zeros_like(self._soft)  # what a change of volume in one block alone costs by its gradient
         for axis, length in enumerate(block * grid.spacing_mm):
@@ -88,10 +90,7 @@ class Level:
 
     def at(self, coefficients: FloatArray, halves: int = -1) -> State:
         """The state at a displacement; of the voxels all (-1) or one half (0, 1), as in `ImagePair.normal`."""
-        F = self.pair.blocks.evaluate(coefficients)[1] + np.eye(3)
-        cofactor = cofactors(F)
-        J = np.einsum("...a,...a->...", F[..., 0, :], cofactor[..., 0, :])
-        pulled = cofactor / np.maximum(J, _FLATTEST)[..., None, None]
+        F, cofactor, J, pulled = strained(self.pair.blocks.evaluate(coefficients)[1])
         images = self.pair.normal(coefficients, pulled, halves)
         if images.count == 0 or not np.isfinite(images.square):
             raise RegistrationError("The registration diverged: the two images no longer have a voxel in common.")
@@ -123,8 +122,7 @@ class Level:
         volume, shear = weights.volume * self._soft, weights.rigidity * self._stiff
         stiffness: Stiffness = (state.images.matrix / variance, state.cofactor, volume, shear)
         force = state.images.force / variance - self.prior_gradient(state, weights)
-        alone = volume + weights.volume_gradient * self._alone
-        diagonal = self.pair.blocks.diagonal((stiffness[0], state.cofactor, alone, shear))
+        diagonal = self.pair.blocks.diagonal(stiffness[0]) + self._prior_diagonal(weights)
         for spline, rough in enumerate(self.roughness.diagonals):
             for entry in (6 * spline, 6 * spline + 3, 6 * spline + 5):
                 diagonal[entry] += weights.bending * rough
@@ -141,6 +139,20 @@ class Level:
 
         inverse = np.concatenate([_inverted(own) for own in np.split(diagonal, len(diagonal) // 6)])
         return conjugate_gradients(product, force, inverse, *solver)
+
+    def _prior_diagonal(self, weights: Weights) -> FloatArray:
+        """The part of the prior's blocks that does not change from step to step; as `SplineSums.diagonal`."""
+        out = weights.volume * self._diagonal_of("volume", "soft")
+        if weights.rigidity and self._resists.any():
+            out += weights.rigidity * self._diagonal_of("shear", "stiff")
+        if weights.volume_gradient:
+            out += weights.volume_gradient * self._diagonal_of("volume", "alone")
+        return out
+
+    def _diagonal_of(self, kind: str, where: str) -> FloatArray:
+        if where not in self._diagonals:
+            self._diagonals[where] = self.pair.blocks.diagonal(**{kind: getattr(self, f"_{where}")})
+        return self._diagonals[where]
 
     def descend(
         self, coefficients: FloatArray, weights: Weights, *, steps: int, stop_mm: float, halves: int = -1
@@ -215,9 +227,31 @@ def _neighbours(field: FloatArray, axis: int) -> tuple[FloatArray, FloatArray]:
     return np.moveaxis(along[:-1], 0, axis), np.moveaxis(along[1:], 0, axis)
 
 
-def cofactors(F: FloatArray) -> FloatArray:
-    """Cofactors of matrices (..., 3, 3): cof F = det F F^-T, the derivative of det F."""
-    return np.stack([np.cross(F[..., a, :], F[..., b, :]) for a, b in ((1, 2), (2, 0), (0, 1))], axis=-2)
+def strained(H: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """F = I + H of displacement gradients (..., 3, 3), its cofactors, det F (...), and F^-T.
+
+    Cofactors, cof F = det F F^-T, are the derivative of det F.
+    """
+    F, cofactor, J, pulled = np.empty_like(H), np.empty_like(H), np.empty(H.shape[:-2]), np.empty_like(H)
+    flat = tuple(each.reshape(-1, 3, 3) for each in (H, F, cofactor, pulled))
+    _strained(*flat, J.reshape(-1))
+    return F, cofactor, J, pulled
+
+
+@njit(cache=True)
+def _strained(H: FloatArray, F: FloatArray, cofactor: FloatArray, pulled: FloatArray, J: FloatArray) -> None:
+    for n in range(len(H)):
+        for a in range(3):
+            for b in range(3):
+                F[n, a, b] = H[n, a, b] + (a == b)
+        for a in range(3):
+            c, d = F[n, (a + 1) % 3], F[n, (a + 2) % 3]
+            for b in range(3):
+                cofactor[n, a, b] = c[(b + 1) % 3] * d[(b + 2) % 3] - c[(b + 2) % 3] * d[(b + 1) % 3]
+        J[n] = F[n, 0, 0] * cofactor[n, 0, 0] + F[n, 0, 1] * cofactor[n, 0, 1] + F[n, 0, 2] * cofactor[n, 0, 2]
+        for a in range(3):
+            for b in range(3):
+                pulled[n, a, b] = cofactor[n, a, b] / max(J[n], _FLATTEST)
 
 
 def conjugate_gradients(

@@ -60,27 +60,32 @@ class SplineSums:
         _product(coefficients, self.inside, self.table, self.factors, stiffness, half)
         return self.closed(half)
 
-    def diagonal(self, stiffness: Stiffness) -> FloatArray:
+    def diagonal(
+        self, image: FloatArray | None = None, volume: FloatArray | None = None, shear: FloatArray | None = None
+    ) -> FloatArray:
         """The points' part of the Hessian for each control point's three coefficients with one another.
 
-        (6 splines, mi, mj, mk): xx, xy, xz, yy, yz, zz, spline by spline; cofactors are taken as those of no strain.
+        (6 splines, mi, mj, mk): xx, xy, xz, yy, yz, zz, spline by spline; it is linear in the parts of `Stiffness` that
+        are given, with cofactors as those of no strain.
         """
-        image, _, volume, shear = stiffness
         if not self.factors.shape[3]:
             return self._diagonal(image, volume, shear)
         diagonals = []
         for factor in np.moveaxis(self.factors, 3, 0):  # each spline seen through it, products of B and grad B left out
             a, slope = factor[..., 0], factor[..., 1:]
-            seen = image * (a * a)[..., None]
-            if slope.any():
-                square = np.einsum("...a,...a->...", slope, slope)
+            square = a * a
+            seen = None if image is None else image * square[..., None]
+            if slope.any() and not (volume is None and shear is None):
+                seen = np.zeros((*a.shape, 6)) if seen is None else seen
+                whole, half = 0.0 if volume is None else volume, 0.0 if shear is None else 0.5 * shear
+                steep = np.einsum("...a,...a->...", slope, slope)
                 for entry, (m, n) in enumerate(_PAIRS):
-                    alone = 0.5 * shear * square * (m == n)
-                    seen[..., entry] += (volume + 0.5 * shear) * slope[..., m] * slope[..., n] + alone
-            diagonals.append(self._diagonal(seen, volume * a * a, shear * a * a))
+                    seen[..., entry] += (whole + half) * slope[..., m] * slope[..., n] + half * steep * (m == n)
+            parts = (None if each is None else each * square for each in (volume, shear))
+            diagonals.append(self._diagonal(seen, *parts))
         return np.concatenate(diagonals)
 
-    def _diagonal(self, image: FloatArray, volume: FloatArray, shear: FloatArray) -> FloatArray:
+    def _diagonal(self, image: FloatArray | None, volume: FloatArray | None, shear: FloatArray | None) -> FloatArray:
         spread = []  # of each axis, the matrices (control points, points) that sum B B, B' B and B' B'
         for (first, v, s), count in zip(self.table, self.control.shape, strict=True):
             at = (first[:, None] + np.arange(4)).ravel(), np.repeat(np.arange(first.size), 4)
@@ -94,15 +99,20 @@ class SplineSums:
                 field = np.moveaxis(summed.reshape(-1, *moved.shape[1:]), 0, axis)
             return field
 
-        volume, shear = np.where(self.inside, volume, 0.0), np.where(self.inside, shear, 0.0)
-        out = np.empty((6, *self.control.shape))
+        volume, shear = (None if each is None else np.where(self.inside, each, 0.0) for each in (volume, shear))
+        out = np.zeros((6, *self.control.shape))
         for entry, (m, a) in enumerate(_PAIRS):
-            out[entry] = onto(np.where(self.inside, image[..., entry], 0.0), (0, 0, 0))
-            if m != a:
-                out[entry] += onto(volume + 0.5 * shear, [int(axis in {m, a}) for axis in range(3)])
-                continue
-            for axis in range(3):
-                out[entry] += onto(volume + shear if axis == m else 0.5 * shear, [2 * (n == axis) for n in range(3)])
+            if image is not None:
+                out[entry] = onto(np.where(self.inside, image[..., entry], 0.0), (0, 0, 0))
+            mixed = [int(axis in {m, a}) for axis in range(3)] if m != a else [2 * (axis == m) for axis in range(3)]
+            if volume is not None:
+                out[entry] += onto(volume, mixed)
+            if shear is not None and m != a:
+                out[entry] += onto(0.5 * shear, mixed)
+            elif shear is not None:
+                for axis in range(3):
+                    share = 1.0 if axis == m else 0.5
+                    out[entry] += onto(share * shear, [2 * (n == axis) for n in range(3)])
         return out
 
     def closed(self, half: FloatArray) -> FloatArray:

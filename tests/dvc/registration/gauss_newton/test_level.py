@@ -12,7 +12,7 @@ from dvc.errors import InputError
 from dvc.images.image import Grid, Image
 from dvc.registration.gauss_newton.fit import control_grid, spline_through
 from dvc.registration.gauss_newton.image_term import ImagePair
-from dvc.registration.gauss_newton.level import Level, Weights, _share_at, cofactors, conjugate_gradients
+from dvc.registration.gauss_newton.level import Level, Weights, _share_at, conjugate_gradients, strained
 from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.spline_sums import SplineSums
 from tests.textures import GRID, everything, pair_of
@@ -73,14 +73,14 @@ def test_product_and_diagonal_are_those_of_the_quadratic_form(sums):
     packed = np.stack([N[..., 0, 0], N[..., 0, 1], N[..., 0, 2], N[..., 1, 1], N[..., 1, 2], N[..., 2, 2]], axis=-1)
     F = np.eye(3) + 0.2 * random.normal(size=(*shape, 3, 3))
     volume, shear = random.uniform(size=shape), random.uniform(size=shape)
-    c, cof = spline.coefficients_mm, cofactors(F)
+    c, cof = spline.coefficients_mm, strained(F - np.eye(3))[1]
     u, H = points.evaluate(c)
     sym = 0.5 * (H + np.swapaxes(H, -1, -2))
     cost = np.einsum("...a,...ab,...b", u, N, u) + volume * np.einsum("...ab,...ab", cof, H) ** 2
     cost = (cost + shear * np.einsum("...ab,...ab", sym, sym))[points.inside].sum()
     assert np.sum(c * points.product(c, (packed, cof, volume, shear))) == pytest.approx(cost, rel=1e-12)
     unstrained = (packed, np.broadcast_to(np.eye(3), cof.shape).copy(), volume, shear)
-    blocks = points.diagonal(unstrained)[:, 2, 2, 3]
+    blocks = points.diagonal(unstrained[0], *unstrained[2:])[:, 2, 2, 3]
     for m, entries in enumerate(([0, 1, 2], [1, 3, 4], [2, 4, 5])):
         one = np.zeros_like(c)
         one[m, 2, 2, 3] = 1.0
@@ -91,7 +91,13 @@ def test_product_and_diagonal_are_those_of_the_quadratic_form(sums):
 def test_cofactors_are_det_times_inverse_transpose():
     F = np.eye(3) + 0.3 * np.random.default_rng(5).normal(size=(20, 3, 3))
     expected = np.linalg.det(F)[:, None, None] * np.swapaxes(np.linalg.inv(F), -1, -2)
-    np.testing.assert_allclose(cofactors(F), expected, atol=1e-12)
+    whole, cofactor, J, pulled = strained(F - np.eye(3))
+    np.testing.assert_allclose(whole, F, atol=1e-15)
+    np.testing.assert_allclose(cofactor, expected, atol=1e-12)
+    np.testing.assert_allclose(J, np.linalg.det(F), atol=1e-12)
+    upright = J > 0.2  # flatter ones are taken as less flat
+    assert upright.any()
+    np.testing.assert_allclose(pulled[upright], np.swapaxes(np.linalg.inv(F[upright]), -1, -2), atol=1e-10)
 
 
 @pytest.fixture(scope="module")
