@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 from dvc.trust.error_model import Uncertainty
@@ -79,10 +79,10 @@ def _believed(
         bias, sd = table.expected(name, found, to_bone_mm, run)
         sd = np.maximum(sd, 1e-9)
         reach = _DEVIATIONS * claimed
-        shares.append(float(np.mean(norm.cdf((reach - bias) / sd) - norm.cdf((-reach - bias) / sd))))
+        shares.append(float(np.mean(ndtr((reach - bias) / sd) - ndtr((-reach - bias) / sd))))
     share = min(_SURE, float(np.quantile(shares, 1.0 - _SURE)))
     apart = max(1.0, len(found) * voxel_mm3 / table.correlation_mm**3)  # voxels nearer than that say the same
-    return max(0.0, share - float(norm.ppf(_SURE)) * float(np.sqrt(share * (1.0 - share) / apart)))
+    return max(0.0, share - float(ndtri(_SURE)) * float(np.sqrt(share * (1.0 - share) / apart)))
 
 
 def _figures(name: str, true: FloatArray, of_twin: Uncertainty) -> list[float]:

@@ -244,14 +244,15 @@ def _strained(H: FloatArray, F: FloatArray, cofactor: FloatArray, pulled: FloatA
         for a in range(3):
             for b in range(3):
                 F[n, a, b] = H[n, a, b] + (a == b)
-        for a in range(3):
-            c, d = F[n, (a + 1) % 3], F[n, (a + 2) % 3]
-            for b in range(3):
-                cofactor[n, a, b] = c[(b + 1) % 3] * d[(b + 2) % 3] - c[(b + 2) % 3] * d[(b + 1) % 3]
+        for a, c, d in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            cofactor[n, a, 0] = F[n, c, 1] * F[n, d, 2] - F[n, c, 2] * F[n, d, 1]
+            cofactor[n, a, 1] = F[n, c, 2] * F[n, d, 0] - F[n, c, 0] * F[n, d, 2]
+            cofactor[n, a, 2] = F[n, c, 0] * F[n, d, 1] - F[n, c, 1] * F[n, d, 0]
         J[n] = F[n, 0, 0] * cofactor[n, 0, 0] + F[n, 0, 1] * cofactor[n, 0, 1] + F[n, 0, 2] * cofactor[n, 0, 2]
+        least = max(J[n], _FLATTEST)
         for a in range(3):
             for b in range(3):
-                pulled[n, a, b] = cofactor[n, a, b] / max(J[n], _FLATTEST)
+                pulled[n, a, b] = cofactor[n, a, b] / least
 
 
 def conjugate_gradients(
