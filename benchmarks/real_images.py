@@ -48,7 +48,7 @@ def floor_of(found: Registration) -> dict[str, float]:
     floor = noise_floor(maps, found.tissue.inside)
     loaded, motion = found.loaded, found.alignment.motion
     grid = found.reference.grid
-    after = carry(loaded, grid, motion, displacement_mm=displacement_on_grid(found.displacement, grid))
+    after = carry(loaded, grid, motion, displacement_mm=displacement_on_grid(found.displacement, grid, np.float32))
     E = maps.green_lagrange[maps.valid & found.tissue.inside].astype(float)
     half = np.sqrt(((E[:, 0] - E[:, 3]) / 2) ** 2 + E[:, 1] ** 2)  # in-plane maximal shear, x and y
     return {

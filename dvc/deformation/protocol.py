@@ -6,14 +6,17 @@ gradient H = du/dX (H[i, j] = du_i/dX_j, no unit), both in LPS, and NaN where it
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol, Self, runtime_checkable
+from typing import ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 from scipy.ndimage import binary_dilation, distance_transform_edt, map_coordinates, spline_filter
 
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.errors import InputError
 from dvc.images.image import Grid, Mask
+
+_T = TypeVar("_T", np.float32, np.float64)
 
 CHUNK = 200_000
 """Points that are evaluated at once, so that memory stays that of the result."""
@@ -69,9 +72,9 @@ def evaluate_on_grid(
     return u, H
 
 
-def displacement_on_grid(deformation: Deformation, grid: Grid) -> FloatArray:
-    """U (ni, nj, nk, 3) mm at the voxels of a grid; NaN where not defined."""
-    u = np.empty((*grid.shape, 3))
+def displacement_on_grid(deformation: Deformation, grid: Grid, dtype: type[_T]) -> npt.NDArray[_T]:
+    """U (ni, nj, nk, 3) mm at the voxels of a grid, in single or double precision; NaN where not defined."""
+    u = np.empty((*grid.shape, 3), dtype)
     step = max(1, CHUNK // (grid.shape[1] * grid.shape[2]))  # planes at once: gradients come along
     for start in range(0, grid.shape[0], step):
         part = grid.part((slice(start, start + step), slice(None), slice(None)))

@@ -11,7 +11,7 @@ from dvc.deformation.strain import StrainField
 from dvc.images.image import Grid, Mask
 
 TENSOR_COMPONENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
-_SLAB_VOXELS = 300_000
+_SLAB_VOXELS = 100_000
 _UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
 
 

@@ -97,7 +97,7 @@ def carried_images(found: Registration, noise: tuple[Noise, Noise | None]) -> Ca
     reference, motion, grid = found.reference, found.alignment.motion, found.reference.grid
     loaded = Carrier(found.loaded)
     # Beyond the spline, in the air, the image is shown where the bone's motion alone puts it.
-    u = np.nan_to_num(displacement_on_grid(found.displacement, grid), copy=False)
+    u = np.nan_to_num(displacement_on_grid(found.displacement, grid, np.float32), copy=False)
     before, aligned, registered = loaded.onto(grid), loaded.onto(grid, motion), loaded.onto(grid, motion, None, u)
     del u
     _, as_scanned = local_correlation(reference, before, found.tissue)

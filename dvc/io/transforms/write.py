@@ -112,7 +112,7 @@ def _itk_part(displacement: Deformation, grid: Grid | None) -> sitk.Transform:
     if grid is None:
         raise InputError(f"To write a {type(displacement).__name__} for ITK, give the grid of its displacement field.")
     return sitk.DisplacementFieldTransform(
-        to_sitk(grid, np.nan_to_num(displacement_on_grid(displacement, grid), copy=False))
+        to_sitk(grid, np.nan_to_num(displacement_on_grid(displacement, grid, np.float64), copy=False))
     )
 
 
