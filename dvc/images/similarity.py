@@ -11,6 +11,7 @@ from dvc.images.image import Image, Mask
 _WINDOW_MM = 2.5
 _BRIGHT = 75.0  # percentile of the tissue that stands for its brightness
 _FEWEST = 1000  # voxels
+_ROWS = 100_000  # of the regression at once
 _LEAST = 1e-5  # eigenvalue of normal equations, over their trace, below which there is no contrast
 _NOISES = 1.0, 1.5  # times that in the air: parallel imaging and normalised intensities raise it in the tissue
 
@@ -103,9 +104,14 @@ def brightness_offset(a: Image, carried: Float32Array, mask: Mask, noise: float)
     size, bright = float(np.abs(x).max()), float(np.percentile(y, _BRIGHT))
     place = 2.0 * at / np.maximum(at.max(axis=0), 1) - 1.0
     linear = np.column_stack([np.ones(len(at)), place])
-    gain = np.column_stack([linear, place**2, place * np.roll(place, 1, axis=1)])
-    both = np.hstack([gain * (x / size)[:, None], linear])
-    normal, right, own = both.T @ both, both.T @ y, gain.T @ gain
+    normal, right, own = np.zeros((14, 14)), np.zeros(14), np.zeros((10, 10))
+    for start in range(0, len(at), _ROWS):
+        rows = slice(start, start + _ROWS)
+        gain = np.column_stack([linear[rows], place[rows] ** 2, place[rows] * np.roll(place[rows], 1, axis=1)])
+        both = np.hstack([gain * (x[rows] / size)[:, None], linear[rows]])
+        normal += both.T @ both
+        right += both.T @ y[rows]
+        own += gain.T @ gain
 
     def offset(factor: float) -> float:
         left, terms = normal.copy(), len(own)

@@ -101,6 +101,7 @@ def carried_images(found: Registration, noise: tuple[Noise, Noise | None]) -> Ca
     before, aligned, registered = loaded.onto(grid), loaded.onto(grid, motion), loaded.onto(grid, motion, None, u)
     del u
     _, as_scanned = local_correlation(reference, before, found.tissue)
+    del loaded, before
     both = Mask(grid, found.tissue.inside & np.isfinite(aligned) & np.isfinite(registered))  # the same voxels for both
     windows = Windows(both, reference.values)
     unloaded, rigid, after = (windows.structure(values) for values in (reference.values, aligned, registered))

@@ -111,9 +111,9 @@ class Measurement:
         more = evidence or Evidence()
         with ThreadPoolExecutor(1) as pool:  # on two cores: NumPy and SciPy let go of the interpreter
             strain, noise = pool.submit(judgement.maps_of, found), judgement.noise_of(found)
-            snr = min(one.snr for one in noise if one is not None)
-            drawn = pool.submit(lambda: error_bars(found, subject, strain.result(), snr, more.error_model, more.twin))
-            images, maps, bars = judgement.carried_images(found, noise), strain.result(), drawn.result()
+            snr, maps = min(one.snr for one in noise if one is not None), strain.result()
+            drawn = pool.submit(error_bars, found, subject, maps, snr, more.error_model, more.twin)
+            images, bars = judgement.carried_images(found, noise), drawn.result()
         if is_repeat:
             more = replace(more, noise_floor=noise_floor(maps, subject.soft(found.tissue)))
         quality, alignment = judgement.quality_of(found, maps, images.similarity, more), judgement.alignment_of(found)
