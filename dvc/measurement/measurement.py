@@ -336,12 +336,14 @@ class Measurement:
             if bars.uncertainty is not None:
                 sure, grid = bars.uncertainty, self.maps.grid
                 writing.append(pool.submit(files.write_uncertainty, partial, grid, sure, bars.model, verdict))
+            if (mesh := made.subject.mesh) is not None:  # in the same thread, as compiled kernels may not be in two
+                onto = pool.submit(files.write_mesh_results, partial, mesh, self.deformation, verdict)
             pictures = self.pictures()  # while files are compressed
             write_regions_csv(partial / files.REGIONS, self.regions, verdict)
-            if made.subject.mesh is not None:
-                told["mesh"] = files.write_mesh_results(partial, made.subject.mesh, self.deformation, verdict)
             for one in writing:
                 one.result()
+            if mesh is not None:
+                told["mesh"] = onto.result()
             write_json(partial / files.QUALITY, told)
             if provenance is not None:
                 write_json(partial / files.PROVENANCE, provenance)

@@ -1,9 +1,9 @@
 """Rigid alignment of a loaded image on a bone of the unloaded one.
 
-Gauss-Newton (`dvc.registration.rigid_fit`) begins where the headers put the bone. Unless that ends where only the bone
-itself can lie, a search follows that cannot be trapped: the bone is placed everywhere in the loaded image in many
-orientations, at low resolution, and normalised correlation is taken by FFT (masked template matching; D. Padfield,
-Masked object registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402); its best places are refined.
+First a search that cannot be trapped: the bone is placed everywhere in the loaded image in many orientations, at low
+resolution, and normalised correlation is taken by FFT (masked template matching; D. Padfield, Masked object
+registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Gauss-Newton (`dvc.registration.rigid_fit`)
+refines the best places, and the header's: along a shaft it would slide to a place that looks right but for its ends.
 Around the best of all, halves of the bone are fitted each by itself, begun to either side along each of the six ways
 to move. Their mean is the result; the largest distance of two is its repeatability.
 """
@@ -113,12 +113,10 @@ def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -
     if not mask.inside.any():
         raise InputError("The mask to align on is empty.")
     fit, likeness = RigidFit(reference, loaded, mask, seed), _Likeness(reference, loaded, mask)
-    score, best = _best(fit, likeness, [RigidMotion.identity()])
-    if score < _CERTAIN_SIMILARITY:
-        starts, highest = _search(reference, loaded, mask)
-        score, best = max((score, best), _best(fit, likeness, starts), key=lambda found: found[0])
-        if score < _LOWEST_SIMILARITY:
-            raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
+    starts, highest = _search(reference, loaded, mask)
+    score, best = _best(fit, likeness, [*starts, RigidMotion.identity()])
+    if score < _LOWEST_SIMILARITY:
+        raise RegistrationError(_why_failed(reference, loaded, mask, score, highest, on))
     points = mask.points()
     advice = f"the {on} is not located. Check that the mask covers it on the unloaded image and that it lies wholly "
     advice += "inside the loaded one."
