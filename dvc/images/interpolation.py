@@ -6,8 +6,9 @@ from numba import njit, prange
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 
 Four = tuple[int, int, int, int]
+"""Places of the four coefficients along an axis whose B-splines are not zero at a point."""
 Weights = tuple[float, float, float, float]
-"""Of the four B-splines along an axis that are not zero at a point: their control points, and values or slopes."""
+"""Values or slopes of these four B-splines at the point."""
 
 _ROUNDING = 1e-6  # voxels
 
@@ -110,7 +111,7 @@ def carry_values(
     """Values of an image at the voxels ``where`` of a grid (ni, nj, nk), NaN where not known, into the last array.
 
     Voxel (i, j, k) lies at the image's index ``start + step @ (i, j, k) + per_mm @ u``, u its displacement (ni, nj, nk,
-    3), mm; ``gaps`` is 1 at missing voxels, (0, 0, 0) where none are, as is the displacement.
+    3), mm. ``gaps`` is 1 at missing voxels, and empty where none is missing; so is a displacement that is zero.
     """
     ni, nj, nk = image.shape
     for i in prange(where.shape[0]):

@@ -60,14 +60,14 @@ def signal_to_noise(image: Image, tissue: Mask) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Noise of a magnitude image: its standard deviation in the air (`noise_in_air`), and `signal_to_noise`."""
+    """Noise of a magnitude image: standard deviation in the air (`noise_in_air`), and `signal_to_noise` (no unit)."""
 
     in_air: float | None
     snr: float
 
     @classmethod
     def of(cls, image: Image, tissue: Mask, body: Mask | None = None) -> Self:
-        """The noise beside the signal of a tissue, which may be a part of the body."""
+        """The noise of an image: the signal is a tissue's, and the air lies beside the body, by default that tissue."""
         in_air = noise_in_air(image, body or tissue)
         sigma = _finest_differences(image, tissue) if in_air is None else in_air
         level = float(np.percentile(image.values[tissue.inside & ~image.missing], 75))

@@ -11,7 +11,7 @@ from dvc.images.image import Grid, Image
 from dvc.images.interpolation import carry_values, sample_values
 
 
-class Motion(Protocol):
+class AffineMotion(Protocol):
     """An affine motion of points, LPS mm, such as `dvc.RigidMotion`: x = matrix @ X + translation_mm."""
 
     @property
@@ -65,7 +65,7 @@ def shows(image: Image, points_mm: FloatArray, margin_mm: float = 0.0) -> BoolAr
 
 
 def carry(
-    image: Image, grid: Grid, motion: Motion | None = None, where: BoolArray | None = None, order: int = 3,
+    image: Image, grid: Grid, motion: AffineMotion | None = None, where: BoolArray | None = None, order: int = 3,
     displacement_mm: npt.ArrayLike | None = None,
 ) -> Float32Array:  # fmt: skip
     """Values of ``image`` on ``grid``, NaN where any of the eight voxels around is missing or outside.
@@ -78,7 +78,7 @@ def carry(
 
 
 def sampled(
-    coefficients: Float32Array, grid: Grid, points_mm: FloatArray, motion: Motion, order: int
+    coefficients: Float32Array, grid: Grid, points_mm: FloatArray, motion: AffineMotion, order: int
 ) -> FloatArray:  # fmt: skip
     """Values (n,) of an image where a motion takes points (n, 3) LPS mm; NaN beyond its voxels' centres.
 
@@ -93,7 +93,7 @@ def sampled(
 
 
 class Carrier:
-    """An image that is carried to other grids more than once; as in `carry`."""
+    """An image that is carried to other grids more than once, with its spline found once; as in `carry`."""
 
     def __init__(self, image: Image, order: int = 3) -> None:
         values = fill_missing(image).values
@@ -102,10 +102,10 @@ class Carrier:
         self._gaps = image.missing.astype(np.float32) if image.missing.any() else np.zeros((0, 0, 0), np.float32)
 
     def onto(
-        self, grid: Grid, motion: Motion | None = None, where: BoolArray | None = None,
+        self, grid: Grid, motion: AffineMotion | None = None, where: BoolArray | None = None,
         displacement_mm: npt.ArrayLike | None = None,
     ) -> Float32Array:  # fmt: skip
-        """Values on a grid."""
+        """Values (ni, nj, nk) on a grid; as in `carry`."""
         matrix, shift = (np.eye(3), np.zeros(3)) if motion is None else (motion.matrix, motion.translation_mm)
         per_mm = np.ascontiguousarray(self.image.grid.index_per_mm @ matrix)
         step = np.ascontiguousarray(per_mm @ (grid.direction * grid.spacing_mm))

@@ -19,7 +19,7 @@ _ITERATIONS = [50, 50, 50]
 def without_shading(images: Sequence[Image], threads: int = 1) -> list[Image]:
     """Images, above their lowest value, divided by their bias fields, estimated by N4 on coarse copies.
 
-    An image on each of so many threads; the result is the same bit for bit on any number of them.
+    So many at once as there are threads; the result is the same bit for bit on any number of them.
 
     Normalised correlation over the whole body takes a bias field for contrast, and a B-spline then bends tissue to
     follow it: on a phantom with fields of +-20 % that tripled the strain error. Only the registration sees the

@@ -65,7 +65,7 @@ def error_bars(
 ) -> ErrorBars:  # fmt: skip
     """Error of a registered load's maximal shear strain, by an error model, the user's own or the preset's.
 
-    ``snr`` is the lower signal-to-noise ratio of the two images (`dvc.images.noise.signal_to_noise`).
+    ``snr`` is the lower signal-to-noise ratio of the two images (`dvc.measurement.judgement.noise_of`).
     Error bars that do not hold in the pair's twin are made wider.
     """
     grid = maps.grid

@@ -78,7 +78,11 @@ def maps_of(found: Registration) -> StrainMaps:
 
 
 def noise_of(found: Registration) -> tuple[Noise, Noise | None]:
-    """The noise of both images; None for a loaded one in which no threshold finds the body."""
+    """The noise of both images; None for a loaded one in which no threshold finds the body.
+
+    The air of the unloaded image is what lies beside the whole body, of which the given tissue may be a part; where no
+    threshold finds that body, its noise in the air is not known.
+    """
 
     def body_in(image: Image) -> Mask | None:
         try:
@@ -87,8 +91,10 @@ def noise_of(found: Registration) -> tuple[Noise, Noise | None]:
             return None
 
     seen, loaded = body_in(found.reference), body_in(found.loaded)
-    body = None if seen is None else Mask(found.reference.grid, found.tissue.inside | seen.inside)
     of_loaded = None if loaded is None else Noise.of(found.loaded, loaded)
+    if seen is None:
+        return replace(Noise.of(found.reference, found.tissue), in_air=None), of_loaded
+    body = Mask(found.reference.grid, found.tissue.inside | seen.inside)
     return Noise.of(found.reference, found.tissue, body), of_loaded
 
 

@@ -1,6 +1,7 @@
 """From a pair of images to a measurement."""
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 
 from dvc.arguments import checked
 from dvc.arrays import FloatArray
@@ -64,9 +65,14 @@ def measure(
     mesh : MeshFile, optional
         Displacement and strain are written at its nodes and cells.
     plate_normal, shear_direction : (3,), optional
-        LPS. The plate's outward normal (default: inferior); with a shear direction, strain also in the plate's axes.
-    name, worker, progress : optional
-        Name of the load; the process to compute in (a new one by default); ``progress(stage, fraction)``.
+        LPS. The plate's outward normal (default: inferior) finds the bone's lowest point, where pictures cut; with a
+        shear direction, strain is written in the plate's axes as well.
+    name : str
+        Of the load.
+    worker : Worker, optional
+        Process to compute in; a new one by default.
+    progress : callable, optional
+        ``progress(stage, fraction)``.
 
     Returns
     -------
@@ -84,17 +90,12 @@ def measure(
     normal, axes = plate_directions(plate_normal, shear_direction)
     subject = Subject(reference, bone, tissue, labels, mesh, normal, axes)
     chosen = settings or Settings(GaussNewton() if labels is None else GaussNewtonWithInterfaces())
-    body, own = subject.body(), None if worker is not None else Worker(chosen.threads)
-    try:
-        given = {"bone": bone, "tissue": body, "labels": labels, "worker": worker or own, "progress": progress}
-        floor = None
+    body, floor = subject.body(), None
+    with nullcontext(worker) if worker is not None else Worker(chosen.threads) as runner:
+        given = {"bone": bone, "tissue": body, "labels": labels, "worker": runner, "progress": progress}
         if repeat is not None:
             again = register(reference, repeat, settings=chosen.of_repeat(), **given)  # type: ignore[arg-type]
             floor = Measurement.from_registration(again, subject, is_repeat=True).quality.noise_floor
         found = register(reference, loaded, settings=chosen, start=start, **given)  # type: ignore[arg-type]
-    finally:
-        if own is not None:
-            own.close()
-    model = error_model or error_model_of(chosen.engine.name)
-    evidence = Evidence(landmarks[:2] if landmarks else None, floor, model)
-    return Measurement.from_registration(found, subject, evidence, name=name)
+    points, model = landmarks and landmarks[:2], error_model or error_model_of(chosen.engine.name)
+    return Measurement.from_registration(found, subject, Evidence(points, floor, model), name=name)

@@ -109,7 +109,8 @@ class Measurement:
         With ``is_repeat`` the loaded image is a second scan without load, judged by its own strain, the noise floor.
         """
         more = evidence or Evidence()
-        with ThreadPoolExecutor(1) as pool:  # on two cores: NumPy and SciPy let go of the interpreter
+        # On two cores, as NumPy and SciPy let go of the interpreter; of two at work, only one calls compiled kernels.
+        with ThreadPoolExecutor(1) as pool:
             strain, noise = pool.submit(judgement.maps_of, found), judgement.noise_of(found)
             snr, maps = min(one.snr for one in noise if one is not None), strain.result()
             drawn = pool.submit(error_bars, found, subject, maps, snr, more.error_model, more.twin)

@@ -3,9 +3,9 @@
 First a search that cannot be trapped: the bone is placed everywhere in the loaded image in many orientations, at low
 resolution, and normalised correlation is taken by FFT (masked template matching; D. Padfield, Masked object
 registration in the Fourier domain, 2012, doi:10.1109/TIP.2011.2181402). Gauss-Newton (`dvc.registration.rigid_fit`)
-refines the best places, and the header's: along a shaft it would slide to a place that looks right but for its ends.
-Around the best of all, halves of the bone are fitted each by itself, begun to either side along each of the six ways
-to move. Their mean is the result; the largest distance of two is its repeatability.
+refines the best places, and the header's last: a fit from there alone may end where a shaft looks right but for its
+ends. Around the best of all, halves of the bone are fitted each by itself, begun to either side along each of the six
+ways to move. Their mean is the result; the largest distance of two is its repeatability.
 """
 
 from collections.abc import Sequence
@@ -168,7 +168,7 @@ def _best(fit: RigidFit, likeness: "_Likeness", starts: Sequence[RigidMotion]) -
         if (similarity := likeness.at(motion)) > score:
             score, best = similarity, motion
         if score >= _CERTAIN_SIMILARITY:
-            break  # only the right place looks like this
+            break  # begun from the best places, no other looks like this
     return score, best
 
 

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 
 import dvc
-from dvc import Deformation, Evidence, Image, Measurement, Registration, Settings, Subject, tissue_mask
-from dvc.errors import InputError, MrstrainError
-from dvc.images.noise import signal_to_noise
+from dvc import Deformation, Evidence, Image, Measurement, Registration, Settings, Subject
+from dvc.errors import MrstrainError
 from dvc.io.result_folder import REPEAT
 from dvc.measurement.error_bars import TwinCheck
-from dvc.measurement.judgement import maps_of
+from dvc.measurement.judgement import maps_of, noise_of
 from dvc.trust.quality import NoiseFloor
 from dvc.worker import Worker
 from mrstrain.measurement.case import Case
@@ -103,8 +102,5 @@ def _twin_check(
 
 def _noisier(found: Registration) -> float:
     """How many times noisier the loaded image is than the unloaded one, for its signal; at least 1."""
-    try:
-        loaded = signal_to_noise(found.loaded, tissue_mask(found.loaded))
-    except InputError:  # no threshold finds the body there
-        return 1.0
-    return max(1.0, signal_to_noise(found.reference, found.tissue) / loaded)
+    reference, loaded = noise_of(found)
+    return 1.0 if loaded is None else max(1.0, reference.snr / loaded.snr)

@@ -63,7 +63,7 @@ def demo(
     seed: Seed of the phantom.
     full: The published size: all seven material sets on some 75,000 tetrahedra; otherwise three on a coarser mesh.
     workers, progress: As in `mrstrain.run`.
-    Returns the summary; a stage that only its time limit ended counts as one that has a result.
+    Returns the summary. It is complete unless a stage failed: how much of a load a model carries is a result itself.
     Raises OutputError if the folder holds another phantom, or other files that would be replaced.
     """
     target = Path(out)

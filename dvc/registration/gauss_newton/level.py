@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -75,7 +76,6 @@ class Level:
         self._tissue = _share_at(control, soft | stiff, grid)
         self._soft, self._stiff = self.pair.share(soft), self.pair.share(stiff)  # mm3 in each block
         self._resists = self._stiff > 0
-        self._diagonals: dict[str, FloatArray] = {}
         self._between = []  # neighbours in soft tissue: the volume that their difference stands for, over its length^2
         self._alone = np.zeros_like(self._soft)  # what a change of volume in one block alone costs by its gradient
         for axis, length in enumerate(block * grid.spacing_mm):
@@ -142,17 +142,24 @@ class Level:
 
     def _prior_diagonal(self, weights: Weights) -> FloatArray:
         """The part of the prior's blocks that does not change from step to step; as `SplineSums.diagonal`."""
-        out = weights.volume * self._diagonal_of("volume", "soft")
+        out = weights.volume * self._diagonal_of_volume
         if weights.rigidity and self._resists.any():
-            out += weights.rigidity * self._diagonal_of("shear", "stiff")
+            out += weights.rigidity * self._diagonal_of_shear
         if weights.volume_gradient:
-            out += weights.volume_gradient * self._diagonal_of("volume", "alone")
+            out += weights.volume_gradient * self._diagonal_of_gradient
         return out
 
-    def _diagonal_of(self, kind: str, where: str) -> FloatArray:
-        if where not in self._diagonals:
-            self._diagonals[where] = self.pair.blocks.diagonal(**{kind: getattr(self, f"_{where}")})
-        return self._diagonals[where]
+    @cached_property
+    def _diagonal_of_volume(self) -> FloatArray:
+        return self.pair.blocks.diagonal(volume=self._soft)
+
+    @cached_property
+    def _diagonal_of_shear(self) -> FloatArray:
+        return self.pair.blocks.diagonal(shear=self._stiff)
+
+    @cached_property
+    def _diagonal_of_gradient(self) -> FloatArray:
+        return self.pair.blocks.diagonal(volume=self._alone)
 
     def descend(
         self, coefficients: FloatArray, weights: Weights, *, steps: int, stop_mm: float, halves: int = -1
@@ -228,9 +235,9 @@ def _neighbours(field: FloatArray, axis: int) -> tuple[FloatArray, FloatArray]:
 
 
 def strained(H: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """F = I + H of displacement gradients (..., 3, 3), its cofactors, det F (...), and F^-T.
+    """F = I + H of displacement gradients H (..., 3, 3), no unit; its cofactors, det F (...), and F^-T.
 
-    Cofactors, cof F = det F F^-T, are the derivative of det F.
+    Cofactors, cof F = det F F^-T, are the derivative of det F. For F^-T, det F is at least 0.1.
     """
     F, cofactor, J, pulled = np.empty_like(H), np.empty_like(H), np.empty(H.shape[:-2]), np.empty_like(H)
     flat = tuple(each.reshape(-1, 3, 3) for each in (H, F, cofactor, pulled))

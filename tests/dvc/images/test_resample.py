@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
 from dvc.deformation.protocol import Affine, RigidMotion
 from dvc.images.image import Grid, Image, Mask
@@ -30,6 +32,25 @@ def test_a_linear_image_is_carried_exactly_and_is_nan_outside(order):
     beyond = carry(image, GRID, Affine(np.eye(3), np.array([5.0, 0.0, 0.0])), order=order)
     assert np.isnan(beyond[-4:]).all()
     assert np.isfinite(beyond[:14]).all()
+
+
+@pytest.mark.parametrize("order", [1, 3])
+def test_an_oblique_image_is_carried_as_scipy_interpolates_it(order):
+    """By a rotation and a displacement of each voxel; where that is NaN, so is the image."""
+    random = np.random.default_rng(7)
+    turned = Rotation.from_rotvec((0.3, -0.2, 0.5)).as_matrix()
+    image = Image(Grid((15, 16, 17), (1.2, 0.9, 1.5), (2.0, -3.0, 1.0), turned), random.normal(size=(15, 16, 17)))
+    grid = Grid((11, 12, 13), (1.0, 1.3, 0.8), image.grid.centre_mm - 5.0)
+    motion = RigidMotion(Rotation.from_rotvec((0.1, 0.2, -0.1)).as_matrix(), np.array([1.0, 0.5, -2.0]))
+    u = random.normal(size=(*grid.shape, 3))
+    u[3, 4, 5] = np.nan
+    got = carry(image, grid, motion, order=order, displacement_mm=u)
+    at = image.grid.indices_of(motion.apply((grid.points() + u).reshape(-1, 3))).T
+    expected = map_coordinates(image.values, at, order=order, mode="mirror").reshape(grid.shape)
+    inside = ((at >= 0) & (np.array(image.grid.shape) - 1 >= at.T).T).all(axis=0).reshape(grid.shape)
+    assert 0.3 < inside.mean() < 0.95
+    assert np.array_equal(np.isfinite(got), inside)
+    np.testing.assert_allclose(got[inside], expected[inside], atol=1e-5)
 
 
 @pytest.mark.parametrize("order", [1, 3])

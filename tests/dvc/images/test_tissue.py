@@ -1,10 +1,10 @@
-"""Where the body is: gaps in the tissue mask are closed as by an ellipsoid laid at every voxel."""
+"""Where the body is: gaps in the tissue mask are closed as by an ellipsoid laid at every voxel; margins are exact."""
 
 import numpy as np
 import pytest
-from scipy.ndimage import binary_closing, gaussian_filter
+from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter
 
-from dvc.images.tissue import _closed, _ellipsoid
+from dvc.images.tissue import _closed, _ellipsoid, within
 
 
 @pytest.mark.parametrize("radius", [(2, 2, 2), (3, 1, 0), (5, 4, 2), (0, 0, 0)])
@@ -17,3 +17,13 @@ def test_closing_by_the_surface_alone_is_closing_by_every_voxel(radius: tuple[in
     assert np.array_equal(_closed(mask, np.array(radius)), expected)
     if 0.0 < level < 1.0 and max(radius) > 0:
         assert np.count_nonzero(expected) > 1.01 * np.count_nonzero(mask)
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.8, 0.8, 3.6), (0.7875, 0.875, 0.825)])
+@pytest.mark.parametrize("margin", [0.0, 0.5, 2.0, 4.0, 4.5, 200.0])
+def test_a_margin_is_that_of_a_distance_transform(spacing: tuple[float, float, float], margin: float) -> None:
+    """Also where voxels lie exactly at the margin: one step along an axis too few, or a smaller margin, fails."""
+    inside = np.random.default_rng(5).random((23, 1, 31)) > 0.97
+    inside = np.concatenate([inside, np.zeros((23, 12, 31), dtype=bool)], axis=1)
+    away_mm = distance_transform_edt(~inside, sampling=spacing)
+    assert np.array_equal(within(inside, np.array(spacing), margin), away_mm <= margin)

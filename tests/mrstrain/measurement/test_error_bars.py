@@ -12,6 +12,7 @@ from scipy.stats import foldnorm
 
 from dvc.deformation.strain_maps import StrainMaps
 from dvc.images.image import Grid, Image, LabelMap, Mask
+from dvc.images.noise import signal_to_noise
 from dvc.measurement.error_bars import TwinCheck, error_bars
 from dvc.measurement.judgement import noise_of, with_caution
 from dvc.measurement.page import error_tables
@@ -118,6 +119,20 @@ def test_the_noisier_image_counts() -> None:
     noise = 60.0 * random.standard_normal((2, *GRID.shape))
     found.loaded = Image(GRID, np.hypot(found.reference.values + noise[0], noise[1]).astype(np.float32))
     assert "too far" in bars_of(found, subject, maps, model()).told
+
+
+def test_tissue_outside_the_mask_is_no_air() -> None:
+    """With it for air, noise would be a third larger; where no threshold finds the body, noise is not known."""
+    found, _, _ = given()
+    whole = noise_of(found)
+    part = found.tissue.inside.copy()
+    part[12:] = False
+    found.tissue = Mask(GRID, part)
+    assert noise_of(found)[0].in_air == pytest.approx(20.0, rel=0.1)
+    assert noise_of(found)[0].snr == pytest.approx(whole[0].snr, rel=0.05)
+    assert signal_to_noise(found.reference, found.tissue) < 0.8 * whole[0].snr
+    found.reference = Image(GRID, np.full(GRID.shape, 500.0))
+    assert noise_of(found)[0].in_air is None
 
 
 def test_several_stages_have_no_known_error() -> None:
