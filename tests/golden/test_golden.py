@@ -16,7 +16,8 @@ from tests.golden.scenes import SCENES
 
 
 @pytest.mark.parametrize(
-    "scene", [pytest.param(name, marks=pytest.mark.full_size) if name == "study" else name for name in SCENES]
+    "scene",
+    [pytest.param(name, marks=pytest.mark.full_size) if name in ("study", "elastix") else name for name in SCENES],
 )
 def test_the_record_holds(scene: str, tmp_path: Path) -> None:
     wrong, words = check(scene, quantities(SCENES[scene](tmp_path, 1)))

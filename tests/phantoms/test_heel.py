@@ -25,7 +25,7 @@ from phantoms import (
 )
 from phantoms.heel import octants
 
-COARSE = {"shape": (40, 45, 42), "spacing_mm": 2.5}
+COARSE = {"shape": (32, 36, 34), "spacing_mm": 3.1}
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_noise_and_bias_are_independent() -> None:
     air = pair.labels.labels == 0
     air[:, :, 5:] = False  # well below the sole
     noise = [getattr(pair, name).values[air] for name in ("reference", "loaded", "repeat")]
-    assert np.abs(np.corrcoef(noise) - np.eye(3)).max() < 0.03
+    assert np.abs(np.corrcoef(noise) - np.eye(3)).max() < 0.05
     clean = heel_pair(seed=1, load=0.0, foot_motion=RigidMotion.identity(), snr=None, **COARSE)
     fat = clean.labels.region("fat").inside
     ratio = clean.loaded.values[fat] / clean.reference.values[fat]

@@ -107,7 +107,10 @@ def test_the_doctor_looks_at_everything_and_finds_this_environment_fit(tmp_path:
     assert {name.casefold() for name in findings} >= {name.casefold() for name in needed}
 
 
-@pytest.mark.parametrize("module", ["dvc.registration.elastix.run", "fe.meshing", "fe.linear"])
+_ELASTIX = pytest.param("dvc.registration.elastix.run", marks=pytest.mark.full_size)  # 8 s of loading it
+
+
+@pytest.mark.parametrize("module", [_ELASTIX, "fe.meshing", "fe.linear"])
 def test_what_it_tries_works_here(module: str) -> None:
     assert import_module(module).self_test()
 

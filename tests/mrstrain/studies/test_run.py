@@ -295,7 +295,8 @@ def test_what_a_lost_worker_of_this_machine_was_at_is_given_to_another(tmp_path)
         assert runner._client.submit(lost_once).result(timeout=60) == "done"
 
 
-def test_a_scheduler_that_is_not_there(images, tmp_path):
+def test_a_scheduler_that_is_not_there(images, tmp_path, monkeypatch):
+    monkeypatch.setattr("mrstrain.studies.cluster._CONNECT_S", 1.0)
     study = tmp_path / "study"
     shutil.copytree(images, study)
     with pytest.raises(InputError, match="No Dask scheduler"):
