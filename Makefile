@@ -20,8 +20,7 @@ PYTHON ?= $(shell for name in python3 python3.13 python3.12 python3.11; do \
 UV ?= uv
 UPGRADE ?=
 VENV := .venv
-# What is never imported need not be compiled: a third of the time of a set-up.
-QUIETLY := --disable-pip-version-check --quiet --no-compile
+QUIETLY := --disable-pip-version-check --quiet
 ifeq ($(OS),Windows_NT)
 BIN := $(VENV)/Scripts
 else
