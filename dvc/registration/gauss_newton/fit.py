@@ -112,7 +112,8 @@ def fit(
         if guess is not None:
             coefficients = turned(axes.T, spline_through(guess, control))
         level = _level(pictures, inside, soft, core, control, sigma_mm)
-        coefficients = level.descend(coefficients, weights, steps=steps * weights.patience, stop_mm=stop_mm)
+        start_at = level.at(coefficients)
+        coefficients = level.descend(start_at, weights, steps=steps * weights.patience, stop_mm=stop_mm).coefficients
         if parameters.volume is None and number == len(LEVELS) - 2:
             usual = replace(weights, bending=USUAL_BENDING)
             choice = replace(choice, asked=level.volume_asked(coefficients, usual, _LOOKING_MM4))
@@ -130,9 +131,9 @@ def fit(
         choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
         progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
     steps = _LAST_STEPS * choice.weights.patience
-    coefficients = level.descend(coefficients, choice.weights, steps=steps, stop_mm=LEVELS[-1][-1])
+    found = level.descend(level.at(coefficients), choice.weights, steps=steps, stop_mm=LEVELS[-1][-1])
     progress(1.0)
-    return BSpline(control, turned(axes, coefficients)), choice
+    return BSpline(control, turned(axes, found.coefficients)), choice
 
 
 def choose(
@@ -144,36 +145,42 @@ def choose(
     One half of the voxels (a chessboard of small cubes) is fitted, the other half's residual is what counts: noise that
     was fitted makes it larger, and so does detail that was smoothed away. Weights are tried in steps of a factor of 3.2
     until the best lies between two others; then the vertex of the parabola through the three, over the weight's
-    logarithm. With a margin instead the weight is raised from there for as long as no more than that share is added to
-    what is left.
+    logarithm. With a margin instead the weight is lowered for as long as a step takes more than a quarter of that share
+    away from what is left, and then raised for as long as no more than that share is added to it.
     """
-    found: dict[int, float] = {}
-    usual = getattr(weights, name)
+    start, usual, found = level.at(coefficients, halves=0), getattr(weights, name), dict[int, float]()
     least, greatest = powers
 
     def left_out(power: int) -> float:
         if power not in found:
             tried = replace(weights, **{name: usual * _RATIO**power})
-            fitted = level.descend(coefficients, tried, steps=1, stop_mm=0.0, halves=0)
-            found[power] = level.at(fitted, halves=1).variance
+            found[power] = level.descend(start, tried, steps=1, stop_mm=0.0).images.left_out
         return found[power]
 
-    best = 0
-    while (nearby := min((p for p in (best, best - 1, best + 1) if least <= p <= greatest), key=left_out)) != best:
-        best = nearby
+    def followed(best: int, way: int, enough: float = 0.0) -> int:
+        while least <= best + way <= greatest and left_out(best + way) < (1.0 - enough) * left_out(best):
+            best += way
+        return best
+
     rule = f"{name} by cross-validation: half of the voxels fitted, the other half's residual least"
-    power = float(best)
     if margin is not None:
-        while power < greatest and left_out(int(power) + 1) <= (1.0 + margin) * found[best]:
+        best = followed(0, -1, 0.25 * margin)
+        power = float(best)
+        while power < greatest and left_out(int(power) + 1) <= (1.0 + margin) * min(found.values()):
             power += 1.0
         rule += f", then raised for as long as that adds no more than {100.0 * margin:g} %"
-    elif least < best < greatest:
-        below, here, above = (left_out(best + d) for d in (-1, 0, 1))
-        power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
     else:
-        rule += "; it is least at the end of what is tried"
+        best = followed(0, 1) or followed(0, -1)
+        power = float(best)
+        if least < best < greatest:
+            below, here, above = (left_out(best + d) for d in (-1, 0, 1))
+            power += 0.5 * (below - above) / max(below - 2.0 * here + above, 1e-12 * here)
+        else:
+            rule += "; it is least at the end of what is tried"
     chosen = replace(weights, **{name: float(usual * _RATIO**power)})
-    return Choice(chosen, rule, tuple((float(usual * _RATIO**p), found[p] / found[best]) for p in sorted(found)))
+    return Choice(
+        chosen, rule, tuple((float(usual * _RATIO**p), found[p] / min(found.values())) for p in sorted(found))
+    )
 
 
 def _level(

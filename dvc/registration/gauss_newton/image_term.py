@@ -39,6 +39,7 @@ class Normal:
     force: FloatArray  # (3, mi, mj, mk), sums over the voxels of r g B
     square: float  # sum of r^2
     count: int  # voxels that both images show
+    left_out: float  # mean of r^2 over such voxels of the other half; NaN if all were asked for
 
 
 class ImagePair:
@@ -103,14 +104,14 @@ class ImagePair:
             self.block, self._carried, both, own,
         )  # fmt: skip
         gain = _gain(both, own, _GAIN_MM / (self.block * self.grid.spacing_mm))
-        matrix, sums = np.zeros((*shape, 6)), np.zeros((shape[0], 2))
+        matrix, sums = np.zeros((*shape, 6)), np.zeros((shape[0], 4))
         half = np.zeros((self.grid.shape[0], coefficients.shape[0], 2, *self.sums.control.shape[1:]))
         _normal(
             self._fixed, self._carried, self.inside, halves, gain, pulled, self._step, self.block, self.sums.table,
             self.sums.factors, matrix, sums, half,
         )  # fmt: skip
-        square, count = sums.sum(axis=0)
-        return Normal(matrix, self.sums.closed(half), float(square), int(count))
+        square, count, other, others = sums.sum(axis=0)
+        return Normal(matrix, self.sums.closed(half), float(square), int(count), other / others if others else np.nan)
 
 
 def _gain(both: FloatArray, own: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -215,7 +216,7 @@ def _normal(
     step: FloatArray, block: IntArray, table: Table, factors: FloatArray, matrix: FloatArray, sums: FloatArray,
     half: FloatArray,
 ) -> None:  # fmt: skip
-    """Sums of g g^T over each block, of r^2 and of voxels (bi, 2), and of r g B plane by plane, into the last three."""
+    """Sums of g g^T over blocks, of r g B by plane, and (bi, 4) of r^2 and voxels, in this half and in the other."""
     _, second, last = table
     ni, nj, nk = inside.shape
     alone = factors.shape[3] == 0
@@ -234,11 +235,13 @@ def _normal(
                     found = carried[i, j, k]
                     if not inside[i, j, k] or np.isnan(found):
                         continue
-                    if halves >= 0 and (i // _CUBE + j // _CUBE + k // _CUBE) % 2 != halves:
-                        continue
                     bk = k // block[2]
                     a, T = gain[bi, bj, bk], pulled[bi, bj, bk]
                     r = a * fixed[i, j, k] - found
+                    if halves >= 0 and (i // _CUBE + j // _CUBE + k // _CUBE) % 2 != halves:
+                        sums[bi, 2] += r * r
+                        sums[bi, 3] += 1.0
+                        continue
                     x = a * (fixed[after_i, j, k] - fixed[before_i, j, k]) / (2.0 * step[0])
                     y = a * (fixed[i, after_j, k] - fixed[i, before_j, k]) / (2.0 * step[1])
                     z = a * (fixed[i, j, min(k + 1, nk - 1)] - fixed[i, j, max(k - 1, 0)]) / (2.0 * step[2])

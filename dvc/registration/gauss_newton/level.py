@@ -1,6 +1,5 @@
 """One level of a Gauss-Newton registration: its energy, and steps that lower it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,15 +12,17 @@ from dvc.errors import RegistrationError
 from dvc.images.image import Grid, Image
 from dvc.registration.gauss_newton.image_term import ImagePair, Normal
 from dvc.registration.gauss_newton.roughness import Roughness
-from dvc.registration.gauss_newton.spline_sums import Stiffness
+from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients, dot
+from dvc.registration.gauss_newton.spline_sums import SplineSums, Stiffness
 
 _BLOCKS = 2.5  # blocks between two control points, about
 _LONGEST = 0.45  # of the control spacing: a step of less than that cannot fold by itself
 _HALVINGS = 4
 _SLACK = 1e-3  # the fixed image's gradient is not quite the energy's own: near the end it may rise by as much
-_SOLVER = 0.1, 60  # of the conjugate gradients: reduction of the residual, most iterations
-_SOLVER_OF_HALF = 0.05, 80  # half of the voxels are fitted in one step, to choose a weight
+_SOLVER = 0.01, 10  # of the conjugate gradients: reduction of the residual, most iterations
+_SOLVER_OF_HALF = 0.01, 12  # half of the voxels are fitted in one step, to choose a weight
 _SMALLEST = 1e-6
+_ON_DIAGONAL = [0, 3, 5]  # xx, yy, zz
 _LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
 _FLATTEST = 0.1  # det F below this is taken as this in F^-T
 
@@ -41,10 +42,12 @@ class Weights:
         return 2 if self.volume_gradient else 1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class State:
-    """A displacement and all that a step from it needs."""
+    """A displacement and all that a step from it needs, with all voxels (-1) or one half of them (0, 1)."""
 
+    halves: int
+    blocks: SplineSums
     coefficients: FloatArray  # (3 splines, mi, mj, mk), mm
     F: FloatArray  # (bi, bj, bk, 3, 3), deformation gradient at the blocks
     cofactor: FloatArray  # (bi, bj, bk, 3, 3), derivative of det F
@@ -56,6 +59,11 @@ class State:
     def variance(self) -> float:
         """Mean square of the residual over the voxels that were asked for."""
         return self.images.square / self.images.count
+
+    @cached_property
+    def own_blocks(self) -> list[FloatArray]:
+        """The images' part of the control points' own blocks, on each grid."""
+        return self.blocks.own_blocks(self.images.matrix)
 
 
 class Level:
@@ -94,16 +102,18 @@ class Level:
         images = self.pair.normal(coefficients, pulled, halves)
         if images.count == 0 or not np.isfinite(images.square):
             raise RegistrationError("The registration diverged: the two images no longer have a voxel in common.")
-        return State(coefficients, F, cofactor, J, self.roughness.product(coefficients), images)
+        return State(
+            halves, self.pair.blocks, coefficients, F, cofactor, J, self.roughness.product(coefficients), images
+        )
 
     def prior(self, state: State, weights: Weights) -> float:
         """The energy of everything but the images."""
         strain = _green_lagrange(state.F[self._resists])
-        uneven = weights.volume_gradient * _dot(state.J, self._unevenness(state.J)) if weights.volume_gradient else 0.0
+        uneven = weights.volume_gradient * dot(state.J, self._unevenness(state.J)) if weights.volume_gradient else 0.0
         return 0.5 * (
-            weights.bending * _dot(state.coefficients, state.bent)
-            + weights.volume * _dot(self._soft, (state.J - 1.0) ** 2)
-            + weights.rigidity * _dot(self._stiff[self._resists], np.einsum("nab,nab->n", strain, strain))
+            weights.bending * dot(state.coefficients, state.bent)
+            + weights.volume * dot(self._soft, (state.J - 1.0) ** 2)
+            + weights.rigidity * dot(self._stiff[self._resists], np.einsum("nab,nab->n", strain, strain))
             + uneven
         )
 
@@ -118,15 +128,10 @@ class Level:
         return np.asarray(self.pair.blocks.gathered(stress) + weights.bending * state.bent)
 
     def step(self, state: State, weights: Weights, variance: float, solver: tuple[float, int]) -> FloatArray:
-        """The Gauss-Newton step, by conjugate gradients, preconditioned by each control point's own 3 x 3 block."""
+        """The Gauss-Newton step, by conjugate gradients."""
         volume, shear = weights.volume * self._soft, weights.rigidity * self._stiff
         stiffness: Stiffness = (state.images.matrix / variance, state.cofactor, volume, shear)
         force = state.images.force / variance - self.prior_gradient(state, weights)
-        diagonal = self.pair.blocks.diagonal(stiffness[0]) + self._prior_diagonal(weights)
-        for spline, rough in enumerate(self.roughness.diagonals):
-            for entry in (6 * spline, 6 * spline + 3, 6 * spline + 5):
-                diagonal[entry] += weights.bending * rough
-                diagonal[entry] += _SMALLEST * diagonal[entry].max()
         blocks = self.pair.blocks
 
         def product(c: FloatArray) -> FloatArray:
@@ -137,38 +142,40 @@ class Level:
                 out += blocks.gathered(pressure[..., None, None] * state.cofactor)
             return np.asarray(out)
 
-        inverse = np.concatenate([_inverted(own) for own in np.split(diagonal, len(diagonal) // 6)])
-        return conjugate_gradients(product, force, inverse, *solver)
+        of_images, of_prior = state.own_blocks, self._prior_blocks(weights)
+        diagonals = [own / variance + held for own, held in zip(of_images, of_prior, strict=True)]
+        for own in diagonals:
+            for block in own.reshape(-1, 6, *own.shape[1:]):
+                block[_ON_DIAGONAL] += _SMALLEST * block[_ON_DIAGONAL].max(axis=(1, 2, 3), keepdims=True)
+        return conjugate_gradients(product, force, by_blocks(diagonals), *solver)
 
-    def _prior_diagonal(self, weights: Weights) -> FloatArray:
-        """The part of the prior's blocks that does not change from step to step; as `SplineSums.diagonal`."""
-        out = weights.volume * self._diagonal_of_volume
+    def _prior_blocks(self, weights: Weights) -> list[FloatArray]:
+        """The prior's part of the control points' own blocks, on each grid."""
+        blocks = [weights.volume * own for own in self._of_volume]
         if weights.rigidity and self._resists.any():
-            out += weights.rigidity * self._diagonal_of_shear
+            blocks = [block + weights.rigidity * own for block, own in zip(blocks, self._of_shear, strict=True)]
         if weights.volume_gradient:
-            out += weights.volume_gradient * self._diagonal_of_gradient
-        return out
+            blocks = [b + weights.volume_gradient * own for b, own in zip(blocks, self._of_gradient, strict=True)]
+        for grid, block in enumerate(blocks):
+            for spline, rough in enumerate(self.roughness.diagonals(grid)):
+                block[6 * spline : 6 * spline + 6][_ON_DIAGONAL] += weights.bending * rough
+        return blocks
+
+    # What does not change from step to step: blocks on each grid for weights of 1.
+    @cached_property
+    def _of_volume(self) -> list[FloatArray]:
+        return self.pair.blocks.own_blocks(volume=self._soft)
 
     @cached_property
-    def _diagonal_of_volume(self) -> FloatArray:
-        return self.pair.blocks.diagonal(volume=self._soft)
+    def _of_shear(self) -> list[FloatArray]:
+        return self.pair.blocks.own_blocks(shear=self._stiff)
 
     @cached_property
-    def _diagonal_of_shear(self) -> FloatArray:
-        return self.pair.blocks.diagonal(shear=self._stiff)
+    def _of_gradient(self) -> list[FloatArray]:
+        return self.pair.blocks.own_blocks(volume=self._alone)
 
-    @cached_property
-    def _diagonal_of_gradient(self) -> FloatArray:
-        return self.pair.blocks.diagonal(volume=self._alone)
-
-    def descend(
-        self, coefficients: FloatArray, weights: Weights, *, steps: int, stop_mm: float, halves: int = -1
-    ) -> FloatArray:
-        """Take steps until one moves soft tissue by less than `stop_mm` (rms) or none lowers the energy.
-
-        From coefficients (3 splines, mi, mj, mk), at most so many `steps`; the voxels used are `halves` as in `at`.
-        """
-        state = self.at(coefficients, halves)
+    def descend(self, state: State, weights: Weights, *, steps: int, stop_mm: float) -> State:
+        """Take at most so many `steps`; end once one moves soft tissue by less than `stop_mm` (rms), or none helps."""
         for _ in range(steps):
             variance, count = max(state.variance, _LEAST_RESIDUAL**2), state.images.count
 
@@ -177,25 +184,25 @@ class Level:
                 return 0.5 * count * at.variance / variance + self.prior(at, weights)
 
             before = energy(state)
-            step = self.step(state, weights, variance, _SOLVER if halves < 0 else _SOLVER_OF_HALF)
+            step = self.step(state, weights, variance, _SOLVER if state.halves < 0 else _SOLVER_OF_HALF)
             if not np.isfinite(step).all():
                 raise RegistrationError("The registration diverged: a step is not finite.")
-            moved = self.pair.blocks.evaluate(step)[0][(self._soft > 0) | self._resists]  # air may go where it likes
-            longest = float((np.abs(moved) / self.control.spacing_mm).max(initial=0.0))
-            step *= min(1.0, _LONGEST / max(longest, _SMALLEST))
+            moved = self.pair.blocks.evaluate(step)[0]
+            tissue = (self._soft > 0) | self._resists  # air may go where it likes
+            longest = float((np.abs(moved[tissue]) / self.control.spacing_mm).max(initial=0.0))
+            share = min(1.0, _LONGEST / max(longest, _SMALLEST))
             for _ in range(_HALVINGS):
-                trial = self.at(state.coefficients + step, halves)
+                trial = self.at(state.coefficients + share * step, state.halves)
                 if energy(trial) <= before + _SLACK * abs(before):
                     break
-                step *= 0.5
+                share *= 0.5
             else:
                 break
             state = trial
-            moved = self.pair.blocks.evaluate(step)[0]
             square = np.einsum("...a,...a->...", moved, moved)
-            if np.sqrt(_dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)) < stop_mm:
+            if share * np.sqrt(dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)) < stop_mm:
                 break
-        return state.coefficients
+        return state
 
     def volume_asked(self, coefficients: FloatArray, weights: Weights, held_mm4: float) -> float:
         """The change of volume |J - 1| that a hundredth of the soft tissue exceeds once only its gradient is held.
@@ -208,7 +215,7 @@ class Level:
         seen = float(np.median(state.images.matrix[soft][:, [0, 3, 5]].mean(axis=1)))
         sharpness = seen / max(state.variance, _LEAST_RESIDUAL**2) / float(self._soft.max())
         looking = replace(weights, volume=0.0, volume_gradient=held_mm4 * sharpness)
-        freed = self.at(self.descend(coefficients, looking, steps=1, stop_mm=0.0))
+        freed = self.descend(state, looking, steps=1, stop_mm=0.0)
         return float(np.percentile(np.abs(freed.J - 1.0)[soft], 99.0))
 
     def _unevenness(self, J: FloatArray) -> FloatArray:
@@ -262,54 +269,5 @@ def _strained(H: FloatArray, F: FloatArray, cofactor: FloatArray, pulled: FloatA
                 pulled[n, a, b] = cofactor[n, a, b] / least
 
 
-def conjugate_gradients(
-    product: Callable[[FloatArray], FloatArray], force: FloatArray, inverse: FloatArray, tolerance: float, most: int
-) -> FloatArray:
-    """Solve A x = force (3 n, ...) for a positive definite A given by its product with x.
-
-    The preconditioner `inverse` (6 n, ...) is n symmetric 3 x 3 matrices at each place: xx, xy, xz, yy, yz, zz. Ends
-    once the residual's preconditioned norm is `tolerance` times what it was, or after the `most` iterations.
-    """
-
-    def preconditioned(v: FloatArray) -> FloatArray:
-        out = np.empty_like(v)
-        for n in range(len(v) // 3):
-            xx, xy, xz, yy, yz, zz = inverse[6 * n : 6 * n + 6]
-            x, y, z = v[3 * n : 3 * n + 3]
-            out[3 * n] = xx * x + xy * y + xz * z
-            out[3 * n + 1] = xy * x + yy * y + yz * z
-            out[3 * n + 2] = xz * x + yz * y + zz * z
-        return out
-
-    x, left = np.zeros_like(force), force.copy()
-    weighted = preconditioned(left)
-    along, norm = weighted.copy(), _dot(left, weighted)
-    enough = tolerance**2 * norm
-    for _ in range(most):
-        if norm <= enough:
-            break
-        pushed = product(along)
-        length = norm / _dot(along, pushed)
-        x += length * along
-        left -= length * pushed
-        weighted = preconditioned(left)
-        before, norm = norm, _dot(left, weighted)
-        along = weighted + norm / before * along
-    return x
-
-
-def _inverted(blocks: FloatArray) -> FloatArray:
-    """Inverses of symmetric positive 3 x 3 matrices (6, ...)."""
-    xx, xy, xz, yy, yz, zz = blocks
-    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    found = np.stack([a, b, c, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy])
-    return np.asarray(found / (xx * a + xy * b + xz * c))
-
-
 def _green_lagrange(F: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (np.swapaxes(F, -1, -2) @ F - np.eye(3)))
-
-
-def _dot(a: FloatArray, b: FloatArray) -> float:
-    """Inner product, summed in an order that does not depend on threads (as BLAS would)."""
-    return float((a * b).sum())

@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from dvc.arrays import FloatArray
 from dvc.images.image import Grid
+from dvc.registration.gauss_newton.spline_sums import TWICE_AS_WIDE, coarser
 
 _NEAR_MM = 4.0  # Gaussian over which the square of a Laplacian is averaged
 _LEAST = 0.05  # of its mean: where there is none, the weight still is finite
@@ -50,16 +51,24 @@ class Roughness:
         self._here = np.full(control.shape, scale) if here is None else scale * here
         self._laplacian = [_second_differences(n, h) for n, h in zip(control.shape, control.spacing_mm, strict=True)]
         self._transposed = [np.stack([np.roll(high, 1), on, np.roll(low, -1)]) for low, on, high in self._laplacian]
-        one = np.zeros((1, 7, 7, 7))
-        one[0, 3, 3, 3] = 1.0  # the Laplacian of one coefficient of 1 mm, far from any face
-        for _ in range(laplacians):
-            one = _summed(one, [_second_differences(7, h) for h in control.spacing_mm])
-        self._diagonal = self._here * float((one**2).sum())
 
-    @property
-    def diagonals(self) -> list[FloatArray]:
-        """Each spline's part of the matrix' diagonal, (ni, nj, nk), for any component; exact where c is even."""
-        return [p * self._diagonal + q for p, q in self._weights]
+    def diagonals(self, grid: int = 0) -> list[FloatArray]:
+        """Each spline's part of the matrix' diagonal, (ni, nj, nk), for any component; exact where c is even.
+
+        On a coarser grid, with points 2 or 4 times as far apart, it is that of splines which are sums of these.
+        """
+        here, alone = self._here, np.ones(1)  # one coefficient of 1 mm, along an axis and far from any face
+        for _ in range(grid):
+            sizes = zip(coarser(here.shape), here.shape, strict=True)
+            here = here[np.ix_(*(np.clip(2 * np.arange(m) - 2, 0, n - 1) for m, n in sizes))]
+            alone = np.convolve(np.insert(alone, range(1, alone.size), 0.0), TWICE_AS_WIDE)
+        alone = np.pad(alone, 2 * self._times)
+        one = alone[:, None, None] * alone[:, None] * alone
+        rough = one[None]
+        for _ in range(self._times):
+            rough = _summed(rough, [_second_differences(alone.size, h) for h in self.control.spacing_mm])
+        square, own = float((rough**2).sum()), float((one**2).sum())
+        return [p * square * here + q * own for p, q in self._weights]
 
     def product(self, coefficients: FloatArray) -> FloatArray:
         """The energy's gradient for coefficients (3 splines, ni, nj, nk)."""

@@ -16,6 +16,10 @@ from dvc.deformation.bspline import Axis, Table, spline_table
 from dvc.images.image import Grid
 
 _ALONE = np.empty((0, 0, 0, 0, 4))  # factors of a spline that has none
+TWICE_AS_WIDE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 8.0
+"""Coefficients of the cubic B-spline of twice the width: a sum of five."""
+GRIDS = 3
+"""Control grids that a solver looks at: the given one, and each next with points twice as far apart."""
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 Stiffness = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -38,9 +42,8 @@ class SplineSums:
         self.control = control
         self.inside = frozen(inside, np.bool_)
         self.factors = _ALONE if factors is None else factors
-        rows = [spline_table(np.ascontiguousarray(t), n) for t, n in zip(along, control.shape, strict=True)]
-        i, j, k = ((first, value, slope / h) for (first, value, slope), h in zip(rows, control.spacing_mm, strict=True))
-        self.table: Table = (i, j, k)
+        self._along = [np.ascontiguousarray(t) for t in along]
+        self.table = _table(self._along, control.shape, control.spacing_mm)
 
     def evaluate(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Give u (ni, nj, nk, 3) mm and grad u (ni, nj, nk, 3, 3) from coefficients (3 splines, mi, mj, mk)."""
@@ -60,17 +63,18 @@ class SplineSums:
         _product(coefficients, self.inside, self.table, self.factors, stiffness, half)
         return self.closed(half)
 
-    def diagonal(
+    def own_blocks(
         self, image: FloatArray | None = None, volume: FloatArray | None = None, shear: FloatArray | None = None
-    ) -> FloatArray:
+    ) -> list[FloatArray]:
         """The points' part of the Hessian for each control point's three coefficients with one another.
 
         (6 splines, mi, mj, mk): xx, xy, xz, yy, yz, zz, spline by spline; it is linear in the parts of `Stiffness` that
-        are given, with cofactors as those of no strain.
+        are given, with cofactors as those of no strain. So for each of the `GRIDS`, finest first; for a coarser one two
+        points of the last along each axis count as one in their middle.
         """
         if not self.factors.shape[3]:
-            return self._diagonal(image, volume, shear)
-        diagonals = []
+            return self._own_blocks(image, volume, shear)
+        of_splines = []
         for factor in np.moveaxis(self.factors, 3, 0):  # each spline seen through it, products of B and grad B left out
             a, slope = factor[..., 0], factor[..., 1:]
             square = a * a
@@ -82,38 +86,22 @@ class SplineSums:
                 for entry, (m, n) in enumerate(_PAIRS):
                     seen[..., entry] += (whole + half) * slope[..., m] * slope[..., n] + half * steep * (m == n)
             parts = (None if each is None else each * square for each in (volume, shear))
-            diagonals.append(self._diagonal(seen, *parts))
-        return np.concatenate(diagonals)
+            of_splines.append(self._own_blocks(seen, *parts))
+        return [np.concatenate(grid) for grid in zip(*of_splines, strict=True)]
 
-    def _diagonal(self, image: FloatArray | None, volume: FloatArray | None, shear: FloatArray | None) -> FloatArray:
-        spread = []  # of each axis, the matrices (control points, points) that sum B B, B' B and B' B'
-        for (first, v, s), count in zip(self.table, self.control.shape, strict=True):
-            at = (first[:, None] + np.arange(4)).ravel(), np.repeat(np.arange(first.size), 4)
-            products, shape = (v * v, s * v, s * s), (count, first.size)
-            spread.append([csr_array((weights.ravel(), at), shape=shape) for weights in products])
-
-        def onto(field: FloatArray, slopes: Sequence[int]) -> FloatArray:
-            for axis in range(3):
-                moved = np.moveaxis(field, axis, 0)
-                summed = spread[axis][slopes[axis]] @ moved.reshape(len(moved), -1)
-                field = np.moveaxis(summed.reshape(-1, *moved.shape[1:]), 0, axis)
-            return field
-
-        volume, shear = (None if each is None else np.where(self.inside, each, 0.0) for each in (volume, shear))
-        out = np.zeros((6, *self.control.shape))
-        for entry, (m, a) in enumerate(_PAIRS):
-            if image is not None:
-                out[entry] = onto(np.where(self.inside, image[..., entry], 0.0), (0, 0, 0))
-            mixed = [int(axis in {m, a}) for axis in range(3)] if m != a else [2 * (axis == m) for axis in range(3)]
-            if volume is not None:
-                out[entry] += onto(volume, mixed)
-            if shear is not None and m != a:
-                out[entry] += onto(0.5 * shear, mixed)
-            elif shear is not None:
-                for axis in range(3):
-                    share = 1.0 if axis == m else 0.5
-                    out[entry] += onto(share * shear, [2 * (n == axis) for n in range(3)])
-        return out
+    def _own_blocks(
+        self, image: FloatArray | None, volume: FloatArray | None, shear: FloatArray | None
+    ) -> list[FloatArray]:
+        found, along, shape = [], self._along, tuple(self.control.shape)
+        parts = [each if each is None else each[..., None] for each in (volume, shear)]
+        fields = [each if each is None else np.where(self.inside[..., None], each, 0.0) for each in (image, *parts)]
+        for grid in range(GRIDS):
+            if grid:
+                along = [0.5 * np.array([t[n : n + 2].mean() for n in range(0, t.size, 2)]) + 1.0 for t in along]
+                fields, shape = [each if each is None else _paired(each) for each in fields], coarser(shape)
+            table = _table(along, shape, 2**grid * self.control.spacing_mm)
+            found.append(_spread(table, shape, *fields))
+        return found
 
     def closed(self, half: FloatArray) -> FloatArray:
         """Sum over the first axis of what was put onto the coefficients of the other two plane by plane."""
@@ -123,6 +111,63 @@ class SplineSums:
 
     def _half(self) -> FloatArray:
         return np.empty((self.inside.shape[0], 3 * max(self.factors.shape[3], 1), 2, *self.control.shape[1:]))
+
+
+def coarser(shape: Sequence[int]) -> tuple[int, int, int]:
+    """Shape of the control grid whose points are twice as far apart, and whose splines are among those of a finer one.
+
+    Its point j lies on point 2 j - 2 of the finer grid: a cubic B-spline is the sum of five of half its width.
+    """
+    i, j, k = ((n - 1) // 2 + 3 for n in shape)
+    return i, j, k
+
+
+def _paired(field: FloatArray) -> FloatArray:
+    """Sums over two neighbours along each of the first three axes."""
+    for axis in range(3):
+        even = np.moveaxis(field, axis, 0)
+        out = even[0::2].copy()
+        out[: len(even) // 2] += even[1::2]
+        field = np.moveaxis(out, 0, axis)
+    return field
+
+
+def _spread(
+    table: Table, shape: Sequence[int], image: FloatArray | None, volume: FloatArray | None, shear: FloatArray | None
+) -> FloatArray:
+    """Own blocks (6, mi, mj, mk) from the parts of a stiffness (ni, nj, nk, 6 or 1) at the points of a table."""
+    spread = []  # of each axis, the matrices (control points, points) that sum B B, B' B and B' B'
+    for (first, v, s), count in zip(table, shape, strict=True):
+        at = (first[:, None] + np.arange(4)).ravel(), np.repeat(np.arange(first.size), 4)
+        size = (count, first.size)
+        spread.append([csr_array((weights.ravel(), at), shape=size) for weights in (v * v, s * v, s * s)])
+
+    def onto(field: FloatArray, slopes: Sequence[int]) -> FloatArray:
+        for axis in range(3):
+            moved = np.moveaxis(field, axis, 0)
+            summed = spread[axis][slopes[axis]] @ moved.reshape(len(moved), -1)
+            field = np.moveaxis(summed.reshape(-1, *moved.shape[1:]), 0, axis)
+        return np.moveaxis(field, -1, 0)
+
+    out = np.zeros((6, *shape)) if image is None else onto(image, (0, 0, 0))
+    for entry, (m, a) in enumerate(_PAIRS):
+        mixed = [int(axis in {m, a}) for axis in range(3)] if m != a else [2 * (axis == m) for axis in range(3)]
+        if volume is not None:
+            out[entry] += onto(volume, mixed)[0]
+        if shear is not None and m != a:
+            out[entry] += 0.5 * onto(shear, mixed)[0]
+        elif shear is not None:
+            for axis in range(3):
+                share = 1.0 if axis == m else 0.5
+                out[entry] += share * onto(shear, [2 * (n == axis) for n in range(3)])[0]
+    return np.ascontiguousarray(out)
+
+
+def _table(along: Sequence[FloatArray], shape: Sequence[int], spacing_mm: FloatArray) -> Table:
+    """Basis functions, and their slopes per mm, at control indices along each axis."""
+    rows = (spline_table(t, n) for t, n in zip(along, shape, strict=True))
+    i, j, k = ((first, value, slope / h) for (first, value, slope), h in zip(rows, spacing_mm, strict=True))
+    return i, j, k
 
 
 # The sweeps: planes, rows and lines of the grid, one axis of B-splines after the other.

@@ -90,11 +90,13 @@ class Residuals:
     def __init__(self, left: dict[int, float]) -> None:
         self._left = left
 
-    def descend(self, coefficients, weights, **_):
-        return 2.0 * np.log10(weights.rigidity / 3.0)
+    def at(self, coefficients, halves):
+        return None
 
-    def at(self, power, halves):
-        return SimpleNamespace(variance=self._left[round(power)])
+    def descend(self, state, weights, **_):
+        return SimpleNamespace(
+            images=SimpleNamespace(left_out=self._left[round(2.0 * np.log10(weights.rigidity / 3.0))])
+        )
 
 
 @pytest.mark.parametrize(
@@ -108,6 +110,9 @@ class Residuals:
         ({-1: 1.1, 0: 1.0, 1: 1.0009, 2: 1.0001}, 3e-4, 0.0),  # raised for as long as
         ({-1: 1.0, 0: 1.0, 1: 1.0, 2: 1.0, 3: 1.0}, 3e-4, 3.0),  # the images do not tell
         ({-2: 1.0, -1: 0.9, 0: 1.0, 1: 1.1}, 3e-4, -1.0),
+        ({-1: 0.99995, 0: 1.0, 1: 1.0002, 2: 1.0004}, 3e-4, 1.0),  # a step down that takes less than a quarter
+        ({-2: 0.9999, -1: 0.9999, 0: 1.0, 1: 1.00025}, 3e-4, 0.0),
+        ({-1: 1.1, 0: 1.0, 1: 0.9, 2: 0.9002, 3: 0.95}, 3e-4, 2.0),  # more than the least, which lies above
     ],
 )
 def test_a_weight_is_chosen_by_what_is_left_out(left, margin, power):
