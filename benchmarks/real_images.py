@@ -39,7 +39,8 @@ from dvc import (
 from dvc.deformation.protocol import displacement_on_grid
 from dvc.errors import MrstrainError
 from dvc.images.resample import carry
-from dvc.worker import Worker, usable_cores
+from dvc.threads import usable_cores
+from dvc.worker import Worker
 from mrstrain.records.provenance import versions
 
 

@@ -22,7 +22,8 @@ from dvc import Mask, Settings, load_preset, read_parameter_file, register, tiss
 from dvc.images.tissue import widened
 from dvc.io.transforms.elastix_text import format_parameters
 from dvc.registration.elastix import run as elastix
-from dvc.worker import Worker, usable_cores
+from dvc.threads import usable_cores
+from dvc.worker import Worker
 from mrstrain import phantom
 from mrstrain.records.provenance import versions
 from phantoms import HeelPair, heel_pair

@@ -23,7 +23,8 @@ from dvc.images.resample import shows
 from dvc.io.transforms.elastix_text import parse_parameters
 from dvc.io.transforms.read import bspline_from_elastix
 from dvc.registration.elastix import run as elastix
-from dvc.worker import Worker, usable_cores
+from dvc.threads import usable_cores
+from dvc.worker import Worker
 from mrstrain.records.provenance import versions
 from phantoms import HeelPair, errors_by_tissue, heel_pair
 

@@ -117,8 +117,3 @@ def _end_with(parent: int) -> None:
 
     if hasattr(os, "fork"):  # elsewhere a child keeps the number of a parent that is gone
         threading.Thread(target=watch, daemon=True).start()
-
-
-def usable_cores() -> int:
-    """Number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
+from dvc.threads import in_parts
 from phantoms.bodies import EllipsoidUnion, distance
 
 TISSUES: Mapping[int, str] = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "ankle"}
@@ -152,12 +153,14 @@ class Heel:
     def tissue_at(self, points_mm: FloatArray) -> IntArray:
         """Labels (n,) of TISSUES at points (n, 3) LPS mm; 0 is air."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        return np.asarray(_tissues(points, self._parameters()))
+        out = np.empty(len(points), dtype=np.int64)
+        in_parts(_tissues, len(points), points, self._parameters(), out)
+        return out
 
     def intensity_at(self, points_mm: FloatArray) -> FloatArray:
         """Noise-free signal (n,) at points (n, 3) LPS mm; air is 0."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        return np.asarray(_signals(points, np.zeros((1, 3, 3)), 1, self._parameters()))[:, 0]
+        return self._signals(points, np.zeros((1, 3, 3)), 1)[:, 0]
 
     def octant_intensity(self, points_mm: FloatArray, axes_mm: FloatArray) -> FloatArray:
         """Noise-free signal (n, 2, 2, 2) at a quarter of each edge before and behind centres (n, 3) of voxels, LPS mm.
@@ -167,7 +170,12 @@ class Heel:
         """
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         axes = np.ascontiguousarray(axes_mm, dtype=np.float64).reshape(-1, 3, 3)
-        return np.asarray(_signals(points, axes, 8, self._parameters())).reshape(-1, 2, 2, 2)
+        return self._signals(points, axes, 8).reshape(-1, 2, 2, 2)
+
+    def _signals(self, points: FloatArray, axes: FloatArray, samples: int) -> FloatArray:
+        out = np.empty((len(points), samples))
+        in_parts(_signals, len(points), points, axes, self._parameters(), out)
+        return out
 
 
 @njit(cache=True)
@@ -332,12 +340,10 @@ def _fat(x, y, z, wide, fine, salt):  # type: ignore[no-untyped-def]
     return _LOBULE_SIGNAL * level * (1.0 - max(strength * wall, 0.24 * thin))
 
 
-@njit(parallel=True, cache=True)
-def _tissues(points, heel):  # type: ignore[no-untyped-def]
-    out = np.empty(points.shape[0], dtype=np.int64)
-    for n in prange(points.shape[0]):
+@njit(nogil=True, cache=True)
+def _tissues(start, stop, points, heel, out):  # type: ignore[no-untyped-def]
+    for n in range(start, stop):
         out[n] = _tissue(points[n, 0], points[n, 1], points[n, 2], heel)
-    return out
 
 
 @njit(cache=True)
@@ -348,19 +354,17 @@ def _within_one_tissue(depths, reach):  # type: ignore[no-untyped-def]
     return soft and abs(foot) > reach and abs(flesh) > reach and abs(tendon) > reach and abs(muscle) > reach
 
 
-@njit(parallel=True, cache=True)
-def _signals(points, axes, samples, heel):  # type: ignore[no-untyped-def]
-    out = np.empty((points.shape[0], samples))
-    for n in prange(points.shape[0]):
+@njit(nogil=True, cache=True)
+def _signals(start, stop, points, axes, heel, out):  # type: ignore[no-untyped-def]
+    for n in range(start, stop):
         a = axes[n] if axes.shape[0] > 1 else axes[0]
         centre = _depths(points[n, 0], points[n, 1], points[n, 2], heel)
         # Distances are of first order, so the corners are given twice their distance.
         reach = _EDGE_MM + 0.5 * np.sqrt((a * a).sum())
         alike = _within_one_tissue(centre, reach)
-        for m in range(samples):
+        for m in range(out.shape[1]):
             s, t, w = 0.25 if m & 4 else -0.25, 0.25 if m & 2 else -0.25, 0.25 if m & 1 else -0.25
             x = points[n, 0] + s * a[0, 0] + t * a[0, 1] + w * a[0, 2]
             y = points[n, 1] + s * a[1, 0] + t * a[1, 1] + w * a[1, 2]
             z = points[n, 2] + s * a[2, 0] + t * a[2, 1] + w * a[2, 2]
             out[n, m] = _signal(x, y, z, centre if alike else _depths(x, y, z, heel), heel)
-    return out

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from dvc.arrays import FloatArray, frozen
 from dvc.errors import InputError
+from dvc.threads import in_parts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +74,9 @@ class EllipsoidUnion:
     def distance(self, points_mm: FloatArray) -> FloatArray:
         """First-order distance of points (n, 3) mm to the surface, (n,) mm; negative inside, exact on the surface."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        return np.asarray(_distances(points, self.centres_mm, self.forms, self.sharpness))
+        out = np.empty(len(points))
+        in_parts(_distances, len(points), points, self.centres_mm, self.forms, self.sharpness, out)
+        return out
 
 
 @njit(cache=True)
@@ -108,9 +111,7 @@ def distance(x, y, z, centres, forms, sharpness):  # type: ignore[no-untyped-def
     return (root - 1.0) * root / max(slope, 1e-3)
 
 
-@njit(parallel=True, cache=True)
-def _distances(points, centres, forms, sharpness):  # type: ignore[no-untyped-def]
-    out = np.empty(points.shape[0])
-    for n in prange(points.shape[0]):
+@njit(nogil=True, cache=True)
+def _distances(start, stop, points, centres, forms, sharpness, out):  # type: ignore[no-untyped-def]
+    for n in range(start, stop):
         out[n] = distance(points[n, 0], points[n, 1], points[n, 2], centres, forms, sharpness)
-    return out

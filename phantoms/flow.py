@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from dvc.arrays import FloatArray, as_points, frozen
 from dvc.errors import InputError
+from dvc.threads import in_parts
 from phantoms.bodies import EllipsoidUnion
 
-_BLOCK = 256
 _NOTHING = 27.0  # exp(-27) = 2e-12: a rise is complete beyond
 
 
@@ -147,51 +147,47 @@ def _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q):  # type: ign
     L[2, 0], L[2, 1], L[2, 2] = c2 * m0 - r2 * n0, c2 * m1 - r2 * n1, c2 * m2 - r2 * n2 - along
 
 
-@njit(parallel=True, cache=True)
-def _carry(points, rest, skin, window, plate, pivot, keeps, steps, gradient):  # type: ignore[no-untyped-def]
+@njit(nogil=True, cache=True)
+def _carry(start, stop, points, rest, skin, window, plate, pivot, keeps, steps, u, F1):  # type: ignore[no-untyped-def]
     """Runge-Kutta 4 on x' = v(x) and, with it, on (F - I)' = grad v F."""
-    count = points.shape[0]
-    u = np.zeros((count, 3))
-    F1 = np.zeros((count if gradient else 0, 3, 3))
     h = 1.0 / steps
     nodes = np.array([0.0, 0.5 * h, 0.5 * h, h])
     shares = np.array([h / 6.0, h / 3.0, h / 3.0, h / 6.0])
     most = max(rest[0].shape[0], skin[0].shape[0])
-    for block in prange((count + _BLOCK - 1) // _BLOCK):
-        v, L, p, du, q = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(most)
-        M, K, dM = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-        for n in range(block * _BLOCK, min(count, (block + 1) * _BLOCK)):
-            for _ in range(steps):
-                du[:] = 0.0
-                dM[:, :] = 0.0
-                v[:] = 0.0
-                K[:, :] = 0.0
-                moving = False
-                for stage in range(4):
-                    for i in range(3):
-                        p[i] = points[n, i] + u[n, i] + nodes[stage] * v[i]
-                    if gradient:
-                        for i in range(3):
-                            for j in range(3):
-                                M[i, j] = F1[n, i, j] + nodes[stage] * K[i, j]
-                    _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q)
-                    for i in range(3):
-                        du[i] += shares[stage] * v[i]
-                        moving = moving or v[i] != 0.0
-                    if gradient:
-                        for i in range(3):
-                            for j in range(3):
-                                K[i, j] = L[i, j] + L[i, 0] * M[0, j] + L[i, 1] * M[1, j] + L[i, 2] * M[2, j]
-                                dM[i, j] += shares[stage] * K[i, j]
-                if not moving:
-                    break  # a point of a stationary flow that is at rest stays at rest
+    v, L, p, du, q = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(most)
+    M, K, dM = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    gradient = F1.shape[0] > 0
+    for n in range(start, stop):
+        for _ in range(steps):
+            du[:] = 0.0
+            dM[:, :] = 0.0
+            v[:] = 0.0
+            K[:, :] = 0.0
+            moving = False
+            for stage in range(4):
                 for i in range(3):
-                    u[n, i] += du[i]
+                    p[i] = points[n, i] + u[n, i] + nodes[stage] * v[i]
                 if gradient:
                     for i in range(3):
                         for j in range(3):
-                            F1[n, i, j] += dM[i, j]
-    return u, F1
+                            M[i, j] = F1[n, i, j] + nodes[stage] * K[i, j]
+                _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q)
+                for i in range(3):
+                    du[i] += shares[stage] * v[i]
+                    moving = moving or v[i] != 0.0
+                if gradient:
+                    for i in range(3):
+                        for j in range(3):
+                            K[i, j] = L[i, j] + L[i, 0] * M[0, j] + L[i, 1] * M[1, j] + L[i, 2] * M[2, j]
+                            dM[i, j] += shares[stage] * K[i, j]
+            if not moving:
+                break  # a point of a stationary flow that is at rest stays at rest
+            for i in range(3):
+                u[n, i] += du[i]
+            if gradient:
+                for i in range(3):
+                    for j in range(3):
+                        F1[n, i, j] += dM[i, j]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,9 +286,10 @@ class Flow:
         points = as_points(points_mm)
         window = np.array([self.centre_mm, self.width_mm])
         skin = _NO_BORDER if self.skin is None else self.skin._numbers()
-        u, H = _carry(
-            points, self.rest._numbers(), skin, window, self.plate_mm, self.pivot_mm, self.keeps_volume, self.steps,
-            gradient,
+        u, H = np.zeros((len(points), 3)), np.zeros((len(points) if gradient else 0, 3, 3))
+        in_parts(
+            _carry, len(points), points, self.rest._numbers(), skin, window, self.plate_mm, self.pivot_mm,
+            self.keeps_volume, self.steps, u, H,
         )  # fmt: skip
         lost = ~np.isfinite(points).all(axis=-1)
         u[lost] = np.nan

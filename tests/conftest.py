@@ -14,6 +14,8 @@ import pytest
 from filelock import FileLock
 from hypothesis import settings
 
+from dvc import threads
+
 # The same examples in every run: a failure that comes and goes tells nobody anything.
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed")
@@ -23,6 +25,7 @@ settings.load_profile("fixed")
 def one_thread() -> None:
     """Two workers have a core each: tests of threads ask for theirs."""
     numba.set_num_threads(1)
+    threads.use(1)
 
 
 @pytest.fixture(scope="session")

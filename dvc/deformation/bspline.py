@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid
 from dvc.images.interpolation import Four, Weights, indices_around, spline_basis
+from dvc.threads import in_parts
 
 _SUPPORT = 4
 # Lengths in control spacings: how far a voxel may lie from the place that the separable way gives it, and how
@@ -123,7 +124,8 @@ class BSpline:
         u, H = np.empty((slabs[-1], 3)), np.empty((slabs[-1], 3, 3))
         coefficients = np.ascontiguousarray(self.coefficients_mm.transpose(0, *(order + 1)))
         i, j, k = (spline_table(t, coefficients.shape[a + 1]) for a, t in enumerate(along))
-        _on_grid(coefficients, where, slabs, (i, j, k), np.ascontiguousarray(self.control.index_per_mm[order]), u, H)
+        per_mm = np.ascontiguousarray(self.control.index_per_mm[order])
+        in_parts(_on_grid, len(where), coefficients, where, slabs, (i, j, k), per_mm, u, H)
         return u, H
 
     def plus(self, other: Self) -> Self:
@@ -166,7 +168,7 @@ def evaluate_spline(
     places = np.ascontiguousarray(indices, dtype=np.float64)
     values = np.empty((len(places), len(coefficients)))
     slopes = np.empty((len(places) if gradient else 0, len(coefficients), 3))
-    _at_indices(np.ascontiguousarray(coefficients), places, mirror, gradient, values, slopes)
+    in_parts(_at_indices, len(places), np.ascontiguousarray(coefficients), places, mirror, gradient, values, slopes)
     return values, slopes
 
 
@@ -215,12 +217,13 @@ def spline_table(t: FloatArray, count: int) -> Axis:
     return first, value, slope
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def _at_indices(
-    coefficients: FloatArray, indices: FloatArray, mirror: bool, gradient: bool, values: FloatArray, slopes: FloatArray
-) -> None:
+    start: int, stop: int, coefficients: FloatArray, indices: FloatArray, mirror: bool, gradient: bool,
+    values: FloatArray, slopes: FloatArray,
+) -> None:  # fmt: skip
     components, ni, nj, nk = coefficients.shape
-    for n in prange(indices.shape[0]):
+    for n in range(start, stop):
         x, y, z = indices[n, 0], indices[n, 1], indices[n, 2]
         if mirror:
             known = np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
@@ -244,10 +247,10 @@ def _at_indices(
                 slopes[n, m, 0], slopes[n, m, 1], slopes[n, m, 2] = by_x, by_y, by_z
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def _on_grid(
-    coefficients: FloatArray, where: BoolArray, slabs: IntArray, table: Table, per_mm: FloatArray, u: FloatArray,
-    H: FloatArray,
+    start: int, stop: int, coefficients: FloatArray, where: BoolArray, slabs: IntArray, table: Table,
+    per_mm: FloatArray, u: FloatArray, H: FloatArray,
 ) -> None:  # fmt: skip
     """Sum over the first axis once per plane of voxels, the second once per row, the third per voxel."""
     nj, nk = where.shape[1], where.shape[2]
@@ -256,7 +259,7 @@ def _on_grid(
     first_i, value_i, slope_i = i_axis
     first_j, value_j, slope_j = j_axis
     first_k, value_k, slope_k = k_axis
-    for i in prange(where.shape[0]):
+    for i in range(start, stop):
         n = slabs[i]
         if slabs[i + 1] == n:
             continue

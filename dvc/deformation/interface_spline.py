@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
 from scipy.special import ndtri
 
@@ -18,6 +18,7 @@ from dvc.deformation.protocol import CHUNK, in_chunks
 from dvc.errors import GeometryError, InputError
 from dvc.images.image import Grid, LabelMap, Mask
 from dvc.images.interpolation import indices_around, spline_basis
+from dvc.threads import in_parts
 
 _BLUR = 1.0  # voxels: a border of voxels' faces becomes a smooth one
 _SURE = 0.03  # of the blurred mask: between that and its complement the border's distance is read off
@@ -105,7 +106,8 @@ class Interfaces:
         indices = self.grid.indices_of(np.asarray(points_mm, dtype=np.float64))
         own, depth = np.empty(len(indices), dtype=np.int64), np.empty((2, len(indices)))
         slope = np.zeros((2, len(indices), 3))
-        _depths_at(self.depth, self.own, self.rest, indices, gradient, own, depth, slope)
+        given = self.depth, self.own, self.rest, indices, gradient
+        in_parts(_depths_at, len(indices), *given, own, depth, slope)
         slope = slope @ self.grid.index_per_mm
         return self._factors(depth[0], slope[0], -depth[1], -slope[1], own)
 
@@ -132,10 +134,10 @@ class Interfaces:
         return depth[:, 0], per_voxel[:, 0] / self.grid.spacing_mm
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def _depths_at(
-    depth: FloatArray, own: IntArray, rest: int, indices: FloatArray, gradient: bool, tissue: IntArray,
-    value: FloatArray, slope: FloatArray,
+    start: int, stop: int, depth: FloatArray, own: IntArray, rest: int, indices: FloatArray, gradient: bool,
+    tissue: IntArray, value: FloatArray, slope: FloatArray,
 ) -> None:  # fmt: skip
     """Each point's own tissue, the depth (2, n) in it and in the bone at rest, and their slopes (2, n, 3) by index.
 
@@ -143,7 +145,7 @@ def _depths_at(
     index, its depth is -inf.
     """
     ni, nj, nk = own.shape
-    for n in prange(len(indices)):
+    for n in range(start, stop):
         x, y, z = indices[n, 0], indices[n, 1], indices[n, 2]
         tissue[n], value[:, n] = 0, -np.inf
         if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
@@ -275,17 +277,17 @@ class InterfaceSpline:
     ) -> tuple[FloatArray, FloatArray]:
         """Join u and H of both splines at the same points."""
         u, H = np.empty_like(smooth[0]), np.empty_like(smooth[1])
-        _join(self.borders.at(points), *smooth, *jump, u, H)
+        in_parts(_join, len(u), self.borders.at(points), *smooth, *jump, u, H)
         return u, H
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def _join(
-    factors: FloatArray, v: FloatArray, v_gradient: FloatArray, w: FloatArray, w_gradient: FloatArray, u: FloatArray,
-    H: FloatArray,
+    start: int, stop: int, factors: FloatArray, v: FloatArray, v_gradient: FloatArray, w: FloatArray,
+    w_gradient: FloatArray, u: FloatArray, H: FloatArray,
 ) -> None:  # fmt: skip
     """Write u = m v + psi w and its gradient (n, 3, 3) from the factors (n, 2, 4) and both splines."""
-    for n in prange(len(u)):
+    for n in range(start, stop):
         m, psi = factors[n]
         for i in range(3):
             u[n, i] = m[0] * v[n, i] + psi[0] * w[n, i]

@@ -4,11 +4,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
 from dvc.arrays import FloatArray, IntArray, as_points, frozen
 from dvc.errors import InputError
 from dvc.mesh import TetMesh
+from dvc.threads import in_parts
 
 _TOLERANCE = 1e-9  # of a barycentric coordinate: points on a face belong to the cells on either side
 _CELLS_PER_BIN = 2.0
@@ -42,7 +43,7 @@ class Locator:
         """
         points = as_points(points_mm)
         cells, inside = np.full(len(points), -1), np.full((len(points), 3), np.nan)
-        _find(points, self._bins, self.inverse, cells, inside)
+        in_parts(_find, len(points), points, self._bins, self.inverse, cells, inside)
         return cells, inside
 
 
@@ -111,10 +112,12 @@ def _binned(first: IntArray, last: IntArray, shape: IntArray) -> tuple[IntArray,
     return starts, members
 
 
-@njit(cache=True, parallel=True)
-def _find(points: FloatArray, bins: _Bins, inverse: FloatArray, cells: IntArray, inside: FloatArray) -> None:
+@njit(nogil=True, cache=True)
+def _find(
+    start: int, stop: int, points: FloatArray, bins: _Bins, inverse: FloatArray, cells: IntArray, inside: FloatArray
+) -> None:
     low, width, shape, starts, members, origin = bins
-    for n in prange(len(points)):
+    for n in range(start, stop):
         bin_, known = 0, True
         for axis in range(3):
             place = np.floor((points[n, axis] - low[axis]) / width)

@@ -9,10 +9,11 @@ from typing import Self
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
 from dvc.arrays import BoolArray, FloatArray, frozen
 from dvc.errors import InputError
+from dvc.threads import in_parts
 
 _ORTHONORMAL = 1e-9
 _PARALLEL_SINE = 1e-6
@@ -81,7 +82,7 @@ class StrainField:
         count = len(H)
         strain, principal, shear, jacobian = (np.empty((count, *shape)) for shape in ((3, 3), (3,), (), ()))
         valid = np.empty(count, dtype=np.bool_)
-        _strain(H, strain, principal, shear, jacobian, valid)
+        in_parts(_strain, len(H), H, strain, principal, shear, jacobian, valid)
         for array in (strain, principal, shear, jacobian, valid):
             array.flags.writeable = False
         return cls(strain, principal, shear, jacobian, valid)
@@ -218,7 +219,7 @@ def principal_values(tensors: npt.ArrayLike) -> FloatArray:
     if array.ndim != 3 or array.shape[1:] != (3, 3):
         raise InputError(f"Tensors have shape (n, 3, 3); got {array.shape}.")
     values = np.empty((len(array), 3))
-    _principal_of(array, values)
+    in_parts(_principal_of, len(array), array, values)
     return values
 
 
@@ -262,9 +263,9 @@ def _principal(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float)
     return max(first, second) * scale, min(first, second) * scale, third * scale
 
 
-@njit(parallel=True, cache=True)
-def _principal_of(tensors: FloatArray, values: FloatArray) -> None:
-    for n in prange(tensors.shape[0]):
+@njit(nogil=True, cache=True)
+def _principal_of(start: int, stop: int, tensors: FloatArray, values: FloatArray) -> None:
+    for n in range(start, stop):
         t = tensors[n]
         values[n, 0], values[n, 1], values[n, 2] = _principal(
             t[0, 0], t[1, 1], t[2, 2],
@@ -272,12 +273,12 @@ def _principal_of(tensors: FloatArray, values: FloatArray) -> None:
         )  # fmt: skip
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def _strain(
-    gradient: FloatArray, strain: FloatArray, principal: FloatArray, shear: FloatArray, jacobian: FloatArray,
-    valid: BoolArray,
+    start: int, stop: int, gradient: FloatArray, strain: FloatArray, principal: FloatArray, shear: FloatArray,
+    jacobian: FloatArray, valid: BoolArray,
 ) -> None:  # fmt: skip
-    for n in prange(gradient.shape[0]):
+    for n in range(start, stop):
         H, E = gradient[n], strain[n]
         known = True
         for i in range(3):

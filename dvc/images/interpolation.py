@@ -1,7 +1,7 @@
 """Cubic B-splines and linear interpolation between voxels, compiled: the weights, and values at any index."""
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray
 
@@ -86,13 +86,20 @@ def _linear_at(image: Float32Array, x: float, y: float, z: float) -> float:
     return float((1.0 - a) * low + a * high)
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def sample_values(
-    image: Float32Array, cubic: bool, points: FloatArray, per_mm: FloatArray, start: FloatArray, values: FloatArray
+    begin: int,
+    end: int,
+    image: Float32Array,
+    cubic: bool,
+    points: FloatArray,
+    per_mm: FloatArray,
+    start: FloatArray,
+    values: FloatArray,
 ) -> None:
     """Values at points (n, 3) mm, whose indices in the image are ``start + per_mm @ point``; NaN beyond its voxels."""
     ni, nj, nk = image.shape
-    for n in prange(len(points)):
+    for n in range(begin, end):
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
         x = start[0] + per_mm[0, 0] * a + per_mm[0, 1] * b + per_mm[0, 2] * c
         y = start[1] + per_mm[1, 0] * a + per_mm[1, 1] * b + per_mm[1, 2] * c
@@ -103,10 +110,10 @@ def sample_values(
             values[n] = np.nan
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def carry_values(
-    image: Float32Array, gaps: Float32Array, cubic: bool, where: BoolArray, step: FloatArray, start: FloatArray,
-    displacement: Float32Array, per_mm: FloatArray, carried: Float32Array,
+    begin: int, end: int, image: Float32Array, gaps: Float32Array, cubic: bool, where: BoolArray, step: FloatArray,
+    start: FloatArray, displacement: Float32Array, per_mm: FloatArray, carried: Float32Array,
 ) -> None:  # fmt: skip
     """Values of an image at the voxels ``where`` of a grid (ni, nj, nk), NaN where not known, into the last array.
 
@@ -114,7 +121,7 @@ def carry_values(
     3), mm. ``gaps`` is 1 at missing voxels, and empty where none is missing; so is a displacement that is zero.
     """
     ni, nj, nk = image.shape
-    for i in prange(where.shape[0]):
+    for i in range(begin, end):
         for j in range(where.shape[1]):
             for k in range(where.shape[2]):
                 if not where[i, j, k]:

@@ -9,6 +9,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from dvc.arrays import BoolArray, Float32Array, FloatArray, frozen
 from dvc.images.image import Grid, Image
 from dvc.images.interpolation import carry_values, sample_values
+from dvc.threads import in_parts
 
 
 class AffineMotion(Protocol):
@@ -86,9 +87,9 @@ def sampled(
     be interpolated linearly (1).
     """
     per_mm, values = np.ascontiguousarray(grid.index_per_mm @ motion.matrix), np.empty(len(points_mm))
-    sample_values(
-        frozen(coefficients, np.float32), order == 3, points_mm, per_mm, grid.indices_of(motion.translation_mm), values
-    )
+    start = grid.indices_of(motion.translation_mm)
+    given = frozen(coefficients, np.float32), order == 3, points_mm, per_mm, start
+    in_parts(sample_values, len(values), *given, values)
     return values
 
 
@@ -114,5 +115,6 @@ class Carrier:
         u = np.zeros((0, 0, 0, 3)) if displacement_mm is None else displacement_mm
         carried = np.full(grid.shape, np.nan, dtype=np.float32)
         moved = np.ascontiguousarray(u, dtype=np.float32)
-        carry_values(self._values, self._gaps, self._cubic, wanted, step, start, moved, per_mm, carried)
+        given = self._values, self._gaps, self._cubic, wanted, step, start, moved, per_mm
+        in_parts(carry_values, len(wanted), *given, carried)
         return carried

@@ -8,7 +8,7 @@ from dvc import Deformation, TetMesh
 from dvc.atomic_files import write_json, write_whole
 from dvc.errors import InputError, MrstrainError
 from dvc.io.result_folder import REGIONS, result_folders
-from dvc.worker import usable_cores
+from dvc.threads import usable_cores
 from mrstrain.comparison.model_files import IN_IMAGE, SETTINGS
 from mrstrain.models.simulate import material_sets
 from mrstrain.options.door import door

@@ -14,9 +14,10 @@ from dvc.io.result_folder import QUALITY, REPEAT, spline_in
 from dvc.registration.align import without_motion
 from dvc.registration.engines import DEFAULT
 from dvc.registration.register import refuse_one_image_twice
+from dvc.threads import usable_cores
 from dvc.trust.error_model import error_model_of
 from dvc.trust.quality import NoiseFloor, read_noise_floor
-from dvc.worker import Worker, each_in_workers, usable_cores
+from dvc.worker import Worker, each_in_workers
 from mrstrain.measurement.case import Case, Series
 from mrstrain.measurement.engines import engine_of
 from mrstrain.measurement.plan import Plan, record_of

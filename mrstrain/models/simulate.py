@@ -14,7 +14,8 @@ import numpy as np
 import fe
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError, MrstrainError, OutputError
-from dvc.worker import Worker, each_in_workers, usable_cores
+from dvc.threads import usable_cores
+from dvc.worker import Worker, each_in_workers
 from fe.simulation_files import ENDING, fingerprint, read_checkpoint, write_checkpoint
 from mrstrain.options.door import door
 from mrstrain.options.measurement import Cores

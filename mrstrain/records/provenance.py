@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dvc.software import distribution_versions
-from dvc.worker import usable_cores
+from dvc.threads import usable_cores
 from mrstrain.records.doctor import usable_memory_bytes
 
 _BLOCK = 1 << 20

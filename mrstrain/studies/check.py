@@ -12,8 +12,8 @@ from dvc import Image, LabelMap, fit_mask, plate_axes, read_error_model, read_im
 from dvc.errors import MrstrainError
 from dvc.io.result_folder import REPEAT
 from dvc.measurement.subject import is_bones_name
+from dvc.threads import usable_cores
 from dvc.trust.error_model import error_model_of
-from dvc.worker import usable_cores
 from fe import MaterialSet, Plate, check_loads, check_meshing, fixed_facets, material_set, problems_of
 from mrstrain.comparison.model_files import model_files
 from mrstrain.measurement.engines import engine_of

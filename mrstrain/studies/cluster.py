@@ -17,7 +17,7 @@ from filelock import FileLock
 
 from dvc.errors import InputError, MrstrainError
 from dvc.software import software_key
-from dvc.worker import usable_cores
+from dvc.threads import usable_cores
 from mrstrain.records.progress import OnProgress
 from mrstrain.studies import stages
 from mrstrain.studies.stages import StageResult

@@ -12,7 +12,8 @@ from dvc import engine_named
 from dvc.errors import InputError, MrstrainError
 from dvc.registration.engines import DEFAULT
 from dvc.software import software_key
-from dvc.worker import Worker, each_in_workers, usable_cores
+from dvc.threads import usable_cores
+from dvc.worker import Worker, each_in_workers
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import OnProgress
 from mrstrain.truth.accuracy_study import AccuracyStudy

@@ -14,11 +14,11 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 
-import numba
 import numpy as np
 from scipy.linalg import solve_banded
 from scipy.ndimage import distance_transform_edt
 
+from dvc import threads
 from dvc.arguments import check_fields
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.bspline import BSpline
@@ -189,7 +189,7 @@ def _level(
     """Images smoothed, and every so manyth voxel of them: a smooth image needs no more."""
     fixed, moving = pictures
     if sigma_mm > 0.0:
-        with ThreadPoolExecutor(min(2, numba.get_num_threads())) as pool:
+        with ThreadPoolExecutor(min(2, threads.count())) as pool:
             fixed, moving = pool.map(lambda i: thinned(smoothed(i, sigma_mm), _every(i.grid, sigma_mm)), pictures)
     every, rim_mm = _every(pictures[0].grid, sigma_mm), _BLURRED * sigma_mm
     return Level((fixed, moving), inside[every], soft[every], bone[every], Roughness(control), rim_mm)

@@ -9,7 +9,7 @@ moving image's gradient at places between voxels is correlated with its noise th
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy.ndimage import binary_dilation, gaussian_filter, spline_filter
 
 from dvc.arrays import BoolArray, Float32Array, FloatArray, IntArray, frozen
@@ -18,6 +18,7 @@ from dvc.images.image import Grid, Image
 from dvc.images.interpolation import cubic_at
 from dvc.images.resample import fill_missing
 from dvc.registration.gauss_newton.spline_sums import SplineSums, plane_sums
+from dvc.threads import in_parts
 
 _GAIN_MM = 10.0
 _FINE = 3.0  # blocks: a window of a larger standard deviation is laid on coarser ones
@@ -99,16 +100,16 @@ class ImagePair:
         """
         shape = self.blocks.inside.shape
         both, own = np.zeros(shape), np.zeros(shape)
-        _carry(
-            coefficients, self.inside, self.sums.table, self.sums.factors, self._fixed, self._scene, self._step,
-            self.block, self._carried, both, own,
+        in_parts(
+            _carry, len(both), coefficients, self.inside, self.sums.table, self.sums.factors, self._fixed,
+            self._scene, self._step, self.block, self._carried, both, own,
         )  # fmt: skip
         gain = _gain(both, own, _GAIN_MM / (self.block * self.grid.spacing_mm))
         matrix, sums = np.zeros((*shape, 6)), np.zeros((shape[0], 4))
         half = np.zeros((self.grid.shape[0], coefficients.shape[0], 2, *self.sums.control.shape[1:]))
-        _normal(
-            self._fixed, self._carried, self.inside, halves, gain, pulled, self._step, self.block, self.sums.table,
-            self.sums.factors, matrix, sums, half,
+        in_parts(
+            _normal, len(gain), self._fixed, self._carried, self.inside, halves, gain, pulled, self._step, self.block,
+            self.sums.table, self.sums.factors, matrix, sums, half,
         )  # fmt: skip
         square, count, other, others = sums.sum(axis=0)
         return Normal(matrix, self.sums.closed(half), float(square), int(count), other / others if others else np.nan)
@@ -160,10 +161,10 @@ def _interpolated(image: Float32Array, gaps: BoolArray, x: float, y: float, z: f
     return float(cubic_at(image, x, y, z))
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def _carry(
-    c: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, fixed: Float32Array, scene: _Scene,
-    step: FloatArray, block: IntArray, carried: Float32Array, both: FloatArray, own: FloatArray,
+    begin: int, end: int, c: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, fixed: Float32Array,
+    scene: _Scene, step: FloatArray, block: IntArray, carried: Float32Array, both: FloatArray, own: FloatArray,
 ) -> None:  # fmt: skip
     """I1(X + u) at the voxels, and sums of I0 I1 and I0 I0 over each block."""
     first, second, last = table
@@ -171,8 +172,7 @@ def _carry(
     ni, nj, nk = inside.shape
     alone = factors.shape[3] == 0
     splines = 1 if alone else factors.shape[3]
-    for counted in prange(both.shape[0]):
-        bi = np.int64(counted)
+    for bi in range(begin, end):
         plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], c.shape[3]))
         for i in range(bi * block[0], min(ni, (bi + 1) * block[0])):
             if not inside[i].any():
@@ -210,19 +210,18 @@ def _carry(
                         own[bi, j // block[1], k // block[2]] += here * here
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def _normal(
-    fixed: Float32Array, carried: Float32Array, inside: BoolArray, halves: int, gain: FloatArray, pulled: FloatArray,
-    step: FloatArray, block: IntArray, table: Table, factors: FloatArray, matrix: FloatArray, sums: FloatArray,
-    half: FloatArray,
+    begin: int, end: int, fixed: Float32Array, carried: Float32Array, inside: BoolArray, halves: int, gain: FloatArray,
+    pulled: FloatArray, step: FloatArray, block: IntArray, table: Table, factors: FloatArray, matrix: FloatArray,
+    sums: FloatArray, half: FloatArray,
 ) -> None:  # fmt: skip
     """Sums of g g^T over blocks, of r g B by plane, and (bi, 4) of r^2 and voxels, in this half and in the other."""
     _, second, last = table
     ni, nj, nk = inside.shape
     alone = factors.shape[3] == 0
     splines = 1 if alone else factors.shape[3]
-    for counted in prange(gain.shape[0]):
-        bi = np.int64(counted)
+    for bi in range(begin, end):
         row = np.empty((half.shape[1], half.shape[4]))
         for i in range(bi * block[0], min(ni, (bi + 1) * block[0])):
             before_i, after_i = max(i - 1, 0), min(i + 1, ni - 1)

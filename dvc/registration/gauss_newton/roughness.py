@@ -11,12 +11,13 @@ from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy.ndimage import gaussian_filter
 
 from dvc.arrays import FloatArray
 from dvc.images.image import Grid
 from dvc.registration.gauss_newton.spline_sums import TWICE_AS_WIDE, coarser
+from dvc.threads import in_parts
 
 _NEAR_MM = 4.0  # Gaussian over which the square of a Laplacian is averaged
 _LEAST = 0.05  # of its mean: where there is none, the weight still is finite
@@ -115,15 +116,16 @@ def _second_differences(count: int, spacing_mm: float) -> FloatArray:
 def _summed(coefficients: FloatArray, along: Sequence[FloatArray]) -> FloatArray:
     """The sum of three tridiagonal matrices, each applied along its own axis of (m, ni, nj, nk)."""
     out = np.empty_like(coefficients)
-    _three_axes(coefficients, along[0], along[1], along[2], out)
+    in_parts(_three_axes, out.shape[1], coefficients, along[0], along[1], along[2], out)
     return out
 
 
-@njit(parallel=True, cache=True)
-def _three_axes(c: FloatArray, di: FloatArray, dj: FloatArray, dk: FloatArray, out: FloatArray) -> None:
+@njit(nogil=True, cache=True)
+def _three_axes(
+    start: int, stop: int, c: FloatArray, di: FloatArray, dj: FloatArray, dk: FloatArray, out: FloatArray
+) -> None:
     ni, nj, nk = c.shape[1], c.shape[2], c.shape[3]
-    for counted in prange(ni):
-        i = np.int64(counted)  # numba counts without a sign
+    for i in range(start, stop):
         before_i, after_i = i - (i > 0), i + (i < ni - 1)
         for m in range(c.shape[0]):
             for j in range(nj):

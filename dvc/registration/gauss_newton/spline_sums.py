@@ -8,12 +8,13 @@ fixed order, so that it is the same bit for bit on any number of threads.
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy.sparse import csr_array
 
 from dvc.arrays import BoolArray, FloatArray, frozen
 from dvc.deformation.bspline import Axis, Table, spline_table
 from dvc.images.image import Grid
+from dvc.threads import in_parts
 
 _ALONE = np.empty((0, 0, 0, 0, 4))  # factors of a spline that has none
 TWICE_AS_WIDE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 8.0
@@ -48,19 +49,19 @@ class SplineSums:
     def evaluate(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Give u (ni, nj, nk, 3) mm and grad u (ni, nj, nk, 3, 3) from coefficients (3 splines, mi, mj, mk)."""
         u, H = np.zeros((*self.inside.shape, 3)), np.zeros((*self.inside.shape, 3, 3))
-        _evaluate(coefficients, self.inside, self.table, self.factors, u, H)
+        in_parts(_evaluate, len(u), coefficients, self.inside, self.table, self.factors, u, H)
         return u, H
 
     def gathered(self, stress: FloatArray) -> FloatArray:
         """Put stresses P (ni, nj, nk, 3, 3) onto the coefficients: sum over points of P : grad B."""
         half = self._half()
-        _gather(stress, self.inside, self.table, self.factors, half)
+        in_parts(_gather, len(half), stress, self.inside, self.table, self.factors, half)
         return self.closed(half)
 
     def product(self, coefficients: FloatArray, stiffness: Stiffness) -> FloatArray:
         """Product of the points' part of the Hessian with coefficients (3 splines, mi, mj, mk)."""
         half = self._half()
-        _product(coefficients, self.inside, self.table, self.factors, stiffness, half)
+        in_parts(_product, len(half), coefficients, self.inside, self.table, self.factors, stiffness, half)
         return self.closed(half)
 
     def own_blocks(
@@ -106,7 +107,7 @@ class SplineSums:
     def closed(self, half: FloatArray) -> FloatArray:
         """Sum over the first axis of what was put onto the coefficients of the other two plane by plane."""
         out = np.empty((half.shape[1], *self.control.shape))
-        _close(half, self.table[0], out)
+        in_parts(_close, out.shape[1], half, self.table[0], out)
         return out
 
     def _half(self) -> FloatArray:
@@ -317,14 +318,21 @@ def _add_line_to_row(line: FloatArray, inside: BoolArray, last: Axis, ends: tupl
                 c[2, at + r] += v * hy
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def _evaluate(
-    c: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, u: FloatArray, H: FloatArray
+    start: int,
+    stop: int,
+    c: FloatArray,
+    inside: BoolArray,
+    table: Table,
+    factors: FloatArray,
+    u: FloatArray,
+    H: FloatArray,
 ) -> None:
     """The displacement u (ni, nj, nk, 3), mm, and its gradient H (ni, nj, nk, 3, 3) at the points that are inside."""
     first, second, last = table
     alone = factors.shape[3] == 0
-    for i in prange(inside.shape[0]):
+    for i in range(start, stop):
         if not inside[i].any():
             continue
         plane, row = np.empty((c.shape[0], 2, c.shape[2], c.shape[3])), np.empty((c.shape[0], 3, c.shape[3]))
@@ -347,12 +355,14 @@ def _evaluate(
                             H[i, j, k, m, a] = joined[m, a + 1, k]
 
 
-@njit(parallel=True, cache=True)
-def _gather(stress: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, half: FloatArray) -> None:
+@njit(nogil=True, cache=True)
+def _gather(
+    start: int, stop: int, stress: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, half: FloatArray
+) -> None:
     """Sums of P : grad B over the points that are inside, onto the last two axes' coefficients, plane by plane."""
     _, second, last = table
     alone = factors.shape[3] == 0
-    for i in prange(inside.shape[0]):
+    for i in range(start, stop):
         half[i] = 0.0
         if not inside[i].any():
             continue
@@ -374,15 +384,22 @@ def _gather(stress: FloatArray, inside: BoolArray, table: Table, factors: FloatA
             _add_row_to_plane(row, second[0][j], second[1][j], second[2][j], half[i])
 
 
-@njit(parallel=True, cache=True)
+@njit(nogil=True, cache=True)
 def _product(
-    c: FloatArray, inside: BoolArray, table: Table, factors: FloatArray, stiffness: Stiffness, half: FloatArray
+    start: int,
+    stop: int,
+    c: FloatArray,
+    inside: BoolArray,
+    table: Table,
+    factors: FloatArray,
+    stiffness: Stiffness,
+    half: FloatArray,
 ) -> None:
     """Product of the points' part of the Hessian with coefficients, whole lines of points at once."""
     first, second, last = table
     image, cofactor, volume, shear = stiffness
     alone = factors.shape[3] == 0
-    for i in prange(inside.shape[0]):
+    for i in range(start, stop):
         half[i] = 0.0
         if not inside[i].any():
             continue
@@ -406,14 +423,14 @@ def _product(
             _add_row_to_plane(back, second[0][j], second[1][j], second[2][j], half[i])
 
 
-@njit(parallel=True, cache=True)
-def _close(half: FloatArray, axis: Axis, out: FloatArray) -> None:
+@njit(nogil=True, cache=True)
+def _close(start: int, stop: int, half: FloatArray, axis: Axis, out: FloatArray) -> None:
     """Sums over the first axis: from planes (ni, m, 2, mj, mk) to coefficients (m, mi, mj, mk)."""
     first, value, slope = axis
-    for a in prange(out.shape[1]):
+    for a in range(start, stop):
         out[:, a] = 0.0
         for i in range(first.size):
-            p = np.int64(a) - first[i]
+            p = a - first[i]
             if not 0 <= p < 4:
                 continue
             v, s = value[i, p], slope[i, p]

@@ -6,13 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial.transform import Rotation
 
+from dvc import threads
 from dvc.deformation.bspline import BSpline, evaluate_spline
 from dvc.deformation.protocol import Composed, GridDeformation, RigidMotion, SampledDisplacement, evaluate_on_grid
 from dvc.errors import GeometryError, InputError
@@ -257,19 +257,17 @@ def test_a_uniform_strain_stays_so_up_to_the_outermost_voxels(direction: np.ndar
 
 
 def test_same_bits_on_one_and_two_threads() -> None:
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip("only one thread is allowed here")
     b = random_spline(np.eye(3))
     grid = Grid((20, 20, 20), (0.5, 0.5, 0.5), b.control.centre_mm - 4.0)
     where = np.ones(grid.shape, dtype=bool)
-    before = numba.get_num_threads()
+    before = threads.count()
     results = []
     try:
-        for threads in (1, 2):
-            numba.set_num_threads(threads)
+        for count in (1, 2):
+            threads.use(count)
             results.append((*b.evaluate_on_grid(grid, where), *b.evaluate(grid.points(where))))
     finally:
-        numba.set_num_threads(before)
+        threads.use(before)
     for one, two in zip(*results, strict=True):
         assert np.array_equal(one, two, equal_nan=True)
 

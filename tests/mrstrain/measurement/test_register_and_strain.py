@@ -25,8 +25,8 @@ from dvc.io.images.read import read_image
 from dvc.io.images.write import write_image, write_labels, write_mask
 from dvc.io.meshes.write import VERDICT_FIELD
 from dvc.io.transforms.read import read_transform
+from dvc.threads import usable_cores
 from dvc.trust.error_model import POOLED, ErrorModel, ErrorTable
-from dvc.worker import usable_cores
 from mrstrain.measurement.register import register
 from mrstrain.measurement.strain import strain
 from tests.quick import QUICK

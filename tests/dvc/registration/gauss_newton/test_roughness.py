@@ -1,9 +1,9 @@
 """Roughness of splines: what costs nothing, what detail costs beside what is long, and where it is let be."""
 
-import numba
 import numpy as np
 import pytest
 
+from dvc import threads
 from dvc.images.image import Grid
 from dvc.registration.gauss_newton.roughness import Roughness
 
@@ -120,12 +120,12 @@ def test_what_rounding_leaves_of_a_straight_displacement_is_no_curvature():
 def test_it_is_the_same_on_any_number_of_threads():
     c = np.random.default_rng(3).normal(size=(6, *CONTROL.shape))
     rough = Roughness(CONTROL, ((1.0, 0.0), (2.0, 0.1)), laplacians=2)
-    before = numba.get_num_threads()
+    before = threads.count()
     try:
         found = []
-        for threads in {1, before}:
-            numba.set_num_threads(threads)
+        for count in (1, 2, 3):
+            threads.use(count)
             found.append(rough.product(c))
     finally:
-        numba.set_num_threads(before)
+        threads.use(before)
     assert all(np.array_equal(each, found[0]) for each in found)

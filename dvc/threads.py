@@ -1,0 +1,52 @@
+"""Compiled loops that several threads share.
+
+A kernel is compiled without numba's own parallel loops, which take more than twice as long to compile, and which some
+platforms do not allow from several threads of Python at once.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+_PARTS = 8  # for each thread: what one part takes longer, another makes up for
+
+
+def usable_cores() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class _Threads:
+    """The threads that this process computes on: NUMBA_NUM_THREADS, or as many as there are cores."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.pool = ThreadPoolExecutor(count, "compiled")  # starts its threads when there is work
+
+
+_threads = [_Threads(int(os.environ.get("NUMBA_NUM_THREADS", "0")) or usable_cores())]
+
+
+def count() -> int:
+    """Number of threads that this process computes on."""
+    return _threads[-1].count
+
+
+def use(count: int) -> None:
+    """Compute on so many threads from now on."""
+    _threads[-1] = _Threads(count)
+
+
+def in_parts(kernel: Callable[..., None], size: int, *arguments: object) -> None:
+    """Run ``kernel(start, stop, *arguments)`` for parts that make up range(size), on all threads.
+
+    A kernel lets go of the interpreter (`nogil`), and writes for each number of its range what no other does: the
+    result is the same bit for bit on any number of threads.
+    """
+    threads = _threads[-1]
+    parts = min(size, _PARTS * threads.count) if threads.count > 1 else 1
+    if parts < 2:
+        kernel(0, size, *arguments)
+        return
+    ends = [size * part // parts for part in range(parts + 1)]
+    list(threads.pool.map(lambda part: kernel(ends[part], ends[part + 1], *arguments), range(parts)))
