@@ -16,7 +16,7 @@ from dvc.io.result_folder import REPORT
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
-from mrstrain.studies.costs import disk_bytes, seconds_of, sizes_of
+from mrstrain.studies.costs import disk_bytes, seconds_of, seconds_to_end, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
@@ -138,7 +138,9 @@ def run_studies(
                 of_disk = needed[study.out.stat().st_dev]
                 of_disk += [disk_bytes(stage, study, voxels) for stage in left]
                 refuse_small_disk(study.out, sum(of_disk), f"the results of {len(of_disk)} stages need")
-                total.seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
+                seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
+                total.seconds |= {prefix + stage.name: of for stage, of in zip(left, seconds, strict=True)}
+                pipelines[prefix].seconds_to_end = seconds_to_end(left, seconds)
             log = partial(_log, study.out / LOG)
             log(f"Study '{study.study.name}': {len(pipelines[prefix].stages)} stages, {len(left)} of them to do")
             logs[prefix] = total.also(log, prefix)

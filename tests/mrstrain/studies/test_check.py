@@ -211,6 +211,12 @@ def test_larger_images_and_meshes_take_longer_and_more_memory(study):
     limited = read_study(study)
     (simulating, *_) = (stage for stage in plan(limited) if stage.kind == "simulate")
     assert costs.seconds_of(simulating, limited, 0.0, 6e4) == 30.0  # one load, one path
+    times = {}
+    for name in ("friedman", "trebbi", "akrami"):  # the softer the fat, the longer
+        (study / "study.toml").write_text(STUDY)
+        one = replace(simulating, arguments={**simulating.arguments, "sets": (name,), "limit_s": None})
+        times[name] = costs.seconds_of(one, told, 0.0, 77e3)
+    assert times["friedman"] > 3.0 * times["trebbi"] > 9.0 * times["akrami"]
 
 
 def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, monkeypatch):
@@ -359,6 +365,8 @@ def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
 
     assert minutes(apart) == pytest.approx(one / 60.0, abs=0.5)
     assert minutes(row) == pytest.approx(4 * one / 60.0, abs=0.5)
+    to_end = costs.seconds_to_end(row, [1.0, 2.0, 3.0, 4.0])
+    assert [to_end[stage.name] for stage in row] == [10.0, 9.0, 7.0, 4.0]
     levelled = replace(first, name="level trebbi Load1")
     (study / "study.toml").write_text(STUDY + '[loads.Load2]\nimage = "Load1.nii.gz"\n')
     assert costs.disk_bytes(levelled, read_study(study), 1e6) == costs.disk_bytes(levelled, told, 1e6)
