@@ -132,7 +132,7 @@ def mesh_labels(
     lattice = None if finer is None else _lattice(labels, numbers[finer[0]], edge_mm, finer[1])
     surface = thinned(borders, _THINNED * spacing)
     points, cells = _limited(surface, edge_mm, _ENVELOPE * spacing, lattice, limit_s, watch)
-    cell_labels = labels_at(borders, points[cells].mean(axis=1))
+    cell_labels = labels_at(labels, borders, points[cells].mean(axis=1))
     body = np.isin(cell_labels, list(soft.values()))
     voxel_mm3 = labels.grid.voxel_volume_mm3
     volumes_mm3 = {number: voxel_mm3 * float((labels.labels == number).sum()) for number in numbers.values()}

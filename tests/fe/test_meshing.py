@@ -47,7 +47,7 @@ def test_borders_keep_the_volumes_that_smoothing_would_take() -> None:
     # a voxel's centre may fall on the other side only where a border is: none by more than half a voxel
     radius = np.linalg.norm(points, axis=-1)
     sure = (np.abs(radius[:, None] - [6, 14, 17]).min(axis=1) > 1.0) & (np.abs(points[:, 2]) > 1.0)
-    assert np.array_equal(labels_at(borders, points[sure]), labels.labels.reshape(-1)[sure])
+    assert np.array_equal(labels_at(labels, borders, points[sure]), labels.labels.reshape(-1)[sure])
 
 
 def test_thinned_borders_are_closed_and_lie_where_they_were() -> None:
