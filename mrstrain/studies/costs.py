@@ -14,6 +14,9 @@ from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.studies.file import Study
 from mrstrain.studies.plan import Stage, labels_to_mesh, mesh_place
 
+CARE = "CARE"
+"""Begins a line on what this machine has too little of."""
+
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
 _REGISTER_S, _MAPS_S_PER_MVOXEL = 35.0, 3.5  # beside what the engine takes (`Cost`)
 _TWIN = 1.3  # times as long again: the twin is made and registered
@@ -24,7 +27,7 @@ _SOFT_MPA, _SOFTER = 0.01, 0.4
 # P2 took 2.2 GiB, MINI .84.
 _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
-_MESH_S = 100.0
+_MESH_S = 40.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
 # GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
 # with borders 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells .84.
@@ -137,11 +140,11 @@ def costs(
         f"{needed:.1f} GiB of memory, {disk:.1f} GB on the disk ({free:.0f} GB free)."
     ]
     if disk > free:
-        lines.append("CARE: the disk has too little room.")
+        lines.append(f"{CARE}: the disk has too little room.")
     there = usable_memory_bytes()
     if there is not None and needed > there / _GIB:
         fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
         smaller = "one stage alone is too large: crop the images, take a coarser mesh, or a larger machine."
         advice = f"run with workers={fitting} (--workers {fitting})." if fitting else smaller
-        lines.append(f"CARE: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
+        lines.append(f"{CARE}: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
     return lines

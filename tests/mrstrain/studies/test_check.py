@@ -20,7 +20,7 @@ from mrstrain.studies import costs, stages
 from mrstrain.studies.check import check, wrong_with
 from mrstrain.studies.file import read_study
 from mrstrain.studies.plan import Stage, plan
-from mrstrain.studies.run import forecast, run
+from mrstrain.studies.run import _tell, forecast, run
 from tests.fe.test_simulate import dome
 
 GRID = Grid((16, 16, 16), (2.0, 2.0, 2.0), (-6.0, -6.0, -6.0))  # around the dome
@@ -348,6 +348,13 @@ def test_gaps_are_left_out_where_the_study_says_so(study):
     with pytest.raises(InputError, match="level = true"):
         forecast(study)
     assert forecast(study, only=("register",))["register Load1"] == "run"
+
+
+def test_what_a_machine_has_too_little_of_is_said_before_a_run_and_logged(caplog):
+    lines, logged = ["To do: 1 of 1 stages", "CARE: this machine has 1.0 GiB of memory"], list[str]()
+    _tell(lines, logged.append)
+    assert logged == lines
+    assert caplog.messages == lines[1:]
 
 
 def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
