@@ -46,10 +46,11 @@ class StageRunner:
         self._finished: queue.Queue[Future[Any]] = queue.Queue()
         client.subscribe_topic(self._topic, lambda event: watch(*event[1]))
 
-    def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path) -> None:
-        """Start a stage as soon as a worker is free and its lock is not held."""
+    def begin(self, name: str, function: str, arguments: Mapping[str, Any], lock: Path, urgency: float = 0.0) -> None:
+        """Start a stage as soon as a worker is free and its lock is not held, the most urgent of those that wait."""
         key = f"{name.replace(' ', '-')}-{uuid.uuid4().hex}"
-        future = self._client.submit(_run, self._topic, name, function, dict(arguments), str(lock), key=key, pure=False)
+        given = self._topic, name, function, dict(arguments), str(lock)
+        future = self._client.submit(_run, *given, key=key, pure=False, priority=urgency)
         self._under_way[future] = name
         future.add_done_callback(self._finished.put)
 

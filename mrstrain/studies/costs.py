@@ -8,21 +8,26 @@ import numpy as np
 from dvc import TetMesh, read_image, read_labels
 from dvc.errors import InputError
 from dvc.registration.engine import Cost
-from fe import LoadStep, paths_of, read_tet_mesh
+from fe import LoadStep, material_set, paths_of, read_tet_mesh
 from mrstrain.measurement.engines import engine_of
 from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.studies.file import Study
 from mrstrain.studies.plan import Stage, labels_to_mesh, mesh_place
 
+CARE = "CARE"
+"""Begins a line on what this machine has too little of."""
+
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
 _REGISTER_S, _MAPS_S_PER_MVOXEL = 35.0, 3.5  # beside what the engine takes (`Cost`)
 _TWIN = 1.3  # times as long again: the twin is made and registered
-_CELLS, _LOAD_S, _GROWTH = 66e3, 70.0, 1.5
+_CELLS, _LOAD_S, _GROWTH = 66e3, 35.0, 1.5
+# The seven published sets took .5 to 2.6 times as long as this says, whose softest tissues have .3 to 390 kPa.
+_SOFT_MPA, _SOFTER = 0.01, 0.4
 # Of P1's time and memory: P2 20 times as long on 60,000 cells of the heel, MINI a third of P2's time on 56,000, where
 # P2 took 2.2 GiB, MINI .84.
 _ELEMENT_TIMES = {"P1": 1.0, "MINI": 7.0, "P2": 20.0}
 _ELEMENT_GIB = {"P1": 1.0, "MINI": 1.0, "P2": 2.8}
-_MESH_S = 100.0
+_MESH_S = 40.0
 _COMPARE_S, _MODEL_S = 8.0, 4.0
 # GiB of all processes of a stage: registrations of 2.1, 7.1, 16.8 and 56.6 million voxels took .95, 2.1, 3.5 and 9.9,
 # with borders 1.2 and 2.3 of the first two, by elastix 1.7 of the first; a factorisation at 79,000 cells .84.
@@ -70,7 +75,9 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
     seconds = float(loads * _LOAD_S * (cells / _CELLS) ** _GROWTH)
     if stage.kind != "simulate":
         return seconds
-    seconds *= _ELEMENT_TIMES[study.models.element]
+    (one,) = stage.arguments["sets"]
+    softest_mpa = min(material.shear_modulus_mpa for material in material_set(one).materials.values())
+    seconds *= _ELEMENT_TIMES[study.models.element] * float((_SOFT_MPA / softest_mpa) ** _SOFTER)
     paths = paths_of([LoadStep(**load) for load in stage.arguments["loads"]], stage.arguments["towards"])
     limit = stage.arguments["limit_s"]
     return seconds if limit is None else min(seconds, len(paths) * limit)
@@ -94,12 +101,16 @@ def disk_bytes(stage: Stage, study: Study, voxels: float) -> float:
     return images + 1e6 * _MB_MODEL * models
 
 
-def _longest(left: Sequence[Stage], seconds: Sequence[float]) -> float:
-    """Seconds of the longest row of stages that wait for one another: no number of cores makes less of it."""
-    until: dict[str, float] = {}
-    for stage, own in zip(left, seconds, strict=True):
-        until[stage.name] = own + max((until.get(name, 0.0) for name in stage.before), default=0.0)
-    return max(until.values())
+def seconds_to_end(left: Sequence[Stage], seconds: Sequence[float]) -> dict[str, float]:
+    """Seconds from the start of each stage to the end of the longest row of stages that wait for one another.
+
+    No number of cores makes less of it, and a study ends soonest if the stage with most of it is started first.
+    """
+    to_end: dict[str, float] = {}
+    for stage, own in reversed(list(zip(left, seconds, strict=True))):
+        waiting = (to_end[other.name] for other in left if stage.name in other.before)
+        to_end[stage.name] = own + max(waiting, default=0.0)
+    return to_end
 
 
 def mesh_given(study: Study) -> TetMesh:
@@ -119,7 +130,7 @@ def costs(
     Other parameters are those of `seconds_of`; ``workers`` are the stages at once.
     """
     seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
-    minutes = max(sum(seconds) / workers, _longest(left, seconds)) / 60.0
+    minutes = max(sum(seconds) / workers, *seconds_to_end(left, seconds).values()) / 60.0
     gib = sorted((gib_of(stage, study, voxels, cells) for stage in left), reverse=True)
     needed = sum(gib[:workers])  # whichever of them meet
     disk = sum(disk_bytes(stage, study, voxels) for stage in left) / 1e9
@@ -129,11 +140,11 @@ def costs(
         f"{needed:.1f} GiB of memory, {disk:.1f} GB on the disk ({free:.0f} GB free)."
     ]
     if disk > free:
-        lines.append("CARE: the disk has too little room.")
+        lines.append(f"{CARE}: the disk has too little room.")
     there = usable_memory_bytes()
     if there is not None and needed > there / _GIB:
         fitting = sum(np.cumsum(gib[:workers]) <= there / _GIB)
         smaller = "one stage alone is too large: crop the images, take a coarser mesh, or a larger machine."
         advice = f"run with workers={fitting} (--workers {fitting})." if fitting else smaller
-        lines.append(f"CARE: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
+        lines.append(f"{CARE}: this machine has {there / _GIB:.1f} GiB of memory; {advice}")
     return lines

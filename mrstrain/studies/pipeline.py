@@ -70,12 +70,16 @@ class Pipeline:
         self.stages, self.ledger = tuple(stages), ledger
         self._only, self._force = tuple(only), tuple(force)
         self.outcomes: dict[str, StageOutcome] = {}
+        self.seconds_to_end: Mapping[str, float] = {}  # by stage; the one with most is started first
         self._keys: dict[str, tuple[str, Mapping[str, Any]]] = {}
         self._waiting = {stage.name: stage for stage in stages}
 
     def in_order(self) -> dict[str, StageOutcome]:
         """Outcomes in the order of the stages."""
         return {stage.name: self.outcomes[stage.name] for stage in self.stages}
+
+    def _urgency(self, stage: Stage) -> float:
+        return self.seconds_to_end.get(stage.name, 0.0)
 
     def _requested(self, stage: Stage) -> bool:
         return not self._only or stage.is_one_of(self._only)
@@ -158,6 +162,7 @@ class Pipeline:
         for name, outcome in self.outcomes.items():
             if name not in before:
                 log(str(outcome))
+        ready.sort(key=lambda one: -self._urgency(one[0]))
         for stage, arguments in ready:
             try:
                 self.ledger.clear(stage, files=not stage.goes_on or stage.is_one_of(self._force))
@@ -166,7 +171,8 @@ class Pipeline:
             except (OSError, MrstrainError) as failure:
                 self.end(stage.name, str(failure), 0.0, log)
                 continue
-            runner().begin(prefix + stage.name, stage.kind, arguments, self.ledger.lock(stage))
+            lock, urgency = self.ledger.lock(stage), self._urgency(stage)
+            runner().begin(prefix + stage.name, stage.kind, arguments, lock, urgency)
 
     def end(self, name: str, result: StageResult | str, seconds: float, log: Log) -> None:
         """Record how a stage ended that was handed to the cluster: its result, or why it failed."""

@@ -1,5 +1,6 @@
 """`run`: a study from its file to its report; finished stages are not repeated."""
 
+import logging
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -13,10 +14,11 @@ from filelock import FileLock, Timeout
 from dvc import Verdict
 from dvc.errors import InputError, OutputError, ParameterError
 from dvc.io.result_folder import REPORT
+from dvc.worker import usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
-from mrstrain.studies.costs import disk_bytes, seconds_of, sizes_of
+from mrstrain.studies.costs import CARE, costs, disk_bytes, seconds_of, seconds_to_end, sizes_of
 from mrstrain.studies.file import Study, read_study
 from mrstrain.studies.ledger import Ledger
 from mrstrain.studies.page import write_run_report
@@ -24,6 +26,7 @@ from mrstrain.studies.pipeline import Log, Pipeline, StageOutcome, left_out_of, 
 from mrstrain.studies.plan import KINDS, Stage, plan
 
 LOG = "study.log"
+_warnings = logging.getLogger("mrstrain.studies")
 _NOTHING = ("nothing",)  # may be run: every stage is taken as it is
 
 
@@ -120,8 +123,8 @@ def run_studies(
         )
     named = {f"{study.study.name}: " if len(studies) > 1 else "": study for study in studies}
     pipelines, to_do = _planned(named, only, force)
-    stages = f"{sum(len(pipeline.stages) for pipeline in pipelines.values())} stages"
-    total = _TotalProgress(progress or (lambda *_: None), stages)
+    of_all = f"{sum(len(pipeline.stages) for pipeline in pipelines.values())} stages"
+    total = _TotalProgress(progress or (lambda *_: None), of_all)
 
     def pool() -> object:
         from mrstrain.studies.cluster import cluster
@@ -133,14 +136,19 @@ def run_studies(
     with ExitStack() as stack:
         for prefix, study in named.items():
             stack.enter_context(_alone(study.out))
-            if left := to_do[prefix]:
+            log = partial(_log, study.out / LOG)
+            stages, left = pipelines[prefix].stages, to_do[prefix]
+            log(f"Study '{study.study.name}': {len(stages)} stages, {len(left)} of them to do")
+            if left:
                 voxels, cells = sizes_of(study)
                 of_disk = needed[study.out.stat().st_dev]
                 of_disk += [disk_bytes(stage, study, voxels) for stage in left]
                 refuse_small_disk(study.out, sum(of_disk), f"the results of {len(of_disk)} stages need")
-                total.seconds |= {prefix + stage.name: seconds_of(stage, study, voxels, cells) for stage in left}
-            log = partial(_log, study.out / LOG)
-            log(f"Study '{study.study.name}': {len(pipelines[prefix].stages)} stages, {len(left)} of them to do")
+                seconds = [seconds_of(stage, study, voxels, cells) for stage in left]
+                total.seconds |= {prefix + stage.name: of for stage, of in zip(left, seconds, strict=True)}
+                pipelines[prefix].seconds_to_end = seconds_to_end(left, seconds)
+                if scheduler is None:
+                    _tell(costs(study, stages, left, voxels, cells, workers or usable_cores()), log)
             logs[prefix] = total.also(log, prefix)
         run_all(pipelines, pool, logs)
         total.report(ALL, total.stages, 1.0)
@@ -149,6 +157,14 @@ def run_studies(
             write_run_report(one.study.out / REPORT, one.study, one.outcomes)
             logs[prefix](f"Report: {one.study.study.out}/{REPORT}")
     return runs
+
+
+def _tell(lines: Sequence[str], log: Log) -> None:
+    """Log what a run takes; what this machine has too little of is said aloud."""
+    for line in lines:
+        log(line)
+        if line.startswith(CARE):
+            _warnings.warning(line)
 
 
 def _planned(

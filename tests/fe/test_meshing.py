@@ -13,7 +13,7 @@ from dvc.mesh import TetMesh
 from fe import mesh_labels, read_tet_mesh, write_tet_mesh
 from fe.meshing import _guessed
 from fe.slivers import dihedral_angles_deg, without_slivers
-from fe.tissue_surfaces import borders_of, labels_at
+from fe.tissue_surfaces import borders_of, labels_at, thinned
 from mrstrain.models.mesh import Meshed
 from tests.blocks import block
 
@@ -47,7 +47,26 @@ def test_borders_keep_the_volumes_that_smoothing_would_take() -> None:
     # a voxel's centre may fall on the other side only where a border is: none by more than half a voxel
     radius = np.linalg.norm(points, axis=-1)
     sure = (np.abs(radius[:, None] - [6, 14, 17]).min(axis=1) > 1.0) & (np.abs(points[:, 2]) > 1.0)
-    assert np.array_equal(labels_at(borders, points[sure]), labels.labels.reshape(-1)[sure])
+    assert np.array_equal(labels_at(labels, borders, points[sure]), labels.labels.reshape(-1)[sure])
+
+
+def test_thinned_borders_are_closed_and_lie_where_they_were() -> None:
+    labels = half_onion()
+    borders = borders_of(labels)
+    points, triangles = thinned(borders, 0.05)
+    assert len(triangles) < 0.5 * len(borders.triangles)
+    edges = np.sort(np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)
+    times = np.unique(edges, axis=0, return_counts=True)[1]
+    assert set(times) == {2, 3}  # three where skin, fat and air meet at the cut
+    middles = points[triangles].mean(axis=1)  # a node stays where it was: what moves is between nodes
+    radius, at_cut = np.linalg.norm(middles, axis=1), middles[:, 2] > -1.5
+    off = np.abs(radius[:, None] - [6.0, 14.0, 17.0]).min(axis=1)[~at_cut]
+    whole = borders.points_mm[borders.points_mm[:, 2] < -1.5]
+    before = np.abs(np.linalg.norm(whole, axis=1)[:, None] - [6.0, 14.0, 17.0]).min(axis=1)
+    assert off.max() < before.max() + 0.3
+    assert off.mean() < before.mean() + 0.05
+    for off_mm in (0.02, 0.2):  # the further it may lie, the fewer triangles
+        assert (len(thinned(borders, off_mm)[1]) - len(triangles)) * (off_mm - 0.05) < 0
 
 
 def test_a_tendon_of_few_voxels_keeps_its_volume() -> None:

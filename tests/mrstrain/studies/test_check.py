@@ -20,7 +20,7 @@ from mrstrain.studies import costs, stages
 from mrstrain.studies.check import check, wrong_with
 from mrstrain.studies.file import read_study
 from mrstrain.studies.plan import Stage, plan
-from mrstrain.studies.run import forecast, run
+from mrstrain.studies.run import _tell, forecast, run
 from tests.fe.test_simulate import dome
 
 GRID = Grid((16, 16, 16), (2.0, 2.0, 2.0), (-6.0, -6.0, -6.0))  # around the dome
@@ -211,6 +211,12 @@ def test_larger_images_and_meshes_take_longer_and_more_memory(study):
     limited = read_study(study)
     (simulating, *_) = (stage for stage in plan(limited) if stage.kind == "simulate")
     assert costs.seconds_of(simulating, limited, 0.0, 6e4) == 30.0  # one load, one path
+    times = {}
+    for name in ("friedman", "trebbi", "akrami"):  # the softer the fat, the longer
+        (study / "study.toml").write_text(STUDY)
+        one = replace(simulating, arguments={**simulating.arguments, "sets": (name,), "limit_s": None})
+        times[name] = costs.seconds_of(one, told, 0.0, 77e3)
+    assert times["friedman"] > 3.0 * times["trebbi"] > 9.0 * times["akrami"]
 
 
 def test_too_little_memory_is_told_with_the_number_of_workers_that_fit(study, monkeypatch):
@@ -344,6 +350,13 @@ def test_gaps_are_left_out_where_the_study_says_so(study):
     assert forecast(study, only=("register",))["register Load1"] == "run"
 
 
+def test_what_a_machine_has_too_little_of_is_said_before_a_run_and_logged(caplog):
+    lines, logged = ["To do: 1 of 1 stages", "CARE: this machine has 1.0 GiB of memory"], list[str]()
+    _tell(lines, logged.append)
+    assert logged == lines
+    assert caplog.messages == lines[1:]
+
+
 def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
     (study / "study.toml").write_text(STUDY)
     told = read_study(study)
@@ -359,6 +372,8 @@ def test_time_counts_what_waits_for_what_and_room_each_load_once(study):
 
     assert minutes(apart) == pytest.approx(one / 60.0, abs=0.5)
     assert minutes(row) == pytest.approx(4 * one / 60.0, abs=0.5)
+    to_end = costs.seconds_to_end(row, [1.0, 2.0, 3.0, 4.0])
+    assert [to_end[stage.name] for stage in row] == [10.0, 9.0, 7.0, 4.0]
     levelled = replace(first, name="level trebbi Load1")
     (study / "study.toml").write_text(STUDY + '[loads.Load2]\nimage = "Load1.nii.gz"\n')
     assert costs.disk_bytes(levelled, read_study(study), 1e6) == costs.disk_bytes(levelled, told, 1e6)

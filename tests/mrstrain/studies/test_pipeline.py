@@ -31,7 +31,7 @@ class Here:
     def busy(self) -> bool:
         return bool(self._ended)
 
-    def begin(self, name: str, function: str, arguments: dict, lock: Path) -> None:
+    def begin(self, name: str, function: str, arguments: dict, lock: Path, urgency: float = 0.0) -> None:
         self.ran.append(name)
         out = Path(arguments["out"])
         if name in self.failing:
@@ -76,7 +76,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def ran(folder: Path, number: int = 1, failing: tuple[str, ...] = (), **how):
+def ran(folder: Path, number: int = 1, failing: tuple[str, ...] = (), seconds: dict[str, float] | None = None, **how):
     """Run the stages; give what was run, and the outcomes."""
     cluster, asked = Here(failing), []
 
@@ -87,6 +87,7 @@ def ran(folder: Path, number: int = 1, failing: tuple[str, ...] = (), **how):
 
     told: list[str] = []
     pipeline = Pipeline(stages_in(folder, number), Ledger(folder / "results", folder), **how)
+    pipeline.seconds_to_end = seconds or {}
     run_all({"": pipeline}, pool, {"": told.append})
     outcomes = pipeline.outcomes
     assert len(asked) == bool(cluster.ran)  # no workers are started for nothing
@@ -105,6 +106,11 @@ def test_finished_work_is_not_done_again(folder):
     again, outcomes, _ = ran(folder)
     assert again == []
     assert all(o.status == "there already" for o in outcomes.values())
+
+
+def test_the_stage_with_the_longest_row_behind_it_is_started_first(folder):
+    order = ran(folder, seconds={"register a": 20.0, "register b": 30.0, "mesh": 90.0, "simulate b": 60.0})[0]
+    assert order == ["mesh", "register b", "register a", "simulate b", "simulate a", "compare"]
 
 
 def test_changed_content_of_the_same_size_is_done_again_and_what_builds_on_it(folder):

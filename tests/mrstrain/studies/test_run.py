@@ -78,6 +78,7 @@ def test_every_result_is_there_and_the_report_tells_it(done):
     assert "all: 6 stages 100 %" in stderr
     log = (out / "study.log").read_text()
     assert all(f"{stage}: done after" in log for stage in STAGES)
+    assert re.search(r"To do: 6 of 6 stages, about \d+ minutes on \d+ cores, [\d.]+ GiB of memory", log)
     record = json.loads((out / "provenance.json").read_text())
     assert {f["name"] for f in record["inputs"]["inputs"]} >= {"Load0.nii.gz", "tissues.nii.gz"}
 
