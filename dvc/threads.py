@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-_PARTS = 8  # for each thread: what one part takes longer, another makes up for
+_PARTS = 4  # for each thread: what one part takes longer, another makes up for
 
 
 def usable_cores() -> int:

@@ -4,6 +4,7 @@ Strain is smooth inside a tissue, but not across its border: fat that shears alo
 right up to them. One B-spline for all carries that strain over the border, as far as its control points lie apart.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -12,6 +13,7 @@ from numba import njit
 from scipy.ndimage import distance_transform_edt, gaussian_filter, spline_filter
 from scipy.special import ndtri
 
+from dvc import threads
 from dvc.arrays import BoolArray, FloatArray, IntArray, as_points, frozen
 from dvc.deformation.bspline import BSpline, evaluate_spline, summed_spline
 from dvc.deformation.protocol import CHUNK, in_chunks
@@ -78,8 +80,12 @@ class Interfaces:
     @classmethod
     def between(cls, grid: Grid, own: IntArray, rest: int, reach_mm: float) -> Self:
         """Interfaces between tissues that are numbered from 0 on; parameters as the attributes."""
-        depths = [_depth_mm(own == number, grid.spacing_mm) for number in range(int(own.max()) + 1)]
-        depth = np.stack([spline_filter(depth, order=3, mode="mirror") for depth in depths])
+
+        def coefficients(number: int) -> FloatArray:
+            return np.asarray(spline_filter(_depth_mm(own == number, grid.spacing_mm), order=3, mode="mirror"))
+
+        with ThreadPoolExecutor(threads.count()) as pool:
+            depth = np.stack(list(pool.map(coefficients, range(int(own.max()) + 1))))
         return cls(grid, frozen(depth, np.float64), own, rest, reach_mm)
 
     def turned(self, rotation: FloatArray) -> Self:
@@ -180,20 +186,23 @@ def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
     distance near the border. Further away it is that to the nearest place of this border.
     """
     blurred = gaussian_filter(inside.astype(np.float64), _BLUR, mode="nearest")
-    normal = np.stack(np.gradient(blurred, *spacing_mm), axis=-1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     sure = (blurred > _SURE) & (blurred < 1.0 - _SURE)
-    sigma_mm = _BLUR * np.linalg.norm(normal * spacing_mm, axis=-1)
-    near_mm = np.where(sure, sigma_mm * ndtri(np.clip(blurred, _SURE, 1.0 - _SURE)), np.inf)
-    side = np.where(inside, 1.0, -1.0)
-    seeds = np.abs(near_mm) < _NEAR * spacing_mm.mean()
-    if not seeds.any():  # one tissue fills everything
-        return np.asarray(side * float(np.linalg.norm(np.array(inside.shape) * spacing_mm)))
-    places = np.moveaxis(np.indices(inside.shape), 0, -1) * spacing_mm
-    border = places - np.where(seeds, near_mm, 0.0)[..., None] * normal
+    normal = np.stack([np.gradient(blurred, h, axis=axis)[sure] for axis, h in enumerate(spacing_mm)], axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    near_mm = _BLUR * np.linalg.norm(normal * spacing_mm, axis=-1) * ndtri(blurred[sure])
+    depth, nearest = np.where(inside, 1.0, -1.0), np.abs(near_mm) < _NEAR * spacing_mm.mean()
+    if not nearest.any():  # one tissue fills everything
+        return np.asarray(depth * float(np.linalg.norm(np.array(inside.shape) * spacing_mm)))
+    seeds = np.zeros_like(inside)
+    seeds[sure] = nearest
+    border = np.argwhere(seeds) * spacing_mm - near_mm[nearest][:, None] * normal[nearest]
     to = distance_transform_edt(~seeds, sampling=spacing_mm, return_distances=False, return_indices=True)
-    far_mm = side * np.linalg.norm(places - border[tuple(to)], axis=-1)
-    depth = gaussian_filter(np.where(sure, near_mm, far_mm), _EVEN, mode="nearest")
+    number = np.empty(inside.shape, dtype=np.int32)
+    number[seeds] = np.arange(len(border))
+    far = ~sure
+    depth[far] *= np.linalg.norm(np.argwhere(far) * spacing_mm - border[number[tuple(to[:, far])]], axis=-1)
+    depth[sure] = near_mm
+    depth = gaussian_filter(depth, _EVEN, mode="nearest")
     return np.asarray(np.where(inside, np.maximum(depth, _LEAST_MM), np.minimum(depth, -_LEAST_MM)))
 
 

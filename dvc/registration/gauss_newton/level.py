@@ -14,13 +14,13 @@ from dvc.registration.gauss_newton.image_term import ImagePair, Normal
 from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients, dot
 from dvc.registration.gauss_newton.spline_sums import SplineSums, Stiffness
+from dvc.threads import in_parts
 
 _BLOCKS = 2.5  # blocks between two control points, about
 _LONGEST = 0.45  # of the control spacing: a step of less than that cannot fold by itself
 _HALVINGS = 4
 _SLACK = 1e-3  # the fixed image's gradient is not quite the energy's own: near the end it may rise by as much
-_SOLVER = 0.01, 10  # of the conjugate gradients: reduction of the residual, most iterations
-_SOLVER_OF_HALF = 0.01, 12  # half of the voxels are fitted in one step, to choose a weight
+_SOLVER = 0.01, 20  # of the conjugate gradients: reduction of the residual, most iterations
 _SMALLEST = 1e-6
 _ON_DIAGONAL = [0, 3, 5]  # xx, yy, zz
 _LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
@@ -127,7 +127,7 @@ class Level:
         stress[self._resists] += weight[:, None, None] * (F @ _green_lagrange(F))
         return np.asarray(self.pair.blocks.gathered(stress) + weights.bending * state.bent)
 
-    def step(self, state: State, weights: Weights, variance: float, solver: tuple[float, int]) -> FloatArray:
+    def step(self, state: State, weights: Weights, variance: float, solver: tuple[float, int] = _SOLVER) -> FloatArray:
         """The Gauss-Newton step, by conjugate gradients."""
         volume, shear = weights.volume * self._soft, weights.rigidity * self._stiff
         stiffness: Stiffness = (state.images.matrix / variance, state.cofactor, volume, shear)
@@ -184,7 +184,7 @@ class Level:
                 return 0.5 * count * at.variance / variance + self.prior(at, weights)
 
             before = energy(state)
-            step = self.step(state, weights, variance, _SOLVER if state.halves < 0 else _SOLVER_OF_HALF)
+            step = self.step(state, weights, variance)
             if not np.isfinite(step).all():
                 raise RegistrationError("The registration diverged: a step is not finite.")
             moved = self.pair.blocks.evaluate(step)[0]
@@ -248,13 +248,15 @@ def strained(H: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatAr
     """
     F, cofactor, J, pulled = np.empty_like(H), np.empty_like(H), np.empty(H.shape[:-2]), np.empty_like(H)
     flat = tuple(each.reshape(-1, 3, 3) for each in (H, F, cofactor, pulled))
-    _strained(*flat, J.reshape(-1))
+    in_parts(_strained, J.size, *flat, J.reshape(-1))
     return F, cofactor, J, pulled
 
 
-@njit(cache=True)
-def _strained(H: FloatArray, F: FloatArray, cofactor: FloatArray, pulled: FloatArray, J: FloatArray) -> None:
-    for n in range(len(H)):
+@njit(nogil=True, cache=True)
+def _strained(
+    start: int, stop: int, H: FloatArray, F: FloatArray, cofactor: FloatArray, pulled: FloatArray, J: FloatArray
+) -> None:
+    for n in range(start, stop):
         for a in range(3):
             for b in range(3):
                 F[n, a, b] = H[n, a, b] + (a == b)
