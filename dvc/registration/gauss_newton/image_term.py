@@ -41,6 +41,7 @@ class Normal:
     square: float  # sum of r^2
     count: int  # voxels that both images show
     left_out: float  # mean of r^2 over such voxels of the other half; NaN if all were asked for
+    shown: BoolArray  # (bi, bj, bk), blocks with such a voxel of either half
 
 
 class ImagePair:
@@ -112,7 +113,8 @@ class ImagePair:
             self.sums.table, self.sums.factors, matrix, sums, half,
         )  # fmt: skip
         square, count, other, others = sums.sum(axis=0)
-        return Normal(matrix, self.sums.closed(half), float(square), int(count), other / others if others else np.nan)
+        left_out = float(other / others) if others else np.nan
+        return Normal(matrix, self.sums.closed(half), float(square), int(count), left_out, own > 0.0)
 
 
 def _gain(both: FloatArray, own: FloatArray, sigma: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ _LONGEST = 0.45  # of the control spacing: a step of less than that cannot fold 
 _HALVINGS = 4
 _SLACK = 1e-3  # the fixed image's gradient is not quite the energy's own: near the end it may rise by as much
 _SOLVER = 0.01, 20  # of the conjugate gradients: reduction of the residual, most iterations
+_SOLVER_OF_HALF = 0.01, 40  # half of the voxels are fitted in one step, to choose a weight, however large that is
 _SMALLEST = 1e-6
 _ON_DIAGONAL = [0, 3, 5]  # xx, yy, zz
 _LEAST_RESIDUAL = 0.01  # of the tissue's brightness: no two images agree better, and noise-free ones must not fold
@@ -127,7 +128,7 @@ class Level:
         stress[self._resists] += weight[:, None, None] * (F @ _green_lagrange(F))
         return np.asarray(self.pair.blocks.gathered(stress) + weights.bending * state.bent)
 
-    def step(self, state: State, weights: Weights, variance: float, solver: tuple[float, int] = _SOLVER) -> FloatArray:
+    def step(self, state: State, weights: Weights, variance: float, solver: tuple[float, int]) -> FloatArray:
         """The Gauss-Newton step, by conjugate gradients."""
         volume, shear = weights.volume * self._soft, weights.rigidity * self._stiff
         stiffness: Stiffness = (state.images.matrix / variance, state.cofactor, volume, shear)
@@ -184,11 +185,11 @@ class Level:
                 return 0.5 * count * at.variance / variance + self.prior(at, weights)
 
             before = energy(state)
-            step = self.step(state, weights, variance)
+            step = self.step(state, weights, variance, _SOLVER if state.halves < 0 else _SOLVER_OF_HALF)
             if not np.isfinite(step).all():
                 raise RegistrationError("The registration diverged: a step is not finite.")
             moved = self.pair.blocks.evaluate(step)[0]
-            tissue = (self._soft > 0) | self._resists  # air may go where it likes
+            tissue = ((self._soft > 0) | self._resists) & state.images.shown  # what is not seen may go where it likes
             longest = float((np.abs(moved[tissue]) / self.control.spacing_mm).max(initial=0.0))
             share = min(1.0, _LONGEST / max(longest, _SMALLEST))
             for _ in range(_HALVINGS):

@@ -15,7 +15,7 @@ from dvc.registration.gauss_newton.image_term import ImagePair
 from dvc.registration.gauss_newton.level import Level, Weights, _share_at, strained
 from dvc.registration.gauss_newton.roughness import Roughness
 from dvc.registration.gauss_newton.spline_sums import SplineSums
-from tests.textures import GRID, everything, pair_of
+from tests.textures import GRID, TURNED, everything, pair_of
 
 
 @pytest.fixture(scope="module")
@@ -211,3 +211,19 @@ def test_the_share_of_tissue_at_control_points_is_the_same_in_any_frame():
     turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
     turned = [Grid(g.shape, g.spacing_mm, turn @ g.origin_mm, turn) for g in (control, grid)]
     np.testing.assert_allclose(_share_at(turned[0], mask, turned[1]), share, atol=1e-12)
+
+
+def test_a_step_is_not_cut_short_for_tissue_that_no_image_shows(monkeypatch):
+    """Beyond the end of the moving image only the prior says where tissue goes, and that may be far."""
+    fixed, moving = pair_of(Affine(np.eye(3), np.zeros(3)))
+    end = 16
+    moving = Image(TURNED.part((slice(None), slice(None), slice(0, end))), moving.values[:, :, :end])
+    inside = everything().inside
+    level = Level(
+        (fixed, moving), inside, inside, np.zeros_like(inside), Roughness(control_grid(GRID, np.full(3, 5.0)))
+    )
+    step = np.zeros((3, *level.control.shape))
+    step[2, :, :, -3:] = 20.0
+    monkeypatch.setattr(level, "step", lambda *_: step)
+    found = level.descend(level.at(0.0 * step), Weights(1e-9, 0.0, 0.0), steps=1, stop_mm=0.0)
+    np.testing.assert_array_equal(found.coefficients, step)
