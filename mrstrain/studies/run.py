@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from dvc import Verdict
 from dvc.errors import InputError, OutputError, ParameterError
 from dvc.io.result_folder import REPORT
-from dvc.worker import usable_cores
+from dvc.threads import usable_cores
 from mrstrain.records.inputs import make_output, refuse_small_disk
 from mrstrain.records.progress import ALL, OnProgress
 from mrstrain.studies.check import wrong_with
