@@ -6,6 +6,7 @@ once, for all nodes that may ever be taped.
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
@@ -15,7 +16,19 @@ from dvc.arrays import BoolArray, FloatArray, IntArray
 from fe.elements import CROWDED, Model
 from fe.hyperelastic import principal_response, singular_values
 
-_CHUNK = 16384  # cells whose matrices are in memory at once
+_GROUP = 256  # cells that a thread computes one after the other, in the same memory
+_CHUNK = 4096  # cells whose matrices are in memory at once
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evaluated:
+    """What was found at a state, by unknown; the tangent's values, where they were formed, are for these equations."""
+
+    state: FloatArray
+    forces: FloatArray
+    lowest: float
+    tangent: FloatArray | None
+    equation: IntArray
 
 
 class Assembler:
@@ -41,6 +54,7 @@ class Assembler:
         pairs = self._cells.shape[1] * (self._cells.shape[1] + 1) // 2
         self._places = np.empty((len(self._cells), pairs), dtype=np.int32)
         self.equation = self._own
+        self._last = _Evaluated(np.empty(0), np.empty(0), np.inf, None, self.equation)
         _locate(self._cells, self.equation, self.indptr, self.indices, np.arange(len(self._cells)), self._places)
 
     def share(self, followers: Mapping[int, IntArray]) -> None:
@@ -67,16 +81,27 @@ class Assembler:
         used[self.equation[self.equation >= 0]] = True
         return np.flatnonzero(~used)
 
-    def residual(self, state: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Forces (N; for pressures mm3) by unknown and by equation, and the least det F; NaN where det F <= 0."""
-        by_unknown = np.zeros(self.model.unknowns)
-        lowest = self._run(state, by_unknown, None)
-        return by_unknown, self.by_equation(by_unknown), lowest
+    def residual(self, state: FloatArray, *, ahead: bool = False) -> tuple[FloatArray, FloatArray, float]:
+        """Forces (N; for pressures mm3) by unknown and by equation, and the least det F; NaN where det F <= 0.
+
+        ``ahead`` forms the tangent in the same sweep, which is quicker where it is asked for next.
+        """
+        if not np.array_equal(state, self._last.state):
+            forces = np.zeros(self.model.unknowns)
+            tangent = np.zeros(len(self.indices)) if ahead else None
+            lowest = self._run(state, forces, tangent)
+            self._last = _Evaluated(state.copy(), forces, lowest, tangent, self.equation)
+        by_unknown = self._last.forces.copy()
+        return by_unknown, self.by_equation(by_unknown), self._last.lowest
 
     def tangent(self, state: FloatArray) -> FloatArray:
         """Values of the upper triangle of the tangent, in the order of `indices`."""
-        data = np.zeros(len(self.indices))
-        self._run(state, np.zeros(self.model.unknowns), data)
+        last = self._last
+        if last.tangent is not None and last.equation is self.equation and np.array_equal(state, last.state):
+            data = last.tangent.copy()
+        else:
+            data = np.zeros(len(self.indices))
+            self._run(state, np.zeros(self.model.unknowns), data)
         data[self.indptr[self.idle]] = 1.0  # the diagonal stands first in its row
         return data
 
@@ -218,30 +243,31 @@ def _add_products(cells: IntArray, local: FloatArray, directions: FloatArray, pr
 
 @njit(inline="always", error_model="numpy")
 def _add_stiffness(
-    K: FloatArray, weight: float, h: FloatArray, U: FloatArray, direct: FloatArray, swapped: FloatArray,
-    block: FloatArray, half: FloatArray,
+    K: FloatArray, weight: float, h: FloatArray, U: FloatArray, direct: FloatArray, swapped: FloatArray
 ) -> None:  # fmt: skip
     """Add the stiffness between the nodes of a cell at one quadrature point, by gradients in the principal frame."""
+    D, T, M = direct, swapped[:, :, 1], swapped[:, :, 0]
     for a in range(len(h)):
+        x, y, z = weight * h[a, 0], weight * h[a, 1], weight * h[a, 2]
         for b in range(a, len(h)):
-            left, right = h[a], h[b]
-            for i in range(3):
-                d = direct[i]
-                for k in range(3):
-                    block[i, k] = swapped[i, k, 0] * left[i] * right[k] + swapped[i, k, 1] * left[k] * right[i]
-                block[i, i] = d[0] * left[0] * right[0] + d[1] * left[1] * right[1] + d[2] * left[2] * right[2]
-            for i in range(3):
-                for k in range(3):
-                    half[i, k] = block[i, 0] * U[k, 0] + block[i, 1] * U[k, 1] + block[i, 2] * U[k, 2]
-            for i in range(3):
-                for k in range(3):
-                    K[3 * a + i, 3 * b + k] += weight * (
-                        U[i, 0] * half[0, k] + U[i, 1] * half[1, k] + U[i, 2] * half[2, k]
-                    )
+            p, q, r = h[b, 0], h[b, 1], h[b, 2]
+            xx = D[0, 0] * x * p + D[0, 1] * y * q + D[0, 2] * z * r
+            yy = D[1, 0] * x * p + D[1, 1] * y * q + D[1, 2] * z * r
+            zz = D[2, 0] * x * p + D[2, 1] * y * q + D[2, 2] * z * r
+            xy, yx = M[0, 1] * x * q + T[0, 1] * y * p, M[0, 1] * y * p + T[0, 1] * x * q
+            xz, zx = M[0, 2] * x * r + T[0, 2] * z * p, M[0, 2] * z * p + T[0, 2] * x * r
+            yz, zy = M[1, 2] * y * r + T[1, 2] * z * q, M[1, 2] * z * q + T[1, 2] * y * r
+            for k in range(3):
+                along = xx * U[k, 0] + xy * U[k, 1] + xz * U[k, 2]
+                across = yx * U[k, 0] + yy * U[k, 1] + yz * U[k, 2]
+                third = zx * U[k, 0] + zy * U[k, 1] + zz * U[k, 2]
+                for i in range(3):
+                    K[3 * a + i, 3 * b + k] += U[i, 0] * along + U[i, 1] * across + U[i, 2] * third
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _elements(
+@njit(cache=True, error_model="numpy")
+def _group(
+    first: int, last: int,
     cells: IntArray, pressure_cells: IntArray, volumes: FloatArray, inverse: FloatArray, law: IntArray,
     vectors: FloatArray, shear: FloatArray, bulk: FloatArray, own: FloatArray,
     weights: FloatArray, tables: FloatArray, pressure: FloatArray, tau: float, u: FloatArray, p: FloatArray,
@@ -250,22 +276,28 @@ def _elements(
     """Forces and tangents of cells, and the least det F at the quadrature points of each."""
     nodes, points = tables.shape[1], tables.shape[0]
     width = 3 * nodes + 4
-    for n in prange(len(cells)):
-        g, h = np.empty((nodes, 3)), np.empty((nodes, 3))
-        F, U, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-        stress, direct, swapped = np.empty(3), np.empty((3, 3)), np.zeros((3, 3, 2))
-        block, half, one = np.empty((3, 3)), np.empty((3, 3)), np.eye(3)
-        K = np.zeros((width, width))
-        f = np.zeros(width)
+    g, h = np.empty((nodes, 3)), np.empty((nodes, 3))
+    F, U, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    stress, direct, swapped = np.empty(3), np.empty((3, 3)), np.zeros((3, 3, 2))
+    K, f = np.empty((width, width)), np.empty(width)
+    for n in range(first, last):
+        f[:] = 0.0
+        if with_tangent:
+            K[:, :] = 0.0
         which = law[n]
         lowest[n] = np.inf
         for q in range(points):
             weight = weights[q] * volumes[n]
-            F[:, :] = one
-            for a in range(nodes):
-                slope, way = tables[q, a], inverse[n]
+            for i in range(3):
                 for j in range(3):
-                    g[a, j] = slope[0] * way[0, j] + slope[1] * way[1, j] + slope[2] * way[2, j]
+                    F[i, j] = 1.0 if i == j else 0.0
+            for a in range(nodes):
+                for j in range(3):
+                    g[a, j] = (
+                        tables[q, a, 0] * inverse[n, 0, j]
+                        + tables[q, a, 1] * inverse[n, 1, j]
+                        + tables[q, a, 2] * inverse[n, 2, j]
+                    )
                     for i in range(3):
                         F[i, j] += u[cells[n, a], i] * g[a, j]
             pq = 0.0
@@ -296,7 +328,7 @@ def _elements(
                 f[3 * nodes + c] += weight * pressure[q, c] * (J - 1.0)
             if not with_tangent:
                 continue
-            _add_stiffness(K, weight, h, U, direct, swapped, block, half)
+            _add_stiffness(K, weight, h, U, direct, swapped)
             for a in range(nodes):
                 for i in range(3):
                     value = 0.0
@@ -318,3 +350,18 @@ def _elements(
                 for j in range(i, width):
                     tangents[n, pair] = K[i, j]
                     pair += 1
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _elements(
+    cells: IntArray, pressure_cells: IntArray, volumes: FloatArray, inverse: FloatArray, law: IntArray,
+    vectors: FloatArray, shear: FloatArray, bulk: FloatArray, own: FloatArray,
+    weights: FloatArray, tables: FloatArray, pressure: FloatArray, tau: float, u: FloatArray, p: FloatArray,
+    with_tangent: bool, forces: FloatArray, tangents: FloatArray, lowest: FloatArray,
+) -> None:  # fmt: skip
+    """Forces and tangents of cells, and the least det F at the quadrature points of each."""
+    for group in prange((len(cells) + _GROUP - 1) // _GROUP):
+        _group(
+            group * _GROUP, min((group + 1) * _GROUP, len(cells)), cells, pressure_cells, volumes, inverse, law,
+            vectors, shear, bulk, own, weights, tables, pressure, tau, u, p, with_tangent, forces, tangents, lowest,
+        )  # fmt: skip

@@ -33,21 +33,28 @@ _SWEEPS = 30
 def isochoric(law: FloatArray, e: FloatArray, slope: FloatArray, curvature: FloatArray) -> float:
     """Wbar (MPa) at logarithmic stretches ``e`` (3,); its derivatives go to ``slope`` (3,), ``curvature`` (3, 3)."""
     mean = (e[0] + e[1] + e[2]) / 3.0
-    energy, invariant = 0.0, 0.0
+    energy = 0.0
+    slope[:] = 0.0
     curvature[:, :] = 0.0
-    for i in range(3):
-        invariant += np.expm1(2.0 * (e[i] - mean))  # I1bar - 3, without cancellation
-    first = law[0] + 2.0 * law[1] * invariant + 3.0 * law[2] * invariant**2
-    second = 2.0 * law[1] + 6.0 * law[2] * invariant
-    energy += invariant * (law[0] + invariant * (law[1] + invariant * law[2]))
+    if law[0] != 0.0 or law[1] != 0.0 or law[2] != 0.0:
+        for i in range(3):
+            slope[i] = np.expm1(2.0 * (e[i] - mean))
+        invariant = slope[0] + slope[1] + slope[2]  # I1bar - 3, without cancellation
+        first = law[0] + 2.0 * law[1] * invariant + 3.0 * law[2] * invariant**2
+        second = 2.0 * law[1] + 6.0 * law[2] * invariant
+        energy += invariant * (law[0] + invariant * (law[1] + invariant * law[2]))
+        for i in range(3):
+            for j in range(3):
+                curvature[i, j] = 4.0 * second * (slope[i] + 1.0) * (slope[j] + 1.0)
+        for i in range(3):
+            square = slope[i] + 1.0
+            slope[i] = 2.0 * first * square
+            curvature[i, i] += 4.0 * first * square
     for i in range(3):
         bar = e[i] - mean
-        square = np.exp(2.0 * bar)
-        slope[i] = 2.0 * first * square + 2.0 * law[3] * bar
-        curvature[i, i] += 4.0 * first * square + 2.0 * law[3]
+        slope[i] += 2.0 * law[3] * bar
+        curvature[i, i] += 2.0 * law[3]
         energy += law[3] * bar * bar
-        for j in range(3):
-            curvature[i, j] += 4.0 * second * square * np.exp(2.0 * (e[j] - mean))
         for q in range(4, len(law), 2):
             mu, alpha = law[q], law[q + 1]
             if mu != 0.0:
@@ -95,6 +102,25 @@ def least_stiffness(law: FloatArray, strains: FloatArray) -> FloatArray:
     return stiffness
 
 
+@njit(inline="always", error_model="numpy")
+def _product(F: FloatArray, i: int, j: int) -> float:
+    return F[0, i] * F[0, j] + F[1, i] * F[1, j] + F[2, i] * F[2, j]  # type: ignore[no-any-return]
+
+
+@njit(inline="always", error_model="numpy")
+def _turned(V: FloatArray, p: int, q: int, at_p: float, at_q: float, off: float) -> tuple[float, float, float]:
+    """Turn columns p and q of V by the angle that clears the entry ``off`` between them; its tangent, cosine, sine."""
+    apart = at_q - at_p
+    root = np.sqrt(apart * apart + 4.0 * off * off)
+    tangent = 2.0 * off / (apart + root if apart >= 0.0 else apart - root) if root > 0.0 else 0.0
+    cosine = 1.0 / np.sqrt(tangent * tangent + 1.0)
+    sine = tangent * cosine
+    for k in range(3):
+        left, right = V[k, p], V[k, q]
+        V[k, p], V[k, q] = cosine * left - sine * right, sine * left + cosine * right
+    return tangent, cosine, sine
+
+
 @njit(cache=True, error_model="numpy")
 def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) -> float:
     """Write U, s and V of F = U diag(s) V^T (3, 3) unless det F <= 0, by Jacobi's rotations of F^T F; return det F."""
@@ -105,35 +131,25 @@ def singular_values(F: FloatArray, U: FloatArray, s: FloatArray, V: FloatArray) 
     )
     if not J > 0.0:
         return float(J)
-    C = np.empty((3, 3))
+    a, b, c = _product(F, 0, 0), _product(F, 1, 1), _product(F, 2, 2)  # C = F^T F, its diagonal
+    d, e, f = _product(F, 0, 1), _product(F, 0, 2), _product(F, 1, 2)  # and its entries 01, 02 and 12
     for i in range(3):
         for j in range(3):
-            C[i, j] = F[0, i] * F[0, j] + F[1, i] * F[1, j] + F[2, i] * F[2, j]
             V[i, j] = 1.0 if i == j else 0.0
     for _ in range(_SWEEPS):
-        off = C[0, 1] ** 2 + C[0, 2] ** 2 + C[1, 2] ** 2
-        if off <= 1e-34 * (C[0, 0] ** 2 + C[1, 1] ** 2 + C[2, 2] ** 2):
+        if d * d + e * e + f * f <= 1e-34 * (a * a + b * b + c * c):
             break
-        for p, q in ((0, 1), (0, 2), (1, 2)):
-            if C[p, q] == 0.0:
-                continue
-            theta = (C[q, q] - C[p, p]) / (2.0 * C[p, q])
-            t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
-            c = 1.0 / np.sqrt(t * t + 1.0)
-            sine = t * c
-            for k in range(3):
-                left, right = C[k, p], C[k, q]
-                C[k, p], C[k, q] = c * left - sine * right, sine * left + c * right
-            for k in range(3):
-                left, right = C[p, k], C[q, k]
-                C[p, k], C[q, k] = c * left - sine * right, sine * left + c * right
-            for k in range(3):
-                left, right = V[k, p], V[k, q]
-                V[k, p], V[k, q] = c * left - sine * right, sine * left + c * right
+        tangent, cosine, sine = _turned(V, 0, 1, a, b, d)
+        a, b, d, e, f = a - tangent * d, b + tangent * d, 0.0, cosine * e - sine * f, sine * e + cosine * f
+        tangent, cosine, sine = _turned(V, 0, 2, a, c, e)
+        a, c, e, d, f = a - tangent * e, c + tangent * e, 0.0, cosine * d - sine * f, sine * d + cosine * f
+        tangent, cosine, sine = _turned(V, 1, 2, b, c, f)
+        b, c, f, d, e = b - tangent * f, c + tangent * f, 0.0, cosine * d - sine * e, sine * d + cosine * e
+    s[0], s[1], s[2] = np.sqrt(a), np.sqrt(b), np.sqrt(c)
     for i in range(3):
-        s[i] = np.sqrt(C[i, i])
+        scale = 1.0 / s[i]
         for k in range(3):
-            U[k, i] = (F[k, 0] * V[0, i] + F[k, 1] * V[1, i] + F[k, 2] * V[2, i]) / s[i]
+            U[k, i] = (F[k, 0] * V[0, i] + F[k, 1] * V[1, i] + F[k, 2] * V[2, i]) * scale
     return float(J)
 
 

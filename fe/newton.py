@@ -130,7 +130,7 @@ class _Newton:
     rotation: Parallel
 
     def at(self, state: FloatArray) -> _Iterate:
-        forces, residual, lowest = self.assembler.residual(state)
+        forces, residual, lowest = self.assembler.residual(state, ahead=True)
         of_forces = out_of_balance(self.imposed.forces_n - residual, self.assembler, self.imposed.prescribed)
         of_moment = self.rotation.missing_n(state, forces)
         return _Iterate(state, forces, residual, lowest, float(np.hypot(of_forces, of_moment)))

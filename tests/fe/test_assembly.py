@@ -174,8 +174,8 @@ def test_no_step_folds_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
     tried, told = [], []
     residual = assembler.residual
 
-    def watched(state: np.ndarray):
-        found = residual(state)
+    def watched(state: np.ndarray, *, ahead: bool):
+        found = residual(state, ahead=ahead)
         tried.append(found[2])
         return found
 
