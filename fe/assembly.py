@@ -9,14 +9,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from scipy import sparse
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
+from dvc.threads import in_parts
 from fe.elements import CROWDED, Model
 from fe.hyperelastic import principal_response, singular_values
 
-_GROUP = 256  # cells that a thread computes one after the other, in the same memory
 _CHUNK = 4096  # cells whose matrices are in memory at once
 
 
@@ -55,7 +55,7 @@ class Assembler:
         self._places = np.empty((len(self._cells), pairs), dtype=np.int32)
         self.equation = self._own
         self._last = _Evaluated(np.empty(0), np.empty(0), np.inf, None, self.equation)
-        _locate(self._cells, self.equation, self.indptr, self.indices, np.arange(len(self._cells)), self._places)
+        self._locate(np.arange(len(self._cells)))
 
     def share(self, followers: Mapping[int, IntArray]) -> None:
         """Let unknowns follow shared equations, numbered as at the start; all others keep their own."""
@@ -64,7 +64,10 @@ class Assembler:
             equation[unknowns] = self.own_equations + number
         if not np.array_equal(equation, self.equation):
             self.equation = equation
-            _locate(self._cells, equation, self.indptr, self.indices, self._touched, self._places)
+            self._locate(self._touched)
+
+    def _locate(self, which: IntArray) -> None:
+        in_parts(_locate, len(which), self._cells, self.equation, self.indptr, self.indices, which, self._places)
 
     @property
     def force_equations(self) -> BoolArray:
@@ -159,10 +162,11 @@ class Assembler:
         for start in range(0, total, _CHUNK):
             stop = min(start + _CHUNK, total)
             part = slice(start, stop) if cells is None else cells[start:stop]
-            _elements(
-                space.cells[part], space.pressure_cells[part], m.volumes_mm3[part], m.inverse[part], m.law[part],
-                m.vectors, m.shear_mpa, m.bulk_mpa, m.own_bulk_mpa, element.weights, element.gradients,
-                element.pressure, element.stabilisation, u, p, with_tangent, forces, tangents, volumes,
+            in_parts(
+                _elements, stop - start, space.cells[part], space.pressure_cells[part], m.volumes_mm3[part],
+                m.inverse[part], m.law[part], m.vectors, m.shear_mpa, m.bulk_mpa, m.own_bulk_mpa, element.weights,
+                element.gradients, element.pressure, element.stabilisation, u, p, with_tangent, forces, tangents,
+                volumes,
             )  # fmt: skip
             yield part, forces, tangents, volumes[: stop - start]
 
@@ -181,13 +185,14 @@ class Assembler:
         return coupled.indptr.astype(np.int32), coupled.indices.astype(np.int32)
 
 
-@njit(cache=True, parallel=True)
+@njit(nogil=True, cache=True)
 def _locate(
-    cells: IntArray, equation: IntArray, indptr: IntArray, indices: IntArray, which: IntArray, places: IntArray
-) -> None:
+    start: int, stop: int, cells: IntArray, equation: IntArray, indptr: IntArray, indices: IntArray, which: IntArray,
+    places: IntArray,
+) -> None:  # fmt: skip
     """Place in the upper triangle of each pair of a cell's unknowns; -1: one is fixed; -2 - place: it counts twice."""
     width = cells.shape[1]
-    for n in prange(len(which)):
+    for n in range(start, stop):
         cell, pair = which[n], 0
         for i in range(width):
             for j in range(i, width):
@@ -265,8 +270,28 @@ def _add_stiffness(
                     K[3 * a + i, 3 * b + k] += U[i, 0] * along + U[i, 1] * across + U[i, 2] * third
 
 
-@njit(cache=True, error_model="numpy")
-def _group(
+@njit(inline="always", error_model="numpy")
+def _deform(
+    F: FloatArray, g: FloatArray, n: int, q: int, cells: IntArray, inverse: FloatArray, tables: FloatArray,
+    u: FloatArray,
+) -> None:  # fmt: skip
+    """Write the gradients of the displacement functions and F at one quadrature point of a cell."""
+    for i in range(3):
+        for j in range(3):
+            F[i, j] = 1.0 if i == j else 0.0
+    for a in range(len(g)):
+        for j in range(3):
+            g[a, j] = (
+                tables[q, a, 0] * inverse[n, 0, j]
+                + tables[q, a, 1] * inverse[n, 1, j]
+                + tables[q, a, 2] * inverse[n, 2, j]
+            )
+            for i in range(3):
+                F[i, j] += u[cells[n, a], i] * g[a, j]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _elements(
     first: int, last: int,
     cells: IntArray, pressure_cells: IntArray, volumes: FloatArray, inverse: FloatArray, law: IntArray,
     vectors: FloatArray, shear: FloatArray, bulk: FloatArray, own: FloatArray,
@@ -288,18 +313,7 @@ def _group(
         lowest[n] = np.inf
         for q in range(points):
             weight = weights[q] * volumes[n]
-            for i in range(3):
-                for j in range(3):
-                    F[i, j] = 1.0 if i == j else 0.0
-            for a in range(nodes):
-                for j in range(3):
-                    g[a, j] = (
-                        tables[q, a, 0] * inverse[n, 0, j]
-                        + tables[q, a, 1] * inverse[n, 1, j]
-                        + tables[q, a, 2] * inverse[n, 2, j]
-                    )
-                    for i in range(3):
-                        F[i, j] += u[cells[n, a], i] * g[a, j]
+            _deform(F, g, n, q, cells, inverse, tables, u)
             pq = 0.0
             for c in range(4):
                 pq += pressure[q, c] * p[pressure_cells[n, c]]
@@ -350,18 +364,3 @@ def _group(
                 for j in range(i, width):
                     tangents[n, pair] = K[i, j]
                     pair += 1
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
-def _elements(
-    cells: IntArray, pressure_cells: IntArray, volumes: FloatArray, inverse: FloatArray, law: IntArray,
-    vectors: FloatArray, shear: FloatArray, bulk: FloatArray, own: FloatArray,
-    weights: FloatArray, tables: FloatArray, pressure: FloatArray, tau: float, u: FloatArray, p: FloatArray,
-    with_tangent: bool, forces: FloatArray, tangents: FloatArray, lowest: FloatArray,
-) -> None:  # fmt: skip
-    """Forces and tangents of cells, and the least det F at the quadrature points of each."""
-    for group in prange((len(cells) + _GROUP - 1) // _GROUP):
-        _group(
-            group * _GROUP, min((group + 1) * _GROUP, len(cells)), cells, pressure_cells, volumes, inverse, law,
-            vectors, shear, bulk, own, weights, tables, pressure, tau, u, p, with_tangent, forces, tangents, lowest,
-        )  # fmt: skip

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 from filelock import FileLock
@@ -24,7 +23,6 @@ settings.load_profile("fixed")
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> None:
     """Two workers have a core each: tests of threads ask for theirs."""
-    numba.set_num_threads(1)
     threads.use(1)
 
 
