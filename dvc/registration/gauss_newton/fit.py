@@ -111,7 +111,8 @@ def fit(
         coefficients = np.zeros((3, *control.shape))
         if guess is not None:
             coefficients = turned(axes.T, spline_through(guess, control))
-        level = _level(pictures, inside, soft, core, control, sigma_mm)
+        rest = None if start is None else turned(axes.T, spline_through(start, control))
+        level = _level(pictures, inside, soft, core, control, sigma_mm, rest)
         start_at = level.at(coefficients)
         coefficients = level.descend(start_at, weights, steps=steps * weights.patience, stop_mm=stop_mm).coefficients
         if parameters.volume is None and number == len(LEVELS) - 2:
@@ -127,7 +128,7 @@ def fit(
         part, box = np.zeros_like(inside), pair.compared.box()  # the middle third: enough, in a third of the time
         margins = [int(0.5 * (1.0 - _MIDDLE) * (edge.stop - edge.start)) for edge in box]
         part[tuple(slice(e.start + m, e.stop - m) for e, m in zip(box, margins, strict=True))] = True
-        middle = Level(pictures, inside & part, soft & part, core & part, level.roughness)
+        middle = Level(pictures, inside & part, soft & part, core & part, level.roughness, rest=rest)
         choice = replace(choose(middle, coefficients, weights), asked=choice.asked)
         progress((len(LEVELS) + 1) / (len(LEVELS) + 2))
     steps = _LAST_STEPS * choice.weights.patience
@@ -184,15 +185,16 @@ def choose(
 
 
 def _level(
-    pictures: tuple[Image, Image], inside: BoolArray, soft: BoolArray, bone: BoolArray, control: Grid, sigma_mm: float
-) -> Level:
+    pictures: tuple[Image, Image], inside: BoolArray, soft: BoolArray, bone: BoolArray, control: Grid, sigma_mm: float,
+    rest: FloatArray | None = None,
+) -> Level:  # fmt: skip
     """Images smoothed, and every so manyth voxel of them: a smooth image needs no more."""
     fixed, moving = pictures
     if sigma_mm > 0.0:
         with ThreadPoolExecutor(min(2, threads.count())) as pool:
             fixed, moving = pool.map(lambda i: thinned(smoothed(i, sigma_mm), _every(i.grid, sigma_mm)), pictures)
     every, rim_mm = _every(pictures[0].grid, sigma_mm), _BLURRED * sigma_mm
-    return Level((fixed, moving), inside[every], soft[every], bone[every], Roughness(control), rim_mm)
+    return Level((fixed, moving), inside[every], soft[every], bone[every], Roughness(control), rim_mm, rest=rest)
 
 
 def brightness_scaled(pair: AlignedPair) -> tuple[Image, Image]:

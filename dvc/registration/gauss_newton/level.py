@@ -70,14 +70,15 @@ class State:
 class Level:
     """Two images at one resolution, the roughness on the control points, and the tissue that the prior is about.
 
-    `soft` voxels of the fixed image keep their volume, `stiff` ones (bone, or the skin) resist strain. Other parameters
-    as in `ImagePair`.
+    `soft` voxels of the fixed image keep their volume, `stiff` ones (bone, or the skin) resist strain. What nothing
+    else holds stays near `rest`, coefficients (3 splines, mi, mj, mk), or at rest. Other parameters as in `ImagePair`.
     """
 
     def __init__(
         self, images: tuple[Image, Image], inside: BoolArray, soft: BoolArray, stiff: BoolArray, roughness: Roughness,
-        rim_mm: float = 0.0, factors: FloatArray | None = None,
+        rim_mm: float = 0.0, factors: FloatArray | None = None, rest: FloatArray | None = None,
     ) -> None:  # fmt: skip
+        self.rest = rest
         grid, control = images[0].grid, roughness.control
         block = np.maximum(np.rint(control.spacing_mm / _BLOCKS / grid.spacing_mm), 1).astype(np.int64)
         self.control, self.roughness = control, roughness
@@ -103,20 +104,27 @@ class Level:
         images = self.pair.normal(coefficients, pulled, halves)
         if images.count == 0 or not np.isfinite(images.square):
             raise RegistrationError("The registration diverged: the two images no longer have a voxel in common.")
-        return State(
-            halves, self.pair.blocks, coefficients, F, cofactor, J, self.roughness.product(coefficients), images
-        )
+        bent = self.roughness.product(coefficients)
+        if self.rest is not None:
+            bent -= self.roughness.held(self.rest)
+        return State(halves, self.pair.blocks, coefficients, F, cofactor, J, bent, images)
 
     def prior(self, state: State, weights: Weights) -> float:
         """The energy of everything but the images."""
         strain = _green_lagrange(state.F[self._resists])
         uneven = weights.volume_gradient * dot(state.J, self._unevenness(state.J)) if weights.volume_gradient else 0.0
         return 0.5 * (
-            weights.bending * dot(state.coefficients, state.bent)
+            weights.bending * self._roughness(state)
             + weights.volume * dot(self._soft, (state.J - 1.0) ** 2)
             + weights.rigidity * dot(self._stiff[self._resists], np.einsum("nab,nab->n", strain, strain))
             + uneven
         )
+
+    def _roughness(self, state: State) -> float:
+        """Twice the energy of the roughness, with the distance from `rest`."""
+        if self.rest is None:
+            return dot(state.coefficients, state.bent)
+        return dot(state.coefficients, state.bent) + dot(self.rest - state.coefficients, self.roughness.held(self.rest))
 
     def prior_gradient(self, state: State, weights: Weights) -> FloatArray:
         """Derivative of `prior` by the coefficients."""

@@ -25,8 +25,8 @@ _POWER = -0.5  # between a weight that is the same everywhere (0) and one that t
 _SMALLEST = 1e-3  # share of a neighbourhood: where less is tissue, the mean of all counts
 _STRAIGHT = 1e-20  # of the square that the largest coefficient would have alone: rounding's, and no curvature
 REST = 1e-5
-"""Of |u|^2 beside the Laplacian's square, 1/mm4: air, which nothing else holds, stays near rest. It outweighs waves
-longer than 11 cm, or 4 cm where the Laplacian counts twice (control points every 3.2 mm)."""
+"""Of |u|^2 beside the Laplacian's square, 1/mm4: air, which nothing else holds, stays near rest or a first guess. It
+outweighs waves longer than 11 cm, or 4 cm where the Laplacian counts twice (control points every 3.2 mm)."""
 NUMBERS = {"near_mm": _NEAR_MM, "least": _LEAST, "power": _POWER, "rest": REST}
 """The numbers that decide what it is, for a record."""
 
@@ -70,6 +70,12 @@ class Roughness:
             rough = _summed(rough, [_second_differences(alone.size, h) for h in self.control.spacing_mm])
         square, own = float((rough**2).sum()), float((one**2).sum())
         return [p * square * here + q * own for p, q in self._weights]
+
+    def held(self, coefficients: FloatArray) -> FloatArray:
+        """The gradient of the part with q alone, for coefficients (3 splines, ni, nj, nk)."""
+        return np.concatenate(
+            [q * c for (_, q), c in zip(self._weights, np.split(coefficients, len(self._weights)), strict=True)]
+        )
 
     def product(self, coefficients: FloatArray) -> FloatArray:
         """The energy's gradient for coefficients (3 splines, ni, nj, nk)."""

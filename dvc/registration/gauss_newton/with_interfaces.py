@@ -26,7 +26,7 @@ from dvc.errors import InputError
 from dvc.images.image import Grid, Mask
 from dvc.registration.engine import AlignedPair
 from dvc.registration.gauss_newton.choice import Choice
-from dvc.registration.gauss_newton.fit import LEVELS, Parameters, brightness_scaled, choose, fit, turned
+from dvc.registration.gauss_newton.fit import LEVELS, Parameters, brightness_scaled, choose, fit, spline_through, turned
 from dvc.registration.gauss_newton.level import Level
 from dvc.registration.gauss_newton.roughness import REST, Roughness
 
@@ -59,7 +59,8 @@ def fit_with_interfaces(
     usual = replace(parameters, bending=parameters.weights.bending)
     smooth, first = fit(pair, usual, start, lambda share: progress(_SMOOTH_SHARE * share))
     axes, control = np.array(pair.fixed.grid.direction), smooth.control
-    stage = _Stage(pair, control)
+    rest = None if start is None else turned(axes.T, spline_through(start, control))
+    stage = _Stage(pair, control, rest)
     weights = replace(first.weights, rigidity=(skin or USUAL_SKIN) if stage.has_skin else 0.0)
     steps, stop_mm = _STEPS * weights.patience, LEVELS[-1][-1]
     coefficients: FloatArray = np.concatenate([turned(axes.T, smooth.coefficients_mm), np.zeros((3, *control.shape))])
@@ -92,7 +93,7 @@ def fit_with_interfaces(
 class _Stage:
     """The last stage at full resolution: in the whole body, and in a slab of it in which weights are chosen."""
 
-    def __init__(self, pair: AlignedPair, control: Grid) -> None:
+    def __init__(self, pair: AlignedPair, control: Grid, rest: FloatArray | None) -> None:
         labels, inside = pair.labels, pair.compared.inside
         if labels is None:
             raise InputError("Strain can jump at tissue interfaces only where a label map tells the tissues.")
@@ -103,11 +104,12 @@ class _Stage:
         pictures = brightness_scaled(pair)
         rough = ((1.0, REST), (_BENDING * self.interfaces.reach_mm**2, _SQUARE))
         roughness, factors = Roughness(control, rough, _LAPLACIANS), self.interfaces.at_voxels()
+        both = None if rest is None else np.concatenate([rest, np.zeros_like(rest)])
         share = np.cumsum(np.count_nonzero(inside, axis=(1, 2))) / max(np.count_nonzero(inside), 1)
         slab = np.zeros_like(inside)  # the middle third of the voxels along the first axis, from skin to skin
         slab[(share > 1.0 / 3.0) & (share <= 2.0 / 3.0)] = True
         self.whole, self.slab = (
-            Level(pictures, inside & part, soft & part, skin & part, roughness, factors=factors)
+            Level(pictures, inside & part, soft & part, skin & part, roughness, factors=factors, rest=both)
             for part in (np.ones_like(soft), slab)
         )
         self.has_skin, self.slab_has_skin = bool(skin.any()), bool((skin & slab).any())
