@@ -24,7 +24,12 @@ class _Threads:
         self.pool = ThreadPoolExecutor(count, "compiled")  # starts its threads when there is work
 
 
-_threads = [_Threads(int(os.environ.get("NUMBA_NUM_THREADS", "0")) or usable_cores())]
+def _asked() -> int:
+    told = os.environ.get("NUMBA_NUM_THREADS", "").strip()
+    return int(told) if told.isdecimal() and int(told) > 0 else usable_cores()
+
+
+_threads = [_Threads(_asked())]
 
 
 def count() -> int:
@@ -35,6 +40,10 @@ def count() -> int:
 def use(count: int) -> None:
     """Compute on so many threads from now on."""
     _threads[-1] = _Threads(count)
+
+
+if hasattr(os, "register_at_fork"):  # a forked process inherits the pool, but none of its threads
+    os.register_at_fork(after_in_child=lambda: use(count()))
 
 
 def in_parts(kernel: Callable[..., None], size: int, *arguments: object) -> None:

@@ -102,7 +102,7 @@ class Level:
         """The state at a displacement; of the voxels all (-1) or one half (0, 1), as in `ImagePair.normal`."""
         F, cofactor, J, pulled = strained(self.pair.blocks.evaluate(coefficients)[1])
         images = self.pair.normal(coefficients, pulled, halves)
-        if images.count == 0 or not np.isfinite(images.square):
+        if images.count == 0 or not np.isfinite(images.square) or (halves >= 0 and np.isnan(images.left_out)):
             raise RegistrationError("The registration diverged: the two images no longer have a voxel in common.")
         bent = self.roughness.product(coefficients)
         if self.rest is not None:
@@ -197,14 +197,12 @@ class Level:
             if not np.isfinite(step).all():
                 raise RegistrationError("The registration diverged: a step is not finite.")
             moved = self.pair.blocks.evaluate(step)[0]
-            tissue = ((self._soft > 0) | self._resists) & state.images.shown  # what is not seen may go where it likes
-            longest = float((np.abs(moved[tissue]) / self.control.spacing_mm).max(initial=0.0))
-            share = min(1.0, _LONGEST / max(longest, _SMALLEST))
-            for _ in range(_HALVINGS):
+            tissue = (self._soft > 0) | self._resists  # what no image shows may go where it likes, if that helps
+            seen, everywhere = (self._share(moved[w]) for w in (tissue & state.images.shown, tissue))
+            for share in (*(seen * 0.5**n for n in range(_HALVINGS)), min(everywhere, seen * 0.5**_HALVINGS)):
                 trial = self.at(state.coefficients + share * step, state.halves)
                 if energy(trial) <= before + _SLACK * abs(before):
                     break
-                share *= 0.5
             else:
                 break
             state = trial
@@ -212,6 +210,11 @@ class Level:
             if share * np.sqrt(dot(self._soft, square) / max(float(self._soft.sum()), _SMALLEST)) < stop_mm:
                 break
         return state
+
+    def _share(self, moved: FloatArray) -> float:
+        """The share of a step, 1 at the most, by which no place moves so far that the step folds it by itself."""
+        longest = float((np.abs(moved) / self.control.spacing_mm).max(initial=0.0))
+        return min(1.0, _LONGEST / max(longest, _SMALLEST))
 
     def volume_asked(self, coefficients: FloatArray, weights: Weights, held_mm4: float) -> float:
         """The change of volume |J - 1| that a hundredth of the soft tissue exceeds once only its gradient is held.

@@ -1,0 +1,61 @@
+"""Compiled loops that several threads share."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvc import threads
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def squares(start: int, stop: int, out: np.ndarray) -> None:
+    out[start:stop] += np.arange(start, stop) ** 2
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("size", [0, 1, 3, 1000])
+def test_every_number_of_a_range_is_done_once(count, size):
+    before = threads.count()
+    threads.use(count)
+    try:
+        out = np.zeros(size, dtype=np.int64)
+        threads.in_parts(squares, size, out)
+    finally:
+        threads.use(before)
+    np.testing.assert_array_equal(out, np.arange(size) ** 2)
+
+
+@pytest.mark.parametrize("told", ["", "-1", "4.0", "many", "2,1"])
+def test_a_number_of_threads_that_is_none_counts_as_not_given(told, monkeypatch):
+    monkeypatch.setenv("NUMBA_NUM_THREADS", told)
+    assert threads._asked() == threads.usable_cores()
+
+
+def test_threads_asked_for_are_taken(monkeypatch):
+    monkeypatch.setenv("NUMBA_NUM_THREADS", " 3")
+    assert threads._asked() == 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no fork here, or not one that is safe")
+def test_a_forked_process_has_threads_of_its_own():
+    code = """
+import os
+import numpy as np
+from dvc import threads
+from tests.dvc.test_threads import squares
+threads.use(2)
+out = np.zeros(100, dtype=np.int64)
+threads.in_parts(squares, 100, out)
+child = os.fork()
+if not child:
+    threads.in_parts(squares, 100, out)
+    os._exit(0)
+os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=60, check=False).returncode == 0
