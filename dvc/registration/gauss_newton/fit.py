@@ -1,11 +1,11 @@
 """Gauss-Newton registration: a cubic B-spline displacement, all voxels, and a prior whose weight the images choose.
 
 The energy is ``1/(2 s^2) sum r^2 + b/2 int c |Δ u|^2 + v/2 int (J - 1)^2 + w/2 int |E|^2``: residuals r over the voxels
-of a mask with their own variance s^2, the bending of the displacement (and, very little, the displacement itself:
-`dvc.registration.gauss_newton.roughness`), the change of volume in soft tissue and the strain of the bone. Bending
-counts alike everywhere (c = 1) at first; in the last steps less where the displacement is curved. Four levels from
-coarse to fine, smoothed images first; each step by conjugate gradients that never form the Hessian. Nothing is random,
-and every sum has a fixed order: the result is the same bit for bit on any number of threads. Reasons:
+of a mask with their own variance s^2, the bending of the displacement (and, very little, its distance from rest or a
+first guess: `dvc.registration.gauss_newton.roughness`), the change of volume in soft tissue and the strain of the bone.
+Bending counts alike everywhere (c = 1) at first; in the last steps less where the displacement is curved. Four levels
+from coarse to fine, smoothed images first; each step by conjugate gradients that never form the Hessian. Nothing is
+random, and every sum has a fixed order: the result is the same bit for bit on any number of threads. Reasons:
 docs/decisions/0009.
 """
 

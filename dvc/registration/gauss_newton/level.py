@@ -197,7 +197,8 @@ class Level:
             if not np.isfinite(step).all():
                 raise RegistrationError("The registration diverged: a step is not finite.")
             moved = self.pair.blocks.evaluate(step)[0]
-            tissue = (self._soft > 0) | self._resists  # what no image shows may go where it likes, if that helps
+            # Air, and tissue that no image shows, may go where it likes; tissue not where the energy then rises.
+            tissue = (self._soft > 0) | self._resists
             seen, everywhere = (self._share(moved[w]) for w in (tissue & state.images.shown, tissue))
             for share in (*(seen * 0.5**n for n in range(_HALVINGS)), min(everywhere, seen * 0.5**_HALVINGS)):
                 trial = self.at(state.coefficients + share * step, state.halves)

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from dvc.arrays import FloatArray
 from dvc.images.image import Grid
-from dvc.registration.gauss_newton.spline_sums import TWICE_AS_WIDE, coarser
+from dvc.registration.gauss_newton.coarser_grids import TWICE_AS_WIDE, coarser
 from dvc.threads import in_parts
 
 _NEAR_MM = 4.0  # Gaussian over which the square of a Laplacian is averaged

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from dvc.arrays import FloatArray
-from dvc.registration.gauss_newton.spline_sums import coarser
+from dvc.registration.gauss_newton.coarser_grids import onto_coarser, onto_finer
 
 _SHARE = 0.4  # of what the coarser grid's blocks tell
 
@@ -58,29 +58,6 @@ def by_blocks(diagonals: Sequence[FloatArray]) -> Preconditioner:
         return out
 
     return preconditioned
-
-
-def onto_coarser(force: FloatArray) -> FloatArray:
-    """Sum forces (n, mi, mj, mk) on splines into those on splines of twice the width: the transpose of `onto_finer`."""
-    for axis, count in enumerate(coarser(force.shape[1:]), start=1):
-        ends = [(0, 0)] * 4
-        ends[axis] = (4, 2 * count + 2 - 4 - force.shape[axis] + 1)
-        f = np.moveaxis(np.pad(force, ends), axis, 0)
-        a, b, c, d, e = (f[n : n + 2 * count : 2][:count] for n in range(5))
-        force = np.moveaxis(0.125 * (a + e) + 0.5 * (b + d) + 0.75 * c, 0, axis)
-    return np.ascontiguousarray(force)
-
-
-def onto_finer(coefficients: FloatArray, shape: Sequence[int]) -> FloatArray:
-    """The same displacement from coefficients (n, mi, mj, mk) of splines of twice the width, on the finer grid."""
-    for axis, count in enumerate(shape, start=1):
-        c = np.moveaxis(coefficients, axis, 0)
-        fine = np.empty((count, *c.shape[1:]))
-        even, odd = (count + 1) // 2, count // 2
-        fine[0::2] = 0.125 * (c[:even] + c[2 : even + 2]) + 0.75 * c[1 : even + 1]
-        fine[1::2] = 0.5 * (c[1 : odd + 1] + c[2 : odd + 2])
-        coefficients = np.moveaxis(fine, 0, axis)
-    return np.ascontiguousarray(coefficients)
 
 
 def _times(blocks: FloatArray, force: FloatArray) -> FloatArray:

@@ -9,19 +9,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from scipy.sparse import csr_array
 
 from dvc.arrays import BoolArray, FloatArray, frozen
 from dvc.deformation.bspline import Axis, Table, spline_table
 from dvc.images.image import Grid
+from dvc.registration.gauss_newton.coarser_grids import GRIDS, PAIRS, coarser, paired, spread
 from dvc.threads import in_parts
 
 _ALONE = np.empty((0, 0, 0, 0, 4))  # factors of a spline that has none
-TWICE_AS_WIDE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 8.0
-"""Coefficients of the cubic B-spline of twice the width: a sum of five."""
-GRIDS = 3
-"""Control grids that a solver looks at: the given one, and each next with points twice as far apart."""
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 Stiffness = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """At each point: normal matrix N of the images (..., 6: xx, xy, xz, yy, yz, zz), cofactors of F (..., 3, 3), weights v
@@ -84,7 +79,7 @@ class SplineSums:
                 seen = np.zeros((*a.shape, 6)) if seen is None else seen
                 whole, half = 0.0 if volume is None else volume, 0.0 if shear is None else 0.5 * shear
                 steep = np.einsum("...a,...a->...", slope, slope)
-                for entry, (m, n) in enumerate(_PAIRS):
+                for entry, (m, n) in enumerate(PAIRS):
                     seen[..., entry] += (whole + half) * slope[..., m] * slope[..., n] + half * steep * (m == n)
             parts = (None if each is None else each * square for each in (volume, shear))
             of_splines.append(self._own_blocks(seen, *parts))
@@ -99,9 +94,9 @@ class SplineSums:
         for grid in range(GRIDS):
             if grid:
                 along = [0.5 * np.array([t[n : n + 2].mean() for n in range(0, t.size, 2)]) + 1.0 for t in along]
-                fields, shape = [each if each is None else _paired(each) for each in fields], coarser(shape)
+                fields, shape = [each if each is None else paired(each) for each in fields], coarser(shape)
             table = _table(along, shape, 2**grid * self.control.spacing_mm)
-            found.append(_spread(table, shape, *fields))
+            found.append(spread(table, shape, *fields))
         return found
 
     def closed(self, half: FloatArray) -> FloatArray:
@@ -112,56 +107,6 @@ class SplineSums:
 
     def _half(self) -> FloatArray:
         return np.empty((self.inside.shape[0], 3 * max(self.factors.shape[3], 1), 2, *self.control.shape[1:]))
-
-
-def coarser(shape: Sequence[int]) -> tuple[int, int, int]:
-    """Shape of the control grid whose points are twice as far apart, and whose splines are among those of a finer one.
-
-    Its point j lies on point 2 j - 2 of the finer grid: a cubic B-spline is the sum of five of half its width.
-    """
-    i, j, k = ((n - 1) // 2 + 3 for n in shape)
-    return i, j, k
-
-
-def _paired(field: FloatArray) -> FloatArray:
-    """Sums over two neighbours along each of the first three axes."""
-    for axis in range(3):
-        even = np.moveaxis(field, axis, 0)
-        out = even[0::2].copy()
-        out[: len(even) // 2] += even[1::2]
-        field = np.moveaxis(out, 0, axis)
-    return field
-
-
-def _spread(
-    table: Table, shape: Sequence[int], image: FloatArray | None, volume: FloatArray | None, shear: FloatArray | None
-) -> FloatArray:
-    """Own blocks (6, mi, mj, mk) from the parts of a stiffness (ni, nj, nk, 6 or 1) at the points of a table."""
-    spread = []  # of each axis, the matrices (control points, points) that sum B B, B' B and B' B'
-    for (first, v, s), count in zip(table, shape, strict=True):
-        at = (first[:, None] + np.arange(4)).ravel(), np.repeat(np.arange(first.size), 4)
-        size = (count, first.size)
-        spread.append([csr_array((weights.ravel(), at), shape=size) for weights in (v * v, s * v, s * s)])
-
-    def onto(field: FloatArray, slopes: Sequence[int]) -> FloatArray:
-        for axis in range(3):
-            moved = np.moveaxis(field, axis, 0)
-            summed = spread[axis][slopes[axis]] @ moved.reshape(len(moved), -1)
-            field = np.moveaxis(summed.reshape(-1, *moved.shape[1:]), 0, axis)
-        return np.moveaxis(field, -1, 0)
-
-    out = np.zeros((6, *shape)) if image is None else onto(image, (0, 0, 0))
-    for entry, (m, a) in enumerate(_PAIRS):
-        mixed = [int(axis in {m, a}) for axis in range(3)] if m != a else [2 * (axis == m) for axis in range(3)]
-        if volume is not None:
-            out[entry] += onto(volume, mixed)[0]
-        if shear is not None and m != a:
-            out[entry] += 0.5 * onto(shear, mixed)[0]
-        elif shear is not None:
-            for axis in range(3):
-                share = 1.0 if axis == m else 0.5
-                out[entry] += share * onto(shear, [2 * (n == axis) for n in range(3)])[0]
-    return np.ascontiguousarray(out)
 
 
 def _table(along: Sequence[FloatArray], shape: Sequence[int], spacing_mm: FloatArray) -> Table:

@@ -131,6 +131,19 @@ def test_a_rotation_costs_nothing(level):
     assert level.prior(level.at(rotated(level)), Weights(1.0, 1.0, 1.0, 1.0)) < 1e-9
 
 
+def test_a_prior_about_a_first_guess_is_least_there(level):
+    random = np.random.default_rng(8)
+    guess, c, d = random.normal(size=(3, 3, *level.control.shape))
+    inside, weights = everything().inside, Weights(2.0, 0.0, 0.0)
+    held = Roughness(level.control, ((0.0, 1.0),))  # nothing but the distance
+    about = Level(pair_of(Affine(np.eye(3), np.zeros(3))), inside, inside, np.zeros_like(inside), held, rest=guess)
+    mm3 = float(np.prod(level.control.spacing_mm))
+    assert about.prior(about.at(c), weights) == pytest.approx(mm3 * np.sum((c - guess) ** 2), rel=1e-10)
+    assert np.sum(about.prior_gradient(about.at(c), weights) * d) == pytest.approx(
+        2.0 * mm3 * np.sum((c - guess) * d), rel=1e-10
+    )
+
+
 @pytest.mark.parametrize(
     "weights", [Weights(2.0, 0.0, 0.0), Weights(0.0, 3.0, 0.0), Weights(0.0, 0.0, 4.0), Weights(0, 0, 0, 5.0)]
 )

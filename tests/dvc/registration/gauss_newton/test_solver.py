@@ -7,9 +7,10 @@ import pytest
 
 from dvc.deformation.bspline import BSpline
 from dvc.images.image import Grid
+from dvc.registration.gauss_newton.coarser_grids import coarser, onto_coarser, onto_finer
 from dvc.registration.gauss_newton.roughness import Roughness
-from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients, onto_coarser, onto_finer
-from dvc.registration.gauss_newton.spline_sums import SplineSums, coarser
+from dvc.registration.gauss_newton.solver import by_blocks, conjugate_gradients
+from dvc.registration.gauss_newton.spline_sums import SplineSums
 
 SHAPES = [(10, 13, 12), (11, 9, 8)]
 
