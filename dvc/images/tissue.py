@@ -2,7 +2,7 @@
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import binary_fill_holes, binary_opening, label
+from scipy.ndimage import binary_opening, label
 from skimage.filters import threshold_otsu
 
 from dvc.arrays import BoolArray, FloatArray, IntArray
@@ -31,7 +31,9 @@ def tissue_mask(image: Image) -> Mask:
     parts, count = label(closed)
     if count:
         closed = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
-    filled = _fill_slices(binary_fill_holes(closed))
+    filled = _filled(closed, (0, 1, 2))
+    for plane in ((1, 2), (0, 2), (0, 1)):  # bone that runs out of the image is open in space only
+        filled = _filled(filled, plane)
     if not 0.01 <= (share := float(filled.mean())) <= 0.99:
         taken = f"the threshold takes {100 * share:.1f} % of the image"
         raise InputError(f"No tissue mask could be made: {taken}. Give one: tissue (--tissue on the command line).")
@@ -120,10 +122,15 @@ def _ellipsoid(radius: IntArray) -> BoolArray:
     return np.asarray(i**2 + j**2 + k**2 <= 1.0 + 1e-9)
 
 
-def _fill_slices(inside: BoolArray) -> BoolArray:
-    """Fill holes slice by slice along each axis too: bone that runs out of the image is open in 3D only."""
-    filled = inside.copy()
-    for axis in range(3):
-        for part in np.moveaxis(filled, axis, 0):
-            part[:] = binary_fill_holes(part)
-    return filled
+def _filled(inside: BoolArray, axes: tuple[int, ...]) -> BoolArray:
+    """The mask and its holes: what is outside it, and joined along these axes to none of the image's ends on them."""
+    joined = np.zeros((3, 3, 3), dtype=bool)
+    for axis in axes:
+        np.moveaxis(joined, axis, 0)[:, 1, 1] = True
+    parts, count = label(~inside, joined)
+    opened = np.zeros(count + 1, dtype=bool)
+    for axis in axes:
+        for end in (0, -1):
+            opened[np.take(parts, end, axis)] = True
+    opened[0] = False  # the mask itself
+    return np.asarray(~opened[parts])

@@ -104,7 +104,8 @@ def carried_images(found: Registration, noise: tuple[Noise, Noise | None]) -> Ca
     loaded = Carrier(found.loaded)
     # Beyond the spline, in the air, the image is shown where the bone's motion alone puts it.
     u = np.nan_to_num(displacement_on_grid(found.displacement, grid, np.float32), copy=False)
-    before, aligned, registered = loaded.onto(grid), loaded.onto(grid, motion), loaded.onto(grid, motion, None, u)
+    before = loaded.onto(grid, where=found.tissue.inside)
+    aligned, registered = loaded.onto(grid, motion), loaded.onto(grid, motion, None, u)
     del u
     _, as_scanned = local_correlation(reference, before, found.tissue)
     del loaded, before

@@ -9,6 +9,7 @@ ways to move. Their mean is the result; the largest distance of two is its repea
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal, Self
@@ -17,6 +18,7 @@ import numpy as np
 from scipy import fft
 from scipy.spatial.transform import Rotation
 
+from dvc import threads
 from dvc.arrays import FloatArray
 from dvc.deformation.protocol import Composed, Deformation, RigidMotion
 from dvc.errors import InputError, RegistrationError
@@ -40,6 +42,7 @@ _LOWEST_SIMILARITY = 0.5
 _CERTAIN_SIMILARITY = 0.9
 _LARGEST_SPREAD_MM = 0.5
 _LEAST_COVERED = 0.75
+_LEAST_VARIANCE = 1e-3  # of the scene under the template, as a share of the whole scene's
 _INVERTED_TRIES = 7
 _CLEARLY = 0.1
 
@@ -247,48 +250,51 @@ def _scored(
 ) -> list[tuple[float, RigidMotion]]:
     """For each rotation the best translation and its normalised correlation (times ``sign``)."""
     centre = mask.points().mean(axis=0)
-    template, weight, template_grid = _template(reference, mask, centre)
+    *template, template_grid = _template(reference, mask, centre)
     low, high = loaded.grid.bounds_mm()
     ni, nj, nk = (int(n) for n in np.maximum(np.ceil((high - low) / _SEARCH_MM) + 1, 2))
     scene_grid = Grid((ni, nj, nk), np.full(3, _SEARCH_MM), low)  # axes L, P, S
     scene = carry(smoothed(loaded, _SEARCH_MM / 2.0), scene_grid, order=1)
     known = np.isfinite(scene)
-    values = np.where(known, scene, np.median(scene[known]))
+    # Single precision is enough for values about zero of a standard deviation of one.
+    values = np.where(known, scene, np.median(scene[known])).astype(np.float64)
+    values = ((values - values.mean()) / (values.std() or 1.0)).astype(np.float32)
     size = [fft.next_fast_len(s + t, real=True) for s, t in zip(scene_grid.shape, template_grid.shape, strict=True)]
-    scene_f, square_f, known_f = (fft.rfftn(v, size) for v in (values, values**2, known.astype(np.float64)))
-    places = tuple(slice(0, s) for s in scene_grid.shape)
+    scene_f, square_f, known_f = (fft.rfftn(v, size) for v in (values, values**2, known.astype(np.float32)))
+    # A shift s of the template wraps round: its centre lies at index s + half of the scene.
     half = (np.array(template_grid.shape) - 1) // 2
-    found = []
-    for rotation in rotations:
+    shifts = np.ix_(*((np.arange(s) - h) % n for s, h, n in zip(scene_grid.shape, half, size, strict=True)))
+
+    def scored(rotation: FloatArray) -> tuple[float, RigidMotion] | None:
         back = RigidMotion.about(centre, rotation.T, np.zeros(3))
-        carried = (carry(image, template_grid, back, order=1) for image in (template, weight))
-        t, w = (np.nan_to_num(each.astype(np.float64)) for each in carried)
-        count = w.sum()
-        deviation = t - (t * w).sum() / count
-        energy = (w * deviation * deviation).sum()
-        w_f = np.conj(fft.rfftn(w, size))
-        cross = fft.irfftn(scene_f * np.conj(fft.rfftn(w * deviation, size)), size)
-        mean = fft.irfftn(scene_f * w_f, size) / count
-        variance = fft.irfftn(square_f * w_f, size) / count - mean**2
-        covered = fft.irfftn(known_f * w_f, size) / count
-        floor = 1e-3 * values.var()
-        score = sign * cross / np.sqrt(energy * count * np.maximum(variance, floor))
-        score[covered < _LEAST_COVERED] = -np.inf
-        # A shift s of the template wraps round: its centre lies at index s + half of the scene.
-        score = np.roll(score, tuple(half), axis=(0, 1, 2))[places]
+        t, w = (np.nan_to_num(image.onto(template_grid, back)) for image in template)
+        count = w.sum(dtype=np.float64)
+        deviation = t - np.float32((t * w).sum(dtype=np.float64) / count)
+        energy = float((w * deviation * deviation).sum(dtype=np.float64))
+        detail_f, w_f = (np.conj(fft.rfftn(v, size)) for v in (w * deviation, w))
+        cross, mean, square, covered = (
+            fft.irfftn(of * by, size)[shifts].astype(np.float64)
+            for of, by in ((scene_f, detail_f), (scene_f, w_f), (square_f, w_f), (known_f, w_f))
+        )
+        variance = np.maximum(square / count - (mean / count) ** 2, _LEAST_VARIANCE)
+        score = sign * cross / np.sqrt(energy * count * variance)
+        score[covered / count < _LEAST_COVERED] = -np.inf
         best = np.unravel_index(int(np.argmax(score)), score.shape)
         if not np.isfinite(score[best]):
-            continue  # nowhere does the loaded image show enough of the mask
+            return None  # nowhere does the loaded image show enough of the mask
         to = scene_grid.points_at(np.array(best, dtype=np.float64))
-        found.append((float(score[best]), RigidMotion(rotation, to - rotation @ centre)))
-    return found
+        return float(score[best]), RigidMotion(rotation, to - rotation @ centre)
+
+    with ThreadPoolExecutor(threads.count()) as pool:
+        return [found for found in pool.map(scored, rotations) if found is not None]
 
 
-def _template(reference: Image, mask: Mask, centre: FloatArray) -> tuple[Image, Image, Grid]:
-    """The reference and its weight around the mask, on a cubic low-resolution grid centred on the mask."""
+def _template(reference: Image, mask: Mask, centre: FloatArray) -> tuple[Carrier, Carrier, Grid]:
+    """The reference and its weight around the mask, blurred, and a cubic low-resolution grid centred on the mask."""
     near = Mask(mask.grid, widened(mask, _SEARCH_MARGIN_MM).inside & ~reference.missing)
     reach = float(np.linalg.norm(near.points() - centre, axis=1).max())
     half = int(np.ceil(reach / _SEARCH_MM)) + 1
     grid = Grid((2 * half + 1,) * 3, np.full(3, _SEARCH_MM), centre - half * _SEARCH_MM)
-    weight = smoothed(Image(mask.grid, near.inside.astype(np.float32)), _SEARCH_MM / 2.0)
-    return smoothed(fill_missing(reference), _SEARCH_MM / 2.0), weight, grid
+    images = fill_missing(reference), Image(mask.grid, near.inside.astype(np.float32))
+    template, weight = (Carrier(smoothed(image, _SEARCH_MM / 2.0), order=1) for image in images)
+    return template, weight, grid

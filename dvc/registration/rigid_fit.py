@@ -12,6 +12,7 @@ between voxels, which correlates with the noise beside it: the gradient of the u
 difference of two neighbours, is correlated neither with the voxel between them nor with the neighbours' mean.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Self
@@ -20,6 +21,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, convolve, spline_filter
 from scipy.spatial.transform import Rotation
 
+from dvc import threads
 from dvc.arrays import BoolArray, FloatArray
 from dvc.deformation.protocol import RigidMotion
 from dvc.errors import InputError, RegistrationError
@@ -111,7 +113,7 @@ class RigidFit:
         """
         changes, fine = self._levels[-1].changes, self._levels[_FINE_FROM:]
         _, ways = np.linalg.eigh(np.einsum("ni,nj->ij", changes, changes))
-        pairs = []
+        begun: list[tuple[RigidMotion, list[BoolArray]]] = []
         for way in _ASIDE_MM * ways.T:
             corner = self._random.uniform(0.0, 2.0 * self._block_mm, 3)
             halves = []
@@ -121,9 +123,11 @@ class RigidFit:
                 if not _LEAST_SHARE <= half.mean() <= 1.0 - _LEAST_SHARE:
                     half = self._random.permuted(np.arange(len(half)) % 2 == 0)
                 halves.append(np.asarray(half))
-            one = self._settled(near.after(self._step(way)), fine, halves)
-            pairs.append((one, self._settled(near.after(self._step(-way)), fine, [~half for half in halves])))
-        return pairs
+            begun.append((near.after(self._step(way)), halves))
+            begun.append((near.after(self._step(-way)), [~half for half in halves]))
+        with ThreadPoolExecutor(threads.count()) as pool:
+            fits = list(pool.map(lambda one: self._settled(one[0], fine, one[1]), begun))
+        return list(zip(fits[::2], fits[1::2], strict=True))
 
     def _level(self, reference: Image, mask: Mask, blur_mm: float, scene: Image) -> _Level:
         box = mask.box(int(np.ceil(3.0 * blur_mm / mask.grid.spacing_mm.min())) + 2)

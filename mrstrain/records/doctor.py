@@ -20,7 +20,7 @@ _OURS = ("dvc", "fe", "phantoms", "validate", "mrstrain")
 _RIVALS = {"dvc": ("dvc", " (Data Version Control)"), "configobj": ("validate", " (ConfigObj)")}
 _RIVALS["validate"] = ("validate", "")
 _NEEDED = (
-    "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "meshio", "nibabel", "pydicom", "numba",
+    "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "meshio", "nibabel", "isal", "pydicom", "numba",
     "matplotlib", "jinja2", "lazy-loader", "rich", "typer", "loky", "distributed", "filelock", "pydantic", "pytetwild",
     "pyvista", "vtk", "psutil",
 )  # fmt: skip

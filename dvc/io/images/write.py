@@ -6,7 +6,6 @@ Missing values are NaN. Programs built on ITK (Slicer, ITK-SNAP, SimpleITK) show
 that of an NRRD file or a MetaImage: give them one of those, or the mask of valid voxels.
 """
 
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import nibabel
 import numpy as np
 import numpy.typing as npt
+from isal import isal_zlib
 
 from dvc.arguments import checked
 from dvc.atomic_files import whole_file, write_csv, write_json
@@ -25,7 +25,7 @@ from dvc.io.images.nifti import LPS_FROM_RAS
 from dvc.trust.verdict import Verdict
 
 _SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha")
-_LEVEL = 1  # floats hardly shrink at higher levels, which take several times as long
+_LEVEL = 1  # floats hardly shrink at higher levels
 _BLOCK = 1 << 22
 _NRRD_TYPES = {"f4": "float", "u1": "uint8", "u2": "uint16", "i4": "int32"}
 _META_TYPES = {"f4": "MET_FLOAT", "u1": "MET_UCHAR", "u2": "MET_USHORT", "i4": "MET_INT"}
@@ -194,7 +194,7 @@ def _write(path: Path, grid: Grid, values: npt.NDArray[Any], vector: bool = Fals
         if suffix == ".nrrd":
             file.write(header)
         if suffix in (".nrrd", ".nii.gz"):  # gzip without name and time, so that equal images give equal files
-            coder = zlib.compressobj(_LEVEL, wbits=31)
+            coder = isal_zlib.compressobj(_LEVEL, wbits=31)
             file.writelines(map(coder.compress, stream))
             file.write(coder.flush())
         else:

@@ -3,13 +3,15 @@
 A cubic B-spline is the sum of five of half its width, so the splines of a coarser grid are among those of a finer one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numba import njit
 from scipy.sparse import csr_array
 
 from dvc.arrays import FloatArray
 from dvc.deformation.bspline import Table
+from dvc.threads import in_parts
 
 GRIDS = 3
 """Control grids that a solver looks at: the given one, and each next with points twice as far apart."""
@@ -31,24 +33,52 @@ def coarser(shape: Sequence[int]) -> tuple[int, int, int]:
 def onto_coarser(force: FloatArray) -> FloatArray:
     """Sum forces (n, mi, mj, mk) on splines into those on splines of twice the width: the transpose of `onto_finer`."""
     for axis, count in enumerate(coarser(force.shape[1:]), start=1):
-        ends = [(0, 0)] * 4
-        ends[axis] = (4, 2 * count - 1 - force.shape[axis])
-        f = np.moveaxis(np.pad(force, ends), axis, 0)
-        a, b, c, d, e = (f[n : n + 2 * count : 2][:count] for n in range(5))
-        force = np.moveaxis(0.125 * (a + e) + 0.5 * (b + d) + 0.75 * c, 0, axis)
-    return np.ascontiguousarray(force)
+        force = _along(axis, _summed, force, count)
+    return force
 
 
 def onto_finer(coefficients: FloatArray, shape: Sequence[int]) -> FloatArray:
     """The same displacement from coefficients (n, mi, mj, mk) of splines of twice the width, on the finer grid."""
     for axis, count in enumerate(shape, start=1):
-        c = np.moveaxis(coefficients, axis, 0)
-        fine = np.empty((count, *c.shape[1:]))
-        even, odd = (count + 1) // 2, count // 2
-        fine[0::2] = 0.125 * (c[:even] + c[2 : even + 2]) + 0.75 * c[1 : even + 1]
-        fine[1::2] = 0.5 * (c[1 : odd + 1] + c[2 : odd + 2])
-        coefficients = np.moveaxis(fine, 0, axis)
-    return np.ascontiguousarray(coefficients)
+        coefficients = _along(axis, _refined, coefficients, count)
+    return coefficients
+
+
+def _along(axis: int, kernel: Callable[..., None], given: FloatArray, count: int) -> FloatArray:
+    """What a kernel makes of an array along one of its axes, which has so many places then."""
+    before, here, after = given.shape[:axis], given.shape[axis], given.shape[axis + 1 :]
+    out = np.empty((*before, count, *after))
+    lines = given.reshape(-1, here, int(np.prod(after)))
+    in_parts(kernel, len(lines), lines, out.reshape(len(lines), count, -1))
+    return out
+
+
+@njit(nogil=True, cache=True)
+def _summed(start: int, stop: int, fine: FloatArray, out: FloatArray) -> None:
+    count = out.shape[1]
+    padded = np.zeros((2 * count + 3, fine.shape[2]))  # beyond the finer grid there is no force
+    for n in range(start, stop):
+        for i in range(fine.shape[1]):
+            for k in range(fine.shape[2]):
+                padded[4 + i, k] = fine[n, i, k]
+        for i in range(count):
+            a, b, c, d, e = padded[2 * i], padded[2 * i + 1], padded[2 * i + 2], padded[2 * i + 3], padded[2 * i + 4]
+            for k in range(fine.shape[2]):
+                out[n, i, k] = 0.125 * (a[k] + e[k]) + 0.5 * (b[k] + d[k]) + 0.75 * c[k]
+
+
+@njit(nogil=True, cache=True)
+def _refined(start: int, stop: int, coarse: FloatArray, out: FloatArray) -> None:
+    for n in range(start, stop):
+        for i in range(out.shape[1]):
+            before, here = coarse[n, i // 2], coarse[n, i // 2 + 1]
+            after = coarse[n, i // 2 + 2]
+            if i % 2:
+                for k in range(out.shape[2]):
+                    out[n, i, k] = 0.5 * (here[k] + after[k])
+            else:
+                for k in range(out.shape[2]):
+                    out[n, i, k] = 0.125 * (before[k] + after[k]) + 0.75 * here[k]
 
 
 def paired(field: FloatArray) -> FloatArray:
