@@ -100,7 +100,8 @@ class Carrier:
         values = fill_missing(image).values
         self.image, self._cubic = image, order > 1
         self._values = frozen(spline_filter(values, 3, np.float32, "mirror") if self._cubic else values, np.float32)
-        self._gaps = image.missing.astype(np.float32) if image.missing.any() else np.zeros((0, 0, 0), np.float32)
+        missing = image.missing
+        self._gaps = frozen(missing if missing.any() else np.zeros((0, 0, 0)), np.float32)
 
     def onto(
         self, grid: Grid, motion: AffineMotion | None = None, where: BoolArray | None = None,
@@ -111,10 +112,11 @@ class Carrier:
         per_mm = np.ascontiguousarray(self.image.grid.index_per_mm @ matrix)
         step = np.ascontiguousarray(per_mm @ (grid.direction * grid.spacing_mm))
         start = self.image.grid.indices_of(matrix @ grid.origin_mm + shift)
-        wanted = np.ones(grid.shape, dtype=bool) if where is None else np.ascontiguousarray(where)
+        # Read-only, as images are: of each kind of array a kernel is compiled anew.
+        wanted = frozen(np.ones(grid.shape, dtype=bool) if where is None else where, np.bool_)
         u = np.zeros((0, 0, 0, 3)) if displacement_mm is None else displacement_mm
         carried = np.full(grid.shape, np.nan, dtype=np.float32)
-        moved = np.ascontiguousarray(u, dtype=np.float32)
+        moved = frozen(u, np.float32)
         given = self._values, self._gaps, self._cubic, wanted, step, start, moved, per_mm
         in_parts(carry_values, len(wanted), *given, carried)
         return carried

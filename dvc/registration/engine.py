@@ -184,6 +184,10 @@ class Engine(Protocol):
         """Refuse, by InputError, an earlier result from which it cannot start."""
         return
 
+    def prepare(self) -> None:
+        """Do what only a first run on a machine needs; a process does it while its worker aligns the images."""
+        return
+
     def record(self) -> dict[str, object]:
         """Its parameters as plain values, for provenance."""
 

@@ -7,6 +7,7 @@ tissue relative to its bone; T(X) = R (X + u(X)) + t is the whole motion.
 
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -167,7 +168,9 @@ def register(
     _check(reference, body, bone, tissues, chosen)
     if start is not None:
         engine.check_start(start)
-    with Worker(chosen.threads) if worker is None else nullcontext(worker) as runner:
+    own = Worker(chosen.threads) if worker is None else nullcontext(worker)
+    with own as runner, ThreadPoolExecutor(1) as beside:
+        beside.submit(engine.prepare)
         pair, alignment, turn = _aligned(reference, loaded, body, bone, tissues, chosen, runner, tell)
         guess = start
         if isinstance(start, BSpline):  # and remains one

@@ -13,6 +13,7 @@ from dvc.deformation.protocol import Deformation
 from dvc.errors import ParameterError
 from dvc.registration.engine import AlignedPair, Cost, Displacement, Engine, Found, Progress
 from dvc.registration.gauss_newton.choice import Choice
+from dvc.registration.gauss_newton.first_run import compile_loops
 from dvc.registration.gauss_newton.fit import Parameters, fit
 from dvc.registration.gauss_newton.with_interfaces import STAGE, USUAL_SKIN, fit_with_interfaces
 from dvc.worker import Worker
@@ -93,6 +94,10 @@ class GaussNewton(Parameters, Engine):
             f"coefficients, less where the displacement is curved; weight {weight}){held}"
         )
 
+    def prepare(self) -> None:
+        """Compile its loops, where no run has before."""
+        compile_loops(lambda pair: fit(pair, self))
+
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress
     ) -> Found:
@@ -167,6 +172,10 @@ class GaussNewtonWithInterfaces(Engine):
             f"{'the bone held at rest and ' if held else ''}strain of a tissue called skin penalised (weight {weight})"
             ", and bending counted by the Laplacian of both splines' Laplacian"
         )
+
+    def prepare(self) -> None:
+        """Compile its loops, where no run has before."""
+        compile_loops(lambda pair: fit_with_interfaces(pair, self.smooth))
 
     def find(
         self, pair: AlignedPair, *, start: Deformation | None, seeds: Sequence[int], worker: Worker, progress: Progress

@@ -6,6 +6,7 @@ fixed order, so that it is the same bit for bit on any number of threads.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numba import njit
@@ -114,6 +115,12 @@ def _table(along: Sequence[FloatArray], shape: Sequence[int], spacing_mm: FloatA
     rows = (spline_table(t, n) for t, n in zip(along, shape, strict=True))
     i, j, k = ((first, value, slope / h) for (first, value, slope), h in zip(rows, spacing_mm, strict=True))
     return i, j, k
+
+
+def stored() -> bool:
+    """Whether a run on this machine has compiled and stored these loops before, or none can be stored."""
+    place = _product.stats.cache_path
+    return place is None or any(Path(place).glob(f"{__name__.rpartition('.')[2]}._product-*.nbi"))
 
 
 # The sweeps: planes, rows and lines of the grid, one axis of B-splines after the other.

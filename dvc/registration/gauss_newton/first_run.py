@@ -1,0 +1,37 @@
+"""The first run on a machine: loops are compiled while another process corrects and aligns the images."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from dvc.deformation.protocol import Deformation, RigidMotion, Within, displacement_on_grid
+from dvc.deformation.strain_maps import strain_maps
+from dvc.images.image import Grid, Image, LabelMap, Mask
+from dvc.registration.engine import AlignedPair
+from dvc.registration.gauss_newton.spline_sums import stored
+
+_SIZE = 16  # voxels of 1 mm along each edge
+_SHIFT_MM = 0.3
+
+
+def compile_loops(fitting: Callable[[AlignedPair], tuple[Deformation, object]]) -> None:
+    """Fit a tiny pair and take its strain, which compiles and stores every loop; nothing where they are stored."""
+    if stored():
+        return
+    pair = _tiny_pair()
+    found, _ = fitting(pair)
+    strain_maps(Within(found, pair.body), pair.body)
+    displacement_on_grid(found, pair.fixed.grid, np.float32)
+
+
+def _tiny_pair() -> AlignedPair:
+    """Waves in a cube of skin, fat and bone, and the same moved along x."""
+    grid = Grid((_SIZE,) * 3, np.ones(3), np.zeros(3))
+    x, y, z = places = np.indices(grid.shape)
+    depth = np.minimum(places, _SIZE - 1 - places).min(axis=0)
+    labels = LabelMap(grid, np.digitize(depth, (2, 3, 6)), {1: "skin", 2: "fat", 3: "bone"})
+    body, bone = Mask(grid, depth >= 2), Mask(grid, depth >= 6)
+    fixed, moving = (
+        Image(grid, 2.0 + np.sin(0.9 * (x - shift)) * np.cos(0.7 * y) + np.sin(0.8 * z)) for shift in (0.0, _SHIFT_MM)
+    )
+    return AlignedPair.of(fixed, moving, RigidMotion.identity(), body, bone, labels).cut()

@@ -1,0 +1,61 @@
+"""What is compiled beforehand on a machine where nothing is yet: everything that a fit needs, and only once."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from dvc.registration.gauss_newton import first_run
+from dvc.registration.gauss_newton.engine import GaussNewton, GaussNewtonWithInterfaces
+
+PREPARE = "from dvc import GaussNewtonWithInterfaces; GaussNewtonWithInterfaces().prepare()"
+FIT = """
+import numpy as np
+from numba.core import event
+from dvc.deformation.protocol import RigidMotion, Within
+from dvc.deformation.strain_maps import strain_maps
+from dvc.images.image import Mask
+from dvc.registration.engine import AlignedPair
+from dvc.registration.gauss_newton.fit import Parameters
+from dvc.registration.gauss_newton.with_interfaces import fit_with_interfaces
+from phantoms import heel_pair
+
+heel = heel_pair(3, load=0.6, shape=(40, 44, 42), spacing_mm=2.5)  # phantoms have loops of their own
+body = Mask(heel.reference.grid, heel.labels.labels > 0)
+pair = AlignedPair.of(heel.reference, heel.loaded, heel.foot_motion, body, heel.bone, heel.labels).cut()
+with event.install_recorder("numba:compile") as compiled:
+    found, _ = fit_with_interfaces(pair, Parameters())
+    strain_maps(Within(found, pair.body), pair.body)
+print(sorted({e.data["dispatcher"].py_func.__name__ for _, e in compiled.buffer}))
+"""
+
+
+@pytest.mark.full_size
+def test_a_fit_compiles_nothing_more(tmp_path) -> None:
+    there = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    for script in (PREPARE, FIT):
+        run = subprocess.run([sys.executable, "-c", script], env=there, capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]", run.stdout
+
+
+@pytest.mark.parametrize("engine", [GaussNewton(), GaussNewtonWithInterfaces()])
+def test_nothing_is_done_where_an_earlier_run_has_stored_its_loops(engine, monkeypatch) -> None:
+    fitted = []
+    monkeypatch.setattr(first_run, "_tiny_pair", lambda: fitted.append("pair"))
+    monkeypatch.setattr(first_run, "stored", lambda: True)
+    engine.prepare()
+    assert not fitted
+    monkeypatch.setattr(first_run, "stored", lambda: False)
+    with pytest.raises(AttributeError):  # there is no pair to fit
+        engine.prepare()
+    assert fitted
+
+
+def test_what_is_stored_is_seen(tmp_path) -> None:
+    told = "from dvc.registration.gauss_newton.spline_sums import stored; print(stored())"
+    there = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    seen = [sys.executable, "-c", told]
+    assert subprocess.run(seen, env=there, capture_output=True, text=True, check=True).stdout == "False\n"
