@@ -121,7 +121,8 @@ class Found:
 class Cost:
     """Approximate cost of an engine, for each million voxels of the unloaded image where it says so."""
 
-    seconds_per_mvoxel: float = 7.0  # on one core
+    seconds: float = 0.0  # on one core, whatever the size
+    seconds_per_mvoxel: float = 1.7  # on one core
     phantom_seconds: float = 30.0  # on one core, to make, register and score one phantom of an accuracy study
     gib: float = 0.0  # memory beside that of alignment
     gib_per_mvoxel: float = 0.175

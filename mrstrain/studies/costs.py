@@ -18,7 +18,7 @@ CARE = "CARE"
 """Begins a line on what this machine has too little of."""
 
 # Seconds on one core, as measured on the phantom heel (2.3 million voxels; 66,000 cells under four loads).
-_REGISTER_S, _MAPS_S_PER_MVOXEL = 35.0, 3.5  # beside what the engine takes (`Cost`)
+_REGISTER_S, _MAPS_S_PER_MVOXEL = 13.0, 3.5  # beside what the engine takes (`Cost`)
 _TWIN = 1.3  # times as long again: the twin is made and registered
 _CELLS, _LOAD_S, _GROWTH = 66e3, 35.0, 1.5
 # The seven published sets took .5 to 2.6 times as long as this says, whose softest tissues have .3 to 390 kPa.
@@ -65,7 +65,8 @@ def seconds_of(stage: Stage, study: Study, voxels: float, cells: float) -> float
     """About how long a stage takes on one core, seconds; voxels are those of the unloaded image, cells of the mesh."""
     loads = len(study.loads)
     if stage.kind in ("register", "level"):
-        registering = _REGISTER_S + (_cost(study).seconds_per_mvoxel + _MAPS_S_PER_MVOXEL) * voxels / 1e6
+        cost = _cost(study)
+        registering = _REGISTER_S + cost.seconds + (cost.seconds_per_mvoxel + _MAPS_S_PER_MVOXEL) * voxels / 1e6
         return registering * (1.5 if stage.kind == "level" else 1.0 + _TWIN * bool(stage.arguments.get("twin")))
     if stage.kind == "mesh":
         return _MESH_S

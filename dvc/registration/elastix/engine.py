@@ -49,7 +49,7 @@ class Elastix(Engine):
     family = "elastix"
     starts_anywhere = False
     sees_brightness = False  # its metrics are correlation and mutual information
-    cost = Cost(phantom_seconds=75.0, gib=0.75)  # 3,500 iterations, whatever the voxel
+    cost = Cost(seconds=20.0, phantom_seconds=75.0, gib=0.75)  # 3,500 iterations, whatever the voxel
 
     def __post_init__(self) -> None:
         if not self.presets:
