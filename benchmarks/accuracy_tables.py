@@ -2,7 +2,7 @@
 
     python -m benchmarks.accuracy_tables benchmarks/results/accuracy
 
-Maximal shear, root mean square error; displacement in fat, root mean square error, mm.
+Maximum shear strain, root mean square error; displacement in fat, root mean square error, mm.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@
 Heel phantom 1 under load, in n^3 voxels with noise of their own, with and without the label map, as a command of its
 own on all cores: each round runs the command of the tree before and of this one, in turn. Wall and processor time of
 all its processes, the peak of their memory (Linux only), the median over rounds of the ratios of time, and the root
-mean square difference of the maximal shear in all voxels where both measure it.
+mean square difference of the maximum shear strain in all voxels where both measure it.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvc import Image, Mask, RigidMotion, read_parameter_file
-from dvc.images.shading import without_shading
+from dvc.images.bias_field import without_bias_field
 from dvc.io.transforms.read import rigid_from_elastix
 from dvc.registration.elastix import run as elastix
 from dvc.registration.rigid_fit import RigidFit
@@ -51,7 +51,7 @@ def by_elastix(fixed: Image, moving: Image, bone: Mask, start: RigidMotion, seed
 
 def one(pair: HeelPair, seed: int, noise: float) -> dict[str, object]:
     random = np.random.default_rng(seed)
-    fixed, moving = without_shading([noisy(image, noise, random) for image in (pair.reference, pair.loaded)])
+    fixed, moving = without_bias_field([noisy(image, noise, random) for image in (pair.reference, pair.loaded)])
     centre = pair.bone.points().mean(axis=0)
     turn = Rotation.from_rotvec(np.radians(random.uniform(-3.0, 3.0, 3))).as_matrix()
     start = pair.foot_motion.after(RigidMotion.about(centre, turn, random.uniform(-1.5, 1.5, 3)))

@@ -68,7 +68,7 @@ def peak_gib() -> float:
 
 
 def errors(pair: HeelPair, still: bool, found: Deformation) -> dict[str, dict[str, float]]:
-    """Of the maximal shear: root mean square and mean error; of the displacement: median and 95th percentile, mm."""
+    """Of the max. shear: root mean square and mean error; of the displacement: median and 95th percentile, mm."""
     labels = pair.labels
     X, inside = labels.grid.points(labels.labels > 0), labels.labels > 0
     u, H = (np.zeros_like(X), np.zeros((len(X), 3, 3))) if still else pair.deformation.evaluate(X)

@@ -51,7 +51,7 @@ def floor_of(found: Registration) -> dict[str, float]:
     grid = found.reference.grid
     after = carry(loaded, grid, motion, displacement_mm=displacement_on_grid(found.displacement, grid, np.float32))
     E = maps.green_lagrange[maps.valid & found.tissue.inside].astype(float)
-    half = np.sqrt(((E[:, 0] - E[:, 3]) / 2) ** 2 + E[:, 1] ** 2)  # in-plane maximal shear, x and y
+    half = np.sqrt(((E[:, 0] - E[:, 3]) / 2) ** 2 + E[:, 1] ** 2)  # in-plane maximum shear strain, x and y
     return {
         "maer": floor.maer,
         "sder": floor.sder,

@@ -1,4 +1,4 @@
-"""Error of displacement and maximal shear on the heel phantom: our own beside elastix' default B-spline.
+"""Error of displacement and maximum shear strain on the heel phantom: our own beside elastix' default B-spline.
 
     python benchmarks/registration_accuracy.py --seeds 1 2 --out benchmarks/results/registration_accuracy.json
 

@@ -2,7 +2,7 @@
 
     .venv/bin/python -m benchmarks.twin_check --work /tmp/twins --out benchmarks/results/twin_check.json
 
-For each heel, load and tissue: root mean square error of the maximal shear, true and in the twin; the share of voxels
+For each heel, load and tissue: root mean square error of the max. shear, true and in the twin; the share of voxels
 whose truth lies within 1.96 standard deviations of the error model about its bias, as it is and as wide as the twin
 made it; the factor. Seconds of the whole command, and the peak memory of this process and of the largest it started.
 What is there already in the work folder is not made again.

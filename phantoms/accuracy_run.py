@@ -55,7 +55,7 @@ class AccuracyCase:
         "still" (registered as a repeat scan is), "smooth", "sliding", "swelling" (volume changes), "Load1" to "Load4",
         or "wave-L" with a wavelength L in mm.
     seed : int
-        Of the heel, its images and the foot's motion.
+        Of the heel, its images and the rigid motion of the foot.
     labels_off : int
         Voxels by which bones and skin are too large (below zero: too small) in the label map that the registration is
         given (`misdrawn`).

@@ -19,7 +19,7 @@ SOFT = tuple(name for name in TISSUES.values() if name not in RIGID)
 _BINS: Mapping[str, tuple[str, tuple[float, ...]]] = {
     "distance to bone, mm": ("to_bone_mm", (0.0, 1.5, 3.0, 6.0, 12.0, np.inf)),
     "distance to a border, mm": ("to_border_mm", (0.0, 1.0, 2.0, 4.0, np.inf)),
-    "true maximal shear": ("true_shear", (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, np.inf)),
+    "true maximum shear strain": ("true_shear", (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, np.inf)),
 }
 _Pool = Mapping[str, npt.NDArray[Any]]
 
@@ -119,7 +119,7 @@ class ErrorRow(OfCondition):
         The condition: voxel size in mm, such as "0.8" or "0.8 x 0.8 x 1.6".
     labels_off : int
         As in `AccuracyCase`.
-    by : {"all", "distance to bone, mm", "distance to a border, mm", "true maximal shear"}
+    by : {"all", "distance to bone, mm", "distance to a border, mm", "true maximum shear strain"}
     low, high : float
         Limits of the bin; NaN for "all".
     true_p50, true_p95 : float

@@ -147,7 +147,7 @@ def _peer_versions() -> dict[str, str]:
 
 
 def table(runs: list[dict[str, Any]]) -> str:
-    """Means over pairs: RMSE of maximal shear; fat's displacement, median / 95th percentile, mm; time and memory.
+    """Means over pairs: RMSE of max. shear; fat's displacement, median / 95th percentile, mm; time and memory.
 
     Time is the processor's, which other work on the machine changes far less; of runs made before it was recorded, wall
     time. On one thread of an idle machine the two are nearly the same.

@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks.registration_accuracy import without_motion
 from dvc import Grid, Image, Mask, write_image, write_labels, write_mask
+from dvc.images.bias_field import without_bias_field
 from dvc.images.resample import carry, fill_missing
-from dvc.images.shading import without_shading
 from phantoms import Heel, HeelPair, heel_pair, motion_named
 
 # Air left around the body: more than tissue moves, so that its true place is inside the aligned image as well.
@@ -48,7 +48,7 @@ def write_pair(pair: HeelPair, folder: Path) -> None:
     write_labels(folder / "labels.mha", pair.labels)
     grid = _box(body)
     write_image(folder / "scan1-moved.mha", without_motion(pair.loaded, pair.foot_motion))
-    unloaded, loaded = without_shading([pair.reference, pair.loaded])
+    unloaded, loaded = without_bias_field([pair.reference, pair.loaded])
     loaded = without_motion(loaded, pair.foot_motion)
     write_image(folder / "reference.mha", _onto(unloaded, grid, order=1))
     write_image(folder / "loaded.mha", loaded)

@@ -20,7 +20,7 @@ _MOSTLY = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorBars:
-    """Errors of a load's maximal shear strain, or why they are not known."""
+    """Errors of a load's maximum shear strain, or why they are not known."""
 
     uncertainty: Uncertainty | None
     told: str  # where the figures come from, or why there are none; empty where no images were registered
@@ -63,7 +63,7 @@ def error_bars(
     found: Registration, subject: Subject, maps: StrainMaps, snr: float, model: ErrorModel | None,
     twin: TwinCheck | None = None,
 ) -> ErrorBars:  # fmt: skip
-    """Error of a registered load's maximal shear strain, by an error model, the user's own or the preset's.
+    """Error of a registered load's maximum shear strain, by an error model, the user's own or the preset's.
 
     ``snr`` is the lower signal-to-noise ratio of the two images (`dvc.measurement.judgement.noise_of`).
     Error bars that do not hold in the pair's twin are made wider.

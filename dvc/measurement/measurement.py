@@ -48,16 +48,16 @@ class Measurement:
     deformation : Deformation
         Displacement of tissue relative to its bone.
     maps : StrainMaps
-        Displacement, Green-Lagrange strain, maximal shear strain (E1 - E3)/2, det F, and where they are valid.
+        Displacement, Green-Lagrange strain, maximum shear strain (E1 - E3)/2, det F, and where they are valid.
     alignment : mapping
         The bone's rigid motion between the scans and how well it is known, as plain values: "on" (what was aligned
         on), "rotation" (3 x 3) and "translation_lps_mm" (`bone_motion`), "repeatability_rms_mm" and more.
     quality : Quality
         The figures behind the verdict.
     regions : tuple of RegionRow
-        Statistics of maximal shear strain, det F and displacement by region.
+        Statistics of maximum shear strain, det F and displacement by region.
     error_bars : ErrorBars
-        Standard deviation and intervals of the maximal shear strain, or why there are none.
+        Standard deviation and intervals of the maximum shear strain, or why there are none.
     image : Image or None
         What maps are shown over: the unloaded image; the registered one where a folder was read.
     source : Source or None
@@ -197,12 +197,12 @@ class Measurement:
 
     @property
     def max_shear(self) -> Float32Array:
-        """Maximal shear strain (E1 - E3)/2 (ni, nj, nk), no unit; NaN where not defined."""
+        """Maximum shear strain (E1 - E3)/2 (ni, nj, nk), no unit; NaN where not defined."""
         return self.maps.max_shear
 
     @property
     def sigma(self) -> Float32Array | None:
-        """(ni, nj, nk): standard deviation of the maximal shear strain, where its error is known."""
+        """(ni, nj, nk): standard deviation of the maximum shear strain, where its error is known."""
         known = self.error_bars.uncertainty
         return None if known is None else known.sigma
 
@@ -219,10 +219,10 @@ class Measurement:
 
     @property
     def strain_line(self) -> str:
-        """The maximal shear strain by region, in a line."""
+        """The maximum shear strain by region, in a line."""
         rows = (r for r in self.regions if r.quantity == "max_shear" and np.isfinite(r.median))
         shear = ", ".join(f"{r.region} {r.median:z.3f} / {r.p95:z.3f}" for r in rows)
-        return f"maximal shear strain (E1 - E3)/2, median / 95th percentile: {shear}"
+        return f"maximum shear strain (E1 - E3)/2, median / 95th percentile: {shear}"
 
     def summary(self) -> list[str]:
         """The verdict with its reasons and the strain, in lines."""
@@ -282,7 +282,7 @@ class Measurement:
         return known[quantity]
 
     def _repr_html_(self) -> str:
-        picture = Picture("Maximal shear strain", "", png_bytes(self.plot()))
+        picture = Picture("Maximum shear strain", "", png_bytes(self.plot()))
         table = page.short_table(self.regions, self.intervals)
         return notebook_html(self.name, picture, table, verdict=self.verdict, notes=self.error_bars.summary)
 

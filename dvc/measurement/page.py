@@ -18,7 +18,7 @@ from dvc.trust.quality import NoiseFloor, Quality
 from dvc.trust.regions import SHEAR_THRESHOLDS, RegionRow
 
 SHEAR_SCALE, SIGMA_SCALE = 0.5, 0.1
-"""Upper ends of the colours for maximal shear strain and its standard deviation."""
+"""Upper ends of the colours for maximum shear strain and its standard deviation."""
 _TWIN = (
     "The unloaded image was moved by what was measured, its noise drawn anew, and the pair registered as the real one: "
     "its true strain is the one above. What came back tells what the noise and texture of these images cost. Strain "
@@ -46,7 +46,7 @@ def pictures_of(
         drawn["similarity"] = Picture.drawn("Where the images agree", figures.similarity_slices, *local)
     strain = view, reference, maps.max_shear, SHEAR_SCALE, labels
     through = "Slices through the bone's lowest point along the plate's normal."
-    drawn["strain"] = Picture.drawn("Maximal shear strain", figures.strain_slices, *strain, note=through)
+    drawn["strain"] = Picture.drawn("Maximum shear strain", figures.strain_slices, *strain, note=through)
     curves = maps.max_shear, labels, None if floor is None else floor.max_shear_p95
     drawn["curves"] = Picture.drawn("Volume above a strain", figures.shear_curves, *curves)
     grid = view, below, maps.displacement_mm, None if bone is None else bone.inside
@@ -54,7 +54,7 @@ def pictures_of(
     drawn["jacobian"] = Picture.drawn("Volume ratio", figures.jacobian_slices, view, reference, maps.jacobian)
     if sigma is not None:
         spread = view, reference, sigma, SIGMA_SCALE
-        drawn["sigma"] = Picture.drawn("Uncertainty of the maximal shear strain", figures.sigma_slices, *spread)
+        drawn["sigma"] = Picture.drawn("Uncertainty of the maximum shear strain", figures.sigma_slices, *spread)
     return drawn
 
 
@@ -79,7 +79,7 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
     bone = "in the bone, before it was held at rest" if quality.bone_held else "left in the bone"
     rows += [
         (f"Displacement {bone} (truth: 0), rms", quality.bone_shift_mm, "mm"),
-        (f"Apparent maximal shear strain {bone} (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
+        (f"Apparent maximum shear strain {bone} (truth: 0), 95th percentile", quality.bone_shear_p95, ""),
         ("Folded voxels (det F <= 0)", quality.folded_voxels, "voxels"),
         ("Lowest det F", quality.lowest_jacobian, ""),
         ("Tissue without a result", 100.0 * quality.undefined_fraction, "%"),
@@ -93,8 +93,8 @@ def key_figures(quality: Quality, alignment: Mapping[str, Any]) -> Table:
         ]
     if (floor := quality.noise_floor) is not None:
         rows += [
-            ("Noise floor (repeat scan): maximal shear strain, median", floor.max_shear_p50, ""),
-            ("Noise floor (repeat scan): maximal shear strain, 95th percentile", floor.max_shear_p95, ""),
+            ("Noise floor (repeat scan): maximum shear strain, median", floor.max_shear_p50, ""),
+            ("Noise floor (repeat scan): maximum shear strain, 95th percentile", floor.max_shear_p95, ""),
             ("Noise floor: mean absolute strain component (MAER), mean over voxels", floor.maer, ""),
             ("Noise floor: standard deviation of the same (SDER)", floor.sder, ""),
         ]
@@ -108,7 +108,7 @@ def weights_table(choice: Regularisation) -> Table:
 
 
 def region_table(regions: Sequence[RegionRow]) -> Table:
-    """The maximal shear strain of every region."""
+    """The maximum shear strain of every region."""
 
     def cells(r: RegionRow) -> tuple[Cell, ...]:
         above = (r.volume_above_ml.get(t) for t in SHEAR_THRESHOLDS)
@@ -117,12 +117,12 @@ def region_table(regions: Sequence[RegionRow]) -> Table:
     rows = tuple(cells(r) for r in regions if r.quantity == "max_shear")
     above = (f"> {t:g}, mL" for t in SHEAR_THRESHOLDS)
     columns = ("region", "volume, mL", "defined, %", "median", "p90", "p95", "p99", *above)
-    note = "Maximal shear strain (E₁ − E₃)/2 (Green-Lagrange), and volumes above a value."
-    return Table("Maximal shear strain by region", columns, rows, note)
+    note = "Maximum shear strain (E₁ − E₃)/2 (Green-Lagrange), and volumes above a value."
+    return Table("Maximum shear strain by region", columns, rows, note)
 
 
 def short_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> Table:
-    """Median and 95th percentile of the maximal shear strain by region, each with its interval where it is known."""
+    """Median and 95th percentile of the maximum shear strain by region, each with its interval where it is known."""
     known = {(i.region, i.figure): f"{shown(i.low)} to {shown(i.high)}" for i in intervals}
 
     def own(region: str, figure: str) -> tuple[str, ...]:
@@ -135,7 +135,7 @@ def short_table(regions: Sequence[RegionRow], intervals: Sequence[Interval]) -> 
         if r.quantity == "max_shear"
     )
     columns = ("region", "volume, mL", "median", *interval, "95th percentile", *interval)
-    return Table("Maximal shear strain", columns, rows)
+    return Table("Maximum shear strain", columns, rows)
 
 
 def error_tables(bars: ErrorBars) -> list[Table]:
@@ -144,7 +144,7 @@ def error_tables(bars: ErrorBars) -> list[Table]:
     if bars.uncertainty is not None:
         rows = tuple((i.region, _words(i.figure), i.found, i.low, i.high) for i in bars.uncertainty.intervals)
         columns = ("region", "figure", "as found", "95 % from", "to")
-        tables.append(Table("Maximal shear strain with its error", columns, rows, bars.told))
+        tables.append(Table("Maximum shear strain with its error", columns, rows, bars.told))
     if bars.twin:
         claims = bars.uncertainty is not None
         head = ("region", "error (rms)", "bias", *(("within the claim", "expected, at least", "wider") * claims))

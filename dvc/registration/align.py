@@ -108,8 +108,8 @@ def refuse_turned_contrast(reference: Image, loaded: Image, tissue: Mask, motion
 def align(reference: Image, loaded: Image, mask: Mask, on: AlignOn, seed: int) -> Alignment:
     """Find the rigid motion of a mask's voxels, a bone or the whole image, from the reference to the loaded image.
 
-    The images are without bias field (`dvc.images.shading`), which would pull the optimum off by some hundredths of a
-    millimetre; the seed is that of the halves into which the mask's voxels are divided. InputError if the mask is
+    The images are without bias field (`dvc.images.bias_field`), which would pull the optimum off by some hundredths of
+    a millimetre; the seed is that of the halves into which the mask's voxels are divided. InputError if the mask is
     empty, or too little of it is seen in the unloaded image; RegistrationError if no place of the loaded image looks
     like the bone, if the contrast is inverted, or if the fits of two halves disagree by more than 0.5 mm.
     """

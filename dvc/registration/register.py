@@ -1,4 +1,4 @@
-"""From a pair of images to the deformation of the tissue: correct shading, align on the bone, register non-rigidly.
+"""From a pair of images to the deformation of the tissue: bias field, alignment on the bone, registration.
 
 The rigid motion of the bone is put into the loaded image's header, which moves the image without resampling it. The
 displacement u then maps the reference configuration straight to the bone-aligned loaded one, so it is that of the
@@ -21,8 +21,8 @@ from dvc.arrays import FloatArray
 from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Composed, Deformation, RigidMotion, Within
 from dvc.errors import InputError, ParameterError
+from dvc.images.bias_field import without_bias_field
 from dvc.images.image import Image, LabelMap, Mask
-from dvc.images.shading import without_shading
 from dvc.images.tissue import tissue_mask
 from dvc.registration.align import Alignment, AlignOn, align, not_aligned, refuse_turned_contrast
 from dvc.registration.engine import AlignedPair, Displacement, Engine, Progress, Regularisation
@@ -202,7 +202,7 @@ def _aligned(
 
     tell("aligning", 0.0)
     scans = [upright, loaded.toward_lps()]
-    fixed, moving = map(turned, worker.run("correcting the shading", without_shading, scans, settings.threads))
+    fixed, moving = map(turned, worker.run("correcting the bias field", without_bias_field, scans, settings.threads))
     tell("aligning", 0.4)
     body, labels = turned(body.toward_lps()), labels and turned(labels.toward_lps())
     on = settings.align_on

@@ -41,8 +41,8 @@ from dvc.trust.regions import volume_above
 
 # The palette of Okabe and Ito, told apart by all common kinds of colour vision.
 REGION_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-MAX_SHEAR = "maximal shear strain (E₁ − E₃)/2, no unit"
-SIGMA = "standard deviation of the maximal shear strain, no unit"
+MAX_SHEAR = "maximum shear strain (E₁ − E₃)/2, no unit"
+SIGMA = "standard deviation of the maximum shear strain, no unit"
 _DISPLACEMENT = "length of the displacement relative to the bone, mm"
 _COLOURS = {  # what is drawn with its unit, and the name of its colour map
     "max_shear": (MAX_SHEAR, "viridis"), "sigma": (SIGMA, "cividis"), "displacement_mm": (_DISPLACEMENT, "viridis"),
@@ -58,7 +58,7 @@ _HIGHEST_SHEAR = 0.6
 def overlay(view: View, reference: Image, rigid: Float32Array, registered: Float32Array) -> bytes:
     """Unloaded image in green and loaded image in magenta: after the rigid alignment, and after all.
 
-    Where both agree the picture is grey, but for a faint tint over whole regions where the scans' shading differs; a
+    Where both agree the picture is grey, but for a faint tint over whole regions where the scans' bias fields differ; a
     coloured rim is a border that lies elsewhere in the other image. Yellow marks: where the other planes cut.
     Dark blue: the loaded scan does not show this place.
     """
@@ -101,7 +101,7 @@ def _beside(
 def strain_slices(
     view: View, reference: Image, max_shear: Float32Array, largest: float, outline: LabelMap | None = None
 ) -> bytes:
-    """Maximal shear strain (E1 - E3)/2 in colour over the unloaded image, in the reference configuration.
+    """Maximum shear strain (E1 - E3)/2 in colour over the unloaded image, in the reference configuration.
 
     Thin white lines are the borders of the regions. The image stays plain grey where there is no result.
     """
@@ -109,7 +109,7 @@ def strain_slices(
 
 
 def sigma_slices(view: View, reference: Image, sigma: Float32Array, largest: float) -> bytes:
-    """Standard deviation of the maximal shear strain in colour over the unloaded image, by the preset's error model.
+    """Standard deviation of the maximum shear strain in colour over the unloaded image, by the preset's error model.
 
     The image stays plain grey where there is no result, and in bone.
     """
@@ -268,7 +268,7 @@ def carried_lines(view: View, plane: Plane, displacement_mm: Values) -> list[Flo
 
 
 def shear_curves(max_shear: Float32Array, labels: LabelMap, noise_floor: float | None = None) -> bytes:
-    """Volume of each region whose maximal shear strain exceeds a value, mL: the exact step curve, without bins.
+    """Volume of each region whose maximum shear strain exceeds a value, mL: the exact step curve, without bins.
 
     Both panels show the same curves; the logarithmic axis opens up the small volumes at high strain.
     The legend tells the share of a region that has no result; its curve is a lower bound.

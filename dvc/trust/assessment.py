@@ -16,7 +16,7 @@ _NOISIER = " even if the noise is half as strong again"
 # Beside the limits: decimals and unit of the figure in the sentence that tells of it.
 # The pooled local correlation depends on noise and texture; the limits were set on phantoms, where sound registrations
 # at SNR 10 to 25 stay above 0.8 and failed ones below 0.6. Those of the voxels come from a warp of a knee with added
-# noise (slices of 4 mm: apparent maximal shear strain 0.1) and a leg's repeat scan (6 mm: 0.3). Unlikeness is what the
+# noise (slices of 4 mm: apparent maximum shear strain 0.1) and a leg's repeat scan (6 mm: 0.3). Unlikeness is what the
 # similarity lacks of the most that noise leaves: it reveals another person's foot. Offsets that rose to 7, 15 and 30 %
 # across a phantom's foot raised the error in fat by 2, 16 and 130 %, in skin by 27, 93 and 380 %.
 _LIMITS = {
@@ -32,13 +32,13 @@ _LIMITS = {
         "where there is none ({limits}). A repeat scan without load tells how much."),
     "bone_shift_mm": (0.3, 0.8, 2, " mm",
         "The bone, which is rigid, was deformed: {value} root mean square ({limits})."),
-    "bone_shear_p95": (0.1, 0.25, 3, "", "The bone, which is rigid, shows an apparent maximal shear strain of {value} "
+    "bone_shear_p95": (0.1, 0.25, 3, "", "The bone, which is rigid, shows an apparent maximum shear strain of {value} "
         "(95th percentile; {limits})."),
     "lowest_jacobian": (0.3, 0.0, 2, "", "Somewhere tissue is squeezed to {value} of its volume ({limits})."),
     "undefined_fraction": (0.15, 0.4, 0, "%", "{value} of the tissue has no result: it is not shown by the loaded "
         "image or not covered by the deformation ({limits})."),
     "landmark_error_mm": (1.0, 2.0, 2, " mm", "Landmarks are missed by {value} in the median ({limits})."),
-    "floor_shear_p95": (0.06, 0.15, 3, "", "The repeat scan shows an apparent maximal shear strain of {value} (95th "
+    "floor_shear_p95": (0.06, 0.15, 3, "", "The repeat scan shows an apparent maximum shear strain of {value} (95th "
         "percentile) where there is none ({limits})."),
 }  # fmt: skip
 
@@ -90,7 +90,7 @@ def assess(
     floor : NoiseFloor, optional
         Of a repeat scan without load (`dvc.noise_floor`).
     in_bone : (mm, no unit), optional
-        Where the maps hold the bone at rest: root mean square displacement and 95th percentile of the maximal shear
+        Where the maps hold the bone at rest: root mean square displacement and 95th percentile of the maximum shear
         strain in it before that was imposed.
 
     Returns
@@ -138,7 +138,7 @@ def assess(
 
 
 def _in_bone(maps: StrainMaps, bone: Mask | None, told: tuple[float, float] | None) -> tuple[float, float]:
-    """Root mean square displacement (mm) and 95th percentile of maximal shear strain in the bone; NaN without one."""
+    """Root mean square displacement (mm) and 95th percentile of maximum shear strain in the bone; NaN without one."""
     if bone is None or not (kept := maps.valid & bone.inside).any():
         return np.nan, np.nan
     if told is not None:

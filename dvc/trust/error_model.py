@@ -1,4 +1,4 @@
-"""Uncertainty of a maximal shear strain: bias and standard deviation measured on phantoms, and intervals from them.
+"""Uncertainty of a maximum shear strain: bias and standard deviation measured on phantoms, and intervals from them.
 
 An error model is made by an accuracy study of one registration preset: of voxels in which a shear m was measured, by
 tissue and distance to bone, how far it lay from the truth on average (bias) and how much that varied (standard
@@ -35,7 +35,7 @@ _DRAWS = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorTable:
-    """Error of the maximal shear strain for one voxel size and `dvc.images.noise.signal_to_noise`.
+    """Error of the maximum shear strain for one voxel size and `dvc.images.noise.signal_to_noise`.
 
     It is given at rising measured shears (m,), linear between and constant beyond, and for bins of distance to bone
     whose lower ends (k,) rise from 0: mean and standard deviation (2, k, m) of measured minus true shear by tissue,
@@ -215,7 +215,7 @@ class Uncertainty:
     """Error of a strain map."""
 
     sigma: (
-        Float32Array  # standard deviation (ni, nj, nk) of the maximal shear strain about its bias; NaN where not known
+        Float32Array  # standard deviation (ni, nj, nk) of the maximum shear strain about its bias; NaN where not known
     )
     intervals: tuple[Interval, ...]
     table: ErrorTable
@@ -245,7 +245,7 @@ class GaussianField:
 class TruthDraws:
     """Draws of the truth, as `uncertainty_of` makes them on a grid.
 
-    At points (n, 3) of the reference configuration, LPS mm: maximal shear strain, tissue and
+    At points (n, 3) of the reference configuration, LPS mm: maximum shear strain, tissue and
     distance to bone, each (n,).
     """
 
@@ -305,7 +305,7 @@ def uncertainty_of(
     seed: int = 1,
     wider: Mapping[str, float] = MappingProxyType({}),
 ) -> Uncertainty:
-    """Error of a map of maximal shear strain (ni, nj, nk), NaN where not defined, by an error table.
+    """Error of a map of maximum shear strain (ni, nj, nk), NaN where not defined, by an error table.
 
     For each of the soft tissues ``regions``, masks by name, at distances to bone (ni, nj, nk). Beside
     `ErrorTable.widening`, ``wider`` holds factors on the deviation and the intervals of some regions.

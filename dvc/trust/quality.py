@@ -47,7 +47,7 @@ class NoiseFloor:
         Mean over voxels of the mean absolute value of the six components of the Green-Lagrange strain, no unit, and its
         standard deviation over voxels (Palanca et al. 2015, doi:10.1115/1.4030533).
     max_shear_p50, max_shear_p95 : float
-        Median and 95th percentile of the apparent maximal shear strain (E1 - E3)/2, no unit.
+        Median and 95th percentile of the apparent maximum shear strain (E1 - E3)/2, no unit.
     displacement_p95_mm : float
         95th percentile of the length of the apparent displacement, mm.
     """
@@ -84,7 +84,7 @@ class Quality:
     undefined_fraction : float
         Share of the tissue's voxels without a value, 0 to 1.
     bone_shift_mm, bone_shear_p95 : float
-        Root mean square displacement, mm, and 95th percentile of the apparent maximal shear strain (E1 - E3)/2, no
+        Root mean square displacement, mm, and 95th percentile of the apparent maximum shear strain (E1 - E3)/2, no
         unit, left inside the bone, which is rigid: zero is the truth. NaN without a bone.
     bone_held : bool
         Whether these two are from before the bone was held at rest, as it is in the maps.

@@ -17,7 +17,7 @@ _FEW = 50
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """How a tissue's maximal shear strain came back from the twin.
+    """How a tissue's maximum shear strain came back from the twin.
 
     The model's bias need not come back: noise lifts a shear, and the twin's own, having been measured, is lifted
     already. So bias counts as part of the error that is claimed, whatever its sign. Without an error model there are no
@@ -43,7 +43,7 @@ def judged(
     of_twin: Uncertainty | None = None,
     voxel_mm3: float = 1.0,
 ) -> tuple[Judged, ...]:
-    """Judge error bars by the maximal shear strain measured ``again`` in a pair of known strain, (ni, nj, nk) or NaN.
+    """Judge error bars by the maximum shear strain measured ``again`` in a pair of known strain, (ni, nj, nk) or NaN.
 
     Regions (masks by name) of fewer than 50 voxels are not judged. ``of_twin`` is what the error model says of the
     shear measured again, at the voxels where both are defined, with the distance to bone; without these two, or either,

@@ -67,7 +67,7 @@ def twin(
         typer.Argument(help="The whole motion: elastix .txt, ITK transform (.h5, .tfm), or a displacement image."),
     ],
     out: Out, subject_files: SubjectFiles, frame: FieldFrame = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of noise and shading.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Of noise and bias field.")] = 1,
 ) -> None:  # fmt: skip
     """A loaded image made of your own unloaded one, with the truth beside it: to see how well that is found."""
     tell(mrstrain.twin.with_options(load0, deformation, out=out, subject_files=subject_files, frame=frame, seed=seed))

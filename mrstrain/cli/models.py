@@ -16,7 +16,7 @@ Measured = Annotated[Path, typer.Argument(help="Results of register: a folder fo
 Loads = Annotated[
     list[str] | None,
     typer.Option(
-        help="NAME=NORMAL or NAME=NORMAL,SHEAR in N, or with mm after a number the plate's travel; repeat. "
+        help="NAME=NORMAL or NAME=NORMAL,SHEAR in N, or with mm after a number plate displacement; repeat. "
         "Default: the published experiment's four.",
         rich_help_panel="Model",
     ),

@@ -150,7 +150,7 @@ def _simulated(models: Mapping[str, Path], measured: Mapping[str, Path]) -> list
     return [
         *([ours] if sets else []),
         *([f"{_DRIVEN} {' '.join(driven)}"] if driven else []),
-        *(["Published sets of laws are those that Trebbi 2023 compiled."] if used & _PUBLISHED else []),
+        *(["The published material sets are those compiled by Trebbi 2023."] if used & _PUBLISHED else []),
         *(f"{_listed(names)}: {how}" for how, names in levelled.items()),
         *([f"Results of other programs were taken as given: {_listed(others)}."] if others else []),
     ]

@@ -46,21 +46,20 @@ class Case:
 
 
 _HOW_TO_READ = (
-    "Displacement u(X) = x - X is that of tissue relative to its bone: the rigid motion of the bone between the scans "
-    "is taken out. All maps are in the reference (unloaded) configuration, on the unloaded image's voxels; components "
-    "are in LPS (x to the patient's left, y to posterior, z to superior), lengths in mm.",
-    "Strain is Green-Lagrange, E = (F^T F - I)/2 with F = I + du/dX, from the analytic gradient of the cubic B-spline;"
-    " maximal shear is (E1 - E3)/2, half the difference of the largest and smallest principal strain. det F is the "
-    "ratio of deformed to reference volume.",
-    "A verdict judges the registration, not the tissue. It cannot see everything: inside a uniform region, and along a"
-    " smooth skin, an image does not show how tissue slides. Small shears are lifted by noise; a repeat scan without "
-    "load (--repeat) tells by how much. Strain that jumps at a border of tissues is smeared over about one spacing of "
-    "the control points (3 to 5 mm), unless a label map told where tissues meet. Scanner distortion and creep between "
-    "scans are not seen at all.",
-    "A noise floor is what a repeat scan shows where there is no strain. MAER is the mean over voxels of the mean "
+    "Displacement u(X) = x - X is that of the tissue relative to its bone: the rigid motion of the bone between the "
+    "scans is removed. All maps are in the reference (unloaded) configuration, on the voxels of the unloaded image; "
+    "components are in LPS (x to the patient's left, y to posterior, z to superior), lengths in mm.",
+    "Strain is Green-Lagrange, E = (F^T F - I)/2 with F = I + du/dX, from the analytic gradient of the cubic B-spline. "
+    "The maximum shear strain is (E1 - E3)/2, half the difference of the largest and smallest principal strains. "
+    "det F is the ratio of deformed to reference volume.",
+    "The verdict concerns the registration, not the tissue. Sliding inside a uniform region or along a smooth skin "
+    "leaves no trace in an image and cannot be detected. Noise raises small shear strains; a repeat scan without load "
+    "(--repeat) shows by how much. Without a label map, a strain discontinuity at a tissue interface is smoothed over "
+    "about one control point spacing (3 to 5 mm). Scanner distortion and creep between scans are not detected.",
+    "The noise floor is the apparent strain between two unloaded scans. MAER is the mean over voxels of the mean "
     "absolute value of the six strain components, SDER the standard deviation of the same.",
-    "Missing is NaN in every map, never zero; valid.nii.gz tells where values are. Programs built on ITK show NaN in "
-    "NIfTI as zero: use the NRRD twin or the validity mask there.",
+    "Missing values are NaN in every map, never zero; valid.nii.gz marks the voxels with values. Programs built on ITK "
+    "show NaN in NIfTI files as zero: use the NRRD file or the validity mask there.",
 )
 
 

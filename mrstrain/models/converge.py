@@ -123,7 +123,7 @@ def _followed(simulation: Simulation, region: str) -> dict[tuple[str, str], floa
     """What is followed from mesh to mesh, by load and figure: the plate's way, and percentiles of a region's shear."""
     moved = {state.load.name: float(np.hypot(*state.plate_displacement_mm[:2])) for state in simulation.states}
     return {(load, "plate travel, mm"): travel for load, travel in moved.items()} | {
-        (row.load, f"maximal shear of {region}, p{percent}"): value
+        (row.load, f"maximum shear strain of {region}, p{percent}"): value
         for row in simulation.regions
         if row.region == region
         for percent, value in ((50, row.shear_p50), (90, row.shear_p90), (99, row.shear_p99))

@@ -66,7 +66,7 @@ def simulate(
     mesh : path
         As `mesh` writes it, or made elsewhere; with facets "skin", "bone", and those that are fixed as well.
     out : path
-        Gets a folder for each set: a VTU file for each load, ``curve.csv`` (force and travel of the plate),
+        Gets a folder for each set: a VTU file for each load, ``curve.csv`` (force and plate displacement),
         ``regions.csv``, ``simulation.json`` and pictures.
     loads : sequence of LoadStep
         Loads with the same normal force lie on one path, in the order of their shear; by default those of the

@@ -61,8 +61,8 @@ class EngineOptions(Options):
     engine: Annotated[str, AfterValidator(_known_engine)] | None = None
     """What finds the non-rigid part. Default: gauss-newton; with --preset, elastix."""
     borders: Flag | None = None
-    """gauss-newton: strain may jump where the tissues of --labels meet. Default: where there are labels. Not for labels
-    that are off by more than a voxel."""
+    """gauss-newton: strain may be discontinuous at interfaces of --labels. Default: with labels. Not for labels that
+    are off by more than a voxel."""
     preset: str | None = None
     """Named parameters of elastix, such as heel-mr."""
     parameters: tuple[Path, ...] = ()
@@ -111,7 +111,7 @@ class Threads(Options):
     panel: ClassVar[str] = "Advanced"
 
     threads: Count | None = None
-    """Threads of each worker. Results are equal bit for bit on equal threads. Default: all cores."""
+    """Threads of each worker. Default: all cores. elastix repeats its results only on the same number of threads."""
 
 
 class Cores(Threads):

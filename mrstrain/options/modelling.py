@@ -116,7 +116,7 @@ class Followed(Options):
     panel: ClassVar[str] = "Model"
 
     region: str = "fat"
-    """Region whose maximal shear is followed."""
+    """Region whose maximum shear strain is followed."""
     material: Annotated[str, Cli("--set")] = "trebbi"
     """Material set."""
 
@@ -162,7 +162,7 @@ class ComparisonOptions(Options):
     panel: ClassVar[str] = "Comparison"
 
     strains: Annotated[tuple[Real, Real], AfterValidator(_rising)] = (0.2, 0.5)
-    """Range of maximal shear of the areas."""
+    """Range of maximum shear strain of the areas."""
     thresholds: Path | None = None
     """CSV: max_shear, source. Levels for clusters."""
     least_ml: NotNegative = 0.1

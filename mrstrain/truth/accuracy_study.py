@@ -148,7 +148,7 @@ def _condition_section(errors: Sequence[ErrorRow], floors: Sequence[FloorRow]) -
         tables.append(Table("Noise floor: apparent strain without load", of_floor, noise, _OF_FLOOR))
     pictures = tuple(
         Picture.drawn(f"Error by {by.split(',')[0]}", figures.errors_by_place, errors, by)
-        for by in ("distance to bone, mm", "distance to a border, mm", "true maximal shear")
+        for by in ("distance to bone, mm", "distance to a border, mm", "true maximum shear strain")
     )
     preset, voxel, snr = errors[0].condition
     return Section(f"{preset}, voxels of {voxel} mm, SNR {snr:g}", tables=tuple(tables), pictures=pictures)

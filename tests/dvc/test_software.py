@@ -14,8 +14,8 @@ import pytest
 import dvc.arrays
 import dvc.deformation.bspline
 import dvc.deformation.strain
+import dvc.images.bias_field
 import dvc.images.noise
-import dvc.images.shading
 import dvc.images.tissue
 import dvc.mesh
 import dvc.registration.engines
@@ -72,7 +72,7 @@ MEASURING = [
     dvc.deformation.strain,
     dvc.images.noise,
     dvc.registration.register,
-    dvc.images.shading,
+    dvc.images.bias_field,
     dvc.registration.engines,
 ]
 

@@ -100,7 +100,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert "Size of the cells, mm" in done.output
     with (out / "convergence.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximal shear of fat, p50"]
+    assert [row["figure"] for row in rows][:2] == ["plate travel, mm", "maximum shear strain of fat, p50"]
     assert 0.1 < float(rows[0]["edge_2.2_mm"]) < 10.0
     assert any(row["limit"] for row in rows) == (out / "convergence.png").is_file()
     before = (out / "mesh-3.2.vtu").read_bytes()

@@ -91,7 +91,7 @@ def test_rows_say_what_the_samples_hold() -> None:
     assert whole.shear_rmse == pytest.approx(np.hypot(whole.shear_bias, whole.shear_sd))
     assert (whole.u_bias_mm, whole.u_rmse_mm, whole.u_p95_mm) == pytest.approx((0.5, 0.5, 0.5))
     assert whole.u_sd_mm == pytest.approx(0.0, abs=1e-6)
-    by_strain = {r.low: r for r in rows if r.tissue == "fat" and r.by == "true maximal shear"}
+    by_strain = {r.low: r for r in rows if r.tissue == "fat" and r.by == "true maximum shear strain"}
     assert by_strain[0.2].shear_bias == pytest.approx(-0.05, abs=2e-3)
     assert by_strain[0.05].shear_bias == pytest.approx(0.0, abs=2e-3)
     assert sum(r.samples for r in rows if r.tissue == "fat" and r.by == "distance to bone, mm") == 8000

@@ -141,7 +141,7 @@ def test_loaded_grid_is_taken_as_given() -> None:
 
 
 def test_strain_of_the_full_pair_is_that_of_a_loaded_heel() -> None:
-    """Points of the full-size field of view: fat's maximal shear, and the largest displacement."""
+    """Points of the full-size field of view: fat's maximum shear strain, and the largest displacement."""
     for seed in (1, 2, 3):
         heel = Heel(seed)
         random = np.random.default_rng(seed)
@@ -156,7 +156,7 @@ def test_strain_of_the_full_pair_is_that_of_a_loaded_heel() -> None:
 
 
 def test_loads_have_the_strain_that_models_of_the_heel_gave() -> None:
-    """Maximal shear of the fat around the calcaneus, median and 90th percentile, for the published forces."""
+    """Maximum shear strain of the fat around the calcaneus, median and 90th percentile, for the published forces."""
     ranges = {
         "Load1": ((0.13, 0.23), (0.32, 0.53)),
         "Load2": ((0.03, 0.06), (0.06, 0.14)),

@@ -20,10 +20,10 @@ from dvc.worker import Worker
 
 _UNLABELLED = 0.1  # of the body: more than that was never in a phantom
 _NOTE = (
-    "Strain may jump where the tissues of the label map meet, and bone that was aligned on does not move at all: the "
-    "figures of the bone are those of the smooth spline that came before. Labels that are off by more than a voxel "
-    "spoil it (then take --no-borders). The whole motion is in transform.h5, as displacements at voxels; text files of "
-    "elastix are not written, since elastix knows no spline with borders."
+    "Strain may be discontinuous at the tissue interfaces of the label map, and the bone that was aligned on is rigid: "
+    "the figures of the bone are those of the smooth spline before it. Labels that are off by more than a voxel spoil "
+    "the result (use --no-borders then). The whole motion is in transform.h5, as displacements at voxels; elastix has "
+    "no spline with discontinuities, so no elastix text files are written."
 )
 
 
@@ -108,7 +108,7 @@ class GaussNewton(Parameters, Engine):
 
 @dataclass(frozen=True, slots=True)
 class GaussNewtonWithInterfaces(Engine):
-    """Strain may jump at the interfaces of the tissues in a label map, and the bone is rigid.
+    """Strain may be discontinuous at the interfaces of the tissues in a label map, and the bone is rigid.
 
     Attributes
     ----------
@@ -167,8 +167,8 @@ class GaussNewtonWithInterfaces(Engine):
         skin, held = last.get("skin"), record.get("align") == "bone"
         weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
         return (
-            f"{smooth}; from there a second B-spline was added that vanishes on the borders "
-            "of the label map's tissues, so that strain may jump there, "
+            f"{smooth}; from there a second B-spline was added that vanishes on the "
+            "interfaces of the label map's tissues, which lets strain be discontinuous there, "
             f"{'the bone held at rest and ' if held else ''}strain of a tissue called skin penalised (weight {weight})"
             ", and bending counted by the Laplacian of both splines' Laplacian"
         )

@@ -1,6 +1,6 @@
 """How well a displacement brings two images together, voxel by voxel, and the normal equations of improving it.
 
-The residual is ``r(X) = a(X) I0(X) - I1(X + u(X))``, with a gain a that is smooth (the images' shading differs), over
+The residual is ``r(X) = a(X) I0(X) - I1(X + u(X))``, with a smooth gain a (the images' bias fields differ), over
 all voxels of a mask. Its derivative by u is taken from the *fixed* image, carried by the deformation:
 ``grad I1 = a F^-T grad I0``. At voxels, the noise of an image is not correlated with its own central difference; the
 moving image's gradient at places between voxels is correlated with its noise there, and pulls the result after it.

@@ -1,4 +1,4 @@
-"""Gauss-Newton registration where the tissues are known: strain may jump at their interfaces, and bone is rigid.
+"""Gauss-Newton registration where the tissues are known: strain is discontinuous at interfaces, and bone is rigid.
 
 The smooth displacement of `dvc.registration.gauss_newton.fit` is the start of one more stage at full resolution, for a
 `InterfaceSpline` u = m v + psi w. Its energy is

@@ -9,9 +9,9 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from dvc.deformation.protocol import Affine, RigidMotion
+from dvc.images.bias_field import without_bias_field
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import carry, fill_missing, shows, smoothed
-from dvc.images.shading import without_shading
 from dvc.registration.align import _scored
 from mrstrain.records.provenance import file_hash
 
@@ -100,7 +100,7 @@ def test_shading_is_removed_whatever_the_images_zero(offset):
     tissue = np.where(body, np.where(random.random(grid.shape) < 0.5, 100.0, 60.0), 0.0)
     field = 1.0 + 0.3 * (X[..., 0] - 0.5) + 0.2 * np.sin(3.0 * X[..., 1])
     noisy = tissue * field + random.normal(scale=1.0, size=grid.shape)
-    (whole,) = without_shading([Image(grid, noisy + offset)])
+    (whole,) = without_bias_field([Image(grid, noisy + offset)])
     corrected = whole.values - offset
 
     def unevenness(values: np.ndarray) -> float:
@@ -112,7 +112,7 @@ def test_shading_is_removed_whatever_the_images_zero(offset):
     try:
         for threads in (1, 2, 4):
             sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(threads)
-            for again in without_shading([Image(grid, noisy + offset)] * 2, threads):
+            for again in without_bias_field([Image(grid, noisy + offset)] * 2, threads):
                 assert np.array_equal(again.values, whole.values)
             assert sitk.ProcessObject.GetGlobalDefaultNumberOfThreads() == threads
     finally:

@@ -76,7 +76,7 @@ def test_arrays_in_and_arrays_out(measured, tiny_pair):
     assert measured.sigma is not None
     assert {i.region for i in measured.intervals} >= {"fat", "muscle"}
     assert str(measured).startswith(f"Load1: {measured.verdict.words}.\n")
-    assert "maximal shear strain (E1 - E3)/2, median / 95th percentile: " in str(measured)
+    assert "maximum shear strain (E1 - E3)/2, median / 95th percentile: " in str(measured)
 
 
 def test_what_is_written_is_read_again(measured, written):
@@ -169,7 +169,7 @@ def test_a_notebook_shows_the_verdict_a_picture_and_a_table_all_escaped(stretche
 @pytest.mark.parametrize(
     ("quantity", "label"),
     [
-        ("max_shear", "maximal shear strain"),
+        ("max_shear", "maximum shear strain"),
         ("jacobian", "det F"),
         ("displacement_mm", "mm"),
         ("xy", "component xy"),

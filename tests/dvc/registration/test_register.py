@@ -13,9 +13,9 @@ from dvc.deformation.bspline import BSpline
 from dvc.deformation.protocol import Composed, RigidMotion, evaluate_on_grid
 from dvc.deformation.strain import StrainField
 from dvc.errors import InputError, ParameterError, RegistrationError
+from dvc.images.bias_field import without_bias_field
 from dvc.images.image import Grid, Image, Mask
 from dvc.images.resample import carry, shows
-from dvc.images.shading import without_shading
 from dvc.images.tissue import tissue_mask
 from dvc.registration.align import Alignment, align, motion_of
 from dvc.registration.elastix.engine import Elastix
@@ -160,7 +160,7 @@ def test_row_9_another_centre_is_no_obstacle(small_pair):
 
 
 def aligned(reference: Image, loaded: Image, bone: Mask) -> Alignment:
-    return align(*without_shading([reference, loaded]), bone, "bone", 1)
+    return align(*without_bias_field([reference, loaded]), bone, "bone", 1)
 
 
 @pytest.mark.parametrize("noise", [0.0, 3.0])

@@ -249,7 +249,7 @@ def test_the_libraries_told_are_those_that_read_and_write(tmp_path: Path, name: 
     for library in used - {"numpy"}:
         assert f"{library} {VERSIONS[library]}" in sentence
     # N4, for whatever images
-    assert "SimpleITK" in libraries_of("dvc.images.shading", set())
+    assert "SimpleITK" in libraries_of("dvc.images.bias_field", set())
     assert "(N4, Tustison 2010, as implemented in SimpleITK 3.4.5, Lowekamp 2013)" in text
 
 

@@ -54,7 +54,7 @@ class Pad:
         return distances_mm(self.labels)[1]
 
     def shear_error(self, shear: np.ndarray) -> dict[str, float]:
-        """Root mean square error of a map of maximal shear: in skin, and in fat within 3 mm of bone."""
+        """Root mean square error of a map of maximum shear strain: in skin, and in fat within 3 mm of bone."""
         inner = np.zeros(GRID.shape, dtype=bool)
         inner[INNER] = True
         _, H = evaluate_on_grid(self.motion, GRID, inner)

@@ -75,7 +75,7 @@ def block(at: np.ndarray) -> Image:
 @pytest.fixture(autouse=True)
 def without_bias_field(monkeypatch):
     """N4 would take most of the time, and there is none in these images."""
-    monkeypatch.setattr("dvc.registration.register.without_shading", unchanged)
+    monkeypatch.setattr("dvc.registration.register.without_bias_field", unchanged)
 
 
 def unchanged(images: list[Image], threads: int) -> list[Image]:

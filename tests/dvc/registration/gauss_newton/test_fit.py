@@ -223,7 +223,7 @@ def registered(small_pair, worker):
 
 
 def shear_error(pair, deformation, tissue: str) -> tuple[float, float]:
-    """RMS error of the maximal shear and median error of the displacement (mm), where the loaded image shows it."""
+    """RMS error of the max. shear and median error of the displacement (mm), where the loaded image shows it."""
     inside = pair.labels.region(tissue).inside
     grid = pair.reference.grid
     U, true_H = evaluate_on_grid(pair.deformation, grid, inside)

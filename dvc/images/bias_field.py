@@ -16,7 +16,7 @@ _CONTROL_POINTS = 4
 _ITERATIONS = [50, 50, 50]
 
 
-def without_shading(images: Sequence[Image], threads: int = 1) -> list[Image]:
+def without_bias_field(images: Sequence[Image], threads: int = 1) -> list[Image]:
     """Images, above their lowest value, divided by their bias fields, estimated by N4 on coarse copies.
 
     So many at once as there are threads; the result is the same bit for bit on any number of them.
