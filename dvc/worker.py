@@ -18,6 +18,13 @@ from dvc.errors import WorkerError
 _T = TypeVar("_T")
 _I = TypeVar("_I")
 _POLL_S = 0.5
+_MEMORY = {
+    "MALLOC_ARENA_MAX": "2",  # glibc keeps memory for each thread otherwise: a fifth more
+    # What glibc comes to by itself, unless it is told otherwise: Dask has its workers hand every freed array back to
+    # the system, which clears the pages of the next one.
+    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+    "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
+}
 
 
 class Worker(AbstractContextManager["Worker", None]):
@@ -45,7 +52,7 @@ class Worker(AbstractContextManager["Worker", None]):
                 names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
                 # elastix and meshes take memory and keep it: loky must not take that for a leak and end the process.
                 environment = dict.fromkeys(names, count) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
-                environment["MALLOC_ARENA_MAX"] = "2"  # glibc keeps memory for each thread otherwise: a fifth more
+                environment |= _MEMORY
                 self._executor = ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
             future = self._executor.submit(task, *args)
             while True:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from dvc.errors import RegistrationError, WorkerError
@@ -27,6 +29,23 @@ def _fails() -> None:
 
 def _process() -> tuple[int, str | None]:
     return os.getpid(), os.environ.get("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS")
+
+
+def _pages_of_freed_arrays() -> int:
+    """Pages that the system had to give for a hundred arrays of 1 MB, each freed before the next."""
+    import resource
+
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(100):
+        np.ones(1 << 17)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_memory_of_a_freed_array_serves_the_next_even_below_a_worker_of_dask(monkeypatch):
+    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "65536")  # as Dask sets it: 25,600 pages
+    with Worker(threads=1) as worker:
+        assert worker.run("counting", _pages_of_freed_arrays) < 1000
 
 
 @pytest.mark.parametrize(("task", "signal_name"), [(_crash, "SIGSEGV"), (_killed, "SIGKILL")])
