@@ -148,6 +148,7 @@ class Section:
     viewers: tuple[Viewer, ...] = ()
     folded: bool = False
     pictures_first: bool = False  # before the tables
+    summary: Table | None = None  # for the first part of a report of many sections
 
 
 def shown(value: Cell) -> str:
