@@ -86,7 +86,7 @@ def measure(
         As `dvc.register`, and if the labels lie on another grid.
     """
     if labels is not None and not labels.grid.same_as(reference.grid):
-        raise GeometryError("The labels lie on another grid than the unloaded image: `fit_mask` brings them onto it.")
+        raise GeometryError("The labels are on another grid than the unloaded image; resample them with `fit_mask`.")
     normal, axes = plate_directions(plate_normal, shear_direction)
     subject = Subject(reference, bone, tissue, labels, mesh, normal, axes)
     chosen = settings or Settings(GaussNewton() if labels is None else GaussNewtonWithInterfaces())

@@ -165,20 +165,20 @@ class Measurement:
         place = Path(folder)
         loads = sorted({path.parent.name for path in place.glob(f"*/{files.QUALITY}")} - {files.REPEAT})
         if loads and not (place / files.QUALITY).is_file():
-            raise InputError(f"{place} holds {', '.join(loads)}: read one of them, e.g. {place / loads[0]}.")
+            raise InputError(f"{place} has several loads ({', '.join(loads)}); read one, such as {place / loads[0]}.")
         told = files.read_quality(place)
         try:
             quality, alignment = Quality.from_dict(told), dict(told["alignment"])
             files.motion_in(alignment)
             at = np.array(told[_SHOWN].split(), dtype=np.float64) if told.get(_SHOWN) else None
         except (KeyError, TypeError, ValueError) as failure:
-            what = f"not as `write` leaves it ({failure!r})"
+            what = f"damaged, or not written by `Measurement.write` ({failure!r})"
             raise InputError(f"{place / files.QUALITY}: {what}. {files.AGAIN}") from failure
         maps = files.read_maps(place)
         uncertainty, model = files.read_uncertainty(place, maps.grid) or (None, None)
         if image is not None and not image.grid.same_as(maps.grid):
-            what = f"The image lies on another grid ({image.grid}) than the maps in {place} ({maps.grid})"
-            raise GeometryError(f"{what}: give the unloaded image that was measured.")
+            what = f"The image is on another grid ({image.grid}) than the maps in {place} ({maps.grid})"
+            raise GeometryError(f"{what}. Pass the unloaded image of that measurement.")
         if image is None and (place / files.REGISTERED).is_file():
             image = files.read_scalar(place / files.REGISTERED, maps.grid)
         regions = tuple(read_regions_csv(place / files.REGIONS))
@@ -274,11 +274,11 @@ class Measurement:
         if quantity in TENSOR_COMPONENTS:
             return self.maps.green_lagrange[..., TENSOR_COMPONENTS.index(quantity)]
         if quantity == "sigma" and self.sigma is None:
-            raise InputError("sigma: the error of this measurement is not known; its `error_bars` tell why.")
+            raise InputError("sigma: this measurement has no error bars; `error_bars.told` gives the reason.")
         known = self.maps.by_quantity | ({} if self.sigma is None else {"sigma": self.sigma})
         if quantity not in known:
             names = ", ".join((*self.maps.by_quantity, "sigma", *TENSOR_COMPONENTS))
-            raise InputError(f"No quantity '{quantity}'; there are {names}.")
+            raise InputError(f"Unknown quantity '{quantity}'; choose one of {names}.")
         return known[quantity]
 
     def _repr_html_(self) -> str:
@@ -356,8 +356,8 @@ class Measurement:
     def _made_from(self) -> Source:
         if self.source is None:
             raise InputError(
-                f"The measurement {self.name} was read from a folder and holds no images to draw or write again: copy "
-                "that folder."
+                f"The measurement {self.name} was read from a folder, so it has no images to draw or write. Copy the "
+                "folder instead."
             )
         return self.source
 

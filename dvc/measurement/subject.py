@@ -85,7 +85,7 @@ def _unit(name: str, vector: Sequence[float]) -> FloatArray:
     length = float(np.linalg.norm(direction))
     if direction.shape != (3,) or not np.isfinite(length) or length < 1e-6:
         told = f"{name} (--{name.replace('_', '-')} on the command line)"
-        raise InputError(f"{told} must be three finite numbers (LPS) that are not all zero; got {list(vector)}.")
+        raise InputError(f"{told} must be three finite numbers (LPS), not all zero; got {list(vector)}.")
     return direction / length
 
 

@@ -82,7 +82,7 @@ class Displacement(Deformation, Protocol):
 
 
 class Regularisation:
-    """How strongly an engine smoothed a pair, and why; as it is here for an engine that decides nothing for a pair."""
+    """The regularisation weights of a pair, and why; this one is for an engine that chooses no weights by pair."""
 
     @property
     def in_bone(self) -> tuple[float, float] | None:
@@ -137,9 +137,9 @@ class Engine(Protocol):
     needs_labels: ClassVar[bool] = False
     """Whether it needs a label map of the tissues."""
     sees_brightness: ClassVar[bool] = True
-    """Whether an even offset of brightness between the images misleads it, as it does not mislead correlation."""
+    """Whether a constant offset in brightness between the images misleads it; it does not mislead correlation."""
     starts_anywhere: ClassVar[bool] = True
-    """Whether it can start from any displacement, or from results of its own alone."""
+    """Whether it can start from any displacement; otherwise only from its own results."""
     cost: ClassVar[Cost] = Cost()
     """Time, memory and disk space that it takes."""
     note: ClassVar[str] = ""
@@ -224,4 +224,4 @@ class Engine(Protocol):
 
 def other_parameters(name: str) -> str:
     """Why an error model does not hold for an engine of its name whose parameters are others."""
-    return f"The error of {name} was measured with other parameters; `mrstrain accuracy` measures that of yours."
+    return f"The error of {name} was measured with other parameters; measure yours with `mrstrain accuracy`."

@@ -179,4 +179,4 @@ def read_noise_floor(path: Path) -> NoiseFloor | None:
         told = json.loads(path.read_text(encoding="utf-8"))["noise_floor"]
         return None if told is None else NoiseFloor.from_dict(told)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: no quality of a repeat scan ({error!r}). Register the repeat scan again.") from error
+        raise InputError(f"{path}: not the quality of a repeat scan ({error!r}). Register that scan again.") from error

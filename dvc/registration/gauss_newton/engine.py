@@ -20,10 +20,10 @@ from dvc.worker import Worker
 
 _UNLABELLED = 0.1  # of the body: more than that was never in a phantom
 _NOTE = (
-    "Strain may be discontinuous at the tissue interfaces of the label map, and the bone that was aligned on is rigid: "
-    "the figures of the bone are those of the smooth spline before it. Labels that are off by more than a voxel spoil "
-    "the result (use --no-borders then). The whole motion is in transform.h5, as displacements at voxels; elastix has "
-    "no spline with discontinuities, so no elastix text files are written."
+    "Strain may be discontinuous at the tissue interfaces of the label map. The bone of the rigid alignment is rigid; "
+    "its figures are those of the preceding smooth spline. Labels that are off by more than a voxel degrade the "
+    "result: use --no-borders then. The whole motion is in transform.h5, as displacements at voxels. No elastix text "
+    "files are written, because elastix has no spline with discontinuities."
 )
 
 
@@ -36,9 +36,10 @@ class GaussNewton(Parameters, Engine):
     spacing_mm : float
         Between control points, at the finest level; never less than two voxels.
     bending : float or None
-        Weight of the bending, 1/mm; None: chosen for each pair by cross-validation. Fixed, it costs the error bars.
+        Weight of the bending, 1/mm; None: chosen for each pair by cross-validation. With a fixed weight there are no
+        error bars.
     volume : float or None
-        Weight of the change of volume in soft tissue, 1/mm3; None: 300, unless the images ask for such a change.
+        Weight of the volume change in soft tissue, 1/mm3; None: 300, unless the images indicate a volume change.
     rigidity : float
         Weight of strain in the bone, 1/mm3.
 
@@ -49,9 +50,9 @@ class GaussNewton(Parameters, Engine):
 
     Notes
     -----
-    `Measurement.sigma` and `.intervals` are known only for the parameters that the error model was measured with: the
-    bending chosen by cross-validation, the default spacing and rigidity, `volume` None or 300. To keep error bars,
-    leave the others alone; `Measurement.error_bars.told` says why there are none. Repeat scans get 3/mm in any case.
+    `Measurement.sigma` and `.intervals` are available only for the parameters of the error model: `bending` chosen by
+    cross-validation, the default spacing and rigidity, and `volume` None or 300. Otherwise
+    `Measurement.error_bars.told` gives the reason. Repeat scans are always registered with a bending of 3/mm.
     """
 
     family = name = "gauss-newton"
@@ -81,17 +82,17 @@ class GaussNewton(Parameters, Engine):
             return ""
         bending, volume = own.get("bending"), own.get("volume")
         weight = "chosen for each pair by cross-validation" if bending is None else f"{bending:g}/mm"
-        by_rule = "300/mm3, or of its gradient alone where the images ask for such a change"
+        by_rule = "300/mm3, or on its gradient alone where the images indicate such a change"
         kept = by_rule if volume is None else f"{volume:g}/mm3"
-        held = f" and on change of volume in the tissue ({kept})"
+        held = f" and on volume change in the tissue ({kept})"
         if record.get("align") == "bone":
             rigid = f"strain of the bone ({own.get('rigidity'):g}/mm3)"
-            held = f", on change of volume in soft tissue ({kept}) and on {rigid}"
+            held = f", on volume change in soft tissue ({kept}) and on {rigid}"
         return (
             f"with the Gauss-Newton engine of mrstrain {versions.get('mrstrain', '?')}: a cubic B-spline with control "
-            f"points every {own.get('spacing_mm'):g} mm (every two voxels, if that is more), least squares over all "
-            "voxels of the tissue and 3 mm around it, and penalties on bending (the square of the Laplacian of its "
-            f"coefficients, less where the displacement is curved; weight {weight}){held}"
+            f"points every {own.get('spacing_mm'):g} mm (or two voxels, if that is larger), fitted by least squares "
+            "over all voxels of the tissue and 3 mm around it, with penalties on bending (the squared Laplacian of the "
+            f"coefficients, reduced where the displacement is curved; weight {weight}){held}"
         )
 
     def prepare(self) -> None:
@@ -167,10 +168,10 @@ class GaussNewtonWithInterfaces(Engine):
         skin, held = last.get("skin"), record.get("align") == "bone"
         weight = "chosen for each pair by cross-validation" if skin is None else f"{skin:g}/mm3"
         return (
-            f"{smooth}; from there a second B-spline was added that vanishes on the "
-            "interfaces of the label map's tissues, which lets strain be discontinuous there, "
-            f"{'the bone held at rest and ' if held else ''}strain of a tissue called skin penalised (weight {weight})"
-            ", and bending counted by the Laplacian of both splines' Laplacian"
+            f"{smooth}; starting from this result, a second B-spline was added that vanishes on the tissue interfaces "
+            f"of the label map, so that strain can be discontinuous there, with {'a rigid bone, ' if held else ''}a "
+            f"penalty on the strain of a tissue named skin (weight {weight}), and bending measured by the Laplacian of "
+            "the Laplacian of both splines"
         )
 
     def prepare(self) -> None:
@@ -187,15 +188,17 @@ class GaussNewtonWithInterfaces(Engine):
     def unlike_study(self, pair: AlignedPair, choice: Choice) -> str:
         """Why its error model does not hold for a pair; empty where it does."""
         if pair.bone is None:
-            return f"The error of {self.name} was measured with the bone held at rest; here no bone was aligned on."
+            return (
+                f"The error of {self.name} was measured with a rigid bone; here the images were not aligned on a bone."
+            )
         if choice.frees_volume or pair.labels is None:
             return _volume_freed(self.name, choice)
         share = float(np.mean(pair.labels.labels[pair.body.inside] == 0))
         if share <= _UNLABELLED:
             return ""
         return (
-            f"{share:.0%} of the body has no label: the error of {self.name} was measured on bodies of which every "
-            "tissue has one. Label it, or take one smooth spline (--no-borders)."
+            f"{share:.0%} of the body has no label, but the error of {self.name} was measured with every tissue "
+            "labelled. Label the whole body, or use one smooth spline (--no-borders)."
         )
 
 
@@ -221,8 +224,8 @@ def _unlike(name: str, used: Parameters) -> str:
     if used.bending is None:
         return f"The error of {name} was measured with other weights than these."
     return (
-        f"The error of {name} was measured with the weight of the bending chosen by its rule, as for a loaded image; "
-        f"here it was fixed at {used.bending:g}/mm, as for a repeat scan, or as you gave it."
+        f"The error of {name} was measured with the bending weight chosen by cross-validation. Here it was fixed at "
+        f"{used.bending:g}/mm, by your choice or because this is a repeat scan."
     )
 
 
@@ -230,6 +233,6 @@ def _volume_freed(name: str, choice: Choice) -> str:
     if not choice.frees_volume:
         return ""
     return (
-        f"The error of {name} was measured on phantoms that keep their volume; here the images ask for a change of "
-        "volume, which was allowed."
+        f"The error of {name} was measured on incompressible phantoms. Here incompressibility was relaxed, because the "
+        "images indicate a volume change."
     )

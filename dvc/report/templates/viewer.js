@@ -25,7 +25,7 @@ for (const box of document.querySelectorAll(".viewer")) {
       button.remove();
       box.dataset.state = "shown";
     } catch (problem) {
-      button.textContent = "This browser cannot draw it (WebGL 2 is needed); the pictures above show the same. " + problem;
+      button.textContent = "This browser cannot show the viewer (WebGL 2 is needed); the figures above show the same. " + problem;
       box.dataset.state = "failed";
     }
   });

@@ -157,7 +157,7 @@ def test_the_bone_that_is_held_is_judged_by_what_the_images_would_have_it_do(out
     assert 0.001 < told["bone_shift_rms_mm"] < 0.3
     assert 0.001 < told["bone_shear_p95"] < 0.1
     assert told["bone_figures_before_it_was_held_at_rest"] is True
-    assert "in the bone, before it was held at rest" in (out / "report.html").read_text()
+    assert "in the bone, before it was made rigid" in (out / "report.html").read_text()
     assert np.nanmax(np.abs(nibabel.load(out / "Load1" / "displacement.nii.gz").dataobj)) > 2.0
 
 
@@ -313,7 +313,7 @@ def test_a_result_with_borders_may_be_a_start(layers, worker):
 
 def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
     missing = {**layers, "labels": None}
-    with pytest.raises(InputError, match=r"give labels \(--labels\)"):
+    with pytest.raises(InputError, match=r"need a label map: labels \(--labels\)"):
         register(**missing)
     labels = layers["labels"]
     aside = labels.grid.moved_by(np.eye(3), np.array([50.0, 0.0, 0.0]))
