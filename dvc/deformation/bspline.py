@@ -83,7 +83,7 @@ class BSpline:
                 f"B-spline coefficients have shape {coefficients.shape}; the grid needs {needed}, component first."
             )
         if min(self.control.shape) < _SUPPORT:
-            raise InputError(f"A cubic B-spline needs four control points or more per axis; got {self.control.shape}.")
+            raise InputError(f"A cubic B-spline needs at least four control points per axis; got {self.control.shape}.")
         object.__setattr__(self, "coefficients_mm", coefficients)
 
     @property
@@ -115,7 +115,7 @@ class BSpline:
         """
         where = frozen(where, np.bool_)
         if where.shape != grid.shape:
-            raise InputError(f"The mask 'where' has shape {where.shape}; its grid has {grid.shape}.")
+            raise InputError(f"The mask 'where' has shape {where.shape}, but the grid {grid.shape}.")
         placed = self._axis_indices(grid)
         if placed is None:
             return self.evaluate(grid.points(where))

@@ -100,7 +100,7 @@ def refuse_turned_contrast(reference: Image, loaded: Image, tissue: Mask, motion
     _, found = local_correlation(reference, carry(loaded, reference.grid, motion), tissue)
     if found < -_CLEARLY:
         raise RegistrationError(
-            f"The local correlation of the two images in the tissue is {found:.2f}, below zero, before the non-rigid "
+            f"The images correlate negatively in the tissue (local correlation {found:.2f}) before the non-rigid "
             f"registration: {_OTHER_MEASURE} (--parameters)."
         )
 

@@ -230,7 +230,7 @@ def test_row_27_without_alignment_too(settings, air_too, tiny_pair, worker):
     grid = loaded.grid.moved_by(back.rotation, back.translation_mm)
     inside = np.ones(grid.shape, dtype=bool) if air_too else tissue_mask(loaded).inside
     turned = Image(grid, np.where(inside, loaded.values.max() - loaded.values, loaded.values))
-    with pytest.raises(RegistrationError, match=r"below zero: .*AdvancedMattesMutualInformation"):
+    with pytest.raises(RegistrationError, match=r"correlate negatively .*AdvancedMattesMutualInformation"):
         register(tiny_pair.reference, turned, settings=replace(settings, align_on="none"), worker=worker)
 
 
@@ -247,7 +247,7 @@ def test_row_27_mutual_information_follows_turned_contrast(tiny_pair, worker):
 
 
 def test_row_8_identical_images_are_refused(tiny_pair):
-    with pytest.raises(InputError, match="every voxel is equal"):
+    with pytest.raises(InputError, match="all voxels are equal"):
         register(tiny_pair.reference, tiny_pair.reference, bone=tiny_pair.bone)
 
 
@@ -290,7 +290,7 @@ def test_missing_voxels_are_left_out(tiny_pair, worker):
     ("given", "told"),
     [
         ({"engine": "gauss-newton"}, "Settings.of"),
-        ({"align_on": "bones"}, "bone, image"),
+        ({"align_on": "bones"}, "bone or image or none"),
         ({"threads": 0}, "1 or"),
     ],
 )
@@ -300,14 +300,14 @@ def test_settings_that_cannot_be_used_are_refused_when_they_are_made(given, told
 
 
 def test_an_engine_that_is_not_there_is_refused_with_those_that_are():
-    with pytest.raises(ParameterError, match="there are gauss-newton, gauss-newton-borders, heel-mr, or a parameter"):
+    with pytest.raises(ParameterError, match="use gauss-newton, gauss-newton-borders, heel-mr, or an elastix parameter"):
         Settings.of("gauss")
 
 
 def test_stages_that_end_on_other_control_points_are_refused_first():
     preset = quick().engine.presets[0]
     other = replace(preset, parameters=preset.parameters | {"FinalGridSpacingInPhysicalUnits": ("5.0",)})
-    with pytest.raises(ParameterError, match="must be the same"):
+    with pytest.raises(ParameterError, match="must be equal"):
         Elastix((preset, other))
 
 

@@ -188,7 +188,7 @@ def test_a_damaged_spline_is_refused_by_name(out, tmp_path, monkeypatch):
     monkeypatch.setattr("dvc.io.transforms.interface_spline.NUMBERS", {"blur": 2.0})
     with pytest.raises(InputError, match="register again"):  # its depths would be others today
         read_transform(place)
-    with pytest.raises(InputError, match="register this load again"):
+    with pytest.raises(InputError, match="Register this load again"):
         spline_in(tmp_path / "nothing")
 
 
