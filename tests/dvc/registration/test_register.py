@@ -300,7 +300,7 @@ def test_settings_that_cannot_be_used_are_refused_when_they_are_made(given, told
 
 
 def test_an_engine_that_is_not_there_is_refused_with_those_that_are():
-    with pytest.raises(ParameterError, match="use gauss-newton, gauss-newton-borders, heel-mr, or an elastix parameter"):
+    with pytest.raises(ParameterError, match="use gauss-newton, gauss-newton-borders, heel-mr, or an elastix"):
         Settings.of("gauss")
 
 
