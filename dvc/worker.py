@@ -5,9 +5,10 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, TimeoutError as FutureTimeout
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from typing import Any, TypeVar
 
 from loky import ProcessPoolExecutor
@@ -17,7 +18,17 @@ from dvc.errors import WorkerError
 
 _T = TypeVar("_T")
 _I = TypeVar("_I")
+Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""`map`, or one that computes in several processes: a task and items, both picklable, give results in their order."""
+
 _POLL_S = 0.5
+_MEMORY = {
+    "MALLOC_ARENA_MAX": "2",  # glibc keeps memory for each thread otherwise: a fifth more
+    # What glibc comes to by itself, unless it is told otherwise: Dask has its workers hand every freed array back to
+    # the system, which clears the pages of the next one.
+    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+    "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
+}
 
 
 class Worker(AbstractContextManager["Worker", None]):
@@ -45,7 +56,7 @@ class Worker(AbstractContextManager["Worker", None]):
                 names = ("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
                 # elastix and meshes take memory and keep it: loky must not take that for a leak and end the process.
                 environment = dict.fromkeys(names, count) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
-                environment["MALLOC_ARENA_MAX"] = "2"  # glibc keeps memory for each thread otherwise: a fifth more
+                environment |= _MEMORY
                 self._executor = ProcessPoolExecutor(1, env=environment, initializer=_end_with, initargs=(os.getpid(),))
             future = self._executor.submit(task, *args)
             while True:
@@ -85,18 +96,38 @@ class Worker(AbstractContextManager["Worker", None]):
 
 def each_in_workers(items: Iterable[_I], task: Callable[[_I, Worker], None], *, at_once: int, threads: int) -> None:
     """Run ``task(item, worker)`` for every item, ``at_once`` at a time; an error or interrupt ends every worker."""
+    with _workers(at_once, threads) as each:
+        list(each(task, items))
+
+
+@contextmanager
+def side_by_side(what: str, at_once: int) -> Iterator[Each]:
+    """A `map` whose calls run ``at_once`` at a time, each in a process of one thread; for 1 it is `map` itself.
+
+    ``what`` the calls do in words ("comparing"); a call that fails ends the others, and its error is raised.
+    """
+    if at_once < 2:
+        yield map
+        return
+    with _workers(at_once, 1) as each:
+        yield lambda task, items: each(lambda item, worker: worker.run(what, task, item), items)
+
+
+@contextmanager
+def _workers(at_once: int, threads: int) -> Iterator[Callable[[Callable[[Any, Worker], Any], Iterable[Any]], Any]]:
+    """A `map` of tasks that get an item and a worker, one of so many that are kept to the end of the block."""
     local = threading.local()
     workers: list[Worker] = []
 
-    def one(item: _I) -> None:
+    def one(task: Callable[[Any, Worker], Any], item: object) -> object:
         if not hasattr(local, "worker"):
             local.worker = Worker(threads)
             workers.append(local.worker)
-        task(item, local.worker)
+        return task(item, local.worker)
 
     pool = ThreadPoolExecutor(at_once)
     try:
-        list(pool.map(one, items))
+        yield lambda task, items: pool.map(partial(one, task), items)
     except BaseException:
         for worker in workers:
             worker.kill()

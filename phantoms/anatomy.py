@@ -15,6 +15,7 @@ from dvc.arrays import FloatArray, IntArray
 from dvc.errors import InputError
 from dvc.threads import in_parts
 from phantoms.bodies import EllipsoidUnion, distance
+from phantoms.compiled import at_point
 
 TISSUES: Mapping[int, str] = {1: "bone", 2: "fat", 3: "muscle", 4: "skin", 5: "tendon", 6: "ankle"}
 """Label numbers and names. "bone" is the calcaneus; "ankle" are the other bones, which move with it."""
@@ -178,7 +179,7 @@ class Heel:
         return out
 
 
-@njit(cache=True)
+@at_point
 def _hash(i, j, k, salt):  # type: ignore[no-untyped-def]
     """Draw a number in [0, 1) from lattice coordinates, by integer mixing (splitmix64's finaliser)."""
     h = np.uint64(i * 73856093) ^ np.uint64(j * 19349663) ^ np.uint64(k * 83492791)
@@ -189,7 +190,7 @@ def _hash(i, j, k, salt):  # type: ignore[no-untyped-def]
     return np.float64(h >> np.uint64(11)) / 9007199254740992.0
 
 
-@njit(cache=True)
+@at_point
 def _noise(x, y, z, salt):  # type: ignore[no-untyped-def]
     """Smooth lattice noise in [-1, 1]: hashed values at integer points, blended by a cubic step."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
@@ -203,7 +204,7 @@ def _noise(x, y, z, salt):  # type: ignore[no-untyped-def]
     return 2.0 * total - 1.0
 
 
-@njit(cache=True)
+@at_point
 def _lobule(x, y, z, salt):  # type: ignore[no-untyped-def]
     """Distance to the border of a Voronoi cell of a jittered unit lattice, and a number of the cell's own."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
@@ -229,7 +230,7 @@ def _lobule(x, y, z, salt):  # type: ignore[no-untyped-def]
     return (second - first) / (2.0 * apart), own
 
 
-@njit(cache=True)
+@at_point
 def _depths(x, y, z, heel):  # type: ignore[no-untyped-def]
     """Depth of a point below the surface (mm) of the foot, its flesh, bone, ankle, tendon, muscle; negative outside."""
     numbers, k, bone_c, bone_f, ankle_c, ankle_f, muscle_c, muscle_f, out_c, out_f, flesh_c, flesh_f = heel
@@ -252,7 +253,7 @@ def _depths(x, y, z, heel):  # type: ignore[no-untyped-def]
     return foot, flesh, bone, ankle, size * max(achilles, sheet), muscle
 
 
-@njit(cache=True)
+@at_point
 def _tissue(x, y, z, heel):  # type: ignore[no-untyped-def]
     foot, flesh, bone, ankle, tendon, muscle = _depths(x, y, z, heel)
     if foot <= 0.0:
@@ -270,14 +271,14 @@ def _tissue(x, y, z, heel):  # type: ignore[no-untyped-def]
     return _FAT
 
 
-@njit(cache=True)
+@at_point
 def _share(depth):  # type: ignore[no-untyped-def]
     """Share of a body at a depth below its surface: 0 outside, 1 inside, and a smooth edge between."""
     t = min(1.0, max(0.0, 0.5 + 0.5 * depth / _EDGE_MM))
     return t * t * (3.0 - 2.0 * t)
 
 
-@njit(cache=True)
+@at_point
 def _signal(x, y, z, depths, heel):  # type: ignore[no-untyped-def]
     """Signals of the tissues at a point by their shares, from the outermost body to the innermost."""
     foot, flesh, bone, ankle, tendon, muscle = depths
@@ -315,7 +316,7 @@ def _signal(x, y, z, depths, heel):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True)
+@at_point
 def _marrow(x, y, z, depth, fine, salt):  # type: ignore[no-untyped-def]
     coarse = _noise(x / 4.5, y / 4.5, z / 4.5, salt + 1)
     # trabeculae: dark sheets where a lattice noise passes through zero
@@ -324,7 +325,7 @@ def _marrow(x, y, z, depth, fine, salt):  # type: ignore[no-untyped-def]
     return _MARROW_SIGNAL * rise * (1.0 + 0.12 * coarse + 0.1 * fine - 0.22 * beam)
 
 
-@njit(cache=True)
+@at_point
 def _fat(x, y, z, wide, fine, salt):  # type: ignore[no-untyped-def]
     """Lobules, taller than wide, between fibrous septa of varying strength; fainter ones inside each."""
     bent = 0.15 * wide * _noise(x / 8.0, y / 8.0, z / 8.0, salt + 6)
@@ -346,7 +347,7 @@ def _tissues(start, stop, points, heel, out):  # type: ignore[no-untyped-def]
         out[n] = _tissue(points[n, 0], points[n, 1], points[n, 2], heel)
 
 
-@njit(cache=True)
+@at_point
 def _within_one_tissue(depths, reach):  # type: ignore[no-untyped-def]
     """Whether no border lies within reach, mm; in bone, whose signal changes with depth, never."""
     foot, flesh, bone, ankle, tendon, muscle = depths

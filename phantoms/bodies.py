@@ -10,6 +10,7 @@ from numba import njit
 from dvc.arrays import FloatArray, frozen
 from dvc.errors import InputError
 from dvc.threads import in_parts
+from phantoms.compiled import at_point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,13 +80,13 @@ class EllipsoidUnion:
         return out
 
 
-@njit(cache=True)
+@at_point
 def _form(A, a, b, c):  # type: ignore[no-untyped-def]
     across = A[0, 1] * a * b + A[0, 2] * a * c + A[1, 2] * b * c
     return A[0, 0] * a * a + A[1, 1] * b * b + A[2, 2] * c * c + 2.0 * across
 
 
-@njit(cache=True)
+@at_point
 def distance(x, y, z, centres, forms, sharpness):  # type: ignore[no-untyped-def]
     """First-order distance (sqrt(Q) - 1) / |grad sqrt(Q)| of one point to an EllipsoidUnion, mm."""
     count = centres.shape[0]

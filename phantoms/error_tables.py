@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dvc import Deformation, LabelMap, StrainField, evaluate_on_grid
-from dvc.arrays import BoolArray, IntArray
+from dvc import Deformation, LabelMap, StrainField, StrainMaps, evaluate_on_grid
+from dvc.arrays import BoolArray, FloatArray, IntArray
 from dvc.errors import GeometryError
 from dvc.trust.error_model import POOLED
 from phantoms.accuracy_run import RIGID, SAMPLED, ErrorSamples
@@ -77,21 +77,45 @@ def errors_by_tissue(
     inside = where & (labels.labels > 0)
     true_u, true_H = evaluate_on_grid(truth, labels.grid, inside)
     u, H = evaluate_on_grid(measured, labels.grid, inside)
-    true, strain = StrainField.from_gradient(true_H), StrainField.from_gradient(H)
-    error = strain.max_shear - true.max_shear
-    distance = np.linalg.norm(u - true_u, axis=1)
-    rows = []
-    for number, tissue in labels.names.items():
-        kept = (labels.labels[inside] == number) & strain.valid
+    true, strain = StrainField.from_gradient(true_H).max_shear, StrainField.from_gradient(H)
+    kept = strain.valid
+    fields = (field[kept] for field in (true, strain.max_shear, strain.jacobian, true_u, u))
+    return _by_tissue(labels.names, labels.labels[inside][kept], *fields)
+
+
+def errors_of_maps(labels: LabelMap, truth: StrainMaps, measured: StrainMaps) -> tuple[TissueError, ...]:
+    """Compare maps of a deformation and of the true one as `errors_by_tissue` does, in the voxels where both are valid.
+
+    Raises
+    ------
+    GeometryError
+        If they are not on the labels' grid.
+    """
+    for name, maps in (("true", truth), ("measured", measured)):
+        if not maps.grid.same_as(labels.grid):
+            raise GeometryError(f"The {name} maps are not on the labels' grid.")
+    where = truth.valid & measured.valid & (labels.labels > 0)
+    fields = (truth.max_shear, measured.max_shear, measured.jacobian, truth.displacement_mm, measured.displacement_mm)
+    return _by_tissue(labels.names, labels.labels[where], *(field[where].astype(np.float64) for field in fields))
+
+
+def _by_tissue(
+    names: Mapping[int, str], number: IntArray, true_shear: FloatArray, shear: FloatArray, jacobian: FloatArray,
+    true_u: FloatArray, u: FloatArray,
+) -> tuple[TissueError, ...]:  # fmt: skip
+    """Errors in voxels (n,) of known label numbers; displacements (n, 3), mm."""
+    error, distance, rows = shear - true_shear, np.linalg.norm(u - true_u, axis=1), []
+    for value, tissue in names.items():
+        kept = number == value
         if not kept.any():
             continue
-        shear, off, length = true.max_shear[kept], error[kept], distance[kept]
-        of_true = np.median(shear), np.percentile(shear, 95)
+        true, off, length = true_shear[kept], error[kept], distance[kept]
+        of_true = np.median(true), np.percentile(true, 95)
         of_shear = np.sqrt(np.mean(off**2)), off.mean(), np.percentile(np.abs(off), 95)
         of_u = np.median(length), np.percentile(length, 95)
-        figures: list[Any] = [float(value) for value in (*of_true, *of_shear, *of_u)]
-        figures.append(int(np.count_nonzero(strain.jacobian[kept] <= 0)))
-        rows.append(TissueError(tissue, len(shear), *figures))
+        figures: list[Any] = [float(found) for found in (*of_true, *of_shear, *of_u)]
+        figures.append(int(np.count_nonzero(jacobian[kept] <= 0)))
+        rows.append(TissueError(tissue, len(true), *figures))
     return tuple(rows)
 
 

@@ -10,11 +10,12 @@ from dvc.arrays import FloatArray, as_points, frozen
 from dvc.errors import InputError
 from dvc.threads import in_parts
 from phantoms.bodies import EllipsoidUnion
+from phantoms.compiled import at_point
 
 _NOTHING = 27.0  # exp(-27) = 2e-12: a rise is complete beyond
 
 
-@njit(cache=True)
+@at_point
 def _rise(x, y, z, parts, numbers, side, q):  # type: ignore[no-untyped-def]
     """Return chi = 1 - exp(-t^order), t = side (sqrt(Q) - 1) / ramp, its gradient, and its Hessian (xx xy xz yy yz zz).
 
@@ -86,7 +87,7 @@ def _rise(x, y, z, parts, numbers, side, q):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@njit(cache=True)
+@at_point
 def _velocity(p, rest, skin, window, plate, pivot, keeps, v, L, q):  # type: ignore[no-untyped-def]
     """Write the velocity at p into v and its gradient into L; q is room to work in."""
     v[:] = 0.0

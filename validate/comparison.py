@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, Self
 
@@ -16,6 +17,7 @@ from dvc.errors import InputError
 from dvc.report.page import Picture, Section, Table, notebook_html, record_lines, write_report
 from dvc.report.sheet import png_bytes
 from dvc.trust.verdict import LEVELS, worst
+from dvc.worker import Each
 from validate import figures, tables
 from validate.agreement import Agreement, SkinDisplacement
 from validate.curves import Area
@@ -132,7 +134,7 @@ class Comparison:
 
     def write(
         self, folder: Path | str, *, record: Mapping[str, object] | None = None, methods: Sequence[str] = (),
-        on_image: bool = False,
+        on_image: bool = False, each: Each = map,
     ) -> tuple[tuple[Section, ...], tuple[Section, ...]]:  # fmt: skip
         """Write tables, fields, pictures and a report, as `mrstrain compare` does; an earlier comparison is replaced.
 
@@ -148,6 +150,8 @@ class Comparison:
             Paragraphs for a methods section.
         on_image : bool
             Also write each model's displacement and maximum shear strain on the voxels of the label map.
+        each : callable
+            As in `validate.compare`.
 
         Raises
         ------
@@ -163,16 +167,9 @@ class Comparison:
         colours = list(dict.fromkeys(name for one in self.loads for name in one.fields.models))
         notes = [note for note in self.notes if note not in _doubts(self.verdict)]
         sections = [overview(self.loads, self.ranking, self.warnings, notes)]
-        for one in self.loads:
-            pictures, viewer = draw(one, colours)
-            with whole_folder(target / one.load) as part:
-                tables.write_fields(part / "fields.vtu", one)
-                for stem, picture in pictures.items():
-                    (part / f"{stem}.png").write_bytes(picture.png)
-                if on_image:
-                    tables.write_on_image(part, one)
-                write_json(part / "provenance.json", about | {"verdict": _plain(one.case.verdict)})
-            sections += load_sections(one, pictures, viewer)
+        write_one = partial(_write_load, folder=target, colours=colours, about=about, on_image=on_image)
+        for of_load in each(write_one, self.loads):
+            sections += of_load
         known = {load: of for load, of in self.verdicts.items() if of is not None}
         levels = {load: of.level for load, of in known.items()}
         levels |= {ALL_LOADS: worst(known.values()).level} if known else {}
@@ -216,11 +213,26 @@ class Comparison:
         )
 
 
+def _write_load(
+    one: LoadComparison, folder: Path, colours: Sequence[str], about: Mapping[str, object], on_image: bool
+) -> list[Section]:
+    """Write the folder of one load; return its sections of the report."""
+    pictures, viewer = draw(one, colours)
+    with whole_folder(folder / one.load) as part:
+        tables.write_fields(part / "fields.vtu", one)
+        for stem, picture in pictures.items():
+            (part / f"{stem}.png").write_bytes(picture.png)
+        if on_image:
+            tables.write_on_image(part, one)
+        write_json(part / "provenance.json", {**about, "verdict": _plain(one.case.verdict)})
+    return load_sections(one, pictures, viewer)
+
+
 @checked
 def compare(
     cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",), *,
     mesh: TetMesh | None = None, criteria: Criteria | None = None, notes: Sequence[str] = (),
-    warnings: Sequence[str] | None = None, progress: Callable[[float], None] | None = None,
+    warnings: Sequence[str] | None = None, progress: Callable[[float], None] | None = None, each: Each = map,
 ) -> Comparison:  # fmt: skip
     """Compare models with a measurement of one or several loads.
 
@@ -240,6 +252,8 @@ def compare(
         What `check_models` gave; by default the models are checked here.
     progress : callable
         Gets the fraction done.
+    each : callable
+        `map`, or that of `dvc.worker.side_by_side`, which computes several loads at once, in processes of their own.
 
     Returns
     -------
@@ -254,14 +268,13 @@ def compare(
         imaged tissue (a slip of unit, frame or configuration); see `check_models`.
     """
     by = Criteria() if criteria is None else criteria
-    odd = list(check_models(cases, labels, bones) if warnings is None else warnings)
+    odd = list(check_models(cases, labels, bones, each=each) if warnings is None else warnings)
     loads: list[LoadComparison] = []
-    for number, case in enumerate(cases):
+    for one in each(partial(compare_load, labels=labels, bones=bones, mesh=mesh, criteria=by), cases):
+        loads.append(replace(one, labels=labels))  # one label map for all, where they come from processes
+        odd += [f"{one.load}: {slip}" for name in one.fields.models if (slip := displacement_slip(one.fields, name))]
         if progress is not None:
-            progress(number / len(cases))
-        loads.append(compare_load(case, labels, bones, mesh=mesh, criteria=by))
-        fields = loads[-1].fields
-        odd += [f"{case.load}: {slip}" for name in fields.models if (slip := displacement_slip(fields, name))]
+            progress(len(loads) / len(cases))
     verdicts = {case.load: case.verdict for case in cases}
     verdict, coverage = verdict_on(verdicts, odd), {one.load: one.fields.coverage() for one in loads}
     return Comparison(

@@ -1,6 +1,7 @@
 """Checks that a model lies in the imaged tissue: slips of unit, frame or reference configuration."""
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import permutations, product
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from dvc import LabelMap, TetMesh
 from dvc.arguments import checked
 from dvc.errors import GeometryError, InputError
 from dvc.mesh import box_told
+from dvc.worker import Each
 from validate.fe_result import FeResult, check_overlap
 from validate.load_comparison import LoadCase
 from validate.mapping import MappedFields, check_bones, tissues_of
@@ -21,8 +23,12 @@ _ALONG, _TURNED, _TIED, _UNIT = 0.7, 0.5, 0.02, 1000.0
 
 
 @checked
-def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",)) -> list[str]:
+def check_models(
+    cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[str] = ("bone",), *, each: Each = map
+) -> list[str]:
     """Check that every model lies in the imaged tissue; a sentence for each thing that looks wrong.
+
+    ``each`` computes for several loads at once where it is that of `dvc.worker.side_by_side`.
 
     Raises
     ------
@@ -37,11 +43,15 @@ def check_models(cases: Sequence[LoadCase], labels: LabelMap, bones: Sequence[st
         raise InputError("No load is given to compare.")
     if len({case.load for case in cases}) < len(cases):
         raise InputError(f"Each load needs a name of its own; got {', '.join(case.load for case in cases)}.")
+    return [odd for of in each(partial(_odd_models, labels=labels, bones=bones), cases) for odd in of]
+
+
+def _odd_models(case: LoadCase, labels: LabelMap, bones: Sequence[str]) -> list[str]:
+    """What looks wrong about the models of one load."""
     warnings = []
-    for case in cases:
-        for result in case.fields()[1]:
-            check_overlap(result.path, result.mesh, labels.grid)
-            warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones)]
+    for result in case.fields()[1]:
+        check_overlap(result.path, result.mesh, labels.grid)
+        warnings += [f"{case.load}: {odd}" for odd in misfits(result, labels, bones)]
     return warnings
 
 

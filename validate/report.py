@@ -107,8 +107,8 @@ def _viewer(one: LoadComparison, measured: Deformation, results: Sequence[FeResu
         "Interactive 3-D viewer",
         f"Maximum shear strain, 0 to {most:g}, in the unloaded configuration: measured, and by {model.name}. Drag to "
         "move through the slices, drag with the right button to rotate; both views follow. Needs WebGL 2.",
-        Volume.of("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
-        (Volume.of("measured", grid, shear[0], most), Volume.of(model.name, grid, shear[1], most)),
+        Volume.image("image", grid, shown, float(np.quantile(shown, 0.997)) or 1.0),
+        (Volume.overlay("measured", grid, shear[0], most), Volume.overlay(model.name, grid, shear[1], most)),
     )
 
 
@@ -124,7 +124,7 @@ def load_sections(one: LoadComparison, pictures: Mapping[str, Picture], viewer: 
     tables, doubtful = (_tissues(one), _location(one), _skin(one)), verdict if _head(one) != one.load else None
     return [
         Section(one.load, doubtful, tables, (curves, slices), tuple(words), (viewer,)),
-        Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others)),
+        Section(f"{one.load}, cell by cell", None, _agreement(one), tuple(others), folded=True),
     ]
 
 

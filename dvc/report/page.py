@@ -2,6 +2,7 @@
 
 import base64
 import gzip
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -13,6 +14,7 @@ import jinja2
 import nibabel
 import numpy as np
 import numpy.typing as npt
+from PIL import Image as Pixels
 
 from dvc.atomic_files import write_whole
 from dvc.errors import InputError
@@ -29,7 +31,9 @@ _TONES: Mapping[Level | None, tuple[str, str]] = {
     None: ("#0b5cad", "#f0f3f6"),
 }  # fmt: skip
 """Colours of a notebook's headline and its ground, by the level of the verdict in it."""
-_STEPS = 250  # of a volume's values: one byte for each voxel
+_GREYS, _COLOURS = 64, 125  # steps of a volume's values, one byte for each voxel: more are not seen, and take room
+_QUALITY = 82  # of pictures on the page; files of figures lose nothing
+_SMALL = 100_000  # bytes of a PNG: a chart, which is smaller yet without loss
 _TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 NIIVUE = "0.69.0"
 """Version of the viewer (WebGL 2, niivue.com) that comes with the package; it draws what the page itself holds."""
@@ -56,8 +60,13 @@ class Picture:
 
     @property
     def data(self) -> str:
-        """The picture for an ``img`` element."""
+        """The picture as it is, for an ``img`` element."""
         return "data:image/png;base64," + base64.b64encode(self.png).decode()
+
+    @property
+    def small(self) -> str:
+        """The picture for an ``img`` element as WebP, in a third of the room."""
+        return _small(self.png)
 
     @property
     def width(self) -> int:
@@ -100,12 +109,21 @@ class Volume:
     most: float
 
     @classmethod
-    def of(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float) -> Self:
-        """Values (ni, nj, nk) on a grid, from 0 to ``most``; NaN becomes 0, which an overlay does not show."""
-        known, step = np.nan_to_num(np.asarray(values, dtype=np.float64)), most / _STEPS
+    def image(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float) -> Self:
+        """An MR image (ni, nj, nk), from 0 to ``most``, the value that is drawn white; NaN becomes 0."""
+        return cls._of(title, grid, values, most, _GREYS)
+
+    @classmethod
+    def overlay(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float) -> Self:
+        """A scalar (ni, nj, nk) in colour, from 0 to ``most``; NaN becomes 0, which an overlay does not show."""
+        return cls._of(title, grid, values, most, _COLOURS)
+
+    @classmethod
+    def _of(cls, title: str, grid: Grid, values: npt.NDArray[np.floating], most: float, steps: int) -> Self:
+        known, step = np.nan_to_num(np.asarray(values, dtype=np.float64)), most / steps
         image = nibabel.Nifti1Image(np.clip(np.rint(known / step), 0, 255).astype(np.uint8), _TO_RAS @ grid.affine)
         image.header.set_slope_inter(step, 0.0)
-        return cls(title, base64.b64encode(gzip.compress(image.to_bytes(), mtime=0)).decode(), most)
+        return cls(title, _packed(image.to_bytes()), most)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +138,7 @@ class Viewer:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a report with its own verdict, or without one."""
+    """A part of a report with its own verdict, or without one; a reader opens a ``folded`` one where it is wanted."""
 
     title: str
     verdict: Verdict | None = None
@@ -128,6 +146,7 @@ class Section:
     pictures: tuple[Picture, ...] = ()
     paragraphs: tuple[str, ...] = ()
     viewers: tuple[Viewer, ...] = ()
+    folded: bool = False
 
 
 def shown(value: Cell) -> str:
@@ -158,11 +177,22 @@ def _line(value: object) -> str:
     return str(value)
 
 
+def _packed(content: bytes) -> str:
+    """Compressed, in base64; equal contents give equal text."""
+    return base64.b64encode(gzip.compress(content, mtime=0)).decode()
+
+
+def _small(png: bytes) -> str:
+    with Pixels.open(io.BytesIO(png)) as picture:
+        file, pixels = io.BytesIO(), picture.convert("RGB")
+    pixels.save(file, "WEBP", quality=_QUALITY, method=2, lossless=len(png) < _SMALL)
+    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode()
+
+
 @cache
-def script() -> str:
-    """The library and what starts it, for a page that has a viewer; with the library's licence."""
-    licence, library, viewer = map(_stored, ("niivue-LICENSE.txt", "niivue.umd.js", "viewer.js"))
-    return f"/* niivue {NIIVUE}\n{licence}*/\n{library}\n{viewer}"
+def _library() -> str:
+    """The viewer's library, compressed; a page unpacks it when a viewer is asked for."""
+    return _packed(_stored("niivue.umd.js").encode())
 
 
 def _stored(name: str) -> str:
@@ -181,13 +211,19 @@ def write_report(
 ) -> None:
     """Write a report: verdict first, if there is one, then the sections, the closing ones, and where it all came from.
 
-    One HTML file without anything to fetch, and without scripts but for a section's viewer; all text is escaped. A list
-    of the sections with their verdicts stands at the top where there are two or more; ``notes``, a line each, stand
-    between the verdict and it. OutputError if the file cannot be written.
+    One HTML file without anything to fetch; all text is escaped. With two sections or more a list of them, with their
+    verdicts, stands beside them. ``notes``, a line each, stand below the verdict. Closing sections and provenance are
+    folded. OutputError if the file cannot be written.
     """
-    told = {"title": title, "verdict": verdict, "notes": notes, "provenance": provenance}
-    library = script() if any(section.viewers for section in sections) else ""
-    write_whole(path, _template("report").render(**told, sections=sections, closing=closing, script=library))
+    told = {"title": title, "verdict": verdict, "notes": notes, "provenance": provenance, "closing": closing}
+    volumes: dict[str, str] = {}  # each once, however many viewers show it
+    for viewer in (viewer for section in sections for viewer in section.viewers):
+        for volume in (viewer.image, *viewer.overlays):
+            volumes.setdefault(volume.data, f"volume-{len(volumes) + 1}")
+    scripts = {"page": _stored("page.js"), "viewer": _stored("viewer.js")}
+    library = {"version": NIIVUE, "licence": _stored("niivue-LICENSE.txt"), "packed": _library()} if volumes else None
+    page = _template("report").render(**told, sections=sections, volumes=volumes, scripts=scripts, library=library)
+    write_whole(path, page)
 
 
 def notebook_html(

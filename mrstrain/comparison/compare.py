@@ -13,15 +13,20 @@ from dvc.arrays import FloatArray
 from dvc.errors import InputError
 from dvc.io.result_folder import ERROR_MODEL, REGISTERED, REPORT, ResultFolder, result_folders
 from dvc.report.page import Section
+from dvc.threads import usable_cores
+from dvc.worker import side_by_side
 from fe import read_tet_mesh
 from mrstrain.comparison.methods import methods
 from mrstrain.comparison.model_files import ModelFile, model_files
 from mrstrain.options.door import door
 from mrstrain.options.model import Vector
 from mrstrain.options.modelling import ComparisonOn, Directions, LabelMapFile, ModelReading
+from mrstrain.records.doctor import usable_memory_bytes
 from mrstrain.records.inputs import make_output, refuse_touching_inputs
 from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
+
+_BYTES_OF_A_LOAD = 1 << 30  # about what the process takes that compares one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,9 +97,6 @@ def compare(
     common = None if comparison.mesh is None else _common_mesh(comparison.mesh, tissues, bones)
     compared = {m.load: m for m in measurements if m.load in files}
     cases = [_case(m, files[load], tissues.grid, own.get(load, usual)) for load, m in compared.items()]
-    # Every file is read once before anything is computed or removed, and again in its turn: together they fill memory.
-    warnings = validate.check_models(cases, tissues, bones)
-    make_output(target)
     given = {
         "bones": list(bones), "plate_axes_lps": usual.tolist(), "strains": list(criteria.strains),
         "plate_axes_lps_of": {load: axes.tolist() for load, axes in own.items()}, "least_cluster_ml": criteria.least_ml,
@@ -102,15 +104,26 @@ def compare(
         "to_image": None if to_image is None else np.asarray(to_image).tolist(), "seed": criteria.seed,
         "files": {load: {file.name: file.path.name for file in of} for load, of in files.items()},
     }  # fmt: skip
-    record = provenance("compare", inputs, given)
-    result = validate.compare(
-        cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings, progress=share
-    )
     folders, of_models = {load: m.folder for load, m in compared.items()}, {file.name: file.path for file in results}
-    paragraphs = methods(folders, of_models, result, criteria)
-    sections, closing = result.write(target, record=record, methods=paragraphs, on_image=comparison.on_image)
+    with side_by_side("comparing", _at_once(len(cases))) as each:
+        # Every file is read once before anything is removed, and again in its turn: together they fill memory.
+        warnings = validate.check_models(cases, tissues, bones, each=each)
+        make_output(target)
+        record = provenance("compare", inputs, given)
+        result = validate.compare(
+            cases, tissues, bones, mesh=common, criteria=criteria, notes=notes, warnings=warnings, progress=share,
+            each=each,
+        )  # fmt: skip
+        said = methods(folders, of_models, result, criteria)
+        parts = result.write(target, record=record, methods=said, on_image=comparison.on_image, each=each)
     share(1.0)
-    return Compared(target, result, sections, closing)
+    return Compared(target, result, *parts)
+
+
+def _at_once(loads: int) -> int:
+    """Number of loads that are compared at once, on the cores and in the memory that there are."""
+    memory = usable_memory_bytes()
+    return max(1, min(loads, usable_cores(), loads if memory is None else memory // _BYTES_OF_A_LOAD))
 
 
 def _axes(normal: Sequence[float], shear: Sequence[float]) -> FloatArray:

@@ -21,8 +21,8 @@ _RIVALS = {"dvc": ("dvc", " (Data Version Control)"), "configobj": ("validate", 
 _RIVALS["validate"] = ("validate", "")
 _NEEDED = (
     "itk-elastix", "SimpleITK", "numpy", "scipy", "scikit-image", "meshio", "nibabel", "isal", "pydicom", "numba",
-    "matplotlib", "jinja2", "lazy-loader", "rich", "typer", "loky", "distributed", "filelock", "pydantic", "pytetwild",
-    "pyvista", "vtk", "psutil",
+    "matplotlib", "jinja2", "pillow", "lazy-loader", "rich", "typer", "loky", "distributed", "filelock", "pydantic",
+    "pytetwild", "pyvista", "vtk", "psutil",
 )  # fmt: skip
 _ELASTIX = "0.25."  # the series that parameters are checked against
 _OLDEST_PYTHON = (3, 11)

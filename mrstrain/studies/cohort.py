@@ -198,7 +198,7 @@ def _sections(
     drawn = Picture.drawn("Distribution over subjects", over_subjects, shares, order)
     sections = [Section("Models", None, (ranked, by_subject), (drawn,), tuple(notes))]
     for name, one in ran.items():
-        failed = tuple(f"Not whole: {outcome}" for outcome in one.outcomes.values() if outcome.record is None)
+        failed = tuple(f"Incomplete: {outcome}" for outcome in one.outcomes.values() if outcome.record is None)
         verdicts = list(one.verdicts.values())
         sections.append(Section(name, worst(verdicts) if verdicts else None, paragraphs=failed))
     return sections

@@ -3,10 +3,10 @@
 import json
 from pathlib import Path
 
-from dvc import read_labels, read_mask, write_labels
+from dvc import read_labels, write_labels
 from dvc.atomic_files import write_whole
 from dvc.errors import OutputError
-from dvc.io.result_folder import REPORT, VALID, spline_in
+from dvc.io.result_folder import REPORT, read_maps
 from mrstrain.models.simulate import LOADS
 from mrstrain.records.outcome import Outcome
 from mrstrain.records.progress import OnProgress
@@ -16,8 +16,8 @@ from mrstrain.studies.pipeline import StageOutcome
 from mrstrain.studies.plan import REGISTRATION
 from mrstrain.studies.run import StudyRun, run
 from mrstrain.studies.true_error import TABLE, read_errors, write_errors
-from mrstrain.truth.phantom import phantom
-from phantoms import Heel, TissueError, errors_by_tissue, heel_grid, labels_of, labels_to_mesh, under_load
+from mrstrain.truth.phantom import TRUTH, phantom
+from phantoms import Heel, TissueError, errors_of_maps, heel_grid, labels_of, labels_to_mesh
 
 _SETS = ("trebbi", "luboz", "akrami")
 _ALL_SETS = ("trebbi", "akrami", "erdemir", "friedman", "luboz", "spears", "zwam")
@@ -69,7 +69,7 @@ def demo(
     target = Path(out)
     _make(target, seed, full, progress)
     done = run(target, workers=workers, progress=progress)
-    errors = _errors(target, seed, done, read_errors(target / TABLE, done.outcomes))
+    errors = _errors(target, done, read_errors(target / TABLE, done.outcomes))
     write_errors(target / TABLE, errors, done.outcomes)
     write_run_report(target / "results" / REPORT, done.study, done.outcomes)
     complete = all(_reached(outcome) for outcome in done.outcomes.values())
@@ -111,19 +111,17 @@ def _text(seed: int, full: bool) -> str:
 
 
 def _errors(
-    target: Path, seed: int, done: StudyRun, known: dict[str, tuple[TissueError, ...]]
+    target: Path, done: StudyRun, known: dict[str, tuple[TissueError, ...]]
 ) -> dict[str, tuple[TissueError, ...]]:
     """Error of each load by tissue, where its strain is valid; ``known`` errors are not computed again."""
     labels = read_labels(target / "tissues.nii.gz", target / "tissues.csv")
-    heel = Heel(seed)
     errors = {}
     for load in done.study.loads:
-        folder = done.study.out / REGISTRATION / load
         if load in known:
             errors[load] = known[load]
         elif done.outcomes[f"register {load}"].record is not None:
-            valid = read_mask(folder / VALID).inside
-            errors[load] = errors_by_tissue(labels, under_load(heel, load), spline_in(folder), valid)
+            measured = read_maps(done.study.out / REGISTRATION / load)
+            errors[load] = errors_of_maps(labels, read_maps(target / TRUTH / load), measured)
     return errors
 
 

@@ -34,7 +34,9 @@ def write_run_report(path: Path, study: Study, outcomes: Mapping[str, StageOutco
     record["inputs"] = {"inputs": [{"name": name, "sha256": sha} for name, sha in files]}
     stages = {name: {"made_utc": one.made_utc, **one.made_from} for name, one in records.items()}
     write_json(path.with_name(PROVENANCE), record | {"stages": stages})
-    sections = [*error_against_truth(study, outcomes), *compared, *registered, _stages(outcomes)]
+    against_truth = error_against_truth(study, outcomes)
+    first, *others = [*compared[:1], *against_truth, *compared[1:], *registered, _stages(outcomes)]
+    sections = [first, *(replace(section, folded=True) for section in others)]
     verdict = _verdict([one for of in of_loads.values() for one in of.verdicts], compared)
     write_report(path, study.study.name, verdict, sections, closing, record_lines(record), notes=_incomplete(outcomes))
 
@@ -57,12 +59,13 @@ def _verdict(verdicts: Sequence[Verdict], compared: Sequence[Section]) -> Verdic
 
 def _incomplete(outcomes: Mapping[str, StageOutcome]) -> list[str]:
     """Notes on stages without a complete result, and on those that were not requested."""
-    incomplete = []
+    alike: dict[str, list[str]] = {}
     for one in outcomes.values():
         if not (one.complete or one.left_out):
             why = one.reason.partition("\n")[0].removeprefix("Not run: ").rstrip(".")
-            incomplete.append(f"{one.stage} {one.status.lower()}" + (f" ({why})" if why else ""))
-    return [*([f"Not whole: {'; '.join(incomplete)}."] if incomplete else []), *left_out_of(outcomes)]
+            alike.setdefault(f"{one.status.lower()}" + (f" ({why})" if why else ""), []).append(one.stage)
+    incomplete = [f"{', '.join(stages)}: {how}" for how, stages in alike.items()]
+    return [*([f"Incomplete: {'; '.join(incomplete)}."] if incomplete else []), *left_out_of(outcomes)]
 
 
 def _stages(outcomes: Mapping[str, StageOutcome]) -> Section:

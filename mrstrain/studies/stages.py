@@ -85,14 +85,9 @@ def level(tell: Tell, *, load0: Path, model: Path, load: str, **options: Any) ->
 
 
 def compare(tell: Tell, **options: Any) -> StageResult:
-    """All models against the measurement; as `mrstrain.compare`, in a process whose memory is given back."""
-    with Worker(threads=1) as worker:
-        return worker.run("comparing", _compared, options)
-
-
-def _compared(options: dict[str, Any]) -> StageResult:
+    """All models against the measurement; as `mrstrain.compare`, on all cores, since a study ends with it."""
     from mrstrain.comparison.compare import compare as run
 
     models = [*dict.fromkeys(options.pop("models", [])), *options.pop("elsewhere")]
-    done = run(options.pop("dvc"), models, **options)
+    done = run(options.pop("dvc"), models, progress=lambda _, *stage: tell(*stage), **options)
     return StageResult(tuple(done.summary()[:-1]), done.sections, done.closing)

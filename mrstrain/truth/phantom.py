@@ -20,6 +20,9 @@ from mrstrain.records.progress import OnProgress
 from mrstrain.records.provenance import provenance
 from phantoms import LOADS, Heel, covering, heel_grid, labels_of, labels_to_mesh, random_foot_motion, scan, under_load
 
+TRUTH = "truth"
+"""Folder of the true fields, with one for each load."""
+
 _BYTES_PER_VOXEL = 12  # measured: files of one load, image and truth
 _REPEAT = 100  # acquisition number of the repeat scan
 _Motions = Mapping[str, Motion]
@@ -38,7 +41,7 @@ class PhantomFiles:
         at = self.out
         loads = " ".join(str(path) for name, path in self.images.items() if name in LOADS)
         return [
-            f"Images: {', '.join(path.name for path in self.images.values())}; truth: {at / 'truth'}",
+            f"Images: {', '.join(path.name for path in self.images.values())}; truth: {at / TRUTH}",
             f"To register them: mrstrain register {self.images['Load0']} {loads} --bone {at / 'calcaneus.nii.gz'} "
             f"--labels {at / 'tissues.nii.gz'} --names {at / 'tissues.csv'} "
             f"--repeat {self.images['Load0-again']} --out {at / 'results'}",
@@ -129,7 +132,7 @@ def _write_images(
             if name in motions:
                 step()
                 maps = strain_maps(motions[name], body)
-                writes.append(pool.submit(_write_truth, target / "truth" / name, maps, labels, record))
+                writes.append(pool.submit(_write_truth, target / TRUTH / name, maps, labels, record))
         for done in writes:
             done.result()
     step()

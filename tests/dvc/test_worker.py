@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from dvc.errors import RegistrationError, WorkerError
-from dvc.worker import Worker, each_in_workers
+from dvc.worker import Worker, each_in_workers, side_by_side
 
 
 def _crash() -> None:
@@ -27,6 +29,23 @@ def _fails() -> None:
 
 def _process() -> tuple[int, str | None]:
     return os.getpid(), os.environ.get("ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS")
+
+
+def _pages_of_freed_arrays() -> int:
+    """Pages that the system had to give for a hundred arrays of 1 MB, each freed before the next."""
+    import resource
+
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(100):
+        np.ones(1 << 17)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_memory_of_a_freed_array_serves_the_next_even_below_a_worker_of_dask(monkeypatch):
+    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "65536")  # as Dask sets it: 25,600 pages
+    with Worker(threads=1) as worker:
+        assert worker.run("counting", _pages_of_freed_arrays) < 1000
 
 
 @pytest.mark.parametrize(("task", "signal_name"), [(_crash, "SIGSEGV"), (_killed, "SIGKILL")])
@@ -84,6 +103,31 @@ def test_each_item_is_done_once_and_one_that_fails_ends_all() -> None:
     with pytest.raises(KeyError):
         each_in_workers([1], wrong, at_once=1, threads=1)
     assert all(worker._executor is None for worker in used)
+
+
+def _slow_to_fast(item: int) -> tuple[int, int]:
+    time.sleep(0.3 / item)
+    return item, os.getpid()
+
+
+def _fails_at_two(item: int) -> int:
+    if item == 2:
+        raise RegistrationError("two")
+    return item
+
+
+def test_a_map_over_processes_keeps_the_order_and_raises_the_error_of_a_call():
+    with side_by_side("counting", 2) as each:
+        found = list(each(_slow_to_fast, [1, 2, 3, 4]))
+        again = list(each(_slow_to_fast, [5, 6]))
+    assert [item for item, _ in (*found, *again)] == [1, 2, 3, 4, 5, 6]
+    processes = {process for _, process in (*found, *again)}
+    assert len(processes) <= 2
+    assert os.getpid() not in processes
+    with pytest.raises(RegistrationError, match="two"), side_by_side("counting", 2) as each:
+        list(each(_fails_at_two, [1, 2, 3]))
+    with side_by_side("counting", 1) as each:
+        assert list(each(_slow_to_fast, [9])) == [(9, os.getpid())]
 
 
 def holding(megabytes: int) -> int:

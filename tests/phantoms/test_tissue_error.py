@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from dvc.deformation.protocol import Affine
+from dvc.deformation.strain_maps import strain_maps
 from dvc.errors import GeometryError
-from dvc.images.image import Grid, LabelMap
-from phantoms import errors_by_tissue
+from dvc.images.image import Grid, LabelMap, Mask
+from phantoms import errors_by_tissue, errors_of_maps
 
 GRID = Grid((8, 6, 5), (1.0, 1.5, 2.0), (-4.0, 3.0, 1.0))
 STRETCH = np.diag([1.2, 1.0, 1.0])
@@ -52,3 +53,19 @@ def test_only_the_voxels_asked_for_are_scored() -> None:
     assert [(row.tissue, row.voxels) for row in rows] == [("fat", 50)]
     with pytest.raises(GeometryError, match="labels' grid"):
         errors_by_tissue(labels(), rest, rest, where[:-1])
+
+
+def test_maps_tell_the_error_of_the_deformations_that_they_were_made_of() -> None:
+    truth, found = Affine(STRETCH, np.zeros(3)), Affine(STRETCH.T[::-1, ::-1], np.array([0.0, 0.3, 0.0]))
+    where = np.ones(GRID.shape, dtype=bool)
+    where[2] = False
+    true, measured = strain_maps(truth, Mask(GRID, labels().labels > 0)), strain_maps(found, Mask(GRID, where))
+    from_maps = errors_of_maps(labels(), true, measured)
+    for row, wanted in zip(from_maps, errors_by_tissue(labels(), truth, found, where), strict=True):
+        assert (row.tissue, row.voxels, row.folded) == (wanted.tissue, wanted.voxels, wanted.folded)
+        figures = ("true_p50", "true_p95", "shear_rmse", "shear_bias", "shear_error_p95", "u_p50_mm", "u_p95_mm")
+        for name in figures:
+            assert getattr(row, name) == pytest.approx(getattr(wanted, name), rel=1e-6, abs=1e-7), name
+    other = Grid(GRID.shape, GRID.spacing_mm, GRID.origin_mm + 1.0)
+    with pytest.raises(GeometryError, match="true maps"):
+        errors_of_maps(labels(), strain_maps(truth, Mask(other, where)), measured)

@@ -15,6 +15,7 @@ import validate
 from dvc.report.page import shown
 from dvc.trust.error_model import ErrorTable
 from dvc.trust.verdict import Verdict
+from dvc.worker import side_by_side
 from tests.validate.test_comparison import case, cube, error_table, labels, max_shear, result, sheared
 from validate import ALL, Comparison, Criteria, InputError, compare, compare_load
 from validate.report import area_rows, load_sections
@@ -38,6 +39,20 @@ def folder(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> 
     place = tmp_path_factory.mktemp("compared")
     comparison.write(place, on_image=True)
     return place
+
+
+def test_loads_compared_in_processes_give_the_same_to_the_bit(comparison: Comparison, folder: Path, tmp_path) -> None:
+    with side_by_side("comparing", 2) as each:
+        cases, by = [one.case for one in comparison.loads], comparison.loads[0].criteria
+        again = compare(cases, labels(), criteria=by, notes=["half is linear."], each=each)
+        again.write(tmp_path / "again", on_image=True, each=each)
+    for rows in ("areas", "overlaps", "agreements", "skin"):
+        assert repr(getattr(again, rows)) == repr(getattr(comparison, rows))
+    assert again.loads[0].labels is again.loads[1].labels
+    written = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    assert len(written) > 20
+    for name in written:
+        assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
 
 
 def test_what_is_read_back_is_what_was_written(comparison: Comparison, folder: Path) -> None:

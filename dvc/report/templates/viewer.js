@@ -1,15 +1,25 @@
-// Starts a viewer when its button is pressed: a page may hold more volumes than a browser draws at once.
+/* Starts a viewer when its button is pressed: a page may hold more volumes than a browser draws at once. */
+const library = () => {
+  window.niivueReady ??= (async () => {
+    const packed = Uint8Array.from(atob(document.getElementById("niivue").textContent.trim()), (c) => c.charCodeAt(0));
+    const code = document.createElement("script");
+    code.textContent = await new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
+    document.head.append(code);
+  })();
+  return window.niivueReady;
+};
 for (const box of document.querySelectorAll(".viewer")) {
   const button = box.querySelector("button");
   const volume = (node, more) => niivue.NVImage.loadFromBase64({
-    base64: node.textContent.trim(), name: node.dataset.title + ".nii.gz", ...more,
+    base64: document.getElementById(node.dataset.volume).textContent.trim(), name: node.dataset.title + ".nii.gz", ...more,
   });
   button.addEventListener("click", async () => {
     button.disabled = true;
     try {
+      await library();
       const canvases = [...box.querySelectorAll("canvas")];
-      const overlays = [...box.querySelectorAll("script.overlay")];
-      const image = box.querySelector("script.image");
+      const overlays = [...box.querySelectorAll(".overlay")];
+      const image = box.querySelector(".image");
       const shown = [];
       for (const [number, canvas] of canvases.entries()) {
         canvas.parentElement.hidden = false;
@@ -25,7 +35,7 @@ for (const box of document.querySelectorAll(".viewer")) {
       button.remove();
       box.dataset.state = "shown";
     } catch (problem) {
-      button.textContent = "This browser cannot show the viewer (WebGL 2 is needed); the figures above show the same. " + problem;
+      button.textContent = "The viewer could not start (it needs WebGL 2); the pictures above show the same strain. " + problem;
       box.dataset.state = "failed";
     }
   });

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
+import io
 import re
 from html.parser import HTMLParser
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
+from PIL import Image as Pixels
 
 from dvc.errors import InputError, OutputError
 from dvc.images.image import Grid, LabelMap
 from dvc.report.figures import shear_curves
-from dvc.report.page import Picture, Section, Table, shown, write_report
+from dvc.report.page import Picture, Section, Table, Viewer, Volume, shown, write_report
 from dvc.trust.verdict import Verdict
 
 ATTACK = "<script>alert('x')</script><img src=x onerror=y>\"&"
@@ -73,7 +78,7 @@ def html(tmp_path: Path) -> str:
 def test_names_are_escaped_everywhere(html: str) -> None:
     page = Page(html)
     assert page.open == []
-    assert not page.all("script")
+    assert page.all("script") == [{}]  # the page's own
     assert len(page.all("img")) == 1
     assert not any(key.startswith("on") for _, attributes in page.tags for key in attributes)
     places = 15  # each place above, of which the title, the section's title and its reason are told more than once
@@ -87,9 +92,9 @@ def test_nothing_is_fetched(html: str) -> None:
     for _, attributes in page.tags:
         for key in ("src", "href"):
             value = attributes.get(key)
-            assert value is None or value.startswith(("data:image/png;base64,", "#"))
+            assert value is None or value.startswith(("data:image/webp;base64,", "#"))
     policy = [a["content"] for a in page.all("meta") if a.get("http-equiv") == "Content-Security-Policy"]
-    assert policy == ["default-src 'none'; img-src data:; style-src 'unsafe-inline'"]
+    assert policy == ["default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"]
 
 
 def test_links_of_the_contents_lead_to_the_parts(html: str) -> None:
@@ -97,15 +102,52 @@ def test_links_of_the_contents_lead_to_the_parts(html: str) -> None:
     ids = [str(a["id"]) for _, a in page.tags if "id" in a]
     assert len(ids) == len(set(ids))
     links = [str(a["href"]) for a in page.all("a")]
-    assert len(links) == 2
+    assert len(links) == 4  # two sections, one that closes, and provenance
     assert {link[1:] for link in links} <= set(ids)
 
 
 def test_verdict_stands_before_all_else_and_in_words(html: str) -> None:
     body = html[html.index("<main>") :]
-    assert body.index('class="verdict distrust"') < body.index("<section")
+    assert body.index('class="verdict distrust"') < body.index("<details")
     assert "Do not trust" in body
     assert '<span class="pill trust">Trust</span>' in body
+    contents = html[html.index("<nav") : html.index("</nav>")]
+    assert "Do not trust" in contents
+    assert "Trust</span>" not in contents.replace("Do not trust", "")  # what is sound needs no mark there
+
+
+def test_what_closes_a_report_and_what_is_folded_is_opened_by_the_reader(tmp_path: Path) -> None:
+    sections = [Section("Load1"), Section("Load1, cell by cell", folded=True)]
+    write_report(tmp_path / "r.html", "A heel", None, sections, [Section("How to read this")], {})
+    parts = {str(a["id"]): "open" in a for a in Page((tmp_path / "r.html").read_text()).all("details")}
+    assert parts == {"part-1": True, "part-2": False, "closing-1": False, "provenance": False}
+
+
+def test_a_picture_on_the_page_is_smaller_than_its_file_and_looks_the_same() -> None:
+    shades = np.linspace(0, 255, 300 * 400).reshape(300, 400, 1) + np.random.default_rng(0).normal(0, 20, (300, 400, 1))
+    file = io.BytesIO()
+    Pixels.fromarray(np.clip(np.repeat(shades, 3, -1), 0, 255).astype(np.uint8)).save(file, "PNG")
+    for png_file, near in ((file.getvalue(), 12.0), (png(), 0.0)):
+        small = base64.b64decode(Picture("t", "c", png_file).small.removeprefix("data:image/webp;base64,"))
+        assert len(small) < 0.7 * len(png_file)
+        one, other = (np.asarray(Pixels.open(io.BytesIO(b)).convert("RGB"), float) for b in (png_file, small))
+        assert np.sqrt(np.mean((one - other) ** 2)) <= near
+
+
+def test_a_volume_is_held_once_for_all_its_viewers(tmp_path: Path) -> None:
+    grid = Grid((4, 5, 6), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    values = np.arange(120.0).reshape(4, 5, 6)
+    image, strain = Volume.image("image", grid, values, 119.0), Volume.overlay("measured", grid, values, 119.0)
+    sections = [Section(load, viewers=(Viewer("Viewer", "c", image, (strain,)),)) for load in ("Load1", "Load2")]
+    write_report(tmp_path / "r.html", "A heel", None, sections, [], {})
+    page = (tmp_path / "r.html").read_text()
+    assert (page.count(image.data), page.count(strain.data)) == (1, 1)
+    assert len(re.findall(r'class="overlay" data-volume="volume-2"', page)) == 2
+    held = nibabel.Nifti1Image.from_bytes(gzip.decompress(base64.b64decode(strain.data)))
+    np.testing.assert_allclose(held.get_fdata(), values, atol=0.5 * 119.0 / 125 + 1e-6)
+    library = gzip.decompress(base64.b64decode(re.search(r'id="niivue">([^<]+)<', page)[1]))
+    assert b"Niivue" in library
+    assert len(page) < 1_500_000
 
 
 def test_pictures_have_a_text_and_their_size(html: str) -> None:

@@ -146,7 +146,9 @@ def test_the_report_needs_nothing_else_and_says_what_it_rests_on(study: Path) ->
     assert policy is not None
     assert "default-src 'none'" in policy[1]
     assert "http" not in policy[1]
-    held = {name: text for name, text in re.findall(r'class="overlay" data-title="([^"]*)"[^>]*>([^<]*)<', page)}
+    volumes = dict(re.findall(r'id="(volume-\d+)">([^<]*)<', page))
+    overlays = re.findall(r'class="overlay" data-volume="([^"]*)" data-title="([^"]*)"', page)
+    held = {name: volumes[which] for which, name in overlays}
     right, measured = (
         nibabel.Nifti1Image.from_bytes(gzip.decompress(base64.b64decode(held[n]))) for n in ("right", "measured")
     )

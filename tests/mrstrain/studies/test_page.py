@@ -92,12 +92,12 @@ def test_what_was_not_asked_for_or_failed_is_no_verdict_on_the_registrations(stu
     broken = ended(study, **sound, mesh="It broke.\nTraceback", simulate_trebbi="Not run: mesh has no result.")
     told = head(page_of(study, broken))
     assert "Do not trust" not in told
-    assert "Not whole: mesh failed (It broke); simulate trebbi not run (mesh has no result)." in told
+    assert "Incomplete: mesh: failed (It broke); simulate trebbi: not run (mesh has no result)." in told
     assert "Traceback" not in told
     assert not StudyRun(study, broken).complete
 
     part = ended(study, **sound, mesh=SOUND, simulate_trebbi=StageResult((), complete=False))
-    assert "Not whole: simulate trebbi in part." in head(page_of(study, part))
+    assert "Incomplete: simulate trebbi: in part." in head(page_of(study, part))
     assert not StudyRun(study, part).complete
 
 
@@ -117,7 +117,7 @@ def test_a_registration_that_is_not_to_be_trusted_heads_the_report(study: Study)
 def test_without_a_verdict_nothing_is_claimed(study: Study) -> None:
     told = head(page_of(study, ended(study, register_Load1="The bone was not found.", register_Load2="Nor here.")))
     assert told.startswith(
-        "Heel Not whole: register Load1 failed (The bone was not found); register Load2 failed (Nor here)."
+        "Heel Incomplete: register Load1: failed (The bone was not found); register Load2: failed (Nor here)."
     )
 
 
@@ -132,7 +132,7 @@ def test_registrations_alone_have_a_methods_text(study: Study) -> None:
     assert "Models and measurement" not in page
     closing = (Section("Methods text", paragraphs=("All of it.",)),)
     page = page_of(study, ended(study, register_Load1=SOUND, compare=StageResult((), (), closing)))
-    assert page.count("Methods text") == 1  # that of the comparison tells the registrations too
+    assert page.count("<h2>Methods text</h2>") == 1  # that of the comparison tells the registrations too
 
 
 def test_no_figure_of_the_report_is_a_negative_zero(study: Study) -> None:

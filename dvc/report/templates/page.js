@@ -1,0 +1,11 @@
+/* Folded parts open for a link that leads there, and for print. */
+const unfolded = () => {
+  const part = location.hash.length > 1 && document.getElementById(location.hash.slice(1));
+  if (part && part.tagName === "DETAILS") { part.open = true; part.scrollIntoView(); }
+};
+addEventListener("hashchange", unfolded);
+addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((part) => { part.open = true; }));
+document.querySelectorAll("nav a").forEach((link) => link.addEventListener("click", () => {
+  document.querySelector(link.getAttribute("href")).open = true;
+}));
+unfolded();
