@@ -132,8 +132,8 @@ def test_error_bars_are_the_engines_own(written):
     [
         ({"engine": "gauss-newton", "preset": "heel-mr"}, "elastix"),
         ({"engine": "elastix", "bending": 3.0}, "gauss-newton"),
-        ({"preset": "heel-mr", "parameters": ["mine.txt"]}, "not both"),
-        ({"engine": "ants"}, "there are elastix and gauss-newton"),
+        ({"preset": "heel-mr", "parameters": ["mine.txt"]}, "use only one of them"),
+        ({"engine": "ants"}, "must be elastix or gauss-newton"),
     ],
 )
 def test_what_belongs_to_the_other_engine_is_refused_first(written, tmp_path, given, told):

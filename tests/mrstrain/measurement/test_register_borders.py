@@ -327,7 +327,7 @@ def test_what_cannot_be_done_is_refused(layers, found, tmp_path, pad):
         GaussNewtonWithInterfaces(skin=0.0)
     with pytest.raises(ParameterError, match="borders are for the engine gauss-newton"):
         engine_of(RegistrationOptions(preset="heel-mr", borders=True))
-    with pytest.raises(InputError, match="Borders need the tissues"):
+    with pytest.raises(InputError, match="borders needs a label map"):
         engine_of(RegistrationOptions(borders=True))
     for wrong, kind, said in (
         ({"bone": pad.folder / "bone.nrrd"}, InputError, "label map"),

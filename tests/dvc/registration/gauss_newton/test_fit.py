@@ -154,7 +154,7 @@ def test_a_change_of_volume_that_the_images_ask_for_is_found():
     assert not by_hand.frees_volume
     assert by_rule.frees_volume
     assert "the images indicate volume changes" in str(by_rule.as_dict()["change_of_volume"])
-    assert "fixed beforehand, 300/mm3" in by_hand.volume_told
+    assert "was fixed at 300/mm3" in by_hand.volume_told
     tissue = LabelMap(GRID, np.ones(GRID.shape, dtype=np.int16), {1: "fat"})  # and so it is where interfaces are known
     _, at_interfaces = fit_with_interfaces(pair_in(where, *swollen_pair(), labels=tissue), GaussNewton(5.0, 3.0))
     assert at_interfaces.frees_volume
