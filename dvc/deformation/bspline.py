@@ -37,7 +37,7 @@ class BSpline:
     Parameters
     ----------
     control : Grid
-        Places of the control points, LPS mm; four or more along each axis.
+        Positions of the control points, LPS mm; at least four along each axis.
     coefficients_mm : (3, ni, nj, nk)
         LPS components of the coefficients, indexed along the control grid's own axes, mm.
 
@@ -48,10 +48,9 @@ class BSpline:
 
     Notes
     -----
-    Defined where all 4 x 4 x 4 control points of the support exist: ``1 <= t < n - 2`` along
-    each axis, the far face left out. That is elastix' rule; where it does not hold, elastix answers with
-    the identity, a displacement of zero that was never measured, and this class with NaN. (ITK's own
-    B-spline transform counts the far face in.)
+    Defined where all 4 x 4 x 4 control points of the support exist: ``1 <= t < n - 2`` along each axis,
+    without the far face. This is the rule of elastix; outside, elastix returns the identity, a displacement
+    of zero that was never measured, and this class NaN. (The B-spline transform of ITK includes the far face.)
 
     References
     ----------

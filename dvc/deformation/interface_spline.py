@@ -210,9 +210,9 @@ def _depth_mm(inside: BoolArray, spacing_mm: FloatArray) -> FloatArray:
 class InterfaceSpline:
     """x = X + u(X), u = m v + psi w: two cubic B-splines v (mm) and w, and the factors of `Interfaces`.
 
-    u is continuous, and zero in the bone at rest. Its gradient H = m grad v + v (x) grad m + psi grad w + w (x) grad
-    psi jumps across borders: by 2 m w (x) n, n the border's normal, between two tissues that both may move. On a border
-    it is that of the side on which rounding puts the point.
+    u is continuous, and zero in the rigid bone. Its gradient H = m grad v + v (x) grad m + psi grad w + w (x) grad psi
+    is discontinuous at interfaces: between two tissues that may both move, by 2 m w (x) n, n the normal of the
+    interface. Exactly on an interface, H is that of either side, by rounding.
 
     Parameters
     ----------

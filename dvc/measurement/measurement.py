@@ -37,21 +37,21 @@ _SHOWN = "slices_meet_at_lps_mm"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """Deformation and strain of one loaded image against the unloaded one, and how far they may be trusted.
+    """Deformation and strain between the unloaded and one loaded image, with verdict and error bars.
 
-    Everything lies on the unloaded image's voxels, in the reference configuration, LPS mm; NaN where not defined.
+    Everything is on the voxels of the unloaded image, in the reference configuration, LPS mm; NaN where not defined.
 
     Attributes
     ----------
     name : str
-        Of the load.
+        Name of the load.
     deformation : Deformation
         Displacement of tissue relative to its bone.
     maps : StrainMaps
         Displacement, Green-Lagrange strain, maximum shear strain (E1 - E3)/2, det F, and where they are valid.
     alignment : mapping
-        The bone's rigid motion between the scans and how well it is known, as plain values: "on" (what was aligned
-        on), "rotation" (3 x 3) and "translation_lps_mm" (`bone_motion`), "repeatability_rms_mm" and more.
+        The bone's rigid motion between the scans, as plain values: "on" (what was aligned), "rotation" (3 x 3) and
+        "translation_lps_mm" (`bone_motion`), "repeatability_rms_mm" and more.
     quality : Quality
         The figures behind the verdict.
     regions : tuple of RegionRow
@@ -59,11 +59,11 @@ class Measurement:
     error_bars : ErrorBars
         Standard deviation and intervals of the maximum shear strain, or why there are none.
     image : Image or None
-        What maps are shown over: the unloaded image; the registered one where a folder was read.
+        Image below the maps in figures: the unloaded image, or the registered one if read from a folder.
     source : Source or None
-        What it was made from; None where a folder was read.
+        What it was made from; None if read from a folder.
     shown_mm : (3,) or None
-        Where the slices of its pictures meet, LPS mm: the bone's lowest point; None: the middle of the tissue.
+        Point where the slices in figures meet, LPS mm: the lowest point of the bone; None: the middle of the tissue.
 
     Examples
     --------
@@ -104,9 +104,9 @@ class Measurement:
         name: str = "load",
         is_repeat: bool = False,
     ) -> Self:
-        """Judge a registered pair by its subject, the unloaded image, and by more evidence.
+        """Strain, verdict and error bars of a registered pair.
 
-        With ``is_repeat`` the loaded image is a second scan without load, judged by its own strain, the noise floor.
+        With ``is_repeat`` the loaded image is a repeat scan without load; its strain is the noise floor.
         """
         more = evidence or Evidence()
         # On two cores, as NumPy and SciPy let go of the interpreter; of two at work, only one calls compiled kernels.
@@ -124,13 +124,13 @@ class Measurement:
 
     @classmethod
     def from_deformation(cls, whole: Deformation, subject: Subject, *, name: str = "load") -> Self:
-        """Strain of a deformation that was estimated elsewhere; no images are compared.
+        """Strain of a deformation from another program; no images are compared.
 
         Parameters
         ----------
         whole : Deformation
-            Of points of the unloaded image to points of the loaded one, LPS mm. Of a subject with a bone, the bone's
-            rigid motion (least squares over its voxels) is taken out.
+            Maps points of the unloaded image to points of the loaded one, LPS mm. If the subject has a bone, its rigid
+            motion (least squares over its voxels) is removed.
 
         Raises
         ------
@@ -151,16 +151,16 @@ class Measurement:
         Parameters
         ----------
         folder : path
-            Of one load; a series has one for each.
+            Folder of one load; a series has one for each load.
         image : Image, optional
-            The unloaded image, to show maps over, which the folder does not hold; by default the registered image.
+            The unloaded image, for figures, which is not in the folder; by default the registered image.
 
         Raises
         ------
         InputError, ImageFileError
-            If a file is missing or damaged, with its name and what to do; if the folder is that of a series.
+            If a file is missing or damaged, or the folder is that of a series.
         GeometryError
-            If the image lies on another grid than the maps.
+            If the image is on another grid than the maps.
         """
         place = Path(folder)
         loads = sorted({path.parent.name for path in place.glob(f"*/{files.QUALITY}")} - {files.REPEAT})
@@ -192,7 +192,7 @@ class Measurement:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the registration may be trusted, and why (not)."""
+        """The verdict on the registration, with its reasons."""
         return self.quality.verdict
 
     @property
@@ -202,19 +202,19 @@ class Measurement:
 
     @property
     def sigma(self) -> Float32Array | None:
-        """(ni, nj, nk): standard deviation of the maximum shear strain, where its error is known."""
+        """Standard deviation of the maximum shear strain (ni, nj, nk); None without error bars."""
         known = self.error_bars.uncertainty
         return None if known is None else known.sigma
 
     @property
     def intervals(self) -> tuple[Interval, ...]:
-        """95 % intervals of percentiles and volumes above a strain by tissue; empty where the error is not known."""
+        """95 % intervals of percentiles and volumes above a strain, by tissue; empty without error bars."""
         known = self.error_bars.uncertainty
         return () if known is None else known.intervals
 
     @property
     def bone_motion(self) -> RigidMotion:
-        """The bone's motion between the scans, which is taken out of the displacement."""
+        """The bone's motion between the scans, which is removed from the displacement."""
         return files.motion_in(dict(self.alignment))
 
     @property
@@ -244,7 +244,7 @@ class Measurement:
         point_mm: npt.ArrayLike | None = None,
         largest: float | None = None,
     ) -> Figure:
-        """Draw a quantity in colour over the unloaded image; thin white lines are the borders of its labels.
+        """Draw a quantity in colour over the unloaded image; thin white lines are the outlines of its labels.
 
         Parameters
         ----------
@@ -253,16 +253,16 @@ class Measurement:
             strain: "xx", "xy", "xz", "yy", "yz", "zz".
         planes : sequence of {"sagittal", "coronal", "axial"}
         point_mm : (3,), optional
-            LPS mm: where the planes meet; by default the lowest point of the bone, or the middle of the tissue.
+            Point where the planes meet, LPS mm; by default the lowest point of the bone, or the middle of the tissue.
         largest : float, optional
-            End of the colours, in the quantity's unit.
+            Upper end of the colour scale, in the unit of the quantity.
 
         Raises
         ------
         InputError
-            If there is no such quantity or plane, or the standard deviation is asked for and not known.
+            If the quantity or plane is unknown, or "sigma" is requested without error bars.
         GeometryError
-            If the point lies outside the image.
+            If the point is outside the image.
         """
         view, values = self._view(point_mm), self._values_of(quantity)
         outline = None if self.source is None else self.source.subject.labels
@@ -300,24 +300,24 @@ class Measurement:
         return page.pictures_of(self._view(), self._made_from(), self.maps, self.quality.noise_floor, self.sigma)
 
     def write(self, folder: Path | str, provenance: Mapping[str, object] | None = None) -> Section:
-        """Write everything to a folder, whole or not at all; an older folder of that name is replaced.
+        """Write everything to a folder, complete or not at all; an older folder of that name is replaced.
 
         Parameters
         ----------
         folder : path
-            Its parent exists.
+            The parent folder must exist.
         provenance : mapping, optional
-            What it was made from, as plain values, kept as ``provenance.json``.
+            What it was made from, as plain values; written to ``provenance.json``.
 
         Returns
         -------
         Section
-            Its part of a report, with the figures that were written.
+            The section of a report, with the figures that were written.
 
         Raises
         ------
         InputError
-            Of a measurement that was read from a folder: copy that one.
+            For a measurement that was read from a folder; copy that folder instead.
         OutputError
             If it cannot be written.
         """

@@ -54,7 +54,7 @@ _OTHER_MEASURE = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """The rigid motion of the bone between two scans, and how well it is known.
+    """The rigid motion of the bone between two scans, and its repeatability.
 
     Attributes
     ----------
@@ -65,8 +65,8 @@ class Alignment:
     similarity_before, similarity : float
         Normalised correlation in and 2 mm around the bone (over the whole mask with "image"), before and after.
     repeatability_mm : float
-        Root mean square, over the bone's voxels, of the distance between the motions that two halves of them give,
-        begun apart; the largest of six pairs. NaN with "none".
+        Distance between the motions fitted to two halves of the bone's voxels from different starts: root mean square
+        over the bone, largest of six pairs. NaN with "none".
     bone_shift_mm : (3,)
         Displacement of the bone's centroid, LPS.
     """

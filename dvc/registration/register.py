@@ -39,14 +39,14 @@ class Settings:
     Attributes
     ----------
     engine : Engine
-        What finds the non-rigid part, with its parameters.
+        Engine of the non-rigid registration, with its parameters.
     align_on : {"bone", "image", "none"}
         What is aligned rigidly first.
     seed : int
         Seed of every random number.
     threads : int
-        Threads of each worker. What the Gauss-Newton engine finds, the bone's alignment and the correction of the bias
-        field are equal bit for bit on any number of threads; what elastix finds, on equal numbers.
+        Threads of each worker. The Gauss-Newton engine, the rigid alignment and the bias field correction give the same
+        result bit for bit on any number of threads; elastix only on equal numbers of threads.
 
     Raises
     ------
@@ -69,7 +69,7 @@ class Settings:
             raise ParameterError(f"`threads` must be 1 or more; got {self.threads}.")
 
     def of_repeat(self) -> Self:
-        """The settings for a repeat scan, which is smoothed no more than a loaded image."""
+        """The settings for a repeat scan, which must not be smoothed more than a loaded image."""
         return replace(self, engine=self.engine.of_repeat())
 
     @classmethod

@@ -74,7 +74,7 @@ def assess(
     floor: NoiseFloor | None = None,
     in_bone: tuple[float, float] | None = None,
 ) -> Quality:
-    """Judge a registration by its strain maps, the images' similarity, and more evidence.
+    """Assess a registration by its strain maps, the similarity of the images, and further evidence.
 
     Parameters
     ----------

@@ -85,9 +85,9 @@ class ErrorModel:
     source: str
 
     def table_for(self, spacing_mm: FloatArray, snr: float) -> ErrorTable:
-        """The table nearest to a voxel (3,) mm and a signal-to-noise ratio: edges, by size, and ratio within 1.6 times.
+        """The closest table to a voxel (3,) mm and an SNR: sorted edges and SNR each within a factor of 1.6.
 
-        InputError if none is that near; the message names those there are.
+        InputError if no table is that close; the message lists all.
         """
         edges = np.sort(spacing_mm)
 
@@ -124,7 +124,7 @@ class ErrorModel:
 
 
 def read_error_model(path: Path | str) -> ErrorModel:
-    """Read what `ErrorModel.write` wrote; InputError if the file cannot be read or is no error model."""
+    """Read a file of `ErrorModel.write`; InputError if it cannot be read or is not an error model."""
     try:
         return _parsed(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError, KeyError, TypeError) as failure:

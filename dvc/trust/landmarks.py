@@ -33,10 +33,11 @@ def read_landmarks(
     ----------
     path : path, or a pair of paths
         A CSV file with the columns x0, y0, z0 (unloaded image), x1, y1, z1 (loaded image), in mm, and optionally
-        name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first. These are paired by name where both
-        hold the same names, each once, and in order (logged) where they share none; anything between is refused.
+        name; or two point lists of 3D Slicer (.mrk.json or .fcsv), unloaded first. If both lists have the same names,
+        each once, points are paired by name; if they have no name in common, in the order listed (logged); otherwise
+        they are refused.
     frame : {"LPS", "RAS"}
-        Frame of the CSV's coordinates. Slicer's files tell theirs.
+        Frame of the coordinates in the CSV file. Slicer files state their own.
 
     Returns
     -------
@@ -83,21 +84,21 @@ def read_landmarks(
 def target_registration_error(
     deformation: Deformation, reference_mm: FloatArray, deformed_mm: FloatArray
 ) -> FloatArray:
-    """Distance between where a deformation puts each landmark and where it was seen, |X + u(X) - x|.
+    """Distance between the registered and the observed position of each landmark, |X + u(X) - x|.
 
     Parameters
     ----------
     deformation : Deformation
-        The whole motion from the unloaded to the loaded image, the bone's included, since the landmarks x lie in the
-        loaded image as it was scanned.
+        The whole motion from the unloaded to the loaded image, bone motion included, because the landmarks x are in
+        the loaded image as scanned.
     reference_mm, deformed_mm : (n, 3)
         Landmarks X in the unloaded and x in the loaded image, LPS mm.
 
     Returns
     -------
     (n,)
-        mm; NaN where the deformation is not defined. Count these in any summary: a mean over the others alone looks
-        better than the registration is.
+        mm; NaN where the deformation is not defined. Report their number, because a mean over the other landmarks alone
+        is too optimistic.
 
     Raises
     ------

@@ -15,14 +15,14 @@ _WORDS: dict[Level, str] = {"trust": "Trust", "caution": "Use with care", "distr
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether a result may be used, and why (not).
+    """Verdict on a result, with reasons.
 
     Parameters
     ----------
     level : {"trust", "caution", "distrust"}
         From the best to the worst; in words "Trust", "Use with care", "Do not trust".
     reasons : tuple of str
-        Full sentences, each naming a figure and its limits; at least one below "trust".
+        Full sentences, each with a figure and its limits; at least one reason unless the level is "trust".
 
     Raises
     ------

@@ -31,9 +31,14 @@ Workers = Annotated[
 ]
 
 EXAMPLES = {
-    "register": "Example: mrstrain register Load0.nii.gz Load1.nii.gz --bone calcaneus.nii.gz --out results",
+    command: f"\b\nExample:\n  mrstrain {command} {given}"
+    for command, given in {
+        "register": "Load0.nii.gz Load1.nii.gz --bone calcaneus.nii.gz --out results",
+        "simulate": "heel.vtu --set trebbi --load Load1=115 --out simulated",
+        "compare": "results simulated/trebbi --labels tissues.nii.gz --names tissues.csv --out compared",
+    }.items()
 }
-"""Ends of commands' help."""
+"""The end of a command's help, by command."""
 
 _GROUPS = ("Arguments", "Options", "Inputs", "Registration", "Model", "Comparison", "Output", "Advanced")
 

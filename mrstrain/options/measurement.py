@@ -83,7 +83,7 @@ class RegistrationOptions(EngineOptions):
     """Start each load from the result of the one before it, in the order given."""
     error_model: Annotated[Path | None, Cli(panel="Advanced")] = None
     """Error model written by `mrstrain accuracy`, instead of the built-in one."""
-    twin: Annotated[Flag, Cli(panel="Output")] = False
+    twin: Flag = False
     """Also register a synthetic warp (twin) of each pair, whose strain is known, to check the error bars. Takes more
     than twice the time."""
     allow_unknown_parameters: Annotated[Flag, Cli(panel="Advanced")] = False

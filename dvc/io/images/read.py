@@ -30,17 +30,17 @@ def read_image(
     path: StrPath, *, allow_missing: bool = False, series: str | None = None, volume: int | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> Image:  # fmt: skip
-    """Read a 3D image, whatever its format, into LPS mm: voxels in the order of the file, slope and intercept applied.
+    """Read a 3D image of any supported format into LPS mm; voxel order as in the file, slope and intercept applied.
 
     Parameters
     ----------
     path : file (.nii, .nii.gz, .nrrd, .nhdr, .mha, .mhd, enhanced DICOM) or folder of a DICOM series
     allow_missing : bool
-        Take voxels that are NaN or infinite as missing (NaN) instead of refusing the image.
+        Treat NaN and infinite voxels as missing (NaN), instead of refusing the image.
     series : str, optional
-        Which DICOM series, echo, stack or the like, where there are several, as the refusal lists them.
+        DICOM series, echo, stack or similar, if there are several; the error message lists their names.
     volume : int, optional
-        Which volume of a 4D file, from 0.
+        Number of the volume in a 4D file, from 0.
     max_bytes : int
         Largest image that is read, counted in single precision.
 

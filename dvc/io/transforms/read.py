@@ -61,9 +61,8 @@ def read_transform(path: StrPath) -> Deformation:
     Returns
     -------
     Deformation
-        Of fixed points to moving points, LPS mm. A `BSpline` is NaN outside its valid region, where elastix and ITK
-        answer with the identity. A displacement field inside an ITK file is interpolated by cubic splines (ITK:
-        linearly).
+        Maps fixed points to moving points, LPS mm. A `BSpline` is NaN outside its valid region, where elastix and ITK
+        return the identity. A displacement field in an ITK file is interpolated by cubic splines (in ITK: linearly).
 
     Raises
     ------

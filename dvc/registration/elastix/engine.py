@@ -36,12 +36,12 @@ class Elastix(Engine):
     Attributes
     ----------
     presets : tuple of Preset
-        Stages, one after the other; each starts from the coefficients of the one before. "heel-mr" by default.
+        Stages in sequence; each starts from the coefficients of the previous one. "heel-mr" by default.
 
     Raises
     ------
     ParameterError
-        If there is no stage, one finds no B-spline, or two end with different spacings of control points.
+        If there is no stage, a stage is not a B-spline, or two stages end with different control point spacings.
     """
 
     presets: tuple[Preset, ...] = field(default_factory=lambda: (load_preset("heel-mr"),))
@@ -70,17 +70,17 @@ class Elastix(Engine):
 
     @property
     def name(self) -> str:
-        """Name of the last preset or parameter file, which an error model is known by."""
+        """Name of the last preset or parameter file, which also names the error model."""
         return self.presets[-1].name
 
     @property
     def text(self) -> str:
-        """All stages' parameters, as written."""
+        """The parameters of all stages, as written."""
         return "\n".join(preset.text for preset in self.presets)
 
     @property
     def needs_one_contrast(self) -> bool:
-        """Whether what is brighter than its neighbours must be so in both images: not for mutual information."""
+        """Whether the two images must have the same contrast; not for mutual information."""
         metrics = [metric for preset in self.presets for metric in preset.parameters.get("Metric", ())]
         return not any("MutualInformation" in metric for metric in metrics)
 
@@ -91,12 +91,12 @@ class Elastix(Engine):
 
     @property
     def without_error_model(self) -> str:
-        """Why no error model can be made for it; empty for a single stage."""
+        """Why there can be no error model for it; empty for a single stage."""
         several = len(self.presets) > 1
         return "The error of several elastix stages in sequence has not been measured." if several else ""
 
     def check_start(self, start: Deformation) -> None:
-        """Refuse, by InputError, a start that is no B-spline."""
+        """InputError for a start that is not a B-spline."""
         _as_bspline(start)
 
     def record(self) -> dict[str, object]:
@@ -106,7 +106,7 @@ class Elastix(Engine):
 
     @classmethod
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
-        """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
+        """Methods text from the parameters of a provenance record; empty if another engine was used."""
         stages = record.get("stages") or []
         if not stages or record.get("gauss_newton"):
             return ""

@@ -98,14 +98,14 @@ def read_parameter_file(path: Path | str, *, allow_unknown: bool = False) -> Pre
     Parameters
     ----------
     allow_unknown : bool
-        Accept parameter names that are not in our list (a newer elastix may have more).
+        Accept parameter names that mrstrain does not know (a newer elastix may have more).
 
     Raises
     ------
     InputError
         If the file cannot be read.
     ParameterError
-        For a name, or a component, that elastix does not know: with the nearest that it does.
+        For a name or component that elastix does not know; the message gives the closest known name.
     """
     try:
         text = Path(path).read_text()

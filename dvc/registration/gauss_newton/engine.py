@@ -59,15 +59,15 @@ class GaussNewton(Parameters, Engine):
 
     @property
     def unlike_its_error_model(self) -> str:
-        """Why an error model of its name does not hold for it, where its parameters are not those of the model."""
+        """Why the error model of this name is not valid, if it was made with other parameters."""
         return _unlike(self.name, self)
 
     def of_repeat(self) -> Self:
-        """With the usual weights: those chosen for a pair without strain would smooth away the noise it is to show."""
+        """With the default weights: weights chosen for a pair without strain would smooth away the noise floor."""
         return replace(self, bending=self.weights.bending, volume=self.weights.volume)
 
     def keeping_volume(self) -> Self:
-        """With the weight of tissue that keeps its volume, whatever the images ask for."""
+        """With the weight of incompressible tissue, whatever the images indicate."""
         return replace(self, volume=self.weights.volume)
 
     def record(self) -> dict[str, object]:
@@ -76,7 +76,7 @@ class GaussNewton(Parameters, Engine):
 
     @classmethod
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
-        """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
+        """Methods text from the parameters of a provenance record; empty if another engine was used."""
         own = record.get("gauss_newton")
         if not own or record.get("borders") is not None:
             return ""
@@ -96,7 +96,7 @@ class GaussNewton(Parameters, Engine):
         )
 
     def prepare(self) -> None:
-        """Compile its loops, where no run has before."""
+        """Compile the loops, if no run has done so before."""
         compile_loops(lambda pair: fit(pair, self))
 
     def find(
@@ -114,7 +114,7 @@ class GaussNewtonWithInterfaces(Engine):
     Attributes
     ----------
     smooth : GaussNewton
-        What comes before, and the weights for both.
+        The smooth spline that is fitted first, with the weights of both fits.
     skin : float or None
         Weight k of strain in the skin, 1/mm3; None: chosen for each pair by cross-validation.
 
@@ -138,20 +138,20 @@ class GaussNewtonWithInterfaces(Engine):
 
     @property
     def text(self) -> str:
-        """Every number that decides the result, as JSON: those of the smooth spline, and those of the last stage."""
+        """Every number that affects the result, as JSON: those of the smooth spline and of the last stage."""
         return json.dumps(json.loads(self.smooth.text) | {"borders": {"skin": self.skin} | STAGE})
 
     @property
     def unlike_its_error_model(self) -> str:
-        """Why an error model of its name does not hold for it, where its parameters are not those of the model."""
+        """Why the error model of this name is not valid, if it was made with other parameters."""
         return _unlike(self.name, self.smooth)
 
     def of_repeat(self) -> Self:
-        """With the usual weights: those chosen for a pair without strain would smooth away the noise it is to show."""
+        """With the default weights: weights chosen for a pair without strain would smooth away the noise floor."""
         return replace(self, smooth=self.smooth.of_repeat(), skin=self.skin or USUAL_SKIN)
 
     def keeping_volume(self) -> Self:
-        """With the weight of tissue that keeps its volume, whatever the images ask for."""
+        """With the weight of incompressible tissue, whatever the images indicate."""
         return replace(self, smooth=self.smooth.keeping_volume())
 
     def record(self) -> dict[str, object]:
@@ -160,7 +160,7 @@ class GaussNewtonWithInterfaces(Engine):
 
     @classmethod
     def methods(cls, record: Mapping[str, Any], versions: Mapping[str, str]) -> str:
-        """How it registered, for a methods section, from a provenance record's parameters; empty if it did not."""
+        """Methods text from the parameters of a provenance record; empty if another engine was used."""
         last = record.get("borders")
         smooth = GaussNewton.methods({**record, "borders": None}, versions)
         if not smooth or last is None:
@@ -175,7 +175,7 @@ class GaussNewtonWithInterfaces(Engine):
         )
 
     def prepare(self) -> None:
-        """Compile its loops, where no run has before."""
+        """Compile the loops, if no run has done so before."""
         compile_loops(lambda pair: fit_with_interfaces(pair, self.smooth))
 
     def find(
@@ -186,7 +186,7 @@ class GaussNewtonWithInterfaces(Engine):
         return Found(displacement, choice, self.unlike_study(pair, choice))
 
     def unlike_study(self, pair: AlignedPair, choice: Choice) -> str:
-        """Why its error model does not hold for a pair; empty where it does."""
+        """Why its error model is not valid for a pair; empty if it is."""
         if pair.bone is None:
             return (
                 f"The error of {self.name} was measured with a rigid bone; here the images were not aligned on a bone."
